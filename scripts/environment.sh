@@ -7,8 +7,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 extras=${1:-} kind=${2:-}
 venv=.venv${kind:+-$kind}
 python=${PYTHON:-python3}
-if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
-  echo "torchrg needs Python 3.11 or newer; set PYTHON to one, as in PYTHON=python3.12 bash $0" >&2
+if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
+  echo "torchrg needs Python 3.10 or newer; set PYTHON to one, as in PYTHON=python3.12 bash $0" >&2
   exit 2
 fi
 

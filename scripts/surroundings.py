@@ -1,9 +1,13 @@
-"""What a time depends on: versions, commit, processor, cores and threads."""
+"""What a time depends on: versions, commit, processor, cores and threads.
+
+Called as a script it prints a table: what torchrg needs at least, and what is here.
+"""
 
 import os
 import platform
+import re
 import subprocess
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
 
 PACKAGES = ("torchrg", "torch", "numpy", "scipy")
@@ -38,3 +42,23 @@ def _processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def oldest_and_here() -> str:
+    """Return the oldest versions that are allowed and those that are installed, as Markdown."""
+    needs = [f"python{metadata('torchrg')['Requires-Python']}", *sorted(requires("torchrg") or ())]
+    found = (re.match(r"([\w-]+)(?:\[.*\])?>=([\d.]+)", need) for need in needs)
+    rows = {f"| {row[1]} | {row[2]} | {_installed(row[1])} |": None for row in found if row}
+    return "\n".join(["| package | oldest | here |", "|---|---|---|", *rows])
+
+
+def _installed(package: str) -> str:
+    """Return the version of a package."""
+    try:
+        return platform.python_version() if package == "python" else version(package)
+    except PackageNotFoundError:
+        return "none"
+
+
+if __name__ == "__main__":
+    print(oldest_and_here())

@@ -2,7 +2,7 @@
 # Sets up .venv with the test extras, then runs the linters, the type checker and the whole suite.
 # Arguments go to pytest: bash scripts/test.sh --run-slow
 # With --lowest first: the suite alone, in .venv-lowest with the oldest versions that pyproject.toml
-# allows (several GB, Python 3.11 or 3.12). There warnings are no errors: old packages do what newer
+# allows (several GB, Python 3.10 to 3.12). There warnings are no errors: old packages do what newer
 # ones of those they need have deprecated.
 if [ "${1:-}" = --lowest ]; then
   shift

@@ -141,7 +141,7 @@ def prepare(room: Scene) -> Sample:
     normals = orient_normals(room.points, seg.normals)
     voxels = sample_voxels(room.points, VOXELS[0])
     rows, truth = voxels.rows, classes_of(room)
-    plane, own = seg.labels[rows], len(seg.planes.count) + torch.arange(len(rows))
+    plane, own = seg.labels[rows], len(seg.planes) + torch.arange(len(rows))
     return Sample(
         make_levels(room.points[rows]),
         normals[rows],

@@ -2,9 +2,11 @@
 
 import dataclasses
 import math
+import types
 from pathlib import Path
 
 import pytest
+import torch
 
 from torchrg.config import (
     DepthConfig,
@@ -15,7 +17,16 @@ from torchrg.config import (
     preset_names,
 )
 from torchrg.errors import ConfigError
+from torchrg.normals import estimate_normals
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.structures import Sampling
+from torchrg.transforms import (
+    EstimateNormals,
+    GrowRegions,
+    MakeSuperpoints,
+    SegmentDepth,
+    SegmentPlanes,
+)
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -78,8 +89,9 @@ def test_an_angle_beyond_a_right_one_is_refused():
     [
         (
             "growing: {max_angle: 5}",
-            "growing: unknown key 'max_angle'; GrowingConfig has max_angle_",
+            "growing: unknown setting 'max_angle'; the nearest is max_angle_",
         ),
+        ("k: 5", "unknown setting 'k'; it is normals.k, as in "),
         ("normals: {k: 2}", "normals: NormalsConfig: expected k >= 3, got 2"),
         ("normals: {k: 3.5}", "normals: k: expected int, got 3.5"),
         ("normals: {k: true}", "normals: k: expected int, got True"),
@@ -89,7 +101,8 @@ def test_an_angle_beyond_a_right_one_is_refused():
         ("growing: 5", "growing: expected a mapping of settings, got 5"),
         ("angle_deg: [5]", r"angle_deg: expected float, got \[5\]"),
         ("angle_deg: 91", r"expected angle_deg in \[0, 90\], got 91"),
-        ("angles: 5", "unknown key 'angles'; PipelineConfig has .*, angle_deg"),
+        ("angles: 5", "unknown setting 'angles'; the nearest is planes"),
+        ("colour: 5", "unknown setting 'colour'; PipelineConfig has .*, angle_deg"),
         ("growing: [", "expected YAML"),
         pytest.param("[" * 900, "expected YAML, got maximum recursion", id="brackets"),
         pytest.param("chunk_size: " + "9" * 5000, "expected YAML, got Exceeds", id="digits"),
@@ -99,7 +112,7 @@ def test_an_angle_beyond_a_right_one_is_refused():
         ("base: [consensus]", "got "),
         ("base: ../mine", "expected base"),
         ("base: consensus\ngrowing: 3", "growing: expected a mapping"),
-        ("base: consensus\ngrow: {}", "unknown key 'grow'"),
+        ("base: consensus\ngrow: {}", "unknown setting 'grow'; the nearest is growing"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, text, message):
@@ -218,3 +231,83 @@ def test_a_file_holds_differences_to_its_base(tmp_path):
     assert settings.chunk_size == 99
     path.write_text("base: paper\n")
     assert load_config(path) == load_config("paper")
+
+
+@pytest.mark.parametrize(
+    ("config", "keywords"),
+    [
+        ("classic", {"normals.k": 30, "growing.min_size": 7}),
+        ("classic", {"normals": {"k": 30}, "growing.min_size": 7}),
+        (load_config("classic"), {"normals.k": 30, "growing": {"min_size": 7}}),
+        ({"base": "classic", "normals": {"k": 30}, "growing": {"min_size": 7}}, {}),
+        ({"base": "classic", "normals.k": 30}, {"growing.min_size": 7}),
+        (types.MappingProxyType({"base": "classic", "growing.min_size": 7}), {"normals.k": 30}),
+    ],
+)
+def test_settings_come_by_dictionary_and_keyword(config, keywords):
+    classic = load_config("classic")
+    expected = dataclasses.replace(
+        classic,
+        normals=dataclasses.replace(classic.normals, k=30),
+        growing=dataclasses.replace(classic.growing, min_size=7),
+    )
+    assert load_config(config, **keywords) == expected
+    assert segment_config(config, **keywords) == expected
+
+
+def segment_config(config, **keywords):
+    return SegmentPlanes(config, **keywords).config
+
+
+def test_sections_and_other_settings_come_by_dictionary_too():
+    assert EstimateNormals({"method": "pca", "k": 9}).config.k == 9
+    assert EstimateNormals({"base": "classic", "normals.k": 9}).config.method == "pca"
+    assert GrowRegions({"growing": {"min_size": 9}}).config.min_size == 9
+    assert MakeSuperpoints({"counts": [100, 10]}).config.counts == (100, 10)
+    assert MakeSuperpoints(counts=100).config.counts == (100,)
+    assert SegmentDepth({"noise": [0, 0.003]}, min_size=9).config == DepthConfig(
+        (0.0, 0.003), min_size=9
+    )
+    assert load_config(growing=GrowingConfig(min_size=9)).growing.min_size == 9
+    assert angles_of(load_config("paper", angle_deg=8)) == (8, 8)
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (
+            lambda: load_config(k=3),
+            r"^load_config: unknown .* normals.k, as in \*\*{'normals.k': 3}",
+        ),
+        (lambda: SegmentPlanes("classic", min_size=3), "it is growing.min_size, as in"),
+        (
+            lambda: SegmentPlanes(**{"normal.k": 3}),
+            "unknown setting 'normal'; the nearest is normals",
+        ),
+        (lambda: SegmentPlanes(**{"normals.k": "3"}), "SegmentPlanes: normals: k: expected int"),
+        (lambda: segment_planes(torch.zeros(3, 3), preset="classic"), "the argument before"),
+        (
+            lambda: estimate_normals(torch.zeros(3, 3), radius=0.1),
+            "radius.*bounded by max_distance",
+        ),
+        (lambda: make_superpoints(torch.zeros(3, 3), n=10), "numbers of superpoints are counts"),
+        (lambda: MakeSuperpoints("classic"), "a SuperpointsConfig or a dictionary, got str"),
+        (lambda: MakeSuperpoints(counts="100"), "counts: expected numbers or null, got '100'"),
+        (lambda: SegmentDepth(noise=[0.1]), "noise: expected numbers or null"),
+        (lambda: load_config(["classic"]), "a dictionary, or a preset, one of .*, got list"),
+    ],
+)
+def test_wrong_keywords_name_the_repair(ask, message):
+    with pytest.raises(ConfigError, match=message):
+        ask()
+
+
+@pytest.mark.parametrize("config", [load_config().normals, DepthConfig(), load_config()])
+def test_settings_that_are_assigned_say_how_others_are_made(config):
+    with pytest.raises(AttributeError, match=r"not changed in place; .*min_size.*7.* makes others"):
+        config.min_size = 7
+
+
+def test_checkpoints_hold_settings_without_trust(tmp_path):
+    torch.save({"config": load_config("paper")}, tmp_path / "a.ckpt")
+    assert torch.load(tmp_path / "a.ckpt", weights_only=True)["config"] == load_config("paper")

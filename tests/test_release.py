@@ -2,13 +2,14 @@
 
 import json
 import re
-import tomllib
 from pathlib import Path
 
+import pytest
 import yaml
 
 from torchrg.version import __version__
 
+tomllib = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 

@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from torchrg.render.page import make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes
+from torchrg.transforms import OrientNormals
 
 CLASSIC = load_config("classic")
 OUTLINED = replace(CLASSIC, planes=PlanesConfig(up="z", outline=True))
@@ -50,7 +51,7 @@ def parts(cloud, seg):
 def assert_same_table(found, expected, tolerance=0.0):
     """Check all that tables hold; outlines ring by ring."""
     assert (found.adjacency is None) == (expected.adjacency is None)
-    for name in (n for n in Planes._fields if n not in ("kind", "outline", "adjacency")):
+    for name in PLANE_COLUMNS:
         ours, theirs = getattr(found, name), getattr(expected, name)
         assert ours.dtype == theirs.dtype, name
         torch.testing.assert_close(ours, theirs, rtol=0, atol=tolerance, msg=name)
@@ -263,7 +264,7 @@ def test_labels_from_elsewhere_get_one_table(monkeypatch, cloud, seg):
 
 
 def test_neighbors_of_the_segmentation_are_not_searched_again(monkeypatch, cloud, seg):
-    bare = seg._replace(planes=seg.planes._replace(adjacency=None))
+    bare = seg._replace(planes=replace(seg.planes, adjacency=None))
     searched = Result.of(cloud, bare).planes
     rows = finite_rows(cloud.points)
     known = bare._replace(neighbors=torchrg.search_knn(cloud.points[rows], 50, canonical=True))
@@ -273,6 +274,17 @@ def test_neighbors_of_the_segmentation_are_not_searched_again(monkeypatch, cloud
     assert result.segmentation.neighbors is known.neighbors
     with pytest.raises(TypeError, match="not callable"):
         _ = Result.of(cloud, bare).planes
+
+
+def test_a_result_is_a_sample_of_transforms(cloud, seg, parts):
+    sample = Result.of(cloud, seg, parts).to_dict()
+    assert torch.equal(sample["coord"], cloud.points)
+    assert torch.equal(sample["plane"], seg.labels)
+    assert torch.equal(sample["superpoint"].long(), parts.labels)
+    assert np.array_equal(sample["origin"][0], cloud.origin)
+    assert len(sample["planes"]) == len(seg.planes)
+    turned = OrientNormals("+z")(sample)["normal"]
+    assert torch.equal(turned.abs(), seg.normals.abs())
 
 
 def test_without_labels_there_is_no_table(tmp_path, cloud):
@@ -330,7 +342,7 @@ def test_no_planes_are_read_back_too(tmp_path):
     points = np.random.default_rng(0).random((40, 3)).astype(np.float32)
     cloud = Cloud(points)
     seg = torchrg.segment_planes(cloud.points, CLASSIC)
-    assert len(seg.planes.count) == 0
+    assert len(seg.planes) == 0
     torchrg.write_cloud(tmp_path / "a.npz", cloud, seg)
     write_results(tmp_path, points, seg)
     for path in (tmp_path / "a.npz", tmp_path):
@@ -340,8 +352,8 @@ def test_no_planes_are_read_back_too(tmp_path):
 
 
 def test_columns_of_files_are_those_of_the_table():
-    assert list(PLANE_COLUMNS) == list(Planes._fields[: len(PLANE_COLUMNS)])
-    assert Planes._fields[len(PLANE_COLUMNS) :] == ("kind", "outline", "adjacency")
+    names = [part.name for part in fields(Planes)]
+    assert names == [*PLANE_COLUMNS, "kind", "outline", "adjacency"]
     assert PlaneAdjacency._fields[0] == "pairs"
 
 

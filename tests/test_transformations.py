@@ -87,14 +87,6 @@ FUNCTIONS = {
     "robust normals": normals_of(fit_normals_robust, estimator=fit_detmm),
 }
 functions = pytest.mark.parametrize("name", FUNCTIONS)
-# An operation of one's own has had a rule for vmap since torch 2.5.
-has_rules = hasattr(torch.library.CustomOpDef, "register_vmap")
-newer_torch = pytest.mark.skipif(not has_rules, reason="needs torch 2.5")
-WITHOUT_RULES = {"covariance", "eigh3", "pca", "jet"}
-transformed_functions = pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name in WITHOUT_RULES else newer_torch) for name in FUNCTIONS],
-)
 # Torch's own, where it inlines a function that has no gradient to record.
 of_torch = pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 
@@ -127,7 +119,7 @@ def assert_close(found, expected):
         assert torch.allclose(part, wanted, rtol=1e-9, atol=1e-12)
 
 
-@transformed_functions
+@functions
 def test_vmap_is_a_loop(name, patches):
     found = torch.vmap(FUNCTIONS[name])(patches)
     assert_close(found, FUNCTIONS[name](patches))
@@ -137,14 +129,14 @@ def test_vmap_is_a_loop(name, patches):
     assert_close((part.flatten(0, 1) for part in twice), FUNCTIONS[name](patches))
 
 
-@transformed_functions
+@functions
 def test_gradients_flow_through_vmap(name, patches):
     leaf = patches.clone().requires_grad_()
     sum((part**2).sum() for part in torch.vmap(FUNCTIONS[name])(leaf)).backward()
     assert_close([leaf.grad], [gradient(name, patches)])
 
 
-@transformed_functions
+@functions
 def test_functional_gradients_are_those_of_autograd(name, patches):
     expected = gradient(name, patches)
     assert_close([torch.func.grad(loss_of(name))(patches)], [expected])
@@ -194,7 +186,6 @@ def test_shapes_without_values_on_meta(name, patches):
     assert [part.shape for part in found] == expected
 
 
-@newer_torch
 @of_torch
 @pytest.mark.parametrize("fit", [fit_detmcd, fit_detmm])
 def test_masks_travel_with_their_patches(fit, patches):
@@ -209,7 +200,6 @@ def test_masks_travel_with_their_patches(fit, patches):
     assert torch.equal(compiled(patches, mask).support, expected.support)
 
 
-@newer_torch
 def test_masked_scales_and_other_axes_under_vmap(patches):
     mask = torch.rand(4, 15, 3, generator=torch.Generator().manual_seed(1)) < 0.8
     found = torch.vmap(lambda x, m: qn(x, dim=0, mask=m))(patches, mask)
@@ -222,7 +212,6 @@ def test_what_does_not_fit_into_an_operation_is_refused(patches):
         torch.vmap(draw)(patches)
 
 
-@newer_torch
 def test_second_derivatives_of_opaque_functions_are_refused(patches):
     hessian = torch.func.jacrev(torch.func.jacrev(lambda x: qn(x)))
     with pytest.raises(NotImplementedError, match="scale_of_rows: has no second derivatives"):

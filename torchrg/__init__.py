@@ -12,7 +12,7 @@ Functions of patches (``covariance``, ``eigh3``, ``median``, ``mad``, ``qn``, ``
 ``fit_detmcd``, ``fit_fastmcd``, ``fit_mve``, ``fit_dets``, ``fit_detmm``) are like those of torch:
 they have gradients, and run under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)``,
 ``torch.export`` and ``torch.autocast``. The robust fits, scales and ``fit_normals_irls`` are one
-operation of their own to ``vmap`` (from torch 2.5), ``torch.func`` and compilers, and have no
+operation of their own to ``vmap``, ``torch.func`` and compilers, and have no
 second derivatives there. Functions of clouds (``search_knn``,
 ``estimate_normals``, ``orient_normals``, ``grow_regions``, ``segment_planes``,
 ``make_superpoints``, ``segment_depth``) search neighbours and grow regions on the CPU: a compiler
@@ -24,7 +24,7 @@ Example:
     >>> import torchrg
     >>> room = torchrg.scenes.make_room(num_points=2000, noise=0.003, seed=0)
     >>> seg = torchrg.segment_planes(room.points, torchrg.load_config("classic"))
-    >>> seg.labels.shape, seg.normals.shape, len(seg.planes.count) > 3
+    >>> seg.labels.shape, seg.normals.shape, len(seg.planes) > 3
     (torch.Size([2000]), torch.Size([2000, 3]), True)
 """
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from torchrg.pipeline import make_superpoints, segment_mesh, segment_planes
     from torchrg.regions import align_axes, grow_regions
     from torchrg.result import read_result
-    from torchrg.structures import UNLABELED, Cloud
+    from torchrg.structures import UNLABELED, Cloud, Plane
 else:
     _NAMES = {
         "config": ("load_config",),
@@ -55,7 +55,7 @@ else:
         "pipeline": ("make_superpoints", "segment_mesh", "segment_planes"),
         "regions": ("align_axes", "grow_regions"),
         "result": ("read_result",),
-        "structures": ("UNLABELED", "Cloud"),
+        "structures": ("UNLABELED", "Cloud", "Plane"),
     }
     _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
@@ -90,8 +90,8 @@ def _load_display() -> "ModuleType":
 _display.register(_load_display)
 
 __all__ = [
-    "UNLABELED", "Cloud", "TorchrgError", "align_axes", "datasets", "depth", "estimate_normals",
-    "grow_regions", "load_config", "make_superpoints", "metrics", "nn", "normals", "read_cloud",
-    "read_result", "robust", "scenes", "search_knn", "segment_mesh", "segment_planes", "transforms",
-    "write_cloud",
+    "UNLABELED", "Cloud", "Plane", "TorchrgError", "align_axes", "datasets", "depth",
+    "estimate_normals", "grow_regions", "load_config", "make_superpoints", "metrics", "nn",
+    "normals", "read_cloud", "read_result", "robust", "scenes", "search_knn", "segment_mesh",
+    "segment_planes", "transforms", "write_cloud",
 ]  # fmt: skip

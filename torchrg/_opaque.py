@@ -97,7 +97,7 @@ def _as_list(outputs: Any) -> list[Tensor]:  # noqa: ANN401
     return [tensor for tensor in tensors if tensor is not None]
 
 
-# With their schemas, as torch 2.4 infers none from list[Tensor].
+# With their schemas, as torch 2.5 infers none from list[Tensor].
 @torch.library.custom_op(
     "torchrg::patchwise", mutates_args=(), schema="(Tensor[] tensors, str call) -> Tensor[]"
 )
@@ -146,16 +146,15 @@ def _with_batch_first(size: int, places: list[int | None], tensors: list[Tensor]
     ]
 
 
-if hasattr(_forward, "register_vmap"):  # torch 2.5
+@_forward.register_vmap
+def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+    outputs = _forward(_with_batch_first(info.batch_size, places[0], tensors), call)
+    return outputs, [0] * len(outputs)
 
-    @_forward.register_vmap
-    def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
-        outputs = _forward(_with_batch_first(info.batch_size, places[0], tensors), call)
-        return outputs, [0] * len(outputs)
 
-    @_backward.register_vmap
-    def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
-        return _backward(_with_batch_first(info.batch_size, places[0], tensors), call), 0
+@_backward.register_vmap
+def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+    return _backward(_with_batch_first(info.batch_size, places[0], tensors), call), 0
 
 
 class _Differentiable(torch.autograd.Function):

@@ -1,14 +1,17 @@
 """All settings, their defaults and their meaning; files and flags hold only differences."""
 
 import dataclasses
+import difflib
 import itertools
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NoReturn, TypeVar
+
+import torch
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError
@@ -326,6 +329,10 @@ class PipelineConfig:
         return {"sampling": sampling._asdict(), "settings": settings}
 
 
+AnyConfig = PipelineConfig | Mapping[str, Any] | str | Path
+"""What stands for a whole configuration: see :func:`load_config`."""
+_SECTIONS = {"normals": NormalsConfig, "growing": GrowingConfig, "planes": PlanesConfig}
+"""The parts of a configuration."""
 _ANGLES = {"normals": "sharp_angle_deg", "growing": "max_angle_deg"}
 """The settings that ``angle_deg`` moves, by their section."""
 
@@ -410,14 +417,17 @@ def preset_names() -> list[str]:
     return sorted(path.stem for path in _preset_folder().glob("*.yaml"))
 
 
-def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
-    """Read settings from a preset or a YAML file; what it leaves out is as in ``consensus``.
+def load_config(config: AnyConfig = DEFAULT_PRESET, **changes: Any) -> PipelineConfig:  # noqa: ANN401
+    """Return settings: those of a preset, a YAML file or a dictionary, with some changed.
 
-    A file that begins with ``base: NAME`` leaves out what that preset says instead. ``angle_deg``
-    at its top sets both angles: see :meth:`PipelineConfig.at_angle`.
+    What a file or a dictionary leaves out is as in ``consensus``, or as in the preset that it names
+    as its ``base``. Its keys are sections, or settings with a dot, as in ``normals.k``.
+    ``angle_deg`` at its top sets both angles: see :meth:`PipelineConfig.at_angle`.
 
     Args:
-        name_or_file: A name from :func:`preset_names`, or the path of a ``.yaml`` file.
+        config: A name from :func:`preset_names`, the path of a ``.yaml`` file, a dictionary, or
+            settings. Default: the preset ``consensus``.
+        **changes: Single settings on top of these, with the same keys.
 
     Returns:
         The settings.
@@ -426,14 +436,12 @@ def load_config(name_or_file: str | Path = DEFAULT_PRESET) -> PipelineConfig:
         ConfigError: If there is no such preset or file, it is not YAML, or a key or value is wrong.
 
     Example:
-        >>> load_config("classic").growing.seed_rule
-        'curvature'
+        >>> load_config("classic", **{"normals.k": 30}).normals.k
+        30
+        >>> load_config({"base": "classic", "growing": {"min_size": 20}}).growing.min_size
+        20
     """
-    path = Path(name_or_file)
-    if path.suffix not in (".yaml", ".yml"):
-        expected = "load_config: expected a .yaml file, or a preset, one of"
-        path = _preset_file(str(name_or_file), expected=expected)
-    return _build_config(PipelineConfig, _read_values(path), where=str(path))
+    return settings_of("load_config", PipelineConfig, config, changes)
 
 
 def settings_of(
@@ -446,10 +454,10 @@ def settings_of(
 
     Args:
         caller: Name of the public function or class, the first word of messages.
-        kind: :class:`PipelineConfig`, or the kind of one of its sections.
-        config: Such settings, a whole configuration, or the name of a preset or a file. Default:
-            that of :func:`load_config`.
-        changes: Single settings.
+        kind: :class:`PipelineConfig`, the kind of one of its sections, or another.
+        config: Such settings, a dictionary of them, a whole configuration, or the name of a preset
+            or a file. Default: that of :func:`load_config`.
+        changes: Single settings, for a whole configuration as ``{"normals.k": 30}``.
 
     Raises:
         ConfigError: If there is no such preset or setting, or a value is wrong.
@@ -458,30 +466,33 @@ def settings_of(
         >>> settings_of("f", NormalsConfig, "classic", {"k": 30}).method
         'pca'
     """
-    if config is None or isinstance(config, str | Path):
-        config = load_config(config or DEFAULT_PRESET)
-    if isinstance(config, PipelineConfig):
+    is_part = kind in (PipelineConfig, *_SECTIONS.values())
+    if isinstance(config, str | Path) and is_part:
+        config = _read_config(config, caller)
+    elif isinstance(config, Mapping):
+        heads = {str(key).partition(".")[0] for key in config}
+        is_whole = kind is PipelineConfig or (is_part and heads & {"base", *_SECTIONS})
+        config = _configured(config, caller) if is_whole else _changed(kind(), config, caller)
+    elif config is None:
+        config = kind()
+    if isinstance(config, PipelineConfig) and is_part:
         parts = (config, config.normals, config.growing, config.planes)
         config = next(part for part in parts if isinstance(part, kind))
     if not isinstance(config, kind):
-        kinds = " or a ".join(dict.fromkeys((kind.__name__, PipelineConfig.__name__)))
+        presets = f", or a preset, one of {', '.join(preset_names())}" if is_part else ""
         raise ConfigError(
-            f"{caller}: expected config to be a {kinds}, or a preset, one of "
-            f"{', '.join(preset_names())}, got {type(config).__name__}."
+            f"{caller}: expected config to be a {kind.__name__} or a dictionary{presets}, got "
+            f"{type(config).__name__}."
         )
-    hints = typing.get_type_hints(kind)
-    given = {}
-    for key, value in (changes or {}).items():
-        if key not in hints:
-            raise ConfigError(
-                f"{caller}: unknown setting {key!r}; {kind.__name__} has {', '.join(hints)}."
-            )
-        given[key] = _checked(value, hints[key], f"{caller}: {key}")
-    return dataclasses.replace(config, **given)  # type: ignore[type-var]
+    return _changed(config, changes, caller) if changes else config
 
 
-def _read_values(path: Path) -> object:
-    """Return the values of a settings file, on top of those of its base if it names one."""
+def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
+    """Return the settings of a preset or a file."""
+    path = Path(name_or_file)
+    if path.suffix not in (".yaml", ".yml"):
+        expected = f"{caller}: expected a .yaml file, or a preset, one of"
+        path = _preset_file(str(name_or_file), expected=expected)
     import yaml
 
     try:
@@ -491,28 +502,21 @@ def _read_values(path: Path) -> object:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: expected YAML, got {reason}.") from error
-    if not isinstance(values, dict):
-        return {} if values is None else values
-    if "angle_deg" in values:
-        angle = _checked(values.pop("angle_deg"), float, f"{path}: angle_deg")
-        _check_angle(str(path), angle)
-        # What the file calls by its own name stays.
-        values = _merged({part: {name: angle} for part, name in _ANGLES.items()}, values)
-    if "base" not in values:
-        return values
-    base = _preset_file(values.pop("base"), expected=f"{path}: expected base to be one of")
-    return _merged(_read_values(base), values)
+    return _configured({} if values is None else values, str(path))
+
+
+def _configured(values: object, where: str) -> PipelineConfig:
+    """Return the settings that a file or a dictionary holds, on top of those of its base."""
+    base = PipelineConfig()
+    if isinstance(values, Mapping) and "base" in values:
+        expected = f"{where}: expected base to be one of"
+        base = _read_config(_preset_file(values["base"], expected=expected), where)
+        values = {key: value for key, value in values.items() if key != "base"}
+    return _changed(base, values, where)
 
 
 _MEASURED_NOW = ("s3dis", "scannet", "laser", "rgbd")
 """Presets of earlier versions, each for a kind of data."""
-
-
-def _merged(base: Any, values: Any) -> Any:  # noqa: ANN401
-    """Return nested mappings as one; what both have is taken from the second."""
-    if not isinstance(base, dict) or not isinstance(values, dict):
-        return values
-    return base | {key: _merged(base.get(key), value) for key, value in values.items()}
 
 
 def _preset_file(name: object, *, expected: str) -> Path:
@@ -527,28 +531,62 @@ def _preset_file(name: object, *, expected: str) -> Path:
     return _preset_folder() / f"{name}.yaml"
 
 
-def _build_config(kind: type[Settings], values: object, *, where: str) -> Settings:
-    """Make a settings object from nested mappings, and refuse keys and types it does not have.
+def _changed(config: Settings, values: object, where: str) -> Settings:
+    """Return settings with others in place of some, and refuse keys and types that there are not.
 
-    ``where`` is the file (and section) for messages.
+    ``where`` is the file and section, or the caller, for messages.
     """
-    hints = typing.get_type_hints(kind)
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of settings, got {values!r}.")
-    filled: dict[str, Any] = {}
+    kind, given = type(config), dict[str, Any]()
+    hints, dotted = typing.get_type_hints(kind), dict[str, dict[str, Any]]()
     for key, value in values.items():
-        if key not in hints:
-            names = ", ".join([*hints, *["angle_deg"] * (kind is PipelineConfig)])
-            raise ConfigError(f"{where}: unknown key {key!r}; {kind.__name__} has {names}.")
-        if dataclasses.is_dataclass(hints[key]):
-            section = typing.cast(type, hints[key])
-            filled[key] = _build_config(section, value, where=f"{where}: {key}")
+        section, dot, name = str(key).partition(".")
+        if dot:
+            dotted.setdefault(section, {})[name] = value
         else:
-            filled[key] = _checked(value, hints[key], f"{where}: {key}")
+            given[section] = value
+    if isinstance(config, PipelineConfig) and "angle_deg" in given:
+        angle = _checked(given.pop("angle_deg"), float, f"{where}: angle_deg")
+        _check_angle(where, angle)
+        # What is called by its own name stays.
+        config = typing.cast(Settings, config.at_angle(angle))
+    for key, value in given.items():
+        if key not in hints:
+            raise ConfigError(f"{where}: unknown setting {key!r}; {_repair(key, value, kind)}.")
+        own = getattr(config, key)
+        at = f"{where}: {key}"
+        is_section = dataclasses.is_dataclass(own) and not dataclasses.is_dataclass(value)
+        given[key] = _changed(own, value, at) if is_section else _checked(value, hints[key], at)
     try:
-        return kind(**filled)
+        changed = dataclasses.replace(config, **given)  # type: ignore[type-var]
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
+    return _changed(changed, dotted, where) if dotted else changed
+
+
+_WORDS_OF_OTHERS = {
+    "preset": "the name of a preset is config, the argument before the settings",
+    "radius": "neighbours are counted, by k, and may be bounded by max_distance",
+    "offset": "torchrg.transforms takes batches with an offset",
+    "n": "numbers of superpoints are counts",
+}
+"""What other programs call something, and what it is here."""
+
+
+def _repair(key: str, value: object, kind: type) -> str:
+    """Return what to write in place of a key that is no setting of a kind."""
+    names = own_names = [*typing.get_type_hints(kind), *["angle_deg"] * (kind is PipelineConfig)]
+    for section, own in _SECTIONS.items() if kind is PipelineConfig else ():
+        names = [*names, *(f"{section}.{name}" for name in typing.get_type_hints(own))]
+    tails = {name.rpartition(".")[2]: name for name in reversed(names)}
+    if key in tails:
+        return f"it is {tails[key]}, as in **{{{tails[key]!r}: {value!r}}}"
+    if key in _WORDS_OF_OTHERS:
+        return _WORDS_OF_OTHERS[key]
+    if near := difflib.get_close_matches(key, [*tails, *names], 1):
+        return f"the nearest is {tails.get(near[0], near[0])}"
+    return f"{kind.__name__} has {', '.join(own_names)}"
 
 
 def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
@@ -561,6 +599,11 @@ def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
                 return value
         elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
+        elif typing.get_origin(choice) is tuple and not isinstance(value, str | Mapping | None):
+            kind, *others = typing.get_args(choice)
+            parts = tuple(value) if isinstance(value, Iterable) else (value,)
+            if others == [...] or len(parts) == len(others) + 1:
+                return tuple(_checked(part, kind, where) for part in parts)
         elif type(value) is choice:
             return value
     allowed = [_spelled(choice) for choice in choices]
@@ -571,7 +614,8 @@ def _spelled(choice: Any) -> str:  # noqa: ANN401
     """Return a type as a user would write it."""
     if typing.get_origin(choice) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(choice)))
-    return "null" if choice is type(None) else str(choice.__name__)
+    names = {type(None): "null", tuple: "numbers"}
+    return names.get(typing.get_origin(choice) or choice, getattr(choice, "__name__", ""))
 
 
 def _check_angle(where: str, angle_deg: float) -> None:
@@ -600,3 +644,20 @@ def _preset_folder() -> Path:
     """Return the folder of the presets: inside an installed package, or beside it."""
     inside = Path(__file__).parent / "presets"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "configs"
+
+
+def _refuse(config: object, name: str, value: object) -> NoReturn:
+    """Say how settings are changed: not in place."""
+    kind = type(config)
+    section = next((key for key, own in _SECTIONS.items() if own is kind), "")
+    whole = f"load_config(config, **{{'{section}.{name}': {value!r}}})"
+    raise dataclasses.FrozenInstanceError(
+        f"{kind.__name__}: settings are not changed in place; "
+        f"{whole if section else f'dataclasses.replace(config, {name}={value!r})'} makes others."
+    )
+
+
+for _kind in (*_SECTIONS.values(), PipelineConfig, SuperpointsConfig, DepthConfig):
+    _kind.__setattr__ = _refuse  # type: ignore[method-assign, assignment]
+# So that torch.load(weights_only=True) reads checkpoints that hold settings.
+torch.serialization.add_safe_globals([*_SECTIONS.values(), PipelineConfig])

@@ -1,8 +1,9 @@
 """From points to planes, and to superpoints: each in one function."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torchrg._checks import (
     of_clouds,
 )
 from torchrg._parallel import return_freed_memory, sequential_operations
-from torchrg.config import PipelineConfig, SuperpointsConfig, settings_of
+from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ShapeError
 from torchrg.neighbors import (
     canonical_order,
@@ -55,11 +56,12 @@ are about as many as of its own in depth frames with noise, meshed, and more in 
 @sequential_operations()
 def segment_planes(
     points: Tensor | NDArray[np.floating],
-    config: PipelineConfig | str | None = None,
+    config: AnyConfig | None = None,
     *,
     voxel: float | None = None,
     keep_neighbors: bool = False,
     on_stage: Callable[[str], None] | None = None,
+    **changes: Any,  # noqa: ANN401
 ) -> Segmentation:
     """Segment a cloud into planes: neighbours, normals, regions, plane table.
 
@@ -74,7 +76,8 @@ def segment_planes(
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64. Clouds far from the origin should be
             float64, or moved to it first, as :func:`torchrg.read_cloud` does.
-        config: Settings, or the name of a preset. Default: that of :func:`torchrg.load_config`.
+        config: Settings, a dictionary of them, or the name of a preset or a file. Default: that of
+            :func:`torchrg.load_config`.
         voxel: Side of voxels, in the unit of the cloud: one point of each is segmented, and every
             point has the result of its voxel. Sizes of regions are counted in voxels then; planes
             are described from all points and numbered by their number, and which of them meet is
@@ -82,6 +85,7 @@ def segment_planes(
         keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
             that :func:`make_superpoints` need not search them again.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
+        **changes: Single settings, as in ``**{"normals.k": 30}``.
 
     Returns:
         Labels, normals, curvature and masks in the order of the points, and the table of planes. A
@@ -90,7 +94,7 @@ def segment_planes(
 
     Raises:
         ShapeError: If ``points`` has another shape or dtype.
-        ConfigError: If ``voxel`` is not positive.
+        ConfigError: If ``voxel`` is not positive, or a setting is wrong.
         FormatError: If arrays are kept on a disk, and it is full.
 
     Warns:
@@ -108,8 +112,7 @@ def segment_planes(
     points = as_tensor("segment_planes", "points", points).detach()
     check_points("segment_planes", points)
     warn_of_steps("segment_planes", points)
-    if not isinstance(config, PipelineConfig):
-        config = settings_of("segment_planes", PipelineConfig, config)
+    settings = settings_of("segment_planes", PipelineConfig, config, changes)
 
     def begin(stage: str) -> None:
         if scratch.is_active():
@@ -117,7 +120,7 @@ def segment_planes(
         if on_stage is not None:
             on_stage(stage)
 
-    seg = _segment(points, config, voxel, begin)
+    seg = _segment(points, settings, voxel, begin)
     return seg if keep_neighbors else seg._replace(neighbors=None)
 
 
@@ -189,10 +192,11 @@ def _segment(
         for values in (fit.normals, fit.curvature, sharp, fit.valid)
     )
     if voxel is not None:
-        labels, place = _numbered_by_points(labels, len(planes.count))
+        labels, place = _numbered_by_points(labels, len(planes))
         rows = finite_rows(points)
         adjacency = _renumbered(planes.adjacency, place)
-        planes = describe(points[rows], normals[rows], labels[rows])._replace(adjacency=adjacency)
+        planes = describe(points[rows], normals[rows], labels[rows])
+        planes = replace(planes, adjacency=adjacency)
     begin("done")
     kept = neighbors if voxel is None else None
     return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept, sampling)
@@ -225,10 +229,11 @@ def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacen
 def make_superpoints(
     points: Tensor | NDArray[np.floating],
     seg: Segmentation | None = None,
-    config: SuperpointsConfig | None = None,
+    config: SuperpointsConfig | Mapping[str, Any] | None = None,
     *,
     colors: Tensor | NDArray[np.generic] | None = None,
     voxel: float | None = None,
+    **changes: Any,  # noqa: ANN401
 ) -> Superpoints:
     """Partition a cloud into superpoints: every finite point in exactly one, in nested levels.
 
@@ -246,12 +251,13 @@ def make_superpoints(
         points: Points, shape ``(N, 3)``, float32 or float64.
         seg: What :func:`segment_planes` said about them. Default: it is asked, with the preset
             ``consensus``.
-        config: Settings.
+        config: Settings, or a dictionary of them.
         colors: Colours, shape ``(N, 3)``, integers up to the largest of their type, or floating in
             [0, 1]. Default: they play no part.
         voxel: Side of voxels, in the unit of the cloud: the points that stand for voxels are
             partitioned, and every point is in the superpoint of its voxel. Sizes are counted in
             voxels then, and superpoints numbered by their number. Default: all points are.
+        **changes: Single settings, as in ``counts=100``.
 
     Returns:
         The partition of the first strength, and those of the others. A superpoint smaller than
@@ -259,6 +265,7 @@ def make_superpoints(
 
     Raises:
         ShapeError: If a shape or dtype is wrong, or ``seg`` is of another number of points.
+        ConfigError: If a setting is wrong.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -277,16 +284,16 @@ def make_superpoints(
             f"make_superpoints: expected seg of {len(tensor):,} points, got {len(seg.labels):,}; "
             "pass the segmentation of these points."
         )
-    config = SuperpointsConfig() if config is None else config
+    settings = settings_of("make_superpoints", SuperpointsConfig, config, changes)
     if voxel is None:
         is_searched = seg.points is not None and seg.points.data_ptr() == tensor.data_ptr()
         neighbors = seg.neighbors if is_searched else None
         return partition_points(
-            tensor, seg.normals, seg.labels, config, shades, neighbors=neighbors
+            tensor, seg.normals, seg.labels, settings, shades, neighbors=neighbors
         )
     rows, inverse = sample_voxels(tensor, voxel)
     shades = None if shades is None else shades[rows]
-    found = partition_points(tensor[rows], seg.normals[rows], seg.labels[rows], config, shades)
+    found = partition_points(tensor[rows], seg.normals[rows], seg.labels[rows], settings, shades)
     labels, *levels = (
         restore_points(level, inverse, fill=UNLABELED) for level in (found.labels, *found.levels)
     )
@@ -301,7 +308,7 @@ def segment_mesh(
     seg_min_verts: int = 20,
     *,
     colors: Tensor | NDArray[np.generic] | None = None,
-    config: PipelineConfig | str | None = None,
+    config: AnyConfig | None = None,
 ) -> Tensor:
     """Return superpoints of the vertices of a mesh, in the shape of ScanNet's Segmentator.
 
@@ -316,8 +323,7 @@ def segment_mesh(
             :class:`torchrg.config.SuperpointsConfig`.
         seg_min_verts: Smaller superpoints join a neighbour, in vertices.
         colors: As of :func:`make_superpoints`; Segmentator knows none.
-        config: How planes are found, settings or the name of a preset. Default: that of
-            :func:`torchrg.load_config`.
+        config: How planes are found, as of :func:`segment_planes`.
 
     Returns:
         Superpoint of each vertex, shape ``(V,)``, int64, consecutive from 0 on by descending size;

@@ -1,6 +1,7 @@
 """The plane table in files: as arrays in ``.npz``, and as JSON in folders of arrays."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -80,10 +81,11 @@ def planes_from_arrays(
     }
     columns["offset"] = columns["offset"] - columns["normal"] @ origin
     columns |= {name: columns[name] - origin for name in ("centroid", "center")}
-    table = Planes._make([*(tensor(columns[name]) for name in PLANE_COLUMNS), None, None, None])
+    known: Json = {name: tensor(values) for name, values in columns.items()}
+    table = Planes(**known)
     if "plane_kind" in arrays:
         kinds = [PLANE_KINDS.index(word) for word in read("plane_kind", "U", (num_planes,))]
-        table = table._replace(kind=torch.tensor(kinds, dtype=torch.int64))
+        table = replace(table, kind=torch.tensor(kinds, dtype=torch.int64))
     if "adjacency_pairs" in arrays:
         num_pairs = len(arrays["adjacency_pairs"])
         pairs = read("adjacency_pairs", "i8", (num_pairs, 2))
@@ -92,7 +94,7 @@ def planes_from_arrays(
         )
         _check_planes(pairs, num_planes)
         adjacency = PlaneAdjacency(tensor(pairs), tensor(length), tensor(angle))
-        table = table._replace(adjacency=adjacency)
+        table = replace(table, adjacency=adjacency)
     if "outline_points" in arrays:
         num_rings = len(arrays["outline_ring_sizes"])
         sizes = read("outline_ring_sizes", "i8", (num_rings,))
@@ -102,7 +104,7 @@ def planes_from_arrays(
         outline: list[tuple[Tensor, ...]] = [()] * num_planes
         for owner, end, size in zip(owners, sizes.cumsum(), sizes, strict=True):
             outline[owner] += (tensor(points[end - size : end]),)
-        table = table._replace(outline=tuple(outline))
+        table = replace(table, outline=tuple(outline))
     return table
 
 
@@ -135,7 +137,7 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     arrays = planes_to_arrays(
         planes, np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
     )
-    columns = {"id": [*range(len(planes.count))]} | _lists(arrays, "plane_")
+    columns = {"id": [*range(len(planes))]} | _lists(arrays, "plane_")
     if planes.outline is not None:
         ends = arrays["outline_ring_sizes"].cumsum()[:-1]
         rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])

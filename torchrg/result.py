@@ -138,12 +138,30 @@ class Result:
             and (name != "color" or values.dtype == np.uint8)
         }
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return what is known as a sample of loaders and transforms.
+
+        ``coord`` ``(N, 3)``, float32, about ``origin`` ``(1, 3)``, float64, and as far as they are
+        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint``, and ``planes``, the
+        table.
+
+        Example:
+            >>> sample = Result(Cloud(np.zeros((2, 3)), {"labels": np.array([0, -1])})).to_dict()
+            >>> list(sample), sample["plane"].tolist(), len(sample["planes"])
+            (['coord', 'origin', 'plane', 'planes'], [0, -1], 1)
+        """
+        fields = {**self.fields, "labels": self.labels} if self.planes is not None else self.fields
+        origin = torch.from_numpy(self.cloud.origin)[None]
+        found = {key: fields[name] for key, name in _FOLDER_FIELDS.items() if name in fields}
+        table = {} if self.planes is None else {"planes": self.planes}
+        return {"coord": self.cloud.points, "origin": origin, **found, **table}
+
     @cached_property
     def _numbering(self) -> tuple[Tensor, Tensor]:
         """Label of each plane, and the plane of each point."""
         labels = self.fields.get("labels", torch.full((len(self.cloud),), UNLABELED)).long()
         if self.table is not None:
-            return torch.arange(len(self.table.count)), labels
+            return torch.arange(len(self.table)), labels
         known = torch.from_numpy(self.cloud.finite) & (labels >= 0)
         return number_labels(torch.where(known, labels, UNLABELED))
 
@@ -183,14 +201,14 @@ class Result:
             cloud = (self.cloud.points, self._normals, self.labels)
             whole = neighbors if has_normals and len(some) == len(rows) else None
             table = summarize_planes(*(values[rows] for values in cloud), neighbors=whole)
-            table = table._replace(curved=table.curved & has_normals)
+            table = replace(table, curved=table.curved & has_normals)
         if neighbors is None or not len(present) or table.adjacency is not None:
             return table
         normal, rms = (column[present].double() for column in (table.normal, table.rms))
         curved, dtype = table.curved[present], table.rms.dtype
         met = find_adjacency(points, labels, neighbors, normal, rms, curved=curved)
         sizes = (size.to(dtype) for size in (met.boundary_length, met.dihedral_deg))
-        return table._replace(adjacency=PlaneAdjacency(present[met.pairs], *sizes))
+        return replace(table, adjacency=PlaneAdjacency(present[met.pairs], *sizes))
 
     @property
     def _normals(self) -> Tensor:
@@ -205,7 +223,7 @@ class Result:
 
         What a file does not hold is zero or False; points with a normal are ``valid``.
         """
-        planes = self.table or self.planes
+        planes = self.planes if self.table is None else self.table
         if planes is None:
             return None
         points, normals = self.cloud.points, self.fields.get("normals", self._normals)

@@ -1,10 +1,11 @@
 """Values that one step gives to the next: clouds, neighbours, fits, planes, segmentations."""
 
+import operator
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
 import numpy as np
 import torch
@@ -267,11 +268,41 @@ class PlaneAdjacency(NamedTuple):
     dihedral_deg: Tensor
 
 
-class Planes(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """One plane of a table, as ``seg.planes[0]``: its row of :class:`Planes`, with the same names.
+
+    Attributes:
+        id: Label of its points.
+        normal: Shape ``(3,)``; so are ``centroid`` and ``center``. ``extent`` is ``(2,)``, and
+            ``axes`` is ``(2, 3)``.
+        offset: A number of Python, as are ``area``, ``count``, ``rms`` and ``curved``.
+        kind: One of :data:`PLANE_KINDS`; None where the up direction was not given.
+        outline: Rings around it, of shape ``(V, 3)``; None where not asked for.
+    """
+
+    id: int
+    normal: Tensor
+    offset: float
+    centroid: Tensor
+    area: float
+    count: int
+    rms: float
+    extent: Tensor
+    axes: Tensor
+    center: Tensor
+    curved: bool
+    kind: str | None = None
+    outline: tuple[Tensor, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
     """The plane table: one row for each region, in the order of the labels.
 
-    Lengths are in the unit of the cloud. Values are computed in float64 and given in the dtype of
-    the points.
+    Its planes are gone through as those of a list; its columns are tensors of all of them. Lengths
+    are in the unit of the cloud. Values are computed in float64 and given in the dtype of the
+    points.
 
     Attributes:
         normal: Unit normals, shape ``(M, 3)``; the sign makes the first of z, y, x that is not
@@ -293,13 +324,22 @@ class Planes(NamedTuple):
         outline: Rings around each region, of shape ``(V, 3)``: outer ones counter-clockwise seen
             against the normal, holes clockwise; None where not asked for.
         adjacency: Which planes meet; None where the neighbours were not given.
+
+    Example:
+        >>> from torchrg import segment_planes
+        >>> floor = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
+        >>> planes = segment_planes(floor).planes
+        >>> len(planes), planes.normal.shape, planes[0].normal.tolist()
+        (1, torch.Size([1, 3]), [0.0, 0.0, 1.0])
+        >>> [(plane.count, plane.offset) for plane in planes]
+        [(81, 1.0)]
     """
 
     normal: Tensor
     offset: Tensor
     centroid: Tensor
     area: Tensor
-    count: Tensor  # type: ignore[assignment]
+    count: Tensor
     rms: Tensor
     extent: Tensor
     axes: Tensor
@@ -308,6 +348,43 @@ class Planes(NamedTuple):
     kind: Tensor | None = None
     outline: tuple[tuple[Tensor, ...], ...] | None = None
     adjacency: PlaneAdjacency | None = None
+
+    def __len__(self) -> int:
+        return len(self.normal)
+
+    def __iter__(self) -> Iterator[Plane]:
+        return map(self.__getitem__, range(len(self)))
+
+    def __getitem__(self, row: SupportsIndex) -> Plane:
+        """Return a plane by its number."""
+        try:
+            row = range(len(self))[operator.index(row)]
+        except TypeError:
+            raise TypeError(
+                f"Planes: expected the number of a plane, got {type(row).__name__}; columns take "
+                "slices and masks, as in planes.normal[planes.area > 1]."
+            ) from None
+        except IndexError:
+            raise IndexError(f"Planes: expected one of {len(self)} planes, got {row}.") from None
+        columns = {name: getattr(self, name)[row] for name in PLANE_COLUMNS}
+        own = {name: value if value.ndim else value.item() for name, value in columns.items()}
+        kind = None if self.kind is None else PLANE_KINDS[int(self.kind[row])]
+        outline = None if self.outline is None else self.outline[row]
+        return Plane(row, **own, kind=kind, outline=outline)
+
+    def to(self, device: torch.device | str) -> "Planes":
+        """Return the table on a device."""
+        return replace(self, **{name: moved(value, device) for name, value in vars(self).items()})
+
+
+def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401
+    """Return tensors, and tuples and tables of them, on a device; anything else as it is."""
+    if isinstance(value, Tensor | Planes):
+        return value.to(device)
+    if isinstance(value, tuple):
+        parts = [moved(part, device) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value
 
 
 PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -352,6 +429,14 @@ class Segmentation(NamedTuple):
     points: Tensor | None = None
     neighbors: Neighbors | None = None
     sampling: Sampling | None = None
+
+    def to(self, device: torch.device | str) -> "Segmentation":
+        """Return the segmentation on a device."""
+        return Segmentation(*(moved(part, device) for part in self))
+
+    def cpu(self) -> "Segmentation":
+        """Return the segmentation on the CPU."""
+        return self.to("cpu")
 
     def show(self, **settings: Any) -> Any:  # noqa: ANN401
         """Return the page of the browser, which a notebook shows; needs ``torchrg[view]``.

@@ -1,6 +1,5 @@
 """The clouds: the paper's four, or made ones in their place, and others with known truth."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from tests.made import (
     quantised_frame,
     scan_scene,
 )
+from torchrg.batch.records import hash_file
 from torchrg.io import read_cloud
 from torchrg.scenes import Scene, build_room, make_room
 from torchrg.structures import UNLABELED
@@ -139,8 +139,7 @@ def _read_cloud(key: str, path: Path, quick: bool) -> EvalCloud:
     if key == "tutorial" and labels is None and "color" in fields:
         labels = faces_of_colors(fields["color"])
         origin += ", its colours taken for faces (somebody's segmentation, not a measured truth)"
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()[:8]
+    digest = hash_file(path)[:8]
     return EvalCloud(
         key, f"{key}-{digest}", cloud.points[kept], labels, normals, origin, is_papers=not quick
     )

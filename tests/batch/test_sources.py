@@ -15,8 +15,9 @@ from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
 from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config
-from torchrg.datasets.rgbd import LAYOUTS
+from torchrg.datasets.rgbd_layouts import LAYOUTS
 from torchrg.depth import DepthConfig, segment_depth
+from torchrg.depth.camera import Pinhole
 from torchrg.io import Cloud, estimate_points, write_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
 
@@ -24,8 +25,8 @@ CLASSIC = load_config("classic")
 
 
 def test_the_command_knows_every_kind_and_layout(tmp_path):
-    assert set(get_args(get_type_hints(RGBDArguments)["layout"])) == LAYOUTS.keys()
-    settings, camera = DepthConfig(), (5.0, 5.0, 2.0, 1.0)
+    assert {*get_args(get_type_hints(RGBDArguments)["layout"])} == {"auto", *LAYOUTS}
+    settings, camera = DepthConfig(), Pinhole(5.0, 5.0, 2.0, 1.0)
     assert RGBDSource(tmp_path, settings, "images", camera, 9.0).describe() == {
         "kind": "rgbd",
         "layout": "images",
@@ -207,7 +208,7 @@ def test_depth_frames_become_images(tmp_path):
     (tmp_path / "in").mkdir()
     np.save(tmp_path / "in" / "1.npy", depth)
     np.save(tmp_path / "in" / "2.npy", np.zeros_like(depth))
-    camera = (50.0, 50.0, 20.0, 15.0)
+    camera = Pinhole(50.0, 50.0, 20.0, 15.0)
     settings = DepthConfig(noise=(0.001, 0.0))
     source = RGBDSource(tmp_path / "in", settings, "images", camera, 1000)
     jobs = list_jobs(source, tmp_path / "out")

@@ -143,7 +143,7 @@ def mistakes(tmp_path, monkeypatch):
         ("ROOM", ["--preset", "clasic"], "classic, classic_increment"),
         ("ROOM", ["--angle-deg", "91"], "expected angle_deg in [0, 90], got 91.0"),
         ("ROOM", ["--angle-deg", "five"], "--angle-deg"),
-        ("ROOM", ["--config", "wrong.yaml"], "unknown key 'max_angle'"),
+        ("ROOM", ["--config", "wrong.yaml"], "unknown setting 'max_angle'"),
         ("ROOM", ["--config", "none.yaml"], "No such file"),
         ("ROOM", ["--normals.k", "2"], "expected k >= 3, got 2"),
         ("ROOM", ["--normals.k", "many"], "--normals.k"),
@@ -224,33 +224,6 @@ def test_every_command_is_named_by_help_and_to_those_who_misspell_one(run):
     wrong = run("segmnet")
     assert "got 'segmnet'. Did you mean segment?" in wrong.error
     assert all(name in wrong.error and name in run("--help").out for name in COMMANDS)
-
-
-def test_view_draws_a_picture(room_file, tmp_path, run):
-    out = tmp_path / "room.png"
-    assert run("view", room_file, "--out", out, "--width", "200").code == 0
-    assert out.read_bytes().startswith(b"\x89PNG")
-    for flags, message in (
-        (["--color", "curvature"], "expected curvature for --color curvature"),
-        (["--azimuth-deg", "nan"], "expected azimuth_deg to be finite, got nan"),
-        (["--out", "room.jpg"], "room.jpg: expected a file that ends in .png or .html"),
-    ):
-        assert message in run("view", room_file, "--out", out, *flags).error
-
-
-def test_view_shows_colours_of_sixteen_bits_as_those_of_eight(room_file, tmp_path, run):
-    points = read_cloud(room_file).coordinates
-    color = np.random.default_rng(0).integers(0, 256, points.shape, dtype=np.uint8)
-    wide = color.astype(np.uint16) * 257
-    wide[0, 0] += 1 if wide[0, 0] < 65535 else -1
-    pictures = []
-    for name, values in (("narrow", color), ("wide", wide)):
-        cloud, picture = tmp_path / f"{name}.npz", tmp_path / f"{name}.png"
-        np.savez(cloud, points=points, color=values)
-        assert read_cloud(cloud).fields["color"].dtype == values.dtype
-        assert run("view", cloud, "--out", picture, "--width", "100").code == 0
-        pictures.append(picture.read_bytes())
-    assert pictures[0] == pictures[1]
 
 
 def test_info_says_what_a_file_holds_and_where_it_is(room_file, tmp_path, run):

@@ -124,10 +124,52 @@ def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_pa
     assert sorted(contents(out)) == ["1.png", "1_planes.png", "3.png", "3_planes.png"]
 
 
-def test_a_folder_is_refused_with_the_command_for_it(tmp_path, frame, run):
+def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
+    folder = tmp_path / "one"
+    folder.mkdir()
+    frame.rename(folder / frame.name)
+    assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels").code == 0
+    assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels.png").code == 0
+    results = contents(tmp_path / "labels")
+    assert sorted(results) == ["frame.png", "frame_planes.png"]
+    assert results["frame.png"] == (tmp_path / "labels.png").read_bytes()
+
+
+def test_a_folder_of_several_is_refused_with_the_command_for_it(tmp_path, frame, run):
+    (tmp_path / "next.png").write_bytes(frame.read_bytes())
     error = run("depth", tmp_path, *CAMERA, "--out", tmp_path / "out").error
-    assert f"got a folder; use: torchrg convert rgbd {tmp_path} OUT --intrinsics" in error
-    assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]
+    assert f"of one depth image, got 2; use: torchrg convert rgbd {tmp_path} OUT" in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.png", "next.png"]
+
+
+def test_a_camera_file_is_as_good_as_its_numbers(tmp_path, frame, depth, run):
+    camera = {
+        "width": 160,
+        "height": 120,
+        "intrinsic_matrix": [100, 0, 0, 0, 100, 0, 79.5, 59.5, 1],
+    }
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    given = ["--intrinsics", tmp_path / "camera.json", *CAMERA[2:]]
+    assert run("depth", frame, *given, "--out", tmp_path / "a.npz").code == 0
+    # Half the size: the middle of the first pixel was at the corner between the first four.
+    numbers = ["--intrinsics", "50,50,39.5,29.5", *CAMERA[2:]]
+    assert run("depth", frame, *numbers, "--out", tmp_path / "b.npz").code == 0
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    write_cloud(tmp_path / "a.pcd", Cloud(points_of(depth).numpy(), grid_shape=(60, 80)))
+    assert run("depth", tmp_path / "a.pcd", *given[:2], "--out", tmp_path / "c.npz").code == 0
+    with np.load(tmp_path / "c.npz") as result:
+        assert json.loads(str(result["provenance"]))["intrinsics"] == "50,50,39.5,29.5"
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mkv", ".r3d", ".exr"])
+def test_recordings_are_refused_with_what_converts_them(tmp_path, suffix, run):
+    source, tools = tmp_path / f"walk{suffix}", {".exr": "OpenEXR", ".r3d": "pyliblzfse"}
+    source.write_bytes(b"no frames")
+    for command in (["depth", source, "--out"], ["convert", "rgbd", source]):
+        error = run(*command, tmp_path / "out").error
+        assert f"walk{suffix}: expected depth images, got {suffix}; " in error
+        assert tools.get(suffix, "Open3D's ") in error
+    assert [path.name for path in tmp_path.iterdir()] == [source.name]
 
 
 def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, run):

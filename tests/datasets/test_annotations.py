@@ -7,7 +7,7 @@ from tests.datasets.s3dis_tree import BROKEN, rows_of, text_of
 from torchrg.datasets.s3dis import read_annotation
 from torchrg.errors import FormatError, MissingDependencyError
 
-pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
+pytest.importorskip("pyarrow", reason="needs torchrg[text]")
 GOOD = b"1.000 2.000 3.000 10 20 30\n"
 
 

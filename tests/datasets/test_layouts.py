@@ -5,6 +5,7 @@ The loading lines are those of the programs in our own words, from descriptions 
 
 import json
 import pickletools
+import shutil
 import zipfile
 from pathlib import Path
 from typing import get_args
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.datasets.s3dis_tree import digest
 from tests.datasets.scannet_tree import ALIGNMENT, WORDS, write_scan, write_tables
 from torchrg import load_config, make_superpoints, segment_planes
 from torchrg.batch.records import reason_to_convert
@@ -24,6 +26,7 @@ from torchrg.cli.flags import Layout
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets.layouts import LAYOUTS
 from torchrg.datasets.scannet import NYU_IDS
+from torchrg.errors import ConfigError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.normals import orient_normals
 from torchrg.scenes import make_room
@@ -284,6 +287,21 @@ def test_what_is_done_is_kept_and_layouts_share_a_directory(root, room, tmp_path
     assert "was not written by torchrg" in report.reason
     assert path.read_bytes() == b"theirs"
     assert not [path for path in tmp_path.rglob(".*") if path.is_file()]
+
+
+def test_results_may_go_beside_the_scans_where_programs_look_for_them(root, room, tmp_path):
+    place = tmp_path / "data"
+    shutil.copytree(root, place)
+    before = digest(place / "scans")
+    for layout in ("spformer", "pointcept"):
+        for status in (["converted"], []):
+            reports = convert(place, place, layout, only=f"*{SCAN}")
+            assert [report.status for report in reports] == status
+    assert digest(place / "scans") == before
+    assert (place / "train" / f"{SCAN}_inst_nostuff.pth").is_file()
+    for layout, out in (("scannet", place), ("spformer", place / "scans")):
+        with pytest.raises(ConfigError, match="expected a directory outside"):
+            convert(place, out, layout)
 
 
 def test_the_command_knows_kind_and_layouts(root, room, tmp_path, capsys):

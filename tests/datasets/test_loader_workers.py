@@ -51,7 +51,7 @@ def two_threads():
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*rooms, got:UserWarning")
 def test_workers_give_what_the_main_process_gives(two_threads, root):
-    pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
+    pytest.importorskip("pyarrow", reason="needs torchrg[text]")
     steps = NoteProcess(nn.Sequential(SampleVoxels(0.2), CenterCloud(), SegmentPlanes("paper")))
     plain = S3DIS(root, [1], transform=steps)
     expected = [plain[i] for i in range(3)]

@@ -1,6 +1,7 @@
 """Scene folders have Pointcept's types, and those of others are completed, never changed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -117,12 +118,13 @@ def test_the_table_describes_the_labels(sample, seg, tmp_path):
 def test_optional_columns_are_described(sample):
     config = load_config("classic")
     seg = segment_planes(sample["coord"], config)
-    bare = seg.planes._replace(kind=None, outline=None, adjacency=None)
+    bare = replace(seg.planes, kind=None, outline=None, adjacency=None)
     assert set(describe_planes(bare)) == {"planes"}
     assert not {"kind", "outline"} & set(describe_planes(bare)["planes"][0])
     ring = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    full = bare._replace(
-        kind=torch.ones(len(seg.planes.count), dtype=torch.int64),
+    full = replace(
+        bare,
+        kind=torch.ones(len(seg.planes), dtype=torch.int64),
         outline=tuple((ring,) for _ in seg.planes.count),
     )
     row = describe_planes(full, origin=[1, 1, 1])["planes"][0]

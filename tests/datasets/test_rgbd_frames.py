@@ -220,7 +220,7 @@ def test_wrong_files_are_refused(tmp_path, tum):
         ("missing.png", "no such file; check the spelling"),
         ("empty.npy", "byte 0: the file is empty"),
         ("missing.npy", "no such file; check the spelling"),
-        ("depth.jpg", r"expected a depth image that ends in one of .png .npy, got '.jpg'"),
+        ("depth.jpg", r"expected a depth image that ends in one of .png .npy .pgm, got '.jpg'"),
     ):
         with pytest.raises(FormatError, match=f"{name}: {message}"):
             read_depth(tmp_path / name, depth_scale=1000)
@@ -241,7 +241,7 @@ def test_wrong_files_are_refused(tmp_path, tum):
 
 
 def test_wrong_folders_are_refused(tmp_path):
-    with pytest.raises(ConfigError, match="expected layout to be one of 7-scenes, icl-nuim"):
+    with pytest.raises(ConfigError, match="expected layout to be one of 3rscan, 7-scenes"):
         RGBDFrames.from_folder(tmp_path, "nyu")
     for layout in ("tum", "icl-nuim", "scannet", "7-scenes"):
         with pytest.raises(FormatError, match=r"expected recordings with .* got none"):

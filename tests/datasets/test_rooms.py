@@ -14,7 +14,7 @@ from tests.datasets.s3dis_tree import (
 from torchrg.datasets import CLASS_ORDERS, read_room
 from torchrg.errors import ConfigError, FormatError
 
-pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
+pytest.importorskip("pyarrow", reason="needs torchrg[text]")
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from tests.datasets.s3dis_tree import digest, rows_of, text_of, write_clean_room
 from torchrg.datasets import S3DIS, read_room
 from torchrg.errors import ConfigError, FormatError
 
-pytest.importorskip("pyarrow", reason="needs torchrg[s3dis]")
+pytest.importorskip("pyarrow", reason="needs torchrg[text]")
 pytestmark = pytest.mark.filterwarnings("ignore:.*rooms, got:UserWarning")
 
 

@@ -96,7 +96,7 @@ def test_bent_faces_without_noise_are_whole_regions(bend):
         assert float((labels >= 0).double().mean()) >= 0.98, face
         assert share_of_one_region(seg.labels, is_face) >= 0.95, face
         assert float((truth[seg.labels == labels.mode().values] == face).double().mean()) > 0.95
-    assert len(seg.planes.count) <= 10
+    assert len(seg.planes) <= 10
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003])
@@ -116,7 +116,7 @@ def test_columns_with_the_noise_of_a_sensor_fall_into_few_parts(rng):
     noise = 0.0012 + 0.0019 * (depth - 0.4) ** 2
     noisy = depth + noise * torch.randn(depth.shape, generator=rng, dtype=torch.float64)
     seg = segment_depth(stored(noisy), CAMERA)
-    assert len(seg.planes.count) <= 8
+    assert len(seg.planes) <= 8
     assert share_of_one_region(seg.labels, truth == 2) >= 0.7
 
 
@@ -127,7 +127,7 @@ def test_creases_without_noise_stay_open(angle):
     left, right = 2 / (1 + half * (view[..., 0] + 0.1)), 2 / (1 - half * (view[..., 0] + 0.1))
     seg = segment_depth(stored(torch.maximum(left, right)), CAMERA)
     assert seg.planes.count.tolist()[2:] == []
-    assert len(seg.planes.count) == 2
+    assert len(seg.planes) == 2
     assert not seg.planes.curved.any()
 
 

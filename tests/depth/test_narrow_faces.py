@@ -89,7 +89,7 @@ def test_faces_a_few_pixels_wide_are_regions():
     depth, face = step_in_a_wall(rays())
     assert 2 <= int((face == 1)[0].sum()) <= 4
     seg = segment_depth(depth.float(), CAMERA)
-    assert len(seg.planes.count) == 3
+    assert len(seg.planes) == 3
     inside = seg.labels[face == 1]
     side = int(inside.mode().values)
     assert float((inside == side).double().mean()) > 0.7
@@ -102,16 +102,16 @@ def test_a_wall_behind_a_post_is_one_region():
     depth = 3 / (1 + 0.2 * rays()[..., 0])
     depth[:, 140:170] = 1.5
     seg = segment_depth(depth.float(), CAMERA)
-    assert len(seg.planes.count) == 2
+    assert len(seg.planes) == 2
     assert seg.labels[100, 20] == seg.labels[100, 300]
 
 
 def test_a_shadow_without_depth_beside_a_post_parts_no_wall():
     depth = torch.full((HEIGHT, WIDTH), 3.0)
     depth[:, 140:170], depth[:, 170:185] = 1.5, 0.0
-    assert len(segment_depth(depth, CAMERA).planes.count) == 2
+    assert len(segment_depth(depth, CAMERA).planes) == 2
     depth[:, 140:185] = 0.0
-    assert len(segment_depth(depth, CAMERA).planes.count) == 2
+    assert len(segment_depth(depth, CAMERA).planes) == 2
 
 
 def test_planes_that_end_stay_apart():
@@ -119,13 +119,13 @@ def test_planes_that_end_stay_apart():
     depth = torch.full((HEIGHT, WIDTH), 2.0)
     depth[:, 140:170] = 3.0
     seg = segment_depth(depth, CAMERA)
-    assert len(seg.planes.count) == 3
+    assert len(seg.planes) == 3
     # Nor does it help that a post stands in most of the gap.
     depth[:, 140:163] = 1.0
-    assert len(segment_depth(depth, CAMERA).planes.count) == 4
+    assert len(segment_depth(depth, CAMERA).planes) == 4
     # Behind the post one side is 5 cm farther away.
     depth[:, 140:170], depth[:, 170:] = 1.0, 2.05
-    assert len(segment_depth(depth, CAMERA).planes.count) == 3
+    assert len(segment_depth(depth, CAMERA).planes) == 3
 
 
 def roof(turn_deg, step=0.0):

@@ -119,7 +119,7 @@ def test_a_step_is_never_bridged(rng):
     seg = segment_depth(depth, SMALL)
     left, right = seg.labels[:, :78].unique(), seg.labels[:, 82:].unique()
     assert not set(left.tolist()) & set(right.tolist()) - {UNLABELED}
-    assert len(seg.planes.offset) == 2
+    assert len(seg.planes) == 2
 
 
 def test_pixels_without_depth_belong_to_nothing():
@@ -142,9 +142,9 @@ def test_images_without_depth_and_tiny_ones_have_no_planes(shape, dtype):
         seg = segment_depth(depth, SMALL)
         assert not seg.valid.any()
         assert seg.labels.shape == shape
-        assert len(seg.planes.offset) == 0
+        assert len(seg.planes) == 0
     if min(shape) < 40:
-        assert len(segment_depth(torch.ones(shape, dtype=dtype), SMALL).planes.offset) == 0
+        assert len(segment_depth(torch.ones(shape, dtype=dtype), SMALL).planes) == 0
 
 
 def test_random_depth_is_no_plane(rng):

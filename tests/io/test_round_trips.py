@@ -205,7 +205,8 @@ def test_kinds_adjacency_and_outlines_are_written(tmp_path, make_cloud, make_seg
     adjacency = PlaneAdjacency(
         torch.tensor([[0, 2], [1, 2]]), torch.tensor([1.5, 2]), torch.tensor([90.0, 45])
     )
-    table = seg.planes._replace(
+    table = replace(
+        seg.planes,
         kind=torch.tensor([1, 3, 0]),
         adjacency=adjacency,
         outline=((rings[0], rings[1]), (), (rings[2],)),

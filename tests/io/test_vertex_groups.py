@@ -31,7 +31,7 @@ def test_planes_of_a_room_are_groups(tmp_path):
     lines = (tmp_path / "room.vg").read_text().splitlines(keepends=True)
     points, groups, planes = literal_groups(lines)
     assert np.array_equal(points, cloud.coordinates)
-    assert len(groups) == len(seg.planes.count) > 5
+    assert len(groups) == len(seg.planes) > 5
     for label, (rows, plane) in enumerate(zip(groups, planes, strict=True)):
         assert np.array_equal(rows, np.flatnonzero(seg.labels == label))
         if not seg.planes.curved[label]:

@@ -145,13 +145,13 @@ def test_exact_and_quantized_walls_do_not_shatter():
 
 def test_no_python_number_is_kept_for_every_point():
     num_points = 30_000
-    order, flags = np.arange(num_points, dtype=np.int32)[::-1], np.ones(num_points, dtype=bool)
-    bits = np.zeros((num_points, 1), dtype=np.int64)
+    order = torch.arange(num_points - 1, -1, -1, dtype=torch.int32)
+    flags, bits = torch.ones(num_points, dtype=torch.bool), torch.zeros(num_points, 1).long()
     tracemalloc.start()
     heads = grow_first_in_first_out(order[:, None], bits, None, flags, flags, order, late=False)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert (heads[order] == order).all()
+    assert torch.equal(heads[order.long()], order)
     assert peak < 30 * num_points
 
 

@@ -8,6 +8,7 @@ import torch
 
 from torchrg.errors import ConfigError, MissingDependencyError, ShapeError
 from torchrg.neighbors import search_knn
+from torchrg.pipeline import segment_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.table import classify_planes
 from torchrg.scenes import make_room
@@ -25,6 +26,10 @@ def rectangle(rng, n, length, width, *, noise=0.0, turn=None, shift=(0.0, 0.0, 0
     flat = rng.uniform(-0.5, 0.5, (n, 3)) * [length, width, 0]
     flat[:, 2] = noise * rng.normal(size=n)
     return torch.from_numpy(flat @ turn.T + np.asarray(shift)), torch.from_numpy(turn)
+
+
+def columns_of(planes):
+    return [getattr(planes, name) for name in PLANE_COLUMNS]
 
 
 def one_region(points):
@@ -116,7 +121,7 @@ def test_few_and_collinear_points_take_the_normals_they_have(num_points, dtype):
     assert planes.area.tolist() == [0.0]
     assert planes.rms[0] < 1e-6
     assert planes.extent[0, 0] == num_points - 1
-    assert all(part.isfinite().all() for part in planes[:9])
+    assert all(part.isfinite().all() for part in columns_of(planes)[:9])
 
 
 def test_coincident_points_are_a_plane_of_no_extent():
@@ -132,7 +137,7 @@ def test_table_of_no_region_is_empty():
     planes = summarize_planes(
         points, points, torch.full((5,), -1), neighbors=search_knn(points, 3), up=(0, 0, 1)
     )
-    assert len(planes.count) == len(planes.normal) == len(planes.adjacency.pairs) == 0
+    assert len(planes) == len(planes.normal) == len(planes.adjacency.pairs) == 0
     nothing = summarize_planes(points[:0], points[:0], torch.zeros(0, dtype=torch.int64))
     assert len(nothing.count) == 0
 
@@ -145,7 +150,7 @@ def test_rows_do_not_depend_on_the_order_of_the_points(rng):
     first = summarize_planes(points, normals, labels)
     order = torch.randperm(1500, generator=rng)
     again = summarize_planes(points[order], normals[order], labels[order])
-    for a, b in zip(first[:9], again[:9], strict=True):
+    for a, b in zip(*(columns_of(planes)[:9] for planes in (first, again)), strict=True):
         assert torch.allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
@@ -158,7 +163,7 @@ def test_threads_change_nothing(set_threads):
     for num_threads in (1, 3):
         set_threads(num_threads)
         tables.append(summarize_planes(points, points, labels, neighbors=neighbors))
-    for a, b in zip(tables[0][:10], tables[1][:10], strict=True):
+    for a, b in zip(*map(columns_of, tables), strict=True):
         assert torch.equal(a, b)
     for a, b in zip(tables[0].adjacency, tables[1].adjacency, strict=True):
         assert torch.equal(a, b)
@@ -369,3 +374,37 @@ def test_rounding_does_not_decide_the_sign_of_a_normal():
             unit * flat, truth.expand(200, 3), torch.zeros(200, dtype=torch.int64)
         )
         assert torch.allclose(planes.normal[0], truth, atol=1e-9)
+
+
+def test_a_table_is_gone_through_plane_by_plane():
+    pytest.importorskip("shapely", reason="needs torchrg[outline]")
+    points = make_room(3000, noise=0.003, seed=0).points
+    seg = segment_planes(points, "classic", **{"planes.up": "z", "planes.outline": True})
+    planes = seg.planes
+    assert len(planes) == len(planes.normal) == len(list(planes)) > 5
+    for row, plane in enumerate(planes):
+        assert plane.id == row
+        assert plane.count == int((seg.labels == row).sum())
+        assert plane.kind == PLANE_KINDS[planes.kind[row]]
+        assert plane.outline is planes.outline[row]
+        for name in PLANE_COLUMNS:
+            one, column = getattr(plane, name), getattr(planes, name)[row]
+            assert type(one) in (torch.Tensor, float, int, bool)
+            assert torch.equal(torch.as_tensor(one, dtype=column.dtype), column)
+    assert planes[-1].id == len(planes) - 1
+    assert planes[torch.tensor(2)].id == 2
+    with pytest.raises(IndexError, match=f"expected one of {len(planes)} planes, got 99"):
+        planes[99]
+    with pytest.raises(TypeError, match="got slice; columns take slices and masks"):
+        planes[:3]
+
+
+def test_a_segmentation_goes_to_a_device_whole():
+    seg = segment_planes(make_room(2000, seed=0).points, "classic", keep_neighbors=True)
+    away = seg.to("meta")
+    tensors = [*away[:5], away.points, away.neighbors.indices, *columns_of(away.planes)]
+    assert {part.device.type for part in (*tensors, *away.planes.adjacency)} == {"meta"}
+    back = seg.cpu()
+    assert torch.equal(back.labels, seg.labels)
+    assert torch.equal(back.planes.normal, seg.planes.normal)
+    assert back.sampling == seg.sampling

@@ -155,6 +155,23 @@ def test_long_clouds_lie_across_the_picture_from_above(rng):
         assert int(right.abs().argmax()) == int(extent.argmax())
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 20.0, -35.0])
+def test_an_azimuth_is_one_direction_whichever_wall_is_largest(rng, turn_deg):
+    points, faces = box_room(rng)
+    angle = torch.tensor(turn_deg).deg2rad()
+    turn = torch.tensor([[angle.cos(), angle.sin(), 0], [-angle.sin(), angle.cos(), 0], [0, 0, 1]])
+    bearing = torch.tensor(turn_deg + 60).deg2rad()
+    for largest in range(2, 6):
+        lowered = (faces >= 2) & (faces < 6) & (faces != largest) & (points[:, 2] > 1.3)
+        surface = sample_surface(points[~lowered] @ turn)
+        sides = find_sides(surface, faces[~lowered][surface.rows], UP)
+        toward = choose_viewpoint(surface, sides, "outside", UP, azimuth_deg=60).toward
+        level = torch.nn.functional.normalize(toward[:2], dim=0)
+        torch.testing.assert_close(
+            level, torch.stack([bearing.cos(), bearing.sin()]), atol=0.02, rtol=0
+        )
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_clouds_of_few_points_have_no_walls(rng, count):
     surface = sample_surface(torch.rand(count, 3, generator=rng))

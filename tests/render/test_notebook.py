@@ -20,9 +20,9 @@ def seg():
 def test_a_notebook_shows_a_picture_and_the_largest_planes(seg):
     text = seg._repr_html_()
     assert "data:image/png;base64,iVBORw0KGgo" in text
-    assert text.count("<tr>") == 1 + min(12, len(seg.planes.count))
+    assert text.count("<tr>") == 1 + min(12, len(seg.planes))
     assert f"{int(seg.planes.count[0]):,}" in text
-    assert f"{len(seg.planes.count):,} planes" in text
+    assert f"{len(seg.planes):,} planes" in text
 
 
 def test_without_points_there_is_the_table_alone(seg):

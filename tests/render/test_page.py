@@ -255,8 +255,12 @@ def test_missing_package_is_told_with_its_repair(monkeypatch):
 def test_view_writes_a_page(tmp_path, run):
     path, out = tmp_path / "room.npz", tmp_path / "room.html"
     np.savez(path, points=room().coordinates, **room().fields)
-    assert "1,600 and 1,600 points" in run("view", path, "--out", out, "--beside", path).out
-    assert len(described(Page(out.read_text(), ()))["clouds"]) == 2
+    flags = ("--out", out, "--beside", path, "--unit", "m")
+    assert "1,600 and 1,600 points" in run("view", path, *flags).out
+    what = described(Page(out.read_text(), ()))
+    assert len(what["clouds"]) == 2
+    assert what["unit"] == "m"
+    assert described(page_of_room())["unit"] == "units"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import json
+import platform
 import stat
 import sys
 from dataclasses import dataclass
@@ -204,3 +205,4 @@ def test_surroundings_name_the_commit():
     assert found["threads"] == 3
     assert torch.__version__.startswith(found["torch"])  # Without the build, as in 2.4.0+cpu.
     assert Path(surroundings.__file__).name == "surroundings.py"
+    assert f"| {platform.python_version()} |" in surroundings.oldest_and_here().splitlines()[2]

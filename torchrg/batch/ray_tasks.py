@@ -1,7 +1,8 @@
 """The Ray engine: what Ray knows about retries and nodes serves."""
 
-import contextlib
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -51,7 +52,9 @@ def run_ray(
         "include_dashboard": False,
     }
     # Ray lets its processes import from the folder it is called in: one where no data are.
-    with contextlib.chdir("/"):
+    folder = Path.cwd()
+    os.chdir("/")
+    try:
         ray.init(
             address=address or "local",
             logging_level="error",
@@ -59,6 +62,8 @@ def run_ray(
             runtime_env={"env_vars": CHILD_ENVIRONMENT},
             **({} if address else started),
         )
+    finally:
+        os.chdir(folder)
     pending: dict[Any, Job] = {}
     try:
         largest = max(

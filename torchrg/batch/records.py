@@ -21,6 +21,8 @@ from torchrg.result import RECORD as RECORD
 
 Record = dict[str, Any]
 """A record, or a piece of one, as JSON holds it."""
+_BYTES_AT_ONCE = 1 << 20
+"""Bytes of a file that are read together, which bounds the memory."""
 
 
 class Recorded(Protocol):
@@ -57,8 +59,11 @@ def describe_versions() -> dict[str, str]:
 
 def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file's bytes as hexadecimal digits."""
+    digest = hashlib.sha256()
     with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        while block := stream.read(_BYTES_AT_ONCE):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def write_record(folder: Path, description: Record, report: TaskReport) -> None:

@@ -46,7 +46,7 @@ from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import num_pixels, read_depth
 from torchrg.datasets.scannet import MESH_PLUSPLUS, read_objects
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.depth.camera import make_intrinsics, points_of_image
+from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
 from torchrg.io.npy import map_folder
@@ -109,7 +109,7 @@ class CloudSource(Source):
             scan.name,
             "converted",
             len(cloud),
-            len(seg.planes.count),
+            len(seg.planes),
             tuple(files),
             repairs=reading.repairs,
             warnings=(*notes, *reading.notes),
@@ -257,7 +257,7 @@ class S3DISSource(CloudSource):
                 f"expected --class-order with --layout pointcept, got layout {self.layout}, which "
                 "has the order pointcept; leave it out."
             )
-        require("pyarrow", extra="s3dis", purpose="read S3DIS")
+        require("pyarrow", extra="text", purpose="read S3DIS")
         rooms = S3DIS(self.root, self.areas, class_order=self.class_order)
         return [Scan(scene.name, scene.files, _estimate(scene)) for scene in rooms.scenes]
 
@@ -278,6 +278,11 @@ class ScanNetSource(CloudSource):
     """
 
     kind: ClassVar[str] = "scannet"
+
+    @property
+    def in_place(self) -> bool:
+        """Whether results may go beside the folders of meshes, where programs look for them."""
+        return self.layout != "scannet"
 
     def list_scans(self) -> list[Scan]:
         """Return the scans in natural order."""
@@ -336,7 +341,7 @@ class RGBDSource(Source):
 
     Args:
         layout: The shape of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
-        intrinsics: ``fx, fy, cx, cy``. Default: the layout's.
+        intrinsics: The camera. Default: the layout's.
         depth_scale: Stored value of one metre. Default: the layout's.
         orient: To which side normals point: to the camera, unless it says ``"interior"`` or
             ``"up"``.
@@ -344,7 +349,7 @@ class RGBDSource(Source):
 
     settings: DepthConfig
     layout: str
-    intrinsics: tuple[float, float, float, float] | None = None
+    intrinsics: Pinhole | None = None
     depth_scale: float | None = None
     orient: CloudOrientation = "auto"
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
@@ -361,9 +366,8 @@ class RGBDSource(Source):
 
     def list_scans(self) -> list[Scan]:
         """Return the frames in natural order."""
-        matrix = None if self.intrinsics is None else make_intrinsics(*self.intrinsics)
         data = RGBDFrames.from_folder(
-            self.root, self.layout, intrinsics=matrix, depth_scale=self.depth_scale
+            self.root, self.layout, intrinsics=self.intrinsics, depth_scale=self.depth_scale
         )
         return [
             Scan(frame.name, (frame.depth, *frame.sources), num_pixels(frame.depth), _plain(frame))
@@ -384,7 +388,7 @@ class RGBDSource(Source):
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = tuple(write_results(folder, coord, seg))
-        num_planes = len(seg.planes.count)
+        num_planes = len(seg.planes)
         notes = () if num_planes else ("no plane found",)
         return TaskReport(scan.name, "converted", depth.numel(), num_planes, files, warnings=notes)
 

@@ -38,12 +38,27 @@ from torchrg.cli.ending import (
 from torchrg.cli.loop import Progress, tell_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig, Up
+from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
 from torchrg.io.files import check_place, free_space, make_folder
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
 from torchrg.result import read_result
+
+FrameLayoutName = Literal[
+    "auto",
+    "scannetpp",
+    "arkitscenes",
+    "3rscan",
+    "replica",
+    "tum",
+    "icl-nuim",
+    "scannet",
+    "7-scenes",
+    "nerfstudio",
+    "images",
+]
 
 
 @dataclass(frozen=True)
@@ -192,15 +207,15 @@ class RGBDArguments(Arguments):
 
     Examples:
         torchrg convert rgbd frames results --intrinsics 525,525,319.5,239.5 --depth-scale 1000
-        torchrg convert rgbd rgbd_dataset_freiburg1_xyz results --layout tum
+        torchrg convert rgbd capture results
     """
 
-    layout: Literal["tum", "icl-nuim", "scannet", "7-scenes", "images"] = "images"
-    """Data set whose folders ROOT has; images are all .png and .npy below it, of one camera."""
-    intrinsics: str | None = None
-    """Camera, as fx,fy,cx,cy in pixels. Default: that of the layout; images have none."""
-    depth_scale: float | None = None
-    """Stored value of one metre. Default: that of the layout; images have none."""
+    layout: FrameLayoutName = "auto"
+    """Data set whose folders ROOT has, auto for the one that its files show; nerfstudio is any
+    transforms.json, as Polycam and COLMAP are imported; images are all depth images below ROOT, of
+    one camera."""
+    intrinsics: flags.IntrinsicsFlag = None
+    depth_scale: flags.DepthScaleFlag = None
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """How planes are found in depth images."""
     orient: flags.ImageOrientFlag = "auto"
@@ -211,7 +226,8 @@ class RGBDArguments(Arguments):
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
         camera = flags.parse_intrinsics(self.intrinsics)
-        options = (self.layout, camera, self.depth_scale, self.orient)
+        layout = find_layout(root) if self.layout == "auto" else self.layout
+        options = (layout, camera, self.depth_scale, self.orient)
         return RGBDSource(root, self.depth, *options)
 
 
@@ -230,7 +246,7 @@ Normals, curvature and plane labels of every scan of a data set.
   s3dis    the rooms of S3DIS as released, into Pointcept's layout
   folder   every cloud below a folder
   scannet  the scans of ScanNet or ScanNet++ as released, into Pointcept's layout
-  rgbd     depth frames, in the folders of TUM, ICL-NUIM, ScanNet, 7-Scenes, or any
+  rgbd     depth frames: captures of phones, folders of public data sets, or any images
 
 Superpoints where other programs look for them: --layout.
 

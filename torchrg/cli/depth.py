@@ -13,16 +13,23 @@ from torchrg.batch.records import describe_run
 from torchrg.batch.sources import orient_image
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say, warn
+from torchrg.cli.ending import say, warn, warnings_as_lines
 from torchrg.cli.loop import check_apart, note_input, output_paths, picture_paths, run_each
-from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, read_depth
-from torchrg.depth import DepthConfig, find_intrinsics, make_intrinsics, segment_depth
-from torchrg.depth.camera import points_of_image
+from torchrg.datasets import RGBDFrame, RGBDFrames
+from torchrg.datasets.rgbd_files import (
+    DEPTH_SUFFIXES,
+    image_size,
+    num_pixels,
+    read_depth,
+    refuse_recording,
+)
+from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
+from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
-from torchrg.io.files import check_place
+from torchrg.io.files import check_place, make_folder
 from torchrg.render import color_planes, write_png
-from torchrg.structures import Cloud, Segmentation
+from torchrg.structures import Cloud
 
 _COLORED_FROM = 200
 """Pixels along the longer side, evenly apart, that tell which planes are next to each other and
@@ -43,18 +50,18 @@ class Arguments:
 
     Examples:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
+        torchrg depth frame.png --intrinsics camera.json --depth-scale 1000 --out labels.png
         torchrg depth kinect.pcd --out planes.ply
     """
 
     inputs: Annotated[tuple[Path, ...], Argument("IMAGE", is_positional=True)]
-    """Depth images (.png of 16 bits, .npy), or organised clouds (.pcd)."""
+    """Depth images (.png or .pgm of 16 bits, .npy), folders with one of them, or organised clouds
+    (.pcd)."""
     out: Path
-    """File to write, .png for labels or a cloud by its suffix; for several inputs a directory."""
-    intrinsics: str | None = None
-    """Camera of the depth images, as fx,fy,cx,cy in pixels, where the middle of the first pixel is
-    0,0. Default: found from the points, for organised clouds."""
-    depth_scale: float | None = None
-    """Stored value of one metre: 1000 for depth in millimetres, 5000 for TUM, 1 for metres."""
+    """File to write, .png for labels or a cloud by its suffix; for several inputs a directory, and
+    for a folder, unless it has such a suffix."""
+    intrinsics: flags.IntrinsicsFlag = None
+    depth_scale: flags.DepthScaleFlag = None
     picture: Path | None = None
     """Place of the coloured picture, a .png file; for several inputs a directory. Default: beside
     labels that are written as .png, with _planes in its name."""
@@ -68,8 +75,15 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, segment each image and write its result."""
     arguments = parse(Arguments, argv, prog="torchrg depth")
     flags.use_threads(arguments.threads)
-    _check_inputs(arguments)
-    inputs = arguments.inputs
+    camera = flags.parse_intrinsics(arguments.intrinsics)
+    frames = [_find_frame(arguments, camera, path) for path in arguments.inputs]
+    given = [camera if frame is None else frame for frame in frames]
+    inputs = [
+        path if frame is None else frame.depth
+        for path, frame in zip(arguments.inputs, frames, strict=True)
+    ]
+    if any(path.is_dir() for path in arguments.inputs) and not arguments.out.suffix:
+        make_folder(arguments.out)
     targets = output_paths(inputs, arguments.out, suffix=".png")
     pictures = picture_paths(targets, arguments.picture, suffixes=(".png",))
     if arguments.picture is None:
@@ -78,28 +92,50 @@ def run(argv: list[str]) -> int:
     check_apart([*targets, *drawn], inputs)
     for picture in drawn:
         check_place(picture)
-    return run_each(_label, arguments, inputs, targets, pictures)
+    return run_each(_label, arguments, inputs, given, targets, pictures)
 
 
-def _check_inputs(arguments: Arguments) -> None:
-    """Refuse folders, and depth images without a camera and a scale, before any is read."""
-    camera = flags.parse_intrinsics(arguments.intrinsics)
-    for path in arguments.inputs:
-        if path.is_dir():
+def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGBDFrame | None:
+    """Return the depth image that an input is, or that a folder holds; None of a cloud.
+
+    Without a camera and a scale it is refused, before any is read.
+    """
+    refuse_recording(path)
+    if path.is_dir():
+        with warnings_as_lines():
+            frame, *others = RGBDFrames.from_folder(
+                path, intrinsics=camera, depth_scale=arguments.depth_scale
+            ).frames
+        if others:
             raise ConfigError(
-                f"{path}: expected depth images or organised clouds, got a folder; use: torchrg "
-                f"convert rgbd {path} OUT --intrinsics FX,FY,CX,CY --depth-scale S."
+                f"{path}: expected a folder of one depth image, got {1 + len(others):,}; use: "
+                f"torchrg convert rgbd {path} OUT."
             )
-        if _is_depth(path) and None in (camera, arguments.depth_scale):
-            flag = "--intrinsics fx,fy,cx,cy" if camera is None else "--depth-scale"
-            raise ConfigError(f"{path}: expected {flag}, which depth images do not hold; pass it.")
+        return frame
+    if path.suffix.lower() not in DEPTH_SUFFIXES:
+        return None
+    if camera is None or arguments.depth_scale is None:
+        flag = "--intrinsics fx,fy,cx,cy" if camera is None else "--depth-scale"
+        raise ConfigError(f"{path}: expected {flag}, which depth images do not hold; pass it.")
+    return RGBDFrame(path, camera.matrix(image_size(path)), arguments.depth_scale)
 
 
-def _label(arguments: Arguments, source: Path, target: Path, picture: Path | None) -> None:
-    """Label an image, write its result, and print one line about it."""
+def _label(
+    arguments: Arguments,
+    source: Path,
+    given: RGBDFrame | Pinhole | None,
+    target: Path,
+    picture: Path | None,
+) -> None:
+    """Label an image, or a cloud with its camera, write the result, and print a line about it."""
     begin = time.perf_counter()
     _check_memory(source)
-    cloud, depth, camera = _read_frame(arguments, source)
+    scale = arguments.depth_scale
+    if isinstance(given, RGBDFrame):
+        scale = given.depth_scale
+        cloud, depth, camera = _read_image(given)
+    else:
+        cloud, depth, camera = _read_cloud(source, given)
     if not _is_png(target):
         check_output(target, cloud)
     note_input(f"{source}", cloud, target, () if _is_png(target) else RESULT_FIELDS)
@@ -109,7 +145,7 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
     seg = segment_depth(depth, camera, arguments.depth, pose=pose)
     points = cloud.points.view(*depth.shape, 3)
     seg = orient_image(seg, points, arguments.orient)
-    num_planes = len(seg.planes.count)
+    num_planes = len(seg.planes)
     if num_planes == 0:
         warn(f"{source}: no plane found: no region is large enough.")
     if picture is not None:
@@ -120,7 +156,15 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
     if _is_png(target):
         write_png(target, seg.labels + 1)
     else:
-        _write_cloud(arguments, source, target, cloud, seg)
+        provenance = describe_run(source, arguments.depth) | {
+            "config": {"depth": asdict(arguments.depth)},
+            "intrinsics": given and _numbers_of(camera),
+            "depth_scale": scale,
+            "orient": arguments.orient,
+        }
+        images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}
+        rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
+        write_cloud(target, cloud, rows, provenance=provenance)
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
     share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
     say(
@@ -130,8 +174,9 @@ def _label(arguments: Arguments, source: Path, target: Path, picture: Path | Non
 
 
 def _check_memory(image: Path) -> None:
-    """Refuse a PNG that says it has more pixels than memory has room for, before it is read."""
-    size, free = num_pixels(image) if _is_png(image) else 0, available_memory()
+    """Refuse an image that says it has more pixels than memory has room for, before it is read."""
+    is_depth, free = image.suffix.lower() in DEPTH_SUFFIXES, available_memory()
+    size = num_pixels(image) if is_depth else 0
     if (needed := size * _LEAST_BYTES_A_PIXEL) > free:
         raise FormatError(
             f"{image}: expected an image that memory has room for, got {size:,} pixels, which take "
@@ -145,47 +190,35 @@ def _is_png(path: Path) -> bool:
     return path.suffix.lower() == ".png"
 
 
-def _is_depth(path: Path) -> bool:
-    """Return whether a file is a depth image by its name."""
-    return path.suffix.lower() in DEPTH_SUFFIXES
+def _numbers_of(camera: Tensor) -> str:
+    """Return a camera matrix as ``fx,fy,cx,cy``."""
+    values = camera[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return ",".join(f"{value:.15g}" for value in values)
 
 
-def _write_cloud(
-    arguments: Arguments, source: Path, target: Path, cloud: Cloud, seg: Segmentation
-) -> None:
-    """Write an image as a cloud with its results."""
-    camera = flags.parse_intrinsics(arguments.intrinsics)
-    provenance = describe_run(source, arguments.depth) | {
-        "config": {"depth": asdict(arguments.depth)},
-        "intrinsics": camera and ",".join(f"{value:.15g}" for value in camera),
-        "depth_scale": arguments.depth_scale,
-        "orient": arguments.orient,
-    }
-    images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}
-    rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
-    write_cloud(target, cloud, rows, provenance=provenance)
+def _read_image(frame: RGBDFrame) -> tuple[Cloud, Tensor, Tensor]:
+    """Return the cloud of an image in camera coordinates, its depth ``(H, W)``, and its camera."""
+    depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
+    points = points_of_image(depth, frame.intrinsics).view(-1, 3).float()
+    height, width = depth.shape
+    cloud = Cloud(points.numpy(), grid_shape=(height, width), source=str(frame.depth))
+    return cloud, depth, frame.intrinsics
 
 
-def _read_frame(arguments: Arguments, path: Path) -> tuple[Cloud, Tensor, Tensor]:
-    """Return the cloud in camera coordinates, its depth ``(H, W)``, and the camera matrix.
+def _read_cloud(path: Path, given: Pinhole | None) -> tuple[Cloud, Tensor, Tensor]:
+    """Return an organised cloud, its depth ``(H, W)``, and its camera matrix.
 
-    Without a camera that of an organised cloud is found from its points.
+    Without a camera that is found from the points.
     """
-    numbers = flags.parse_intrinsics(arguments.intrinsics)
-    camera = None if numbers is None else make_intrinsics(*numbers)
-    if camera is not None and arguments.depth_scale is not None and _is_depth(path):
-        depth = read_depth(path, depth_scale=arguments.depth_scale)
-        points = points_of_image(depth, camera).view(-1, 3).float()
-        height, width = depth.shape
-        return Cloud(points.numpy(), grid_shape=(height, width), source=str(path)), depth, camera
     cloud = read_cloud(path)
     if cloud.grid_shape is None:
         raise FormatError(
             f"{path}: expected an organised cloud, with a height above 1, got a list of points; "
             "use torchrg segment."
         )
-    points = torch.from_numpy(cloud.coordinates).view(*cloud.grid_shape, 3)
-    camera = find_intrinsics(points) if camera is None else camera
+    height, width = cloud.grid_shape
+    points = torch.from_numpy(cloud.coordinates).view(height, width, 3)
+    camera = find_intrinsics(points) if given is None else given.matrix((width, height))
     if camera is None:
         raise FormatError(
             f"{path}: expected points of a pinhole camera in its own coordinates, got others; "

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import torch
 
 from torchrg.cli.arguments import Argument
+from torchrg.cli.ending import warnings_as_lines
 from torchrg.config import (
     DEFAULT_PRESET,
     WHITENESS,
@@ -20,6 +21,8 @@ from torchrg.config import (
     Up,
     load_config,
 )
+from torchrg.datasets.camera_files import CAMERA_SUFFIXES, read_camera
+from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.fields import COLUMNS_RULE
@@ -63,6 +66,22 @@ OrientFlag = Annotated[
         "else to the scanner where it names its places, as E57 does, else into the free space of "
         "rooms (auto); always into rooms (interior), to the scanner (viewpoint) or along +z (up); "
         "or to that side where the first of z, y, x that is not zero is positive (none).",
+    ),
+]
+IntrinsicsFlag = Annotated[
+    str | None,
+    Argument(
+        metavar="CAMERA",
+        text="Camera, as fx,fy,cx,cy in pixels, where the middle of the first pixel is 0,0, or a "
+        "file: Open3D's or nerfstudio's .json, camera_info of ROS as .yaml. Those of images of "
+        "another size are scaled. Default: that of the folder's layout.",
+    ),
+]
+DepthScaleFlag = Annotated[
+    float | None,
+    Argument(
+        text="Stored value of one metre: 1000 for depth in millimetres, 5000 for TUM, 1 for "
+        "metres. Default: that of the folder's layout.",
     ),
 ]
 ImageOrientFlag = Annotated[
@@ -191,17 +210,21 @@ def check_level(level: int, config: SuperpointsConfig) -> None:
         raise ConfigError(f"expected --level from 0 to {most}, the levels there are, got {level}.")
 
 
-def parse_intrinsics(text: str | None) -> tuple[float, float, float, float] | None:
-    """Return the four numbers of ``fx,fy,cx,cy``; None where no camera is given."""
+def parse_intrinsics(text: str | None) -> Pinhole | None:
+    """Return the camera of ``fx,fy,cx,cy`` or of a file; None where none is given."""
     if text is None:
         return None
+    if text.lower().endswith(CAMERA_SUFFIXES):
+        with warnings_as_lines():
+            return read_camera(Path(text))
     try:
         fx, fy, cx, cy = map(float, text.split(","))
     except ValueError:
         raise ConfigError(
-            f"expected --intrinsics fx,fy,cx,cy, four numbers without blanks, got {text!r}."
+            "expected --intrinsics fx,fy,cx,cy, four numbers without blanks, or a file that ends "
+            f"in {' '.join(CAMERA_SUFFIXES)}, got {text!r}."
         ) from None
-    return fx, fy, cx, cy
+    return Pinhole(fx, fy, cx, cy)
 
 
 def use_threads(threads: int | None) -> None:

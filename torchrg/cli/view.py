@@ -7,6 +7,7 @@ from typing import Annotated, Literal, get_args
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn
@@ -45,6 +46,7 @@ class Arguments:
     Examples:
         torchrg view planes.npz --out planes.png
         torchrg view planes.npz --out planes.html
+        torchrg view room.npz --beside planes.npz --out truth_and_result.png
         torchrg view planes.npz --out compared.html --beside other.npz --truth room.npz
         torchrg view scan.ply --out normals.png --color normal --view above
     """
@@ -66,13 +68,15 @@ class Arguments:
     azimuth_deg: float | None = None
     """Angle about the up axis from which to look, in degrees. Default: the one that shows most."""
     width: int = 1600
-    """Width in pixels of a picture."""
+    """Width in pixels of a picture, both halves together."""
     beside: Path | None = None
-    """Another cloud or result, for the right half of a page; both are turned together."""
+    """Another cloud or result, for the right half; on a page both are turned together."""
     truth: Path | None = None
     """Cloud of the same points with true labels or normals, to show errors on a page."""
     max_points: int = MAX_POINTS
     """Most points that a page shows. Of a larger cloud it shows a random sample, and says so."""
+    unit: str = "units"
+    """Name of the unit of the coordinates, such as m, for the scale bar of a page."""
     columns: ColumnsFlag = None
 
 
@@ -102,23 +106,37 @@ def _read(path: Path, arguments: Arguments) -> Result:
 
 
 def _write_picture(arguments: Arguments, result: Result) -> str:
-    """Write a picture, and return what there is to say about it."""
-    if arguments.beside is not None or arguments.truth is not None:
-        raise ConfigError("expected --beside and --truth with a page, --out PAGE.html.")
+    """Write a picture, or two side by side, and return what there is to say about it."""
+    if arguments.truth is not None:
+        raise ConfigError("expected --truth with a page, --out PAGE.html.")
+    halves = [_draw(arguments, result)]
+    if arguments.beside is not None:
+        halves.append(_draw(arguments, _read(arguments.beside, arguments), result))
+    height = max(len(half) for half in halves)
+    level = [
+        functional.pad(half, (0, 0, 0, 0, 0, height - len(half)), value=255) for half in halves
+    ]
+    write_png(arguments.out, torch.cat(level, dim=1))
+    return f"{sum(half.shape[1] for half in halves)} x {height} pixels"
+
+
+def _draw(arguments: Arguments, result: Result, first: Result | None = None) -> Tensor:
+    """Draw a result; if the first has the same points, from the same place and in its colors."""
     cloud, normals = result.cloud, result.cloud.fields.get("normals")
+    reference = None
+    if first and np.array_equal(cloud.coordinates, first.cloud.coordinates, equal_nan=True):
+        reference = first.fields.get("labels")
     up = _direction(arguments.up or "z")
-    picture = render_cloud(
+    return render_cloud(
         cloud.points,
-        _colors(cloud, arguments.color, up),
+        _colors(cloud, arguments.color, up, reference),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
-        labels=result.fields.get("labels"),
+        labels=result.fields.get("labels") if reference is None else reference,
         view=arguments.view,
         up=up,
         azimuth_deg=arguments.azimuth_deg,
-        width=arguments.width,
+        width=arguments.width // (1 if arguments.beside is None else 2),
     )
-    write_png(arguments.out, picture)
-    return f"{picture.shape[1]} x {picture.shape[0]} pixels"
 
 
 def _write_page(arguments: Arguments, result: Result) -> str:
@@ -132,13 +150,16 @@ def _write_page(arguments: Arguments, result: Result) -> str:
         up=None if arguments.up is None else _direction(arguments.up),
         azimuth_deg=arguments.azimuth_deg,
         max_points=arguments.max_points,
+        unit=arguments.unit,
     )
     write_page(arguments.out, page)
     shown = " and ".join(f"{number:,}" for number in page.num_points)
     return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
 
 
-def _colors(cloud: Cloud, color: PageColorBy | None, up: Direction) -> Tensor:
+def _colors(
+    cloud: Cloud, color: PageColorBy | None, up: Direction, reference: Tensor | None
+) -> Tensor:
     """Return the colour of each point; raise ConfigError if the cloud has none of that kind."""
     present = [name for name in get_args(ColorBy) if MODES[name][1] in cloud.fields]
     if color is None:
@@ -153,7 +174,7 @@ def _colors(cloud: Cloud, color: PageColorBy | None, up: Direction) -> Tensor:
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)
     values = torch.from_numpy(cloud.fields[MODES[color][1]])
     if color in ("plane", "superpoint"):
-        return color_planes(values, cloud.points)
+        return color_planes(values, cloud.points, reference=reference if color == "plane" else None)
     if color == "normal":
         return color_normals(values, up=up)
     if color == "curvature":

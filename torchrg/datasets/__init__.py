@@ -7,11 +7,11 @@ called with it, and ``data.scenes`` lists what there is without reading it: :cla
 :func:`collate_offset` joins samples into a ragged batch. :func:`read_room` reads one room of S3DIS,
 :func:`read_pointcept_scene` and :func:`write_pointcept_scene` one folder of Pointcept's layout.
 
-The guide on training says how the loaders of Pointcept, Superpoint Transformer, KPConv, OpenPCSeg,
-and networks on superpoints take these results.
+The guide with recipes for other programs says how their loaders take these results.
 
 A new data set is a :class:`~torchrg.datasets.folder.SceneDataset` in a file of its own, exported
-here, and a test; a new folder of depth frames is a row of :data:`~torchrg.datasets.rgbd.LAYOUTS`.
+here, and a test; a new folder of depth frames is a row of
+:data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
 """
 
 from torchrg.datasets.collate import collate_offset

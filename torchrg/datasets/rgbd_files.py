@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import struct
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
@@ -14,14 +15,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.files import DAMAGES, check_file, read_text, refusing
+from torchrg.io.files import DAMAGES, check_file, check_promise, read_text, refusing
 from torchrg.structures import FARTHEST, Array
 
 Value = TypeVar("Value")
-DEPTH_SUFFIXES = (".png", ".npy")
+DEPTH_SUFFIXES = (".png", ".npy", ".pgm")
 """Suffixes of depth images."""
+_CONVERTERS = {
+    ".bag": "save its frames by Open3D's RGBDVideoReader",
+    ".mkv": "save its frames by Open3D's azure_kinect_mkv_reader.py",
+    ".r3d": "unzip it, and save what pyliblzfse reads of its .depth files as .npy, in metres",
+    ".exr": "save what OpenEXR reads of it as .npy, usually in metres",
+}
+"""What turns recordings and images that are not read into frames that are."""
+_PNG = b"\x89PNG"
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
 """Width and height in the header of a PNG, and the byte at which they begin."""
+_PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
+"""Beginning of a binary PGM: width, height and the largest value."""
+_LONGEST_HEAD, _MOST_OF_A_BYTE = 512, 255
 _MOST_PIXELS = 1 << 26
 """Pixels of the largest image that is read, 8192 x 8192. No depth camera has as many, and what is
 made of them on the way to metres takes 1.5 GB. A library that has less ends the process."""
@@ -32,7 +44,7 @@ _MOST_SECONDS = 0.02
 def read_depth(
     path: str | os.PathLike[str], *, depth_scale: float, no_depth: int | None = None
 ) -> Tensor:
-    """Read depth in metres, shape ``(H, W)``, float32, from a gray PNG of 16 bits or a ``.npy``.
+    """Read depth in metres, ``(H, W)``, float32, from gray PNG or PGM of 16 bits, or ``.npy``.
 
     It is 0 where there is none (0, negative, not finite, or ``no_depth``, as 65535 in 7-Scenes).
     ``depth_scale`` is the stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for
@@ -48,18 +60,38 @@ def read_depth(
     if not 0 < depth_scale < float("inf"):
         raise ConfigError(f"read_depth: expected depth_scale > 0, got {depth_scale}.")
     source = Path(path)
-    if source.suffix.lower() not in DEPTH_SUFFIXES:
+    refuse_recording(source)
+    readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16}
+    reader = readers.get(source.suffix.lower())
+    if reader is None:
         known = " ".join(DEPTH_SUFFIXES)
         raise FormatError(
             f"{source}: expected a depth image that ends in one of {known}, got {source.suffix!r}."
         )
-    stored = _read_npy(source) if source.suffix.lower() == ".npy" else _read_png16(source)
+    stored = reader(source)
     depth = stored.astype(np.float64)
     with np.errstate(invalid="ignore"):
         bad = ~(np.isfinite(depth) & (depth > 0))
     if no_depth is not None:
         bad |= stored == no_depth
     return torch.from_numpy((np.where(bad, 0, depth) / depth_scale).astype(np.float32))
+
+
+def refuse_recording(path: Path) -> None:
+    """Raise FormatError with the tool that converts it, of a file that holds depth and is not read.
+
+    Example:
+        >>> refuse_recording(Path("walk.bag"))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.FormatError: walk.bag: expected depth images, got .bag; save its frames by...
+    """
+    suffix = path.suffix.lower()
+    if suffix in _CONVERTERS and not path.is_dir():
+        raise FormatError(
+            f"{path}: expected depth images, got {suffix}; {_CONVERTERS[suffix]}, and give the "
+            "folder to torchrg convert rgbd."
+        )
 
 
 def read_color(source: Path) -> Tensor:
@@ -104,22 +136,47 @@ def _read_image(source: Path, kinds: str) -> Array:
         return np.asarray(io.read_image(str(source)))
 
 
-def num_pixels(path: Path) -> int:
-    """Return the number of pixels of a depth image, as far as its beginning tells; 0 of damage.
+def _read_pgm16(source: Path) -> NDArray[np.uint16]:
+    """Return the values of a binary PGM of 16 bits, shape ``(H, W)``."""
+    check_file(source)
+    content = source.read_bytes()
+    found = _PGM.match(content)
+    most = int(found[3]) if found else 0
+    if found is None or not _MOST_OF_A_BYTE < most <= np.iinfo(np.uint16).max:
+        raise FormatError(
+            f"{source}: expected a binary PGM of 16 bits, P5, got {content[:16]!r}; depth does not "
+            "fit into 8 bits."
+        )
+    width, height = int(found[1]), int(found[2])
+    needed, available = 2 * width * height, len(content) - found.end()
+    check_promise(source, found.end(), needed, "its pixels", available=available)
+    values = np.frombuffer(content, ">u2", width * height, found.end())
+    return values.astype(np.uint16).reshape(height, width)
 
-    It is 0, too, of a file that is not there, which reading tells.
+
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Return width and height of a depth image, as far as its beginning tells.
+
+    It is None of damage, and of a file that is not there, which reading tells.
     """
     try:
-        if path.suffix.lower() != ".png":
-            return path.stat().st_size // 2
+        if path.suffix.lower() == ".npy":
+            height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape
+            return width, height
         with path.open("rb") as stream:
-            head = stream.read(_PNG_SIZE_AT + _PNG_SIZE.size)
-    except (OSError, ValueError):
-        return 0
-    if len(head) < _PNG_SIZE_AT + _PNG_SIZE.size:
-        return 0
-    width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
-    return int(width * height)
+            head = stream.read(_LONGEST_HEAD)
+        if head.startswith(_PNG):
+            width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
+            return width, height
+    except (OSError, *DAMAGES):
+        return None
+    found = _PGM.match(head)
+    return (int(found[1]), int(found[2])) if found else None
+
+
+def num_pixels(path: Path) -> int:
+    """Return the number of pixels of a depth image, 0 where :func:`image_size` does not know it."""
+    return math.prod(image_size(path) or (0,))
 
 
 def _read_npy(source: Path) -> NDArray[np.number]:
@@ -140,6 +197,14 @@ def read_matrix(path: Path) -> Tensor:
     if [len(row) for row in rows] != [4] * 4:
         raise FormatError(f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows.")
     return torch.tensor(_numbers(path, rows), dtype=torch.float64)
+
+
+def read_numbers(path: Path, count: int, what: str) -> list[list[float]]:
+    """Read rows of so many numbers; ``what`` says which they are."""
+    rows = _words(path)
+    if not rows or any(len(row) != count for row in rows):
+        raise FormatError(f"{path}: expected {what} in each row.")
+    return _numbers(path, rows)
 
 
 def known_pose(matrix: Tensor) -> Tensor | None:
@@ -164,6 +229,22 @@ def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
     poses[:, :3, :3] = _rotations(values[:, 4:])
     poses[:, :3, 3] = values[:, 1:4]
+    return values[:, 0].tolist(), [known_pose(pose) for pose in poses]
+
+
+def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor | None]]:
+    """Read rows of ``time rx ry rz tx ty tz``, which lead from world to camera, turns in radians.
+
+    Returns what :func:`read_trajectory` does: poses from camera to world.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rows = _rows_by_time(path, 7, "time rx ry rz tx ty tz")
+    values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
+    back = torch.from_numpy(Rotation.from_rotvec(values[:, 1:4].numpy()).as_matrix()).mT
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
+    poses[:, :3, :3] = back
+    poses[:, :3, 3] = -(back @ values[:, 4:, None])[..., 0]
     return values[:, 0].tolist(), [known_pose(pose) for pose in poses]
 
 

@@ -277,8 +277,8 @@ def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
     # A lone CR would end a line here, and a minus that lost its bit is one.
     if content.count(b"\r") != content.count(b"\r\n"):
         return None
-    arrow = require("pyarrow", extra="s3dis", purpose="read S3DIS")
-    csv = require("pyarrow.csv", extra="s3dis", purpose="read S3DIS")
+    arrow = require("pyarrow", extra="text", purpose="read S3DIS")
+    csv = require("pyarrow.csv", extra="text", purpose="read S3DIS")
     try:
         table = csv.read_csv(
             arrow.BufferReader(content),

@@ -1,6 +1,6 @@
 """Pinhole cameras: depth images to points, through kornia, and back from organised clouds."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -130,6 +130,56 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
             f"{fx}, {fy}, {cx}, {cy}."
         )
     return matrix
+
+
+class Pinhole(NamedTuple):
+    """A pinhole camera as files give it, with the size of the images that its numbers are of.
+
+    Attributes:
+        fx: Focal length along rows in pixels.
+        fy: Focal length along columns in pixels.
+        cx: Place of the optical axis in a row, where the middle of the first pixel is 0.
+        cy: Place of the optical axis in a column.
+        size: Width and height of the images; None where nobody says, so that it fits any.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    size: tuple[int, int] | None = None
+
+    def matrix(self, size: tuple[int, int] | None = None) -> Tensor:
+        """Return the camera matrix ``(3, 3)``, float64, for images made smaller or larger.
+
+        Convention:
+            An image that is resized keeps its outer edges, half a pixel beyond the middles of its
+            first and last pixels, so that ``cx + 0.5`` grows as ``fx`` does.
+
+        Args:
+            size: Width and height of the images; None for those that the camera is of.
+
+        Raises:
+            ConfigError: If images of this size do not show what the camera's do, up to a pixel, or
+                a value is that of no camera.
+
+        Example:
+            >>> Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((160, 120))[0].tolist()
+            [150.0, 0.0, 79.5]
+        """
+        fx, fy, cx, cy, own = self
+        if size is None or own is None or size == own:
+            return make_intrinsics(fx, fy, cx, cy)
+        (width, height), (own_width, own_height) = size, own
+        if abs(width * own_height - height * own_width) > max(own):
+            raise ConfigError(
+                f"Pinhole: expected images with the sides of {own_width} x {own_height} pixels, "
+                f"which the camera is of, or in their ratio, got {width} x {height}; pass the "
+                "camera of the depth images."
+            )
+        across, down = width / own_width, height / own_height
+        middle = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
+        return make_intrinsics(fx * across, fy * down, *middle)
 
 
 def find_intrinsics(points: Tensor) -> Tensor | None:

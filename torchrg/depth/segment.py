@@ -1,11 +1,15 @@
 """From one depth image to planes."""
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import places_of, sequential_operations
-from torchrg.config import DepthConfig
+from torchrg.config import DepthConfig, settings_of
 from torchrg.depth.camera import has_depth, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels, join_pixels
 from torchrg.depth.normals import Pixels, describe_pixels, fit_pixels
@@ -21,9 +25,10 @@ from torchrg.structures import Segmentation
 def segment_depth(
     depth: Tensor,
     intrinsics: Tensor,
-    config: DepthConfig | None = None,
+    config: DepthConfig | Mapping[str, Any] | None = None,
     *,
     pose: Tensor | None = None,
+    **changes: Any,  # noqa: ANN401
 ) -> Segmentation:
     """Segment a depth image into planes.
 
@@ -40,9 +45,10 @@ def segment_depth(
         depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
         intrinsics: Camera matrix, shape ``(3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; see
             :func:`torchrg.depth.camera.depth_to_points`.
-        config: Settings. Default: :class:`DepthConfig`.
+        config: Settings, or a dictionary of them. Default: :class:`DepthConfig`.
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
             the world. Default: they are in camera coordinates.
+        **changes: Single settings, as in ``max_depth=4.0``.
 
     Returns:
         A segmentation whose fields are images, of ``(H, W)`` or ``(H, W, 3)``. Sharp are the pixels
@@ -50,7 +56,7 @@ def segment_depth(
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If ``intrinsics`` is no matrix of a camera.
+        ConfigError: If ``intrinsics`` is no matrix of a camera, or a setting is wrong.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -70,7 +76,8 @@ def segment_depth(
         pose=(pose, "4 4"),
     )
     check_floating("segment_depth", depth=depth)
-    return _segment(depth, intrinsics, config or DepthConfig(), pose)
+    settings = settings_of("segment_depth", DepthConfig, config, changes)
+    return _segment(depth, intrinsics, settings, pose)
 
 
 def _segment(
@@ -113,7 +120,7 @@ def _segment(
         pixels.curvature.to(depth.dtype),
         edge,
         valid,
-        table._replace(curved=curved),
+        replace(table, curved=curved),
     )
 
 

@@ -13,6 +13,7 @@ import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any
 
@@ -46,7 +47,7 @@ _COORDINATES = ("points", "coord")
 POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 """What a segmentation says of each point."""
 _NOT_PER_POINT = {
-    *(f"plane_{name}" for name in (*Planes._fields, "of_superpoint")),
+    *(f"plane_{name}" for name in (*(part.name for part in fields(Planes)), "of_superpoint")),
     *(f"adjacency_{name}" for name in PlaneAdjacency._fields),
     *(f"outline_{name}" for name in ("points", "ring_sizes", "ring_planes")),
     "provenance",

@@ -19,6 +19,7 @@ of shape ``(*, K, 3)`` and are what the estimators are made of.
 """
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_points, of_clouds
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
-from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, settings_of
+from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.neighbors import finite_rows, restore_rows, search_knn
 from torchrg.normals.consensus import estimate_consensus
@@ -83,13 +84,12 @@ WITHOUT_GRADIENT = {"consensus"}
 @sequential_operations()
 def estimate_normals(
     points: Tensor | NDArray[np.floating],
-    config: NormalsConfig | PipelineConfig | str | None = None,
+    config: NormalsConfig | AnyConfig | None = None,
     *,
-    method: NormalMethod | None = None,
-    k: int | None = None,
     neighbors: Neighbors | None = None,
     max_distance: float | None = None,
     chunk_size: int = CHUNK_SIZE,
+    **changes: Any,  # noqa: ANN401
 ) -> NormalFit:
     """Estimate normal and curvature of every point of a cloud.
 
@@ -102,14 +102,13 @@ def estimate_normals(
 
     Args:
         points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
-        config: Settings, a whole configuration, or the name of a preset. Default: that of
-            :func:`torchrg.load_config`.
-        method: A name from :data:`ESTIMATORS`. Default: that of ``config``.
-        k: Number of neighbours, the point itself included. Default: that of ``config``. A cloud
-            with fewer points uses those it has.
+        config: Settings, a dictionary of them, a whole configuration, or the name of a preset.
+            Default: that of :func:`torchrg.load_config`.
         neighbors: Neighbours found before, for finite points. Default: searched.
         max_distance: As of :func:`torchrg.search_knn`.
         chunk_size: Points handled at a time; bounds memory, changes no result.
+        **changes: Single settings, as in ``method="pca", k=20``: see
+            :class:`torchrg.config.NormalsConfig`.
 
     Returns:
         The fit in the order of the points.
@@ -131,9 +130,7 @@ def estimate_normals(
     tensor = as_tensor("estimate_normals", "points", points)
     check_points("estimate_normals", tensor)
     warn_of_steps("estimate_normals", tensor)
-    changes = {"method": method, "k": k}
-    changed = {name: value for name, value in changes.items() if value is not None}
-    settings = settings_of("estimate_normals", NormalsConfig, config, changed)
+    settings = settings_of("estimate_normals", NormalsConfig, config, changes)
     estimate = ESTIMATORS[settings.method]
     if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():
         names = ", ".join(sorted(ESTIMATORS.keys() - WITHOUT_GRADIENT))

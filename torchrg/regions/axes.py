@@ -123,7 +123,8 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
     outline = planes.outline
     if outline is not None:
         outline = tuple(tuple(moved(ring) for ring in rings) for rings in outline)
-    return planes._replace(
+    return replace(
+        planes,
         normal=normal.to(dtype),
         offset=((turned(foot) + shift) * normal).sum(dim=1).to(dtype),
         centroid=moved(planes.centroid),

@@ -1,6 +1,7 @@
 """Region growing: from points, normals and neighbours to labels."""
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from torchrg._parallel import (
     return_freed_memory,
     sequential_operations,
 )
-from torchrg.config import GrowingConfig, PipelineConfig, settings_of
+from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
@@ -37,7 +38,7 @@ def grow_regions(
     normals: Tensor | NDArray[np.floating],
     curvature: Tensor | NDArray[np.floating],
     neighbors: Neighbors,
-    config: GrowingConfig | PipelineConfig | str | None = None,
+    config: GrowingConfig | AnyConfig | None = None,
     *,
     valid: Tensor | None = None,
     residual_rms: Tensor | NDArray[np.floating] | None = None,
@@ -46,6 +47,7 @@ def grow_regions(
     signed_normals: bool = False,
     canonical: bool = False,
     chunk_size: int = CHUNK_SIZE,
+    **changes: Any,  # noqa: ANN401
 ) -> Tensor:
     """Grow regions of similar normals, in the order of ascending curvature (Algorithm 2) [1].
 
@@ -67,8 +69,8 @@ def grow_regions(
         normals: Unit normals, shape ``(N, 3)``; their sign only matters with ``signed_normals``.
         curvature: Surface variation, shape ``(N,)``.
         neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
-        config: Settings, a whole configuration, or the name of a preset. Default: that of
-            :func:`torchrg.load_config`, which needs ``residual_rms``.
+        config: Settings, a dictionary of them, a whole configuration, or the name of a preset.
+            Default: that of :func:`torchrg.load_config`, which needs ``residual_rms``.
         valid: Points that have a normal, shape ``(N,)``, bool; no region passes through others, nor
             through points whose normal or curvature is not finite. Default: all.
         residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
@@ -77,10 +79,10 @@ def grow_regions(
         max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
             unit of the colours) does not join. Default: colours play no part.
         signed_normals: Whether opposite normals, if oriented, differ by 180 degrees instead of 0,
-        so
-            that the two faces of a thin wall never join.
+            so that the two faces of a thin wall never join.
         canonical: Whether the points already are in canonical order; saves a copy.
         chunk_size: Points handled at a time.
+        **changes: Single settings, as in ``max_angle_deg=7``.
 
     Returns:
         Labels, shape ``(N,)``, int64; :data:`torchrg.UNLABELED` for points of no region and of
@@ -88,7 +90,7 @@ def grow_regions(
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If residuals or colours are needed, and there are none.
+        ConfigError: If residuals or colours are needed, and there are none, or a setting is wrong.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -105,9 +107,8 @@ def grow_regions(
         >>> labels.unique()
         tensor([0])
     """
-    if not isinstance(config, GrowingConfig):
-        config = settings_of("grow_regions", GrowingConfig, config)
-    cloud = checked_cloud(config, points, normals, curvature, neighbors, valid, residual_rms)
+    settings = settings_of("grow_regions", GrowingConfig, config, changes)
+    cloud = checked_cloud(settings, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
     if max_color_distance < math.inf:
         cloud = _with_colors(cloud, colors, max_color_distance)
@@ -116,9 +117,9 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    if "auto" in (config.min_size, config.facet_tolerance):
-        config = config.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
-    labels = label_regions(cloud, grow(cloud, config, chunk_size), config, chunk_size)
+    if "auto" in (settings.min_size, settings.facet_tolerance):
+        settings = settings.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
+    labels = label_regions(cloud, grow(cloud, settings, chunk_size), settings, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
 
@@ -281,8 +282,7 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     if kernels.serve(indices, masked, cloud.valid, cloud.curvature):
         with scratch.scattered_reads():
             return kernels.call("grow_regions", *edges, order, late)[0]
-    arrays = [None if values is None else values.cpu().numpy() for values in (*edges, order)]
-    return torch.from_numpy(grow_first_in_first_out(*arrays, late=late)).to(indices.device)
+    return grow_first_in_first_out(*edges, order, late=late)
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
@@ -293,15 +293,15 @@ def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
 
 
 def grow_first_in_first_out(
-    lists: NDArray[np.integer],
-    joins: NDArray[np.int64],
-    makes_seed: NDArray[np.int64] | None,
-    is_seed: NDArray[np.bool_],
-    valid: NDArray[np.bool_],
-    order: NDArray[np.int32],
+    indices: Tensor,
+    joins: Tensor,
+    makes_seed: Tensor | None,
+    is_seed: Tensor,
+    valid: Tensor,
+    order: Tensor,
     *,
     late: bool,
-) -> NDArray[np.int32]:
+) -> Tensor:
     """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
 
     A point belongs to the first seed in the queue that has an edge to it. Whether it becomes a seed
@@ -314,9 +314,11 @@ def grow_first_in_first_out(
     exactly what one seed after the other does. The edges are those of :func:`mark_edges`. Returns
     the root of each point's region, -1 where not valid.
     """
-    free, roots = valid.copy(), np.full(len(valid), -1, dtype=np.int32)
+    lists, bits, makes_itself = (values.cpu().numpy() for values in (indices, joins, is_seed))
+    promoting = None if makes_seed is None else makes_seed.numpy()
+    free, roots = valid.cpu().numpy().copy(), np.full(len(valid), -1, dtype=np.int32)
     queue, slots = np.empty_like(roots), np.empty_like(roots)
-    for root in order:
+    for root in order.numpy():
         if not free[root]:
             continue
         free[root], roots[root], queue[0] = False, root, root
@@ -326,10 +328,10 @@ def grow_first_in_first_out(
             while done < count:
                 seeds = queue[done : min(done + _SEEDS_AT_ONCE, count)]
                 done += len(seeds)
-                near, joined = lists[seeds], _read_bits(joins[seeds], lists.shape[1])
-                promotes = is_seed[near]
-                if makes_seed is not None:
-                    promotes = _read_bits(makes_seed[seeds], lists.shape[1])
+                near, joined = lists[seeds], _read_bits(bits[seeds], lists.shape[1])
+                promotes = makes_itself[near]
+                if promoting is not None:
+                    promotes = _read_bits(promoting[seeds], lists.shape[1])
                 if late:
                     joined &= promotes != claims
                 joined &= free[near]
@@ -343,7 +345,7 @@ def grow_first_in_first_out(
                     new = targets[promotes[joined][is_first]]
                     queue[count : count + len(new)] = new
                     count += len(new)
-    return roots
+    return torch.from_numpy(roots).to(indices.device)
 
 
 def _read_bits(words: NDArray[np.int64], k: int) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -146,15 +147,15 @@ def summarize_planes(
         curved=fit.curved,
     )
     if up is not None:
-        planes = planes._replace(kind=classify_planes(planes, _direction(up, points)))
+        planes = replace(planes, kind=classify_planes(planes, _direction(up, points)))
     if outline:
-        planes = planes._replace(outline=sum(outlines, ()))
+        planes = replace(planes, outline=sum(outlines, ()))
     if neighbors is not None:
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
         lengths, angles = as_given(meeting.boundary_length), as_given(meeting.dihedral_deg)
-        planes = planes._replace(adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
+        planes = replace(planes, adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes
 
 

@@ -115,7 +115,7 @@ def _of_regions(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Cha
     values = torch.where(labels < 0, none, labels)
     colors = palette[-1:].repeat(none + 1, 1)
     colors[values] = palette[rows]
-    legend = [([UNLABELED_GRAY] * 3, "in none")] if bool((rows < 0).any()) else []
+    legend = [([UNLABELED_GRAY] * 3, f"in no {mode}")] if bool((rows < 0).any()) else []
     return Channel(mode, values.numpy().astype(np.min_scalar_type(none)), colors.numpy(), legend)
 
 

@@ -1,5 +1,6 @@
 """What a page says about a cloud: its axes, the points it shows, its planes, what closes it."""
 
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import NamedTuple
 
@@ -137,10 +138,10 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     none.
     """
     planes, origin = result.planes, result.cloud.origin
-    if planes is None or len(planes.count) == 0:
+    if not planes:
         return []
     if planes.kind is None:
-        planes = planes._replace(kind=classify_planes(planes, frame.rotation[2]))
+        planes = replace(planes, kind=classify_planes(planes, frame.rotation[2]))
     table = describe_planes(planes, origin=origin.tolist())
     meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
     for found in table.get("adjacency", []):

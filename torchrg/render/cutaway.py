@@ -39,19 +39,16 @@ _LEAST_INSIDE = 0.05
 """Least share of the cloud on the inner side of an outer wall."""
 _THICKNESS = 1.5
 """Voxels nearer to a wall than this many of their edges, and twice its own noise, are in it."""
-_LEAST_AREA = 0.3
-"""Share of the area of the largest wall or horizontal plane from which on another one closes a side
-as well, whatever it is called."""
-_LEAST_BELOW = 0.4
-"""Least share of the cloud's height below a horizontal plane that closes it: more than a table has.
-"""
+_LEAST_AREA, _LEAST_BELOW = 0.3, 0.4
+"""Least shares of the area of the largest plane, and of the cloud's height below it, of a
+horizontal plane that is the ceiling of a lower room: more than a table has."""
 _BELOW_CEILING = 0.15
 """Share of the cloud's height below a ceiling that goes with it: lamps and beams hang there."""
 _MOST_PIXELS = 500
 """Side of the picture that tells how much a view shows."""
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
-"""Angles from the normal of the largest wall, in degrees, that are tried. None looks straight at a
-wall, so that two walls of a corner are always seen."""
+"""Azimuths that are tried, in degrees. None looks straight at a wall, so that two walls of a corner
+are always seen."""
 
 
 class Sides(NamedTuple):
@@ -62,7 +59,7 @@ class Sides(NamedTuple):
         of_voxels: Bits of the sides that each voxel is in, shape ``(V,)``, uint8.
         of_points: The same of each point, shape ``(n,)``: where it has a label, of its plane, so
             that what stands against a wall, and the floor along it, is not part of the wall.
-        heading: Horizontal normal of the largest wall, shape ``(3,)``.
+        heading: Horizontal direction from which azimuths are measured, shape ``(3,)``.
     """
 
     directions: Tensor
@@ -103,7 +100,12 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
     planes = summarize_planes(centers, surface.normals, number_labels(of_voxels)[1])
     altitude = centers @ up
     low, high = altitude.quantile(altitude.new_tensor([0.02, 0.98])).tolist()
-    walls, ceilings = _closing(planes, up, low, high)
+    kind = classify_planes(planes, up)
+    walls, ceilings, level = (
+        kind == PLANE_KINDS.index(name) for name in ("wall", "ceiling", "horizontal")
+    )
+    broad = planes.area >= _LEAST_AREA * functional.pad(planes.area, (0, 1)).amax()
+    ceilings |= level & broad & (planes.center @ up - low > _LEAST_BELOW * (high - low))
     directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
     powers = 1 << torch.arange(MOST_SIDES, device=centers.device)
     by_place = (covered * powers).sum(dim=1)
@@ -116,24 +118,6 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
     points = torch.where(of_points < 0, by_place[surface.voxel_of], of_planes[of_points])
     heading = _heading(planes.normal[walls], planes.area[walls], up)
     return Sides(directions, voxels.to(torch.uint8), points.to(torch.uint8), heading)
-
-
-def _closing(planes: Planes, up: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
-    """Return which planes may be outer walls, and which ceilings, shape ``(M,)`` each.
-
-    They have that kind, or are about as large as those that have it; the cloud reaches from the
-    height ``low`` to ``high``.
-    """
-    kind = classify_planes(planes, up)
-    is_kind = {name: kind == place for place, name in enumerate(PLANE_KINDS)}
-    upright = is_kind["wall"] | is_kind["vertical"]
-    level = is_kind["ceiling"] | is_kind["horizontal"] | is_kind["floor"]
-    broad = [
-        among & (planes.area >= _LEAST_AREA * functional.pad(planes.area[among], (0, 1)).amax())
-        for among in (upright, level)
-    ]
-    is_high = planes.center @ up - low > _LEAST_BELOW * (high - low)
-    return broad[0] | is_kind["wall"], (broad[1] & is_high) | is_kind["ceiling"]
 
 
 def _outer(
@@ -168,13 +152,17 @@ def _outer(
 
 
 def _heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor:
-    """Return the horizontal normal of the largest wall, or any direction if there are none."""
-    if len(normals):
-        axis = normals[areas.argmax()]
-    else:
-        axis = torch.zeros_like(up)
-        axis[up.abs().argmin()] = 1
-    return functional.normalize(axis - (axis @ up) * up, dim=0)
+    """Return the horizontal direction nearest to an axis along or across the largest wall."""
+    east = torch.zeros_like(up)
+    east[up.abs().argmin()] = 1
+    east = functional.normalize(east - (east @ up) * up, dim=0)
+    if len(normals) == 0:
+        return east
+    wall = normals[areas.argmax()]
+    wall = functional.normalize(wall - (wall @ up) * up, dim=0)
+    across = torch.linalg.cross(up, wall)
+    sides = torch.stack([wall, across, -wall, -across])
+    return sides[(sides @ east).argmax()]
 
 
 class Viewpoint(NamedTuple):
@@ -202,9 +190,10 @@ def choose_viewpoint(
 ) -> Viewpoint:
     """Choose the direction from which most surface is seen.
 
-    The azimuth is the angle about ``up`` from the normal of the largest wall: by default the best
-    of eight, equal ones decided by the angle, and from above the one that lays the cloud across the
-    picture. The elevation is the angle over the horizon: by default 35, from above 90.
+    The azimuth is the angle about ``up`` from the direction, along or across the largest wall, that
+    is nearest to x: by default the best of eight, equal ones decided by the angle, and from above
+    the one that lays the cloud across the picture. The elevation is the angle over the horizon: by
+    default 35, from above 90.
     """
     for name, angle in (("azimuth_deg", azimuth_deg), ("elevation_deg", elevation_deg)):
         if angle is not None and not math.isfinite(angle):

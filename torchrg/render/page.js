@@ -12,6 +12,8 @@ const SLOW_MS = 45, FAST_MS = 22; // Frames between these times keep the number 
 // Radii by which the rim of a disc is farther than its middle: of discs that reach past an edge from
 // either side, that with the nearer middle is in front. With more, one sees through thin plates.
 const DOME = "1.0";
+// Radius of a disc in units of the spacing: smaller ones leave gaps between random points.
+const RADIUS = 1.75;
 const STILL_MS = 250; // After so long without a turn all points are drawn again.
 
 // ---- What the file holds ---------------------------------------------------------------------
@@ -298,7 +300,7 @@ function layersOf({ PathLayer, LineLayer }) {
     const length = cloud.levels[level - 1] ?? 0;
     // Fewer points are larger, but do not close surfaces: without a GPU it is pixels that take time.
     const growth = (cloud.shown / Math.max(length, 1)) ** 0.25;
-    const radius = 1.2 * cloud.spacing * 1.15 ** state.size * growth;
+    const radius = RADIUS * cloud.spacing * 1.15 ** state.size * growth;
     const eye = plus(state.camera.target, scaled(toward, focalLength() / 2 ** state.camera.zoom));
     const isCut = cutOf(cloud);
     const inView = ({ sides, rings }, plane) => !cloud.hidden.has(plane) && !(sides & bits)
@@ -422,7 +424,7 @@ function showScale() {
   const power = 10 ** Math.floor(Math.log10(160 / perUnit));
   const length = [5, 2, 1].find((digit) => digit * power * perUnit <= 160) * power;
   $("scale").hidden = false;
-  $("scale").firstChild.textContent = number(length);
+  $("scale").firstChild.textContent = `${number(length)} ${page.unit}`;
   $("scale").lastChild.style.width = `${length * perUnit}px`;
 }
 

@@ -86,6 +86,7 @@ def make_page(
     up: tuple[float, float, float] | None = None,
     azimuth_deg: float | None = None,
     max_points: int = MAX_POINTS,
+    unit: str = "units",
 ) -> Page:
     """Make a page that shows a result, or two of them with one camera.
 
@@ -106,6 +107,7 @@ def make_page(
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
         max_points: Most points of a cloud that are shown; of a larger one it is a random sample,
             and the page says so.
+        unit: Name of the unit of the coordinates, for the scale bar.
 
     Returns:
         The page.
@@ -150,6 +152,7 @@ def make_page(
             "scale": frame.scale,
         },
         "kinds": PLANE_KINDS,
+        "unit": unit,
         "clouds": scenes,
     }
     text = _fill_template(description, [_encode_library(library), *blobs], library)

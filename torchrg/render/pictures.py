@@ -192,7 +192,8 @@ def render_cloud(
             ceilings. Default: the voxels of the cloud are segmented.
         view: See above.
         up: Upward direction; not used from the sensor.
-        azimuth_deg: Angle of the viewer about ``up``, from the normal of the largest walls.
+        azimuth_deg: Angle of the viewer about ``up``, from the direction along or across the
+            largest wall that is nearest to x; clouds of one room are seen from one place.
             Default: of eight, the one from which most surface is seen.
         elevation_deg: Angle of the viewer over the horizon. Default: 35, from above 90.
         width: In pixels.

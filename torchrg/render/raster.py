@@ -33,13 +33,15 @@ _LIGHT = (-0.45, -0.7, -0.55)
 """Direction toward the light in the axes of the camera: from the left, above, and behind it."""
 _DARKEST = 0.62
 """Brightness of a surface that faces away from the light. Its colour can still be told."""
-_DEEPEST = 0.85
-"""Share of its brightness that a pixel loses in the deepest hollow."""
+_DEEPEST = 0.6
+"""Share of its brightness that a pixel loses in the deepest hollow. More looks like dirt."""
 _REACHES = ((1, 0.5), (2, 0.3), (3, 0.2))
 """Distances at which hollows are looked for, in radii of a disc, and how much each counts. Together
 they count 1, and the nearest counts most, so that creases are drawn as thin lines."""
-_NOISE = 0.35
+_NOISE = 0.7
 """Tangent of a bend over the radius of one disc. A smaller bend is noise and is not shown."""
+_WIDEST_SHADE = 4.0
+"""Most pixels of a radius in which hollows are looked for: wider shades are halos."""
 
 
 class Discs(NamedTuple):
@@ -297,7 +299,7 @@ def shade_hollows(inverse_depth: Tensor, *, focal: float, radius: float) -> Tens
     depth = torch.where(drawn, 1 / inverse_depth, 0.0)
     darkness = torch.zeros_like(inverse_depth)
     for factor, weight in _REACHES:
-        reach = max(1, round(factor * radius))
+        reach = max(1, round(factor * min(radius, _WIDEST_SHADE)))
         padded = functional.pad(inverse_depth[None, None], [reach] * 4, mode="replicate")[0, 0]
         for dx, dy in ((reach, 0), (0, reach), (reach, reach), (reach, -reach)):
             after, before = (

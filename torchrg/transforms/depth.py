@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, of_clouds
+from torchrg.config import settings_of
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
 from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError
@@ -133,8 +134,9 @@ class SegmentDepth(DepthTransform):
     (:class:`torchrg.structures.Planes`; a list of them for a batch).
 
     Args:
-        config: Settings.
+        config: Settings, or a dictionary of them.
         planes: Whether to add the table.
+        **changes: Single settings, as in ``max_depth=4.0``.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -146,13 +148,14 @@ class SegmentDepth(DepthTransform):
 
     def __init__(
         self,
-        config: DepthConfig | None = None,
+        config: DepthConfig | Mapping[str, Any] | None = None,
         *,
         planes: bool = False,
         keys: Mapping[str, str] | None = None,
+        **changes: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(keys=keys)
-        self.config = config or DepthConfig()
+        self.config = settings_of("SegmentDepth", DepthConfig, config, changes)
         self.planes = planes
 
     @of_clouds

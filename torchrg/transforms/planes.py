@@ -1,10 +1,10 @@
 """Normals, plane labels and superpoints as modules.
 
-``config`` is settings, a whole configuration, or the name of a preset; where none is passed it is
-that of :func:`torchrg.load_config`. ``changes`` are single settings, as in ``k=30``.
+``config`` is settings, a dictionary of them, a whole configuration, or the name of a preset; where
+none is passed it is that of :func:`torchrg.load_config`. ``changes`` are single settings, as in
+``k=30``, of a whole configuration as in ``**{"normals.k": 30}``.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import (
-    DEFAULT_PRESET,
+    AnyConfig,
     GrowingConfig,
     NormalsConfig,
     PipelineConfig,
@@ -51,7 +51,7 @@ class EstimateNormals(CloudTransform):
 
     def __init__(
         self,
-        config: NormalsConfig | PipelineConfig | str | None = None,
+        config: NormalsConfig | AnyConfig | None = None,
         *,
         residual: bool = True,
         chunk_size: int = CHUNK_SIZE,
@@ -176,7 +176,7 @@ class GrowRegions(CloudTransform):
 
     def __init__(
         self,
-        config: GrowingConfig | PipelineConfig | str | None = None,
+        config: GrowingConfig | AnyConfig | None = None,
         *,
         k: int = NormalsConfig.k,
         keep_neighbors: bool = False,
@@ -222,19 +222,20 @@ class SegmentPlanes(CloudTransform):
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
-        >>> SegmentPlanes("classic")({"coord": floor})["plane"].unique()
+        >>> SegmentPlanes("classic", **{"normals.k": 9})({"coord": floor})["plane"].unique()
         tensor([0])
     """
 
     def __init__(
         self,
-        config: PipelineConfig | str = DEFAULT_PRESET,
+        config: AnyConfig | None = None,
         *,
         keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
+        **changes: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(keep_neighbors=keep_neighbors, keys=keys)
-        self.config = settings_of("SegmentPlanes", PipelineConfig, config)
+        self.config = settings_of("SegmentPlanes", PipelineConfig, config, changes)
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return plane labels, normals and curvature of a cloud."""
@@ -254,7 +255,7 @@ class MakeSuperpoints(CloudTransform):
         config: Settings. Default: :class:`torchrg.config.SuperpointsConfig`.
         white: Largest value of a colour, 255 or 1, to read ``color`` ``(N, 3)`` too. Default:
             colours play no part.
-        **changes: Single settings, as in ``strengths=(2.0,)``.
+        **changes: Single settings, as in ``strengths=2.0``.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -265,7 +266,7 @@ class MakeSuperpoints(CloudTransform):
 
     def __init__(
         self,
-        config: SuperpointsConfig | None = None,
+        config: SuperpointsConfig | Mapping[str, Any] | None = None,
         *,
         white: float | None = None,
         keys: Mapping[str, str] | None = None,
@@ -274,7 +275,7 @@ class MakeSuperpoints(CloudTransform):
         super().__init__(keys=keys)
         if white is not None and not white > 0:
             raise ConfigError(f"MakeSuperpoints: expected white > 0 or none, got {white!r}.")
-        self.config = dataclasses.replace(config or SuperpointsConfig(), **changes)
+        self.config = settings_of("MakeSuperpoints", SuperpointsConfig, config, changes)
         self.white = white
         self.reads = ("coord", "normal", "plane", *["color"] * (white is not None))
 
@@ -313,13 +314,14 @@ class AlignAxes(SampleTransform):
 
     def __init__(
         self,
-        config: PipelineConfig | str = DEFAULT_PRESET,
+        config: AnyConfig | None = None,
         *,
         up: Sequence[float] = (0.0, 0.0, 1.0),
         keys: Mapping[str, str] | None = None,
+        **changes: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(keys=keys)
-        self.config = settings_of("AlignAxes", PipelineConfig, config)
+        self.config = settings_of("AlignAxes", PipelineConfig, config, changes)
         self.up = tuple(up)
 
     def transform(self, sample: Sample) -> Sample:

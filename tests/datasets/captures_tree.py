@@ -1,0 +1,174 @@
+"""Depth frames of a box-shaped room, cast ray by ray, in the folders of phones and data sets."""
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+
+from torchrg.render import write_png
+
+SIZE = np.array([4.0, 3.0, 2.5])
+"""Sides of the room in metres; a corner is the origin, z points up."""
+WIDTH, HEIGHT = 128, 96
+FX, FY, CX, CY = 832.0, 840.0, 505.0, 390.0
+"""Camera of the colour images, in pixels from their corner, where the first middle is 0.5."""
+ENLARGED = 8
+"""Pixels of a colour image along one of a depth image."""
+COLOR = (ENLARGED * WIDTH, ENLARGED * HEIGHT)
+
+
+class MadeFrame(NamedTuple):
+    """A depth image in metres ``(H, W)``, its points ``(H, W, 3)``, and the turn and place."""
+
+    depth: np.ndarray
+    points: np.ndarray
+    turn: np.ndarray
+    place: np.ndarray
+
+    def pose(self, *signs):
+        """Return the matrix to the world from axes that are x right, y up, z backwards, turned."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.turn * signs, self.place
+        return pose
+
+
+def cast_frame(azimuth, place):
+    """Return what a camera in the room sees that looks level and a little down."""
+    sin, cos = np.sin(azimuth), np.cos(azimuth)
+    back = np.array([-cos, -sin, 0.25])
+    back /= np.linalg.norm(back)
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    turn, place = np.stack([right, np.cross(back, right), back], axis=1), np.array(place)
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    across = ((columns + 0.5) * ENLARGED - CX) / FX
+    up = -((rows + 0.5) * ENLARGED - CY) / FY
+    rays = np.stack([across, up, -np.ones_like(up)], axis=-1) @ turn.T
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, SIZE - place, -place) / rays
+    depth = np.abs(reach).min(axis=-1)
+    return MadeFrame(depth, place + depth[..., None] * rays, turn, place)
+
+
+FRAMES = [cast_frame(0.6, (1.0, 1.0, 1.4)), cast_frame(2.5, (2.5, 1.2, 1.5))]
+GL, CV = (1, 1, 1), (1, -1, -1)
+"""Signs of the axes of a camera of OpenGL, and of one whose y points down and z forwards."""
+
+
+def write_depth(path, depth, scale=1000.0):
+    """Write depth in metres as its suffix says: whole numbers as PNG or PGM, or floating point."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = (depth * scale).round().astype(np.int32)
+    if path.suffix == ".png":
+        write_png(path, values)
+    elif path.suffix == ".pgm":
+        head = f"P5\n# made\n{WIDTH} {HEIGHT}\n65535\n".encode()
+        path.write_bytes(head + values.astype(">u2").tobytes())
+    else:
+        np.save(path, (depth * scale).astype(np.float32))
+
+
+def write_text(path, text):
+    """Write a text file and its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text if isinstance(text, str) else json.dumps(text))
+
+
+def camera_of_depth(first_middle):
+    """Return fx, fy, cx, cy of the depth images, where the middle of the first pixel is so."""
+    off = first_middle - 0.5
+    return [FX / ENLARGED, FY / ENLARGED, CX / ENLARGED + off, CY / ENLARGED + off]
+
+
+def write_nerfstudio(root, suffix=".png", scale=1000.0, **more):
+    """Write ``transforms.json``, whose intrinsics are of colour images, and its depth images."""
+    names = {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": COLOR[0], "h": COLOR[1]}
+    frames = []
+    for number, frame in enumerate(FRAMES):
+        depth = f"./depth/frame_{number:05d}{suffix}"
+        write_depth(root / depth, frame.depth, scale)
+        frames.append(
+            {
+                "file_path": f"images/frame_{number:05d}.jpg",
+                "depth_file_path": depth,
+                "transform_matrix": frame.pose(*GL).tolist(),
+            }
+        )
+    write_text(root / "transforms.json", {**names, **more, "frames": frames})
+    return root
+
+
+def write_arkitscenes(root):
+    """Write a video of ARKitScenes, with poses from world to camera as axis and angle."""
+    from scipy.spatial.transform import Rotation
+
+    scan, rows = root / "Training" / "40753679", []
+    fx, fy, cx, cy = camera_of_depth(0)
+    for time, off, frame in zip((6791.2, 6791.3), (0.0, 0.001), FRAMES, strict=True):
+        write_depth(scan / "lowres_depth" / f"40753679_{time:.3f}.png", frame.depth)
+        name = f"40753679_{time + off:.3f}.pincam"
+        text = f"{WIDTH} {HEIGHT} {fx} {fy} {cx} {cy}"
+        write_text(scan / "lowres_wide_intrinsics" / name, text)
+        back = np.linalg.inv(frame.pose(*CV))
+        angles = Rotation.from_matrix(back[:3, :3]).as_rotvec()
+        rows.append(" ".join(map(repr, map(float, [time + off, *angles, *back[:3, 3]]))))
+    write_text(scan / "lowres_wide.traj", "\n".join(rows))
+    return root
+
+
+def write_replica(root):
+    """Write a room of Replica as NICE-SLAM gives it."""
+    fx, fy, cx, cy = camera_of_depth(0)
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "scale": 6553.5}
+    write_text(root / "cam_params.json", {"camera": camera})
+    for number, frame in enumerate(FRAMES):
+        write_depth(root / "room0" / "results" / f"depth{number:06d}.png", frame.depth, 6553.5)
+    rows = (" ".join(map(str, frame.pose(*CV).ravel().tolist())) for frame in FRAMES)
+    write_text(root / "room0" / "traj.txt", "\n".join(rows))
+    return root
+
+
+def write_scannetpp(root):
+    """Write frames of an iPhone of ScanNet++, whose intrinsics are of 1920 x 1440 pixels."""
+    scan, records = root / "data" / "0a5c013435", {}
+    larger = 1920 / COLOR[0]
+    matrix = [[FX * larger, 0, CX * larger - 0.5], [0, FY * larger, CY * larger - 0.5], [0, 0, 1]]
+    for number, frame in enumerate(FRAMES):
+        name = f"frame_{10 * number:06d}"
+        write_depth(scan / "iphone" / "depth" / f"{name}.png", frame.depth)
+        pose = frame.pose(*CV).tolist()
+        records[name] = {"pose": np.eye(4).tolist(), "aligned_pose": pose, "intrinsic": matrix}
+    write_text(scan / "iphone" / "pose_intrinsic_imu.json", records)
+    write_text(scan / "dslr" / "nerfstudio" / "transforms.json", {"frames": []})
+    return root
+
+
+def write_3rscan(root):
+    """Write a sequence of 3RScan, with a rendered image beside one."""
+    folder = root / "0988ea72" / "sequence"
+    fx, fy, cx, cy = camera_of_depth(0)
+    info = f"""m_sensorName = Tango
+m_colorWidth = 960
+m_depthWidth = {WIDTH}
+m_depthHeight = {HEIGHT}
+m_depthShift = 1000
+m_calibrationColorIntrinsic = 756 0 492 0 0 756 270 0 0 0 1 0 0 0 0 1
+m_calibrationDepthIntrinsic = {fx} 0 {cx} 0 0 {fy} {cy} 0 0 0 1 0 0 0 0 1
+"""
+    write_text(folder / "_info.txt", info)
+    for number, frame in enumerate(FRAMES):
+        write_depth(folder / f"frame-{number:06d}.depth.pgm", frame.depth)
+        rows = (" ".join(map(str, row)) for row in frame.pose(*CV).tolist())
+        write_text(folder / f"frame-{number:06d}.pose.txt", "\n".join(rows))
+    write_depth(folder / "frame-000000.rendered.depth.png", FRAMES[0].depth)
+    return root
+
+
+WRITERS = {
+    "nerfstudio": write_nerfstudio,
+    "arkitscenes": write_arkitscenes,
+    "replica": write_replica,
+    "scannetpp": write_scannetpp,
+    "3rscan": write_3rscan,
+}
+"""What writes each kind of capture below a folder and returns it."""

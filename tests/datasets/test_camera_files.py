@@ -1,0 +1,128 @@
+"""Cameras from files of other programs, and cameras of images of another size."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.datasets.camera_files import read_camera
+from torchrg.depth.camera import Pinhole, depth_to_points
+from torchrg.errors import ConfigError, FormatError
+
+CAMERA = Pinhole(525.0, 526.0, 319.5, 239.5, (640, 480))
+SIZE = {"width": 640, "height": 480}
+ROWS = [[525, 0, 319.5], [0, 526, 239.5], [0, 0, 1]]
+FLAT = [value for row in ROWS for value in row]
+COLUMNS = np.array(ROWS).T.ravel().tolist()
+CALIBRATION = """image_width: 640
+image_height: 480
+camera_name: depth
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500., 0., 310., 0., 500., 230., 0., 0., 1.]
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [525., 0., 319.5, 0., 0., 526., 239.5, 0., 0., 0., 1., 0.]
+"""
+MESSAGE = """header:
+  frame_id: camera_depth_optical_frame
+height: 480
+width: 640
+distortion_model: plumb_bob
+d: [0.0, 0.0, 0.0, 0.0, 0.0]
+k: [525.0, 0.0, 319.5, 0.0, 526.0, 239.5, 0.0, 0.0, 1.0]
+r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+p: [525.0, 0.0, 319.5, 0.0, 0.0, 526.0, 239.5, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+---
+"""
+NERFSTUDIO = {"fl_x": 525, "fl_y": 526, "cx": 320, "cy": 240, "w": 640, "h": 480, "frames": []}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("open3d.json", {**SIZE, "intrinsic_matrix": COLUMNS}),
+        ("parameters.json", {"extrinsic": [], "intrinsic": {**SIZE, "intrinsic_matrix": COLUMNS}}),
+        ("rows.json", {**SIZE, "intrinsic_matrix": ROWS}),
+        ("transforms.json", NERFSTUDIO),
+        (
+            "cam_params.json",
+            {"camera": {"w": 640, "h": 480, "fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5}},
+        ),
+        ("calibration.yaml", CALIBRATION),
+        ("info.YML", MESSAGE),
+        ("ros1.yaml", {**SIZE, "K": FLAT}),
+    ],
+)
+def test_every_program_says_the_same_camera(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    assert read_camera(path) == CAMERA
+
+
+def test_a_lens_that_bends_lines_is_told(tmp_path):
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({**NERFSTUDIO, "k1": 0.03, "k2": 0, "p2": -1e-7}))
+    with pytest.warns(UserWarning, match=r"the distortion of the lens \(k1, p2\) is left"):
+        assert read_camera(path) == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.json", "{", "expected JSON or YAML, got: Expecting property name"),
+        ("a.yaml", "a: [", "expected JSON or YAML, got: while parsing a flow"),
+        ("a.yaml", "", "expected names with values, got NoneType"),
+        ("a.json", "[1, 2]", "expected names with values, got list"),
+        (
+            "a.json",
+            '{"fov": 60}',
+            "of Open3D, nerfstudio or ROS, got none in fov; pass fx,fy,cx,cy",
+        ),
+        ("a.json", '{"frames": [{"fl_x": 1}]}', "got one for each frame, or none; give its folder"),
+        (
+            "a.json",
+            '{"intrinsic_matrix": [1, 2]}',
+            "expected intrinsic_matrix of 3 x 3 or 3 x 4 or",
+        ),
+        ("a.json", '{"intrinsic_matrix": [[1], [2, 3]]}', "numbers, got"),
+        ("a.json", '{"K": [1, 0, 0, 0, 0, 0, 0, 0, 1]}', "K: expected intrinsics of rows"),
+        ("a.json", '{"fx": 1, "fy": NaN, "cx": 0, "cy": 0}', "expected a number for fy, got nan"),
+        ("a.json", '{"fx": 1, "fy": 1, "cx": 0, "cy": 0, "w": 0, "h": 1}', "w and h above 0"),
+        ("a.json", '{"fx": 1, "fy": 1, "cx": 0, "cy": 0, "w": 4}', "expected a number for h"),
+    ],
+)
+def test_files_without_a_camera_are_refused(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_text(content)
+    with pytest.raises((FormatError, ConfigError), match=f"{name}: .*{message}"):
+        read_camera(path)
+
+
+def test_a_camera_file_that_is_missing_is_refused(tmp_path):
+    with pytest.raises(FormatError, match=r"a\.json: cannot be read: No such file"):
+        read_camera(tmp_path / "a.json")
+
+
+def test_a_pixel_of_a_smaller_image_looks_through_the_middle_of_those_it_stands_for():
+    camera = Pinhole(31.0, 29.0, 18.25, 15.5, (40, 30))
+    rays = depth_to_points(torch.ones(1, 30, 40).double(), camera.matrix()[None])[0]
+    means = rays.view(6, 5, 8, 5, 3).mean(dim=(1, 3))
+    smaller = camera.matrix((8, 6))
+    found = depth_to_points(torch.ones(1, 6, 8).double(), smaller[None])[0]
+    torch.testing.assert_close(found, means)
+
+
+def test_sizes_may_differ_by_a_rounded_pixel():
+    camera = Pinhole(756.0, 756.0, 479.5, 269.5, (960, 540))
+    assert camera.matrix((224, 126))[0, 0] == pytest.approx(756 * 224 / 960)
+    assert camera.matrix((225, 127)).isfinite().all()
+    with pytest.raises(ConfigError, match="got 224 x 172; pass the camera of the depth images"):
+        camera.matrix((224, 172))
+    assert torch.equal(camera._replace(size=None).matrix((3, 999)), camera.matrix())

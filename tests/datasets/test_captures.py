@@ -1,0 +1,262 @@
+"""Captures of phones and of data sets: read, they show the room that they were made in."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.datasets.captures_tree import (
+    FRAMES,
+    HEIGHT,
+    SIZE,
+    WIDTH,
+    WRITERS,
+    write_depth,
+    write_nerfstudio,
+    write_text,
+)
+from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
+from torchrg.batch.sources import RGBDSource
+from torchrg.config import DepthConfig
+from torchrg.datasets import RGBDFrames
+from torchrg.datasets.rgbd_files import image_size, read_depth
+from torchrg.datasets.rgbd_layouts import find_layout
+from torchrg.depth.camera import points_of_image
+from torchrg.errors import FormatError
+from torchrg.pipeline import segment_planes
+
+NAMES = {
+    "nerfstudio": ["capture/depth/frame_00000", "capture/depth/frame_00001"],
+    "arkitscenes": [f"Training/40753679/40753679_6791.{tenth}00" for tenth in (2, 3)],
+    "replica": ["room0/000000", "room0/000001"],
+    "scannetpp": [f"data/0a5c013435/iphone/frame_0000{tens}" for tens in ("00", "10")],
+    "3rscan": ["0988ea72/sequence/frame-000000", "0988ea72/sequence/frame-000001"],
+}
+
+
+def points_of(sample):
+    """Return the points of a sample in the world, float64."""
+    points = points_of_image(sample["depth"][0], sample["intrinsics"], sample["pose"])
+    return points.numpy()
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_frames_lie_on_the_walls_that_they_were_taken_of(tmp_path, layout):
+    root = WRITERS[layout](tmp_path / "capture")
+    assert find_layout(root) == layout
+    data = RGBDFrames.from_folder(root)
+    assert [scene.name for scene in data.scenes] == NAMES[layout]
+    for sample, frame in zip(data, FRAMES, strict=True):
+        # Half a millimetre of rounding, and what a ray of it moves sideways.
+        np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)
+    assert all(root in path.parents for path in data.scenes[0].files)
+
+
+@pytest.mark.parametrize(("suffix", "unit"), [(".png", None), (".npy", 1.0), (".pgm", 0.0005)])
+def test_a_capture_in_opengl_axes_has_the_planes_of_its_cloud(tmp_path, suffix, unit):
+    given = {} if unit is None else {"depth_unit_scale_factor": unit}
+    root = write_nerfstudio(tmp_path / "capture", suffix, 1 / (unit or 0.001), **given)
+    jobs = list_jobs(RGBDSource(root, DepthConfig(), "nerfstudio"), tmp_path / "out")
+    assert [convert_scan(job).status for job in jobs] == ["converted"] * 2
+    for number, frame in enumerate(FRAMES):
+        cloud = segment_planes(torch.from_numpy(frame.points.reshape(-1, 3)).float(), "classic")
+        folder = tmp_path / "out" / "capture" / "depth" / f"frame_{number:05d}"
+        planes = json.loads((folder / "planes.json").read_text())["planes"]
+        assert len(planes) == 3
+        for plane in planes:
+            cosines = cloud.planes.normal.double() @ torch.tensor(plane["normal"]).double()
+            best = int(cosines.abs().argmax())
+            assert cosines[best].abs() > np.cos(np.radians(0.1))
+            offset = float(cloud.planes.offset[best] * cosines[best].sign())
+            assert offset == pytest.approx(plane["offset"], abs=1e-3)
+            # And those of the room that it was made in.
+            axis = int(np.abs(plane["normal"]).argmax())
+            assert abs(plane["normal"][axis]) > np.cos(np.radians(0.1))
+            wall = plane["offset"] * np.sign(plane["normal"][axis])
+            assert min(abs(wall), abs(wall - SIZE[axis])) < 1e-3
+
+
+def test_frames_may_have_cameras_of_their_own_and_no_depth(tmp_path):
+    root = write_nerfstudio(tmp_path, k1=0.1, applied_scale=2.0)
+    shared = json.loads((root / "transforms.json").read_text())
+    for frame in shared["frames"]:
+        # As saved coordinates are twice those in metres.
+        frame["transform_matrix"] = [
+            [*row[:3], 2 * row[3]] for row in frame["transform_matrix"][:3]
+        ]
+    own = {key: shared.pop(key) for key in ("fl_x", "cx", "w")}
+    first, second = shared["frames"]
+    first |= own
+    second.pop("depth_file_path")
+    write_text(root / "transforms.json", shared)
+    with pytest.warns(UserWarning, match="transforms.json: ") as warned:
+        data = RGBDFrames.from_folder(root)
+    assert "left out 1 of 2 frames, which name no depth" in str(warned[0].message)
+    assert "the distortion of the lens (k1) is left as it is" in str(warned[1].message)
+    (sample,) = data
+    np.testing.assert_allclose(points_of(sample), FRAMES[0].points, atol=1e-3)
+
+
+def without_camera(shared):
+    del shared["fl_x"]
+
+
+def with_fisheye(shared):
+    shared["camera_model"] = "OPENCV_FISHEYE"
+
+
+def without_depth(shared):
+    for frame in shared["frames"]:
+        del frame["depth_file_path"]
+
+
+def without_frames(shared):
+    shared["frames"] = {"0": 1}
+
+
+def with_wide_images(shared):
+    shared["w"] *= 2
+
+
+def with_words(shared):
+    shared["frames"][1]["transform_matrix"][2][3] = "far"
+
+
+def with_no_focus(shared):
+    shared["fl_y"] = 0
+
+
+def with_a_huge_number(shared):
+    shared["cx"] = 10**400
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (without_camera, "expected a number for fl_x, got None; add it"),
+        (with_fisheye, "expected images of a pinhole camera, got OPENCV_FISHEYE; undistort"),
+        (without_depth, "expected depth_file_path in its frames, got none; name the depth"),
+        (without_frames, "expected a list of frames"),
+        (with_wide_images, "which the camera is of, or in their ratio, got 128 x 96; pass the"),
+        (with_words, "expected transform_matrix of 4 x 4 or 3 x 4 numbers, got [["),
+        (with_no_focus, "expected fl_x and fl_y other than 0"),
+        (with_a_huge_number, "expected a number for cx, got 10000"),
+    ],
+)
+def test_a_spoilt_capture_is_refused_in_one_line(tmp_path, run, spoil, message):
+    path = write_nerfstudio(tmp_path / "capture") / "transforms.json"
+    shared = json.loads(path.read_text())
+    spoil(shared)
+    write_text(path, shared)
+    error = run("convert", "rgbd", path.parent, tmp_path / "out").error
+    assert error.startswith("torchrg: ")
+    assert message in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_depth_that_is_missing_fails_its_frame_and_leaves_nothing(tmp_path, run):
+    root, out = write_nerfstudio(tmp_path / "capture"), tmp_path / "out"
+    (root / "depth" / "frame_00001.png").unlink()
+    done = run("convert", "rgbd", root, out, "--workers", "1")
+    assert done.code == 3
+    (told,) = [line for line in done.err.splitlines() if "frame_00001" in line]
+    assert told.endswith(f"{root / 'depth' / 'frame_00001.png'}: No such file or directory.")
+    assert [path.name for path in (out / "capture" / "depth").iterdir()] == ["frame_00000"]
+    alone = tmp_path / "alone"
+    shared = json.loads((root / "transforms.json").read_text())
+    write_text(alone / "transforms.json", {**shared, "frames": shared["frames"][1:]})
+    error = run("depth", alone, "--out", tmp_path / "labels.png").error
+    assert error.endswith("frame_00001.png: no such file; check the spelling.\n")
+    assert not (tmp_path / "labels.png").exists()
+
+
+def test_a_capture_of_one_frame_needs_no_camera(tmp_path, run):
+    root = write_nerfstudio(tmp_path / "capture")
+    shared = json.loads((root / "transforms.json").read_text())
+    write_text(root / "transforms.json", {**shared, "frames": shared["frames"][:1]})
+    assert run("depth", root, "--out", tmp_path / "planes.npz").code == 0
+    with np.load(tmp_path / "planes.npz") as result:
+        # In coordinates of the camera: x right, y down, z forwards.
+        expected = (FRAMES[0].points - FRAMES[0].place) @ (FRAMES[0].turn * [1, -1, -1])
+        np.testing.assert_allclose(result["points"], expected.reshape(-1, 3), atol=1e-3)
+
+
+def test_the_unit_of_floating_point_is_not_guessed(tmp_path, run):
+    root = write_nerfstudio(tmp_path / "capture", ".npy", 1.0)
+    error = run("convert", "rgbd", root, tmp_path / "out").error
+    assert "frame_00000.npy: expected depth_scale, which depth images do not hold; pass it" in error
+    data = RGBDFrames.from_folder(root, depth_scale=1.0)
+    np.testing.assert_allclose(points_of(data[1]), FRAMES[1].points, atol=1e-5)
+
+
+def test_other_captures_say_what_they_lack(tmp_path):
+    roots = {name: write(tmp_path / name) for name, write in WRITERS.items()}
+    scan = roots["arkitscenes"] / "Training" / "40753679"
+    (scan / "lowres_wide_intrinsics" / "40753679_6791.200.pincam").write_text("256 192 212\n")
+    (scan / "lowres_wide.traj").write_text("6791.2 0 0\n")
+    iphone = roots["scannetpp"] / "data" / "0a5c013435" / "iphone"
+    records = json.loads((iphone / "pose_intrinsic_imu.json").read_text())
+    write_text(iphone / "pose_intrinsic_imu.json", {"frame_000000": records["frame_000000"]})
+    (roots["replica"] / "cam_params.json").unlink()
+    info = roots["3rscan"] / "0988ea72" / "sequence" / "_info.txt"
+    info.write_text(info.read_text().replace("m_depthShift", "m_shift"))
+    for name, message in (
+        ("arkitscenes", "lowres_wide.traj: expected time rx ry rz tx ty tz in each row"),
+        ("scannetpp", "pose_intrinsic_imu.json: expected frame_000010, of which there is depth"),
+        ("replica", "cam_params.json: cannot be read: No such file"),
+        ("3rscan", "_info.txt: expected a number for m_depthShift, got None; add it"),
+    ):
+        with pytest.raises(FormatError, match=message):
+            RGBDFrames.from_folder(roots[name])
+    (scan / "lowres_wide.traj").unlink()
+    with pytest.raises(FormatError, match=r"pincam: expected width height fx fy cx cy in each row"):
+        RGBDFrames.from_folder(roots["arkitscenes"])
+    (iphone / "depth").rename(iphone / "depth.bin")
+    with pytest.raises(FormatError, match=r"take them out of depth\.bin by iphone/prepare_iphone"):
+        RGBDFrames.from_folder(roots["scannetpp"])
+
+
+def test_layouts_are_found_by_what_is_there(tmp_path):
+    roots = [write(tmp_path / name) for name, write in WRITERS.items()]
+    assert [find_layout(root) for root in roots] == [*WRITERS]
+    write_depth(tmp_path / "plain" / "depth" / "0.png", FRAMES[0].depth)
+    assert find_layout(tmp_path / "plain") == "images"
+    assert find_layout(tmp_path / "missing") == "images"
+    with pytest.raises(FormatError, match="expected a folder of frames, got a file; pass its fol"):
+        RGBDFrames.from_folder(roots[0] / "transforms.json")
+    (tmp_path / "capture").mkdir()
+    with pytest.raises(FormatError, match=r"expected depth images \(.png .npy .pgm\), got none"):
+        RGBDFrames.from_folder(tmp_path / "capture")
+
+
+def test_portable_graymaps_are_read_as_they_are_stored(tmp_path):
+    path = tmp_path / "a.pgm"
+    path.write_bytes(b"P5\n# a comment 3 4\n3 2\n65535\n" + bytes(range(12)))
+    assert image_size(path) == (3, 2)
+    expected = [[0x0001, 0x0203, 0x0405], [0x0607, 0x0809, 0x0A0B]]
+    assert (read_depth(path, depth_scale=1) == torch.tensor(expected)).all()
+    for content, message in (
+        (b"P5\n3 2\n65535\n" + bytes(11), "expected 12 bytes for its pixels, got 11"),
+        (b"P5\n3 2\n255\n" + bytes(6), "expected a binary PGM of 16 bits, P5, got b'P5"),
+        (b"P2\n1 1\n65535\n7\n", "expected a binary PGM of 16 bits, P5, got b'P2"),
+        (b"P5\n0 2\n65535\n", "expected a binary PGM of 16 bits"),
+        (b"P5\n99999999 99999999\n65535\n", "for its pixels, got 0; the file is cut off"),
+        (b"P5 # " + b"9 " * 1000, "expected a binary PGM of 16 bits"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(FormatError, match=message):
+            read_depth(path, depth_scale=1)
+
+
+def test_sizes_are_read_from_the_beginning_or_not_at_all(tmp_path):
+    for name in ("a.png", "a.npy", "a.pgm"):
+        write_depth(tmp_path / name, FRAMES[0].depth)
+        assert image_size(tmp_path / name) == (WIDTH, HEIGHT)
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:9])
+        assert image_size(tmp_path / name) is None
+        (tmp_path / name).unlink()
+        assert image_size(tmp_path / name) is None
+    np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
+    assert image_size(tmp_path / "cube.npy") is None

@@ -1,0 +1,419 @@
+"""Folder shapes of depth frames: benchmarks, data sets, and captures of phones.
+
+A new shape is a function here that lists the frames of a recording, a row of :data:`LAYOUTS`, its
+name among the choices of ``torchrg convert rgbd``, and a test.
+"""
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrg.datasets.camera_files import (
+    camera_of_matrix,
+    camera_of_numbers,
+    camera_of_transforms,
+    matrix_of,
+    number_of,
+    read_info,
+    read_record,
+    warn_of_lens,
+)
+from torchrg.datasets.folder import check_folder, files_below, listed, natural_key, warn_of_links
+from torchrg.datasets.rgbd_files import (
+    DEPTH_SUFFIXES,
+    known_pose,
+    read_axis_angles,
+    read_matrix,
+    read_nearest,
+    read_numbers,
+    read_timed,
+    read_trajectory,
+)
+from torchrg.depth.camera import Pinhole, check_camera
+from torchrg.errors import ConfigError, FormatError
+
+_COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+_TUM_INTRINSICS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+"""fx, fy, cx, cy of the three cameras, as the data set gives them."""
+_ICL_NUIM_INTRINSICS = (481.2, -480.0, 319.5, 239.5)
+"""The scenes were rendered with y upwards: rows count against it."""
+_SEVEN_SCENES_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
+_SCANNETPP_COLOR = (1920, 1440)
+"""Size of the colour images, which the intrinsics of ScanNet++ are of."""
+_NERFSTUDIO_UNIT = 0.001
+"""Metres that one stored value is worth for nerfstudio where no file says another."""
+_OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+"""From the axes of our cameras to those of OpenGL: x right, y up, z backwards."""
+
+
+class ListedFrame(NamedTuple):
+    """A frame as a folder lists it.
+
+    Attributes:
+        name: As of :class:`torchrg.datasets.RGBDFrame`, like all that follow.
+        camera: That of the frame alone, where the recording has none for all.
+        depth_scale: That of the frame alone.
+    """
+
+    name: str
+    depth: Path
+    color: Path | None = None
+    pose: Tensor | None = None
+    sources: tuple[Path, ...] = ()
+    camera: Pinhole | None = None
+    depth_scale: float | None = None
+
+
+Camera = Callable[[Path], tuple[Pinhole, tuple[Path, ...]]]
+"""Returns the camera of a recording, and the files that it was read from."""
+
+
+class FrameLayout(NamedTuple):
+    """The shape of a folder of frames.
+
+    Attributes:
+        frames: Yields the frames of a recording in natural order.
+        mark: Pattern of the name of an entry of every recording; nothing where a folder is one.
+        camera: The camera of a recording, None where frames have their own or none is known.
+        depth_scale: Stored value of one metre, None where frames have their own or none is known.
+        no_depth: As of :class:`torchrg.datasets.RGBDFrame`.
+        places: Where recordings are below a folder of several, as patterns.
+    """
+
+    frames: Callable[[Path], Iterable[ListedFrame]]
+    mark: str = ""
+    camera: Camera | None = None
+    depth_scale: float | None = None
+    no_depth: int | None = None
+    places: tuple[str, ...] = ("", "*/")
+
+
+def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of TUM RGB-D, which are listed in ``depth.txt``.
+
+    Colour (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are those nearest in time;
+    without one, the frame has none.
+    """
+    lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
+    times, images = read_timed(lists[0])
+    colors = read_nearest(times, lists[1], read_timed)
+    poses = read_nearest(times, lists[2], read_trajectory)
+    sources = tuple(path for path in lists if path.is_file())
+    for image, color, pose in zip(images, colors, poses, strict=True):
+        beside = None if color is None else folder / color
+        yield ListedFrame(Path(image).stem, folder / image, beside, pose, sources)
+
+
+def _tum_camera(folder: Path) -> tuple[Pinhole, tuple[Path, ...]]:
+    """Return the camera matrix of a recording by its name."""
+    name = folder.resolve().name.lower()
+    for camera, values in _TUM_INTRINSICS.items():
+        if camera in name:
+            return Pinhole(*values), ()
+    raise ConfigError(
+        f"{folder}: expected intrinsics, as the name says none of {', '.join(_TUM_INTRINSICS)}; "
+        "pass them."
+    )
+
+
+def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of ICL-NUIM in its TUM-compatible form: ``depth/0.png``, ``rgb/0.png``.
+
+    There is perhaps one trajectory ``*.gt.freiburg``, whose first column is the number of the
+    image.
+    """
+    tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
+    numbers, matrices = read_trajectory(tracks[0]) if tracks else ([], [])
+    poses = {f"{number:.0f}": pose for number, pose in zip(numbers, matrices, strict=True)}
+    for name, image in _depth_images(folder, "depth/*"):
+        yield ListedFrame(name, image, _color_image(folder / "rgb" / name), poses.get(name), tracks)
+
+
+def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterator[ListedFrame]]:
+    """Return what yields frames by the names of their files, where ``*`` is that of the frame."""
+
+    def frames(folder: Path) -> Iterator[ListedFrame]:
+        for name, image in _depth_images(folder, depth):
+            path = folder / pose.replace("*", name)
+            known = (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
+            yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *known)
+
+    return frames
+
+
+def _depth_images(folder: Path, pattern: str) -> Iterator[tuple[str, Path]]:
+    """Yield names and depth images of a folder, in natural order; the pattern has no suffix."""
+    place, _, name = pattern.rpartition("/")
+    before, after = name.split("*")
+    check_folder(folder / place)
+    for path in listed(folder / place):
+        fits = path.stem.startswith(before) and path.stem.endswith(after)
+        if path.suffix.lower() in DEPTH_SUFFIXES and fits:
+            yield path.stem.removeprefix(before).removesuffix(after), path
+
+
+def _color_image(path: Path) -> Path | None:
+    """Return the colour image of a path without its suffix, None if there is none."""
+    paths = (path.with_name(f"{path.name}{suffix}") for suffix in _COLOR_SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _same_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
+    """Return what gives every recording the same camera."""
+    return lambda folder: (Pinhole(fx, fy, cx, cy), ())
+
+
+def _scannet_camera(folder: Path) -> tuple[Pinhole, tuple[Path, ...]]:
+    """Return the camera matrix of a scan."""
+    calibration = folder / "intrinsic" / "intrinsic_depth.txt"
+    camera = read_matrix(calibration)[:3, :3]
+    check_camera(str(calibration), camera)
+    (fx, _, cx), (_, fy, cy) = camera[:2].tolist()
+    return Pinhole(fx, fy, cx, cy), (calibration,)
+
+
+def _all_images(folder: Path) -> Iterator[ListedFrame]:
+    """Yield all depth images below a folder, by one camera, without colours and poses."""
+    for path in files_below(folder):
+        if path.suffix.lower() in DEPTH_SUFFIXES:
+            yield ListedFrame(path.relative_to(folder).with_suffix("").as_posix(), path)
+
+
+def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of ``transforms.json``, which nerfstudio and its importers write.
+
+    Its cameras have the axes of OpenGL, and what stands in a frame goes before what all share.
+    """
+    path = folder / "transforms.json"
+    shared = read_record(path)
+    frames = shared.get("frames")
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise FormatError(f"{path}: expected a list of frames; is it one of nerfstudio?")
+    records = sorted(
+        ({**shared, **frame} for frame in frames if frame.get("depth_file_path")),
+        key=lambda record: natural_key(str(record["depth_file_path"])),
+    )
+    if not records:
+        raise FormatError(
+            f"{path}: expected depth_file_path in its frames, got none; name the depth images "
+            "there, as ns-process-data polycam --use-depth does."
+        )
+    if len(records) < len(frames):
+        left = f"{len(frames) - len(records):,} of {len(frames):,} frames, which name no depth"
+        warnings.warn(f"{path}: left out {left}.", stacklevel=2)
+    warn_of_lens(path, records)
+    for record in records:
+        image = Path(str(record["depth_file_path"]))
+        name = Path(image.as_posix().removesuffix(image.suffix))
+        steps = [step for step in name.parts if step not in ("..", name.anchor)]
+        color = folder / str(record.get("file_path"))
+        unit = None if image.suffix.lower() == ".npy" else _NERFSTUDIO_UNIT
+        if "depth_unit_scale_factor" in record:
+            unit = number_of(path, record, "depth_unit_scale_factor")
+        yield ListedFrame(
+            "/".join(steps),
+            folder / image,
+            color if color.suffix.lower() in _COLOR_SUFFIXES and color.is_file() else None,
+            _nerfstudio_pose(path, record),
+            (path,),
+            camera_of_transforms(path, record),
+            unit and 1 / unit,
+        )
+
+
+def _nerfstudio_pose(path: Path, record: dict[str, Any]) -> Tensor | None:
+    """Return the pose of a frame in metres, from the axes of our cameras to the world."""
+    pose = torch.eye(4, dtype=torch.float64)
+    given = matrix_of(path, record, "transform_matrix", (4, 4), (3, 4))
+    pose[: len(given)] = given
+    pose[:3, 3] /= number_of(path, record, "applied_scale", 1.0)
+    return known_pose(pose @ _OPENGL_AXES)
+
+
+def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of ARKitScenes: ``lowres_depth/<video>_<seconds>.png``.
+
+    Cameras are files of the same name, whose times are a millisecond off in some, and poses stand
+    in ``lowres_wide.traj``.
+    """
+    images = [*_depth_images(folder, "lowres_depth/*")]
+    track = folder / "lowres_wide.traj"
+    stamps = [name.rpartition("_") for name, _ in images]
+    try:
+        times = [float(seconds) for _, _, seconds in stamps]
+    except ValueError as error:
+        raise FormatError(f"{folder}: expected names like 40753679_6791.2.png: {error}.") from None
+    poses = read_nearest(times, track, read_axis_angles)
+    for (name, image), (video, _, _), time, pose in zip(images, stamps, times, poses, strict=True):
+        cameras = [folder / "lowres_wide_intrinsics" / f"{name}.pincam"]
+        cameras += [
+            cameras[0].with_name(f"{video}_{time + off:.3f}.pincam") for off in (-0.001, 0.001)
+        ]
+        path = next((path for path in cameras if path.is_file()), cameras[0])
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        record = dict(zip(names, read_numbers(path, 6, " ".join(names))[0], strict=True))
+        yield ListedFrame(
+            name,
+            image,
+            _color_image(folder / "lowres_wide" / name),
+            pose,
+            (path, *([track] if track.is_file() else [])),
+            camera_of_numbers(path, record),
+        )
+
+
+def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of Replica as NICE-SLAM gives them: ``results/depth000000.png``.
+
+    The number of an image is that of its row in ``traj.txt``; the rooms share a camera.
+    """
+    places = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
+    calibration = next((path for path in places if path.is_file()), places[0])
+    record = read_record(calibration, "camera")
+    camera = camera_of_numbers(calibration, record)
+    scale = number_of(calibration, record, "scale")
+    track = folder / "traj.txt"
+    rows = read_numbers(track, 16, "16 numbers, those of a matrix,")
+    poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
+    for name, image in _depth_images(folder, "results/depth*"):
+        color = _color_image(folder / "results" / f"frame{name}")
+        has_row = name.isdecimal() and int(name) < len(poses)
+        pose = known_pose(poses[int(name)]) if has_row else None
+        yield ListedFrame(name, image, color, pose, (calibration, track), camera, scale)
+
+
+def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of an iPhone of ScanNet++, ``depth/frame_000000.png``, in its aligned world.
+
+    Where a frame has no aligned pose, it has none.
+    """
+    if not (folder / "depth").is_dir():
+        raise FormatError(
+            f"{folder}: expected images in depth, got none; take them out of depth.bin by "
+            "iphone/prepare_iphone_data.py of the data set's toolbox."
+        )
+    path = folder / "pose_intrinsic_imu.json"
+    records = read_record(path)
+    for name, image in _depth_images(folder, "depth/*"):
+        record = records.get(name)
+        if not isinstance(record, dict):
+            raise FormatError(f"{path}: expected {name}, of which there is depth, got no such.")
+        camera = camera_of_matrix(path, record, "intrinsic", _SCANNETPP_COLOR)
+        pose = None
+        if record.get("aligned_pose") is not None:
+            pose = known_pose(matrix_of(path, record, "aligned_pose", (4, 4)))
+        color = _color_image(folder / "rgb" / name)
+        yield ListedFrame(name, image, color, pose, (path,), camera)
+
+
+def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of 3RScan, ``frame-000000.depth.pgm``, without what was rendered beside."""
+    path = folder / "_info.txt"
+    record = read_info(path)
+    camera = camera_of_matrix(path, record, "m_calibrationDepthIntrinsic")
+    scale = number_of(path, record, "m_depthShift")
+    for frame in _named_frames("*.depth", "*.color", "*.pose.txt")(folder):
+        if frame.depth.suffix.lower() == ".pgm":
+            yield frame._replace(sources=(path, *frame.sources), camera=camera, depth_scale=scale)
+
+
+LAYOUTS = {
+    "scannetpp": FrameLayout(
+        _scannetpp_frames,
+        "pose_intrinsic_imu.json",
+        depth_scale=1000.0,
+        places=("", "iphone/", "*/iphone/", "data/*/iphone/"),
+    ),
+    "arkitscenes": FrameLayout(
+        _arkitscenes_frames,
+        "lowres_depth",
+        depth_scale=1000.0,
+        places=("", "*/", "*/*/", "*/*/*/"),
+    ),
+    "3rscan": FrameLayout(_3rscan_frames, "_info.txt", places=("", "*/", "*/sequence/")),
+    "replica": FrameLayout(_replica_frames, "traj.txt"),
+    "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
+    "icl-nuim": FrameLayout(_icl_nuim_frames, "depth", _same_camera(*_ICL_NUIM_INTRINSICS), 5000.0),
+    "scannet": FrameLayout(
+        _named_frames("depth/*", "color/*", "pose/*.txt"), "depth", _scannet_camera, 1000.0
+    ),
+    "7-scenes": FrameLayout(
+        _named_frames("*.depth", "*.color", "*.pose.txt"),
+        "frame-*.depth.png",
+        _same_camera(*_SEVEN_SCENES_INTRINSICS),
+        1000.0,
+        no_depth=65535,
+    ),
+    "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json"),
+    "images": FrameLayout(_all_images),
+}
+"""Shapes of folders of frames by their names, in the order in which :func:`find_layout` looks for
+them: those of C. Yeshwanth et al., ScanNet++, ICCV, 2023; G. Baruch et al., ARKitScenes, NeurIPS,
+2021; J. Wald et al., RIO, ICCV, 2019 (3RScan); Z. Zhu et al., NICE-SLAM, CVPR, 2022 (Replica);
+J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS, 2012; A. Handa et al.,
+A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM, ICRA, 2014; A. Dai et al.,
+ScanNet, CVPR, 2017, as its reader exports it; J. Shotton et al., Scene coordinate regression
+forests, CVPR, 2013; M. Tancik et al., Nerfstudio, SIGGRAPH, 2023; and any other."""
+
+
+def find_layout(root: Path) -> str:
+    """Return the layout of the recordings in a folder by their marks; ``images`` where it has none.
+
+    A mark that two layouts share tells neither.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> (folder / "transforms.json").touch()
+        >>> find_layout(folder)
+        'nerfstudio'
+    """
+    marks = Counter(layout.mark for layout in LAYOUTS.values())
+    found = (
+        name
+        for name, layout in LAYOUTS.items()
+        if layout.mark and marks[layout.mark] == 1 and any(_marked(root, layout))
+    )
+    return next(found, "images")
+
+
+def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path]]:
+    """Yield the recordings in a folder, which may be one itself, with the folder of their names.
+
+    One that is there under several names has the one without links, or else the one that comes
+    first.
+    """
+    if not layout.mark:
+        yield "", root
+        return
+    check_folder(root)
+    marked = sorted(
+        {*_marked(root, layout)},
+        key=lambda path: [natural_key(part) for part in path.relative_to(root).parts],
+    )
+    own: dict[Path, Path] = {}
+    for path in sorted(marked, key=lambda path: path != root and path.is_symlink()):
+        own.setdefault(path.resolve(), path)
+    found = [path for path in marked if own[path.resolve()] == path]
+    warn_of_links(root, [path for path in marked if path not in found])
+    if not found:
+        raise FormatError(f"{root}: expected recordings with {layout.mark} in them, got none.")
+    for folder in found:
+        inside = folder.resolve().name if folder == root else folder.relative_to(root).as_posix()
+        yield f"{inside}/", folder
+
+
+def _marked(root: Path, layout: FrameLayout) -> Iterator[Path]:
+    """Yield the folders with the mark of a layout, each perhaps several times."""
+    for place in layout.places:
+        for path in root.glob(place + layout.mark):
+            yield path.parent
