@@ -198,8 +198,10 @@ def _segment(
         planes = describe(points[rows], normals[rows], labels[rows])
         planes = replace(planes, adjacency=adjacency)
     begin("done")
-    kept = neighbors if voxel is None else None
-    return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept, sampling)
+    searched = neighbors if voxel is None else None
+    return Segmentation(
+        labels, normals, curvature, sharp, valid, planes, points, searched, sampling
+    )
 
 
 def _has_auto(config: PipelineConfig) -> bool:

@@ -255,10 +255,10 @@ def _fit_chunk(
         store_exact(exact, members[:, exact])
     lower = torch.nonzero(dimension < size - 1).squeeze(1)
     if len(lower):
-        rest = ~members[:, lower].t()
+        outside = ~members[:, lower].t()
         fit = _fit_groups(
             patches[lower],
-            rest,
+            outside,
             PATCHES_IN_CACHE,
             lambda chunk: _fit_chunk(chunk, support_fraction, estimator, majority),
         )

@@ -306,11 +306,11 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
-        (found,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
-        endless = found.isnan().nonzero().squeeze(1)
+        (differences,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
+        endless = differences.isnan().nonzero().squeeze(1)
         if len(endless):
-            found[endless] = _difference_by_lags(sorted_rows[endless])
-        return found
+            differences[endless] = _difference_by_lags(sorted_rows[endless])
+        return differences
     return _difference_by_lags(sorted_rows)
 
 
@@ -342,9 +342,9 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
     place = torch.searchsorted(rows, rows + difference[:, None])
     last = rows.shape[1] - 1
     partners = torch.stack([(place + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
-    own = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
+    numbers = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
     gaps = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
-    is_pair = (gaps == difference[:, None, None]) & (partners > own)
+    is_pair = (gaps == difference[:, None, None]) & (partners > numbers)
     pick = is_pair.flatten(1).to(torch.uint8).argmax(dim=1, keepdim=True)
-    low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (own, partners))
+    low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (numbers, partners))
     return torch.where(difference.isfinite(), (high - low).squeeze(1), difference)
