@@ -1,112 +1,82 @@
 """Guides: pages of Markdown whose examples run while the page is made, with what they print.
 
 Blocks of ``python`` share their names within a page; blocks of ``bash`` hold commands of torchrg,
-and ``mkdir``. Both run in the folder in which the page is made, so that it shows the pictures that
-they draw. Blocks of another kind (``console``, ``yaml``, ``text``) are only shown, and those called
-``python hidden`` only run.
+and ``mkdir``. Both run in a folder of the page alone. Blocks called ``python hidden`` only run, and
+what those called ``python page`` print is a part of the page. Blocks of another kind (``console``,
+``yaml``, ``text``) are only shown.
 """
 
 import contextlib
-import html
 import io
 import os
 import re
 import shlex
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pdoc
-
 from torchrg.cli import main
 
 GUIDES = Path(__file__).parent / "guides"
-_BLOCK = re.compile(r"^```(\w+)( hidden)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+MADE = "made"
+"""Folder beside the pages that holds what the examples of each of them write."""
+BLOCK = re.compile(r"^```(\w+)( hidden| page)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_PICTURE = re.compile(r"(!\[[^\]]*\]\()")
+_NAME = re.compile(r"`(torchrg(?:\.\w+)*)`")
 _MOST_LINES = 40
 """Lines of what a block prints that a page shows."""
-_SHELL = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<meta name="viewport" content="width=device-width, initial-scale=1"><style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 52rem; margin: 2rem auto; }}
-img {{ max-width: 100%; }} table {{ border-collapse: collapse; }}
-td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; vertical-align: top; }}
-pre {{ background: #f6f6f4; padding: .6rem; overflow-x: auto; }} code {{ font-size: 90%; }}
-pre.printed {{ background: none; border-left: 3px solid #ccc; margin-top: -.6rem; }}
-</style></head><body><nav><a href="{home}">torchrg</a></nav>
-{body}
-</body></html>
-"""
 
 
 def guide_files() -> list[Path]:
-    """Return the guides in the order of the index."""
-    order = re.findall(r"\]\(guides/([\w-]+)\.html", (GUIDES / "index.md").read_text("utf-8"))
-    return [GUIDES / f"{name}.md" for name in order]
+    """Return the guides; that of the index comes first."""
+    return sorted(GUIDES.glob("*.md"), key=lambda path: (path.stem != "index", path))
 
 
-def make_guide(guide: Path, folder: Path, modules: set[str]) -> Path:
-    """Run the examples of a guide in a folder, and write its page there.
-
-    Args:
-        guide: The Markdown.
-        folder: Where the page goes, and where the examples run.
-        modules: Names of the modules that have a page in the folder above; names in them become
-            links.
+def make_page(guide: Path, folder: Path) -> Path:
+    """Run the examples of a guide, and write its page, Markdown for Sphinx, into a folder.
 
     Raises:
         RuntimeError: If an example fails; the message names its line.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    made = folder / MADE / guide.stem
+    made.mkdir(parents=True, exist_ok=True)
     text, names = guide.read_text(encoding="utf-8"), {"__name__": guide.stem}
     parts, end = [], 0
-    for block in _BLOCK.finditer(text):
-        kind, lines = block[1], block[3]
-        parts.append(text[end : block.start() if block[2] else block.end()])
+    for block in BLOCK.finditer(text):
+        kind, role, lines = block.groups()
+        parts.append(_linked(text[end : block.start()], guide.stem))
         end = block.end()
+        printed = ""
         if kind in ("python", "bash"):
             where = f"{guide.name}:{text[: block.start()].count(chr(10)) + 2}"
-            with _inside(folder):
+            with _inside(made):
                 printed = _run(kind, lines, names, where)
-            if printed:
-                parts.append(f'\n\n<pre class="printed">{html.escape(printed)}</pre>\n')
-    page = folder / f"{guide.stem}.html"
-    page.write_text(render("".join([*parts, text[end:]]), modules, home="../"), encoding="utf-8")
+        if role == " page":
+            parts.append(printed)
+        elif role is None:
+            parts.append(block[0])
+            parts.append(_shown(printed) if printed else "")
+    page = folder / guide.name
+    page.write_text("".join([*parts, _linked(text[end:], guide.stem)]), encoding="utf-8")
     return page
 
 
-def names_in(markdown: str) -> list[str]:
-    """Return the dotted names of torchrg in backquotes, which become links."""
-    return re.findall(r"`(torchrg(?:\.\w+)*)`", _BLOCK.sub("", markdown))
-
-
-def render(markdown: str, modules: set[str], *, home: str = "") -> str:
-    """Return a page of Markdown; names of torchrg in backquotes lead to the reference."""
-    title = markdown.partition("\n")[0].lstrip("# ")
-    body = str(pdoc.render_helpers.to_html(markdown))
-
-    def link(match: re.Match[str]) -> str:
-        place = place_of(match[1], modules)
-        return f'<a href="{home}{place}">{match[0]}</a>' if place else match[0]
-
-    body = re.sub(r"<code>(torchrg(?:\.\w+)*)</code>", link, body)
-    return _SHELL.format(title=html.escape(title), body=body, home=f"{home}index.html")
-
-
-def place_of(name: str, modules: set[str]) -> str:
-    """Return page and anchor of a dotted name in the reference; empty if it has none.
+def _linked(prose: str, stem: str) -> str:
+    """Return text whose pictures are those that were made, and whose names lead to the reference.
 
     Example:
-        >>> place_of("torchrg.config.NormalsConfig.k", {"torchrg", "torchrg.config"})
-        'torchrg/config.html#NormalsConfig.k'
+        >>> _linked("`torchrg.Cloud`: ![one](a.png)", "guide")
+        '{py:obj}`torchrg.Cloud`: ![one](made/guide/a.png)'
     """
-    parts = name.split(".")
-    for count in range(len(parts), 0, -1):
-        module = ".".join(parts[:count])
-        if module in modules:
-            anchor = ".".join(parts[count:])
-            return f"{module.replace('.', '/')}.html" + (f"#{anchor}" if anchor else "")
-    return ""
+    return _NAME.sub(r"{py:obj}`\1`", _PICTURE.sub(rf"\1{MADE}/{stem}/", prose))
+
+
+def _shown(printed: str) -> str:
+    """Return what an example prints as a block below it."""
+    lines = printed.splitlines()
+    more = [f"... {len(lines) - _MOST_LINES} more lines"] if len(lines) > _MOST_LINES else []
+    shown = "\n".join([*lines[:_MOST_LINES], *more])
+    return f"\n\n```{{code-block}} text\n:class: printed\n\n{shown}\n```"
 
 
 def _run(kind: str, lines: str, names: dict[str, Any], where: str) -> str:
@@ -121,9 +91,7 @@ def _run(kind: str, lines: str, names: dict[str, Any], where: str) -> str:
                     _run_command(line)
     except (Exception, SystemExit) as error:
         raise RuntimeError(f"{where}: {type(error).__name__}: {error}") from error
-    shown = printed.getvalue().rstrip().splitlines()
-    more = [f"... {len(shown) - _MOST_LINES} more lines"] if len(shown) > _MOST_LINES else []
-    return "\n".join([*shown[:_MOST_LINES], *more])
+    return printed.getvalue().rstrip()
 
 
 def _run_command(line: str) -> None:
@@ -152,5 +120,4 @@ def _inside(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        sys.stdout.flush()
         os.chdir(before)

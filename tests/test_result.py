@@ -353,7 +353,7 @@ def test_no_planes_are_read_back_too(tmp_path):
 
 def test_columns_of_files_are_those_of_the_table():
     names = [part.name for part in fields(Planes)]
-    assert names == [*PLANE_COLUMNS, "kind", "outline", "adjacency"]
+    assert names == [*PLANE_COLUMNS, "kind", "outline", "adjacency", "object"]
     assert PlaneAdjacency._fields[0] == "pairs"
 
 

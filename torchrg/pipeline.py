@@ -30,6 +30,7 @@ from torchrg.neighbors import (
     sample_voxels,
     search_knn,
 )
+from torchrg.neighbors.knn import keep_within
 from torchrg.normals import ESTIMATORS
 from torchrg.precision import warn_of_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
@@ -59,6 +60,7 @@ def segment_planes(
     config: AnyConfig | None = None,
     *,
     voxel: float | None = None,
+    within: Tensor | NDArray[np.integer] | None = None,
     keep_neighbors: bool = False,
     on_stage: Callable[[str], None] | None = None,
     **changes: Any,  # noqa: ANN401
@@ -82,6 +84,9 @@ def segment_planes(
             point has the result of its voxel. Sizes of regions are counted in voxels then; planes
             are described from all points and numbered by their number, and which of them meet is
             found on the voxels. Default: all points are segmented.
+        within: Object of each point, shape ``(N,)``, integers, to keep planes within objects: no
+            plane has points of two of them, and the table names that of each. Points of voxels of
+            another object have no label. Default: planes go across.
         keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
             that :func:`make_superpoints` need not search them again.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
@@ -93,7 +98,7 @@ def segment_planes(
         cloud with fewer points than ``k`` uses those it has; fewer than three points give no plane.
 
     Raises:
-        ShapeError: If ``points`` has another shape or dtype.
+        ShapeError: If ``points`` or ``within`` has another shape or dtype.
         ConfigError: If ``voxel`` is not positive, or a setting is wrong.
         FormatError: If arrays are kept on a disk, and it is full.
 
@@ -108,10 +113,19 @@ def segment_planes(
         ([400], [[0.0, 0.0, 1.0]])
         >>> segment_planes(grid, "classic", voxel=2.0).planes.count.tolist()
         [400]
+        >>> halves = segment_planes(grid, "classic", within=torch.arange(400) // 200 + 5).planes
+        >>> halves.count.tolist(), halves.object.tolist()
+        ([200, 200], [5, 6])
     """
     points = as_tensor("segment_planes", "points", points).detach()
     check_points("segment_planes", points)
     warn_of_steps("segment_planes", points)
+    objects = None if within is None else as_tensor("segment_planes", "within", within)
+    check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
+    if objects is not None and (objects.is_floating_point() or objects.is_complex()):
+        raise ShapeError(
+            f"segment_planes: expected within of integers, got {objects.dtype}; number the objects."
+        )
     settings = settings_of("segment_planes", PipelineConfig, config, changes)
 
     def begin(stage: str) -> None:
@@ -120,7 +134,8 @@ def segment_planes(
         if on_stage is not None:
             on_stage(stage)
 
-    seg = _segment(points, settings, voxel, begin)
+    objects = None if objects is None else objects.long().to(points.device)
+    seg = _segment(points, settings, voxel, objects, begin)
     return seg if keep_neighbors else seg._replace(neighbors=None)
 
 
@@ -151,7 +166,11 @@ class _CanonicalCloud(NamedTuple):
 
 
 def _segment(
-    points: Tensor, config: PipelineConfig, voxel: float | None, begin: Callable[[str], None]
+    points: Tensor,
+    config: PipelineConfig,
+    voxel: float | None,
+    objects: Tensor | None,
+    begin: Callable[[str], None],
 ) -> Segmentation:
     """Do what :func:`segment_planes` says: the steps, in their order."""
     begin("neighbors")
@@ -170,11 +189,15 @@ def _segment(
     fit = estimate(cloud.points, neighbors, config.normals, config.chunk_size)
 
     begin("regions")
+    beside = neighbors
+    if objects is not None:
+        # Growth, and all steps after it, join neighbours alone.
+        beside = keep_within(neighbors, objects[cloud.rows], config.chunk_size)
     labels = grow_regions(
         cloud.points,
         fit.normals,
         fit.curvature,
-        neighbors,
+        beside,
         config.growing,
         valid=fit.valid,
         residual_rms=fit.residual_rms,
@@ -191,12 +214,18 @@ def _segment(
         cloud.restore(values, len(points))
         for values in (fit.normals, fit.curvature, sharp, fit.valid)
     )
+    if objects is not None and cloud.inverse is not None:
+        labels = labels.where(objects == objects[cloud.rows][cloud.inverse], UNLABELED)
     if voxel is not None:
         labels, place = _numbered_by_points(labels, len(planes))
         rows = finite_rows(points)
         adjacency = _renumbered(planes.adjacency, place)
         planes = describe(points[rows], normals[rows], labels[rows])
         planes = replace(planes, adjacency=adjacency)
+    if objects is not None:
+        own = objects.new_zeros(len(planes))
+        own[labels[labels >= 0]] = objects[labels >= 0]
+        planes = replace(planes, object=own)
     begin("done")
     searched = neighbors if voxel is None else None
     return Segmentation(

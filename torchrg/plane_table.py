@@ -1,5 +1,10 @@
-"""The plane table in files: as arrays in ``.npz``, and as JSON in folders of arrays."""
+"""The plane table in files: arrays in ``.npz``, JSON in folders of arrays, CSV for other programs.
 
+:func:`describe_planes` says what is known of a plane; the others are made of it.
+"""
+
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,6 +20,14 @@ Arrays = dict[str, Array]
 """Parts of the table by their names in ``.npz``."""
 Json = dict[str, Any]
 """Parts of the table as JSON can hold them, by name."""
+CSV_COLUMNS = (
+    "id", "kind", "object", "normal", "offset", "centroid", "area", "count", "rms", "dip_deg",
+    "dip_direction_deg", "curved", "outline",
+)  # fmt: skip
+"""Columns of CSV and of data frames, empty where nothing is known. Directions and places are three
+of them, as ``normal_x``; an outline is text, a WKT ``POLYGON Z``."""
+TABLE_SUFFIXES = (".csv", ".json")
+"""Suffixes of files of tables."""
 
 
 def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
@@ -43,6 +56,8 @@ def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
     arrays |= {f"plane_{name}": moved(getattr(planes, name)) for name in ("centroid", "center")}
     if planes.kind is not None:
         arrays["plane_kind"] = np.array(PLANE_KINDS)[planes.kind.numpy(force=True)]
+    if planes.object is not None:
+        arrays["plane_object"] = planes.object.numpy(force=True)
     if planes.adjacency is not None:
         for name, values in planes.adjacency._asdict().items():
             arrays[f"adjacency_{name}"] = values.numpy(force=True)
@@ -86,6 +101,8 @@ def planes_from_arrays(
     if "plane_kind" in arrays:
         kinds = [PLANE_KINDS.index(word) for word in read("plane_kind", "U", (num_planes,))]
         table = replace(table, kind=torch.tensor(kinds, dtype=torch.int64))
+    if "plane_object" in arrays:
+        table = replace(table, object=tensor(read("plane_object", "i8", (num_planes,))))
     if "adjacency_pairs" in arrays:
         num_pairs = len(arrays["adjacency_pairs"])
         pairs = read("adjacency_pairs", "i8", (num_pairs, 2))
@@ -125,6 +142,8 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     Returns:
         ``planes``: for each plane its ``id``, the value in ``plane.npy``, and the columns of
         :class:`torchrg.structures.Planes`; ``kind`` as a word, and ``outline`` as rings of points.
+        With z up and y north, ``dip_deg`` is the angle to the horizontal, in [0, 90], and
+        ``dip_direction_deg`` where the plane falls, clockwise from north, 0 if it is level.
         ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
 
     Example:
@@ -138,6 +157,10 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
         planes, np.array([0.0] * 3 if origin is None else origin, dtype=np.float64)
     )
     columns = {"id": [*range(len(planes))]} | _lists(arrays, "plane_")
+    x, y, z = arrays["plane_normal"].T.astype(np.float64)
+    columns["dip_deg"] = np.degrees(np.arctan2(np.hypot(x, y), np.abs(z))).tolist()
+    falls = np.arctan2(x * np.copysign(1, z), y * np.copysign(1, z))
+    columns["dip_direction_deg"] = (np.degrees(falls) % 360).tolist()
     if planes.outline is not None:
         ends = arrays["outline_ring_sizes"].cumsum()[:-1]
         rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
@@ -147,6 +170,56 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
         pairs = _lists(arrays, "adjacency_")
         table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
     return table
+
+
+def tabulate_planes(described: Json) -> Json:
+    """Return what :func:`describe_planes` described as columns of single values by name.
+
+    Example:
+        >>> plane = {"id": 0, "normal": [0.0, 0.6, 0.8], "centroid": [1.0, 2.0, 3.0], "area": 2.5}
+        >>> columns = tabulate_planes({"planes": [plane]})
+        >>> columns["normal_z"], columns["area"], columns["kind"]
+        ([0.8], [2.5], [None])
+    """
+    rows, columns = described["planes"], Json()
+    for name in CSV_COLUMNS:
+        values = [row.get(name) for row in rows]
+        if name in ("normal", "centroid"):
+            columns |= {f"{name}_{x}": [v[i] for v in values] for i, x in enumerate("xyz")}
+        elif name == "outline":
+            columns[name] = [
+                None if rings is None else _to_wkt(rings, row["normal"])
+                for rings, row in zip(values, rows, strict=True)
+            ]
+        else:
+            columns[name] = values
+    return columns
+
+
+def encode_csv(described: Json) -> bytes:
+    """Return what :func:`describe_planes` described as CSV, with a line of names."""
+    columns, text = tabulate_planes(described), io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
+    return text.getvalue().encode()
+
+
+def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float]) -> str:
+    """Return rings as a WKT polygon, or several: outer ones run counter-clockwise, then holes.
+
+    Example:
+        >>> _to_wkt([[[0.0, 0.0, 7.5], [1.0, 0.0, 7.5], [0.0, 1.0, 7.5]]], [0, 0, 1])
+        'POLYGON Z ((0.0 0.0 7.5, 1.0 0.0 7.5, 0.0 1.0 7.5, 0.0 0.0 7.5))'
+    """
+    polygons: list[list[str]] = []
+    for ring in rings:
+        places = np.array(ring) - ring[0]
+        if np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0) @ normal > 0:
+            polygons.append([])
+        polygons[-1].append(", ".join(" ".join(map(repr, place)) for place in [*ring, ring[0]]))
+    texts = [f"(({'), ('.join(polygon)}))" for polygon in polygons]
+    if len(texts) > 1:
+        return f"MULTIPOLYGON Z ({', '.join(texts)})"
+    return f"POLYGON Z {''.join(texts) or 'EMPTY'}"
 
 
 def _lists(arrays: Arrays, prefix: str) -> Json:
@@ -166,8 +239,9 @@ def arrays_of_description(described: Json) -> Arrays:
         f"plane_{name}": np.array([row[name] for row in rows], dtype).reshape(len(rows), *shape)
         for name, (dtype, shape) in PLANE_COLUMNS.items()
     }
-    if rows and "kind" in rows[0]:
-        arrays["plane_kind"] = np.array([row["kind"] for row in rows])
+    for name in ("kind", "object"):
+        if rows and name in rows[0]:
+            arrays[f"plane_{name}"] = np.array([row[name] for row in rows])
     if rows and "outline" in rows[0]:
         rings = [(row["id"], ring) for row in rows for ring in row["outline"]]
         arrays["outline_points"] = np.array([p for _, ring in rings for p in ring]).reshape(-1, 3)

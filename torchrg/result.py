@@ -17,13 +17,19 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ShapeError
-from torchrg.io import read_cloud
+from torchrg.io import atomic_path, read_cloud
 from torchrg.io.fields import are_whole, put_results
 from torchrg.io.files import DAMAGES
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows, search_knn
-from torchrg.plane_table import Arrays, arrays_of_description, planes_from_arrays
+from torchrg.plane_table import (
+    Arrays,
+    Json,
+    arrays_of_description,
+    encode_csv,
+    planes_from_arrays,
+)
 from torchrg.plane_table import describe_planes as describe_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency
@@ -182,7 +188,7 @@ class Result:
     def planes(self) -> Planes | None:
         """The plane table; None without labels.
 
-        Of a result it is :attr:`table`. What that lacks, for labels from elsewhere all of it, for
+        Of a result it is ``table``. What that lacks, for labels from elsewhere all of it, for
         images which planes meet, is found once, from the labels.
         """
         table = self.table
@@ -258,6 +264,14 @@ class Result:
         return Superpoints(labels, plane, tuple(levels))
 
 
+def write_table(path: Path, described: Json) -> None:
+    """Write what :func:`describe_planes` described, as JSON or CSV by its suffix."""
+    is_json = path.suffix.lower() == ".json"
+    content = json.dumps(described, indent=1).encode() if is_json else encode_csv(described)
+    with atomic_path(path) as beside:
+        beside.write_bytes(content)
+
+
 def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Result:
     """Read what ``segment``, ``depth`` or ``convert`` wrote, or any other cloud.
 
@@ -266,10 +280,10 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         columns: As of :func:`torchrg.read_cloud`.
 
     Returns:
-        The cloud and what is known about it: ``.npz`` files hold all of a result, folders all but
+        The cloud and what is known about it. ``.npz`` files hold all of a result, folders all but
         the masks, other files what :func:`torchrg.write_cloud` puts beside each point. A plane
         table that is not of the labels, as somebody changed them since, is left out, and
-        :attr:`Cloud.notes` says so.
+        ``notes`` of the cloud say so.
 
     Raises:
         FormatError: If there is no such file, or it is damaged; see :func:`torchrg.read_cloud`.

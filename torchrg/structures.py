@@ -279,6 +279,7 @@ class Plane:
         offset: A number of Python, as are ``area``, ``count``, ``rms`` and ``curved``.
         kind: One of :data:`PLANE_KINDS`; None where the up direction was not given.
         outline: Rings around it, of shape ``(V, 3)``; None where not asked for.
+        object: Number of its object; None where planes were not kept within objects.
     """
 
     id: int
@@ -294,6 +295,7 @@ class Plane:
     curved: bool
     kind: str | None = None
     outline: tuple[Tensor, ...] | None = None
+    object: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,6 +326,8 @@ class Planes:
         outline: Rings around each region, of shape ``(V, 3)``: outer ones counter-clockwise seen
             against the normal, holes clockwise; None where not asked for.
         adjacency: Which planes meet; None where the neighbours were not given.
+        object: Object that each plane is of, shape ``(M,)``, int64; None where planes were not kept
+            within objects.
 
     Example:
         >>> from torchrg import segment_planes
@@ -348,6 +352,7 @@ class Planes:
     kind: Tensor | None = None
     outline: tuple[tuple[Tensor, ...], ...] | None = None
     adjacency: PlaneAdjacency | None = None
+    object: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.normal)
@@ -370,11 +375,20 @@ class Planes:
         own = {name: value if value.ndim else value.item() for name, value in columns.items()}
         kind = None if self.kind is None else PLANE_KINDS[int(self.kind[row])]
         outline = None if self.outline is None else self.outline[row]
-        return Plane(row, **own, kind=kind, outline=outline)
+        within = None if self.object is None else int(self.object[row])
+        return Plane(row, **own, kind=kind, outline=outline, object=within)
 
     def to(self, device: torch.device | str) -> "Planes":
         """Return the table on a device."""
         return replace(self, **{name: moved(value, device) for name, value in vars(self).items()})
+
+    def to_pandas(self) -> Any:  # noqa: ANN401
+        """Return a ``pandas.DataFrame``, the columns of :data:`torchrg.plane_table.CSV_COLUMNS`.
+
+        Raises:
+            MissingDependencyError: If pandas is not installed.
+        """
+        return _display.call("as_frame", self)
 
 
 def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401

@@ -1,14 +1,20 @@
-"""The report of all parts that are there: a page, by ``report.html.jinja``, and JSON."""
+"""The report of all parts that are there: a page, by ``report.html.jinja``, and JSON.
+
+The numbers of the last full report are a page of the documentation as well.
+"""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
 from reproduction.cells import Folder, Record, describe_surroundings
-from reproduction.sections import Block, verdict
+from reproduction.faces import LARGE
+from reproduction.methods import METHODS
+from reproduction.sections import Block, mark_best, verdict
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 
@@ -21,6 +27,13 @@ INTRO = (
     "place of the paper's, or a piece of it. The default of torchrg, consensus, is not in the "
     "paper."
 )
+
+SCORES = (
+    ("Adjusted Rand index", "ari", ".2f"),
+    (f"F1 of faces of {LARGE:,} points and more", "f1_large", ".0f"),
+    ("Mean best IoU", "mean_best_iou", ".2f"),
+)
+"""What the page shows of each cloud and method: its title, its name and how it is printed."""
 
 
 def write_report(folder: Folder, names: Sequence[str], *, quick: bool) -> Record:
@@ -78,3 +91,37 @@ def _figures(claim: Block) -> str:
     """Return the numbers behind a claim, and what else is to be known."""
     numbers = "; ".join(f"{place}: {number}" for place, number in claim["numbers"].items())
     return f"{numbers}. {claim['why']}".strip()
+
+
+def to_markdown(results: Mapping[str, Any]) -> str:
+    """Return the results that are kept beside this file as a part of a page.
+
+    Args:
+        results: Scores and claims, as ``results.json`` has them.
+    """
+    parts = ["## Scores"]
+    for title, name, form in SCORES:
+        parts += [f"### {title}", _rows(["cloud", *METHODS], _score_rows(results, name, form))]
+    parts.append("## Claims")
+    for claim in results["claims"]:
+        numbers = claim["numbers"].items()
+        rows = [
+            [place, "yes" if place in claim["holds"] else "no", found] for place, found in numbers
+        ]
+        parts += [f"### {claim['text']}", f"{claim['where']}: **{verdict(claim)}**. {claim['why']}"]
+        parts.append(_rows(["tried on", "holds", "numbers"], rows))
+    return re.sub(r"(?<!\*)\*(?!\*)", r"\\*", "\n\n".join(parts))
+
+
+def _score_rows(results: Mapping[str, Any], name: str, form: str) -> Iterator[list[str]]:
+    """Yield a row for each cloud: a score of each method, the best bold."""
+    for cloud in dict.fromkeys(score["cloud"] for score in results["scores"]):
+        found = {score["method"]: score for score in results["scores"] if score["cloud"] == cloud}
+        values = [found[method][name] for method in METHODS]
+        yield [found["paper"]["title"], *mark_best(values, form, higher=True)]
+
+
+def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

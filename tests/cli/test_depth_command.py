@@ -121,7 +121,9 @@ def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_pa
     assert damaged.count("2.png") == 1
     assert sums == "torchrg: 1 of 3 inputs failed, the others are written."
     assert told.out.count(" 2 planes, ") == 2
-    assert sorted(contents(out)) == ["1.png", "1_planes.png", "3.png", "3_planes.png"]
+    assert sorted(contents(out)) == [
+        f"{name}{end}" for name in (1, 3) for end in (".json", ".png", "_planes.png")
+    ]
 
 
 def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
@@ -131,7 +133,7 @@ def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
     assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels").code == 0
     assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels.png").code == 0
     results = contents(tmp_path / "labels")
-    assert sorted(results) == ["frame.png", "frame_planes.png"]
+    assert sorted(results) == ["frame.json", "frame.png", "frame_planes.png"]
     assert results["frame.png"] == (tmp_path / "labels.png").read_bytes()
 
 

@@ -1,7 +1,6 @@
 """What ``--help`` prints can be read, and all of it is true."""
 
 import dataclasses
-import importlib
 import re
 import shlex
 import subprocess
@@ -10,16 +9,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
+from command_page import PROGS as KINDS
 
-from torchrg.cli import COMMANDS, convert, flags, main
+from torchrg.cli import flags, main
 from torchrg.cli.arguments import Argument, example_lines, list_flags, parse
 from torchrg.errors import ConfigError
 
-KINDS = {
-    f"torchrg {name}": importlib.import_module(f"torchrg.cli.{name}").Arguments
-    for name in COMMANDS
-    if name != "convert"
-} | {f"torchrg convert {name}": kind for name, kind in convert.KINDS.items()}
 QUICK = """
 import sys, torchrg.cli
 try:

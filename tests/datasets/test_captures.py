@@ -78,25 +78,19 @@ def test_a_capture_in_opengl_axes_has_the_planes_of_its_cloud(tmp_path, suffix, 
             assert min(abs(wall), abs(wall - SIZE[axis])) < 1e-3
 
 
-def test_frames_may_have_cameras_of_their_own_and_no_depth(tmp_path):
-    root = write_nerfstudio(tmp_path, k1=0.1, applied_scale=2.0)
+def test_frames_may_have_cameras_of_their_own(tmp_path):
+    root = write_nerfstudio(tmp_path, k1=0.1)
     shared = json.loads((root / "transforms.json").read_text())
-    for frame in shared["frames"]:
-        # As saved coordinates are twice those in metres.
-        frame["transform_matrix"] = [
-            [*row[:3], 2 * row[3]] for row in frame["transform_matrix"][:3]
-        ]
     own = {key: shared.pop(key) for key in ("fl_x", "cx", "w")}
-    first, second = shared["frames"]
-    first |= own
-    second.pop("depth_file_path")
-    write_text(root / "transforms.json", shared)
-    with pytest.warns(UserWarning, match="transforms.json: ") as warned:
+    for frame in shared["frames"]:
+        frame |= own
+        frame["transform_matrix"] = frame["transform_matrix"][:3]
+    shared["frames"].reverse()
+    write_text(root / "transforms.json", {**shared, "fl_x": 1})
+    with pytest.warns(UserWarning, match=r"the distortion of the lens \(k1\) is left as it is"):
         data = RGBDFrames.from_folder(root)
-    assert "left out 1 of 2 frames, which name no depth" in str(warned[0].message)
-    assert "the distortion of the lens (k1) is left as it is" in str(warned[1].message)
-    (sample,) = data
-    np.testing.assert_allclose(points_of(sample), FRAMES[0].points, atol=1e-3)
+    for sample, frame in zip(data, FRAMES, strict=True):
+        np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)
 
 
 def without_camera(shared):
@@ -108,8 +102,7 @@ def with_fisheye(shared):
 
 
 def without_depth(shared):
-    for frame in shared["frames"]:
-        del frame["depth_file_path"]
+    del shared["frames"][1]["depth_file_path"]
 
 
 def without_frames(shared):
@@ -124,6 +117,11 @@ def with_words(shared):
     shared["frames"][1]["transform_matrix"][2][3] = "far"
 
 
+def with_a_turn_alone(shared):
+    frame = shared["frames"][0]
+    frame["transform_matrix"] = [row[:3] for row in frame["transform_matrix"][:3]]
+
+
 def with_no_focus(shared):
     shared["fl_y"] = 0
 
@@ -135,12 +133,13 @@ def with_a_huge_number(shared):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (without_camera, "expected a number for fl_x, got None; add it"),
+        (without_camera, "expected a camera, as fl_x, fl_y, cx, cy or a matrix, got none in fl_y"),
         (with_fisheye, "expected images of a pinhole camera, got OPENCV_FISHEYE; undistort"),
-        (without_depth, "expected depth_file_path in its frames, got none; name the depth"),
+        (without_depth, "expected a list of frames, each with depth_file_path; name the depth"),
         (without_frames, "expected a list of frames"),
-        (with_wide_images, "which the camera is of, or in their ratio, got 128 x 96; pass the"),
-        (with_words, "expected transform_matrix of 4 x 4 or 3 x 4 numbers, got [["),
+        (with_wide_images, "as its camera's, or in their ratio, got 128 x 96; pass the camera"),
+        (with_words, "expected transform_matrix to be a matrix, got [["),
+        (with_a_turn_alone, "expected transform_matrix to be a matrix, got [["),
         (with_no_focus, "expected fl_x and fl_y other than 0"),
         (with_a_huge_number, "expected a number for cx, got 10000"),
     ],

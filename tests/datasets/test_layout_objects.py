@@ -244,7 +244,7 @@ def test_superpoints_of_scannet_plusplus_are_where_sai3d_reads_them(tmp_path):
     assert not [*out.rglob("*aggregation*")]
     for layout in ("mmdet3d", "spformer", "isbnet", "mask3d"):
         source = ScanNetSource(tmp_path / "in", settings, layout=layout)
-        with pytest.raises(ConfigError, match=r"pointcept, scannet, npy for ScanNet\+\+, got"):
+        with pytest.raises(ConfigError, match=r"pointcept, scannet, nag, npy for ScanNet\+\+, got"):
             list_jobs(source, tmp_path / "other")
 
 
@@ -255,10 +255,10 @@ def test_pointcepts_folders_of_unknown_classes_have_no_layout_with_classes(tmp_p
     np.save(folder / "segment.npy", np.zeros((5, 1), np.int16))
     for layout in LAYOUTS:
         source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path, layout=layout)
-        if layout in ("scannet", "npy"):
+        if layout in ("scannet", "nag", "npy"):
             assert len(list_jobs(source, tmp_path / "out")) == 1
             continue
-        with pytest.raises(ConfigError, match="scannet, npy for Area_1/office_1, got"):
+        with pytest.raises(ConfigError, match="scannet, nag, npy for Area_1/office_1, got"):
             list_jobs(source, tmp_path / "out")
     np.save(folder / "segment20.npy", np.zeros(5, np.int64))
     source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path, layout="mask3d")

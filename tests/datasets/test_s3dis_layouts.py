@@ -173,8 +173,14 @@ def test_databases_have_an_area_without_rooms_as_an_empty_one(converted):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--layout", "spformer"], "pointcept, mmdet3d, isbnet, mask3d, npy for S3DIS, got spf"),
-        (["--layout", "scannet"], "pointcept, mmdet3d, isbnet, mask3d, npy for S3DIS, got scannet"),
+        (
+            ["--layout", "spformer"],
+            "pointcept, mmdet3d, isbnet, mask3d, nag, npy for S3DIS, got spf",
+        ),
+        (
+            ["--layout", "scannet"],
+            "pointcept, mmdet3d, isbnet, mask3d, nag, npy for S3DIS, got scannet",
+        ),
         (
             ["--layout", "mask3d", "--class-order", "spt"],
             "expected --class-order with --layout pointcept, got layout mask3d",

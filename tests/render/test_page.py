@@ -1,8 +1,10 @@
 """Pages without a browser: what is in the file, what is escaped, and what is refused."""
 
 import base64
+import csv
 import functools
 import gzip
+import io
 import json
 import re
 
@@ -313,3 +315,18 @@ def test_points_are_as_large_as_the_space_around_them():
     is_sparse = places(page)[:, 0] > 3
     octaves = (np.median(radii[is_sparse]) - np.median(radii[~is_sparse])) / 16
     assert octaves == pytest.approx(1, abs=0.25)
+
+
+def test_the_table_as_csv_names_planes_as_the_file_does():
+    cloud = room()
+    labels = np.where(cloud.fields["labels"] >= 0, cloud.fields["labels"] * 3 + 4, -1)
+    page = make_page(Result(Cloud(cloud.coordinates, {**cloud.fields, "labels": labels})))
+    text = unpacked(page)["table"].astype(np.uint8).tobytes().decode()
+    rows = list(csv.DictReader(io.StringIO(text)))
+    names, counts = np.unique(labels[labels >= 0], return_counts=True)
+    assert [int(row["id"]) for row in rows] == names.tolist()
+    assert [int(row["count"]) for row in rows] == counts.tolist()
+    shown = described(page)["clouds"][0]["planes"]
+    assert [float(row["area"]) for row in rows] == [plane["area"] for plane in shown]
+    bare = make_page(Result(Cloud(cloud.coordinates)))
+    assert "table" not in {entry["name"] for entry in described(bare)["clouds"][0]["arrays"]}

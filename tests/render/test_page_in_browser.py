@@ -1,5 +1,6 @@
 """Pages in a real Chromium without a screen: what is drawn, picked, hidden, and linked."""
 
+import csv
 import io
 import shutil
 import time
@@ -352,3 +353,18 @@ def test_odd_clouds_open(browser, tmp_path, cloud, words):
         assert "no plane labels" in tab.run("planes.textContent")
     assert tab.said == []
     tab.page.close()
+
+
+def test_the_table_of_the_chosen_cloud_is_saved_as_csv(tab, room):
+    labels = room.fields["labels"]
+    for place in (0, 1):  # The second has no plane 0.
+        tab.run(f"cloud.value = {place}; cloud.onchange()")
+        with tab.page.expect_download() as started:
+            tab.run("csv.click()")
+        with started.value.path().open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        names, counts = np.unique(labels[labels >= place], return_counts=True)
+        assert [int(row["id"]) for row in rows] == names.tolist()
+        assert [int(row["count"]) for row in rows] == counts.tolist()
+        assert {row["kind"] for row in rows} > {"wall"}
+    assert tab.said == []

@@ -1,60 +1,42 @@
-"""The reference: its guides run, and every link in it leads somewhere."""
+"""The documentation: its guides and commands run, and every link in it leads somewhere."""
 
+import re
+import shlex
+
+import command_page
 import docs
 import guide_pages
 import pytest
 
+from torchrg.cli import main
+
 GUIDES = guide_pages.guide_files()
+TEXTS = {guide.stem: guide.read_text(encoding="utf-8") for guide in GUIDES}
 
 
-def test_every_guide_is_on_the_index():
-    found = {path.stem for path in guide_pages.GUIDES.glob("*.md")} - {"index"}
-    assert {guide.stem for guide in GUIDES} == found
+def test_the_index_names_every_guide_twice():
+    index, _, trees = TEXTS["index"].partition("```{toctree}")
+    others = set(TEXTS) - {"index"}
+    assert set(re.findall(r"^\* \[[^]]+\]\(([\w-]+)\.md\): ", index, re.MULTILINE)) == others
+    assert set(re.findall(r"^[\w-]+$", trees, re.MULTILINE)) == others
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_links_between_guides_lead_to_guides(name):
+    for target in re.findall(
+        r"(?<!!)\[[^]]*\]\(([^)#]+)\)", guide_pages.BLOCK.sub("", TEXTS[name])
+    ):
+        assert target.startswith("https://") or target.removesuffix(".md") in TEXTS, target
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
-def test_guide_runs(guide, tmp_path):
-    page = guide_pages.make_guide(guide, tmp_path / "guides", set())
-    wanting = [line for line in docs.broken_links(tmp_path) if "index.html" not in line]
-    others = {f"{other.stem}.html" for other in GUIDES}
-    assert not [line for line in wanting if line.split()[1] not in others]
-    assert page.stat().st_size > 2000
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("default")
-def test_every_public_module_has_a_page_and_links_lead_somewhere(tmp_path):
-    found = docs.public_modules()
-    docs.write_reference(tmp_path, found)
-    for name in ("config", "structures", "io", "linalg", "errors", "regions", "scratch"):
-        assert (tmp_path / "torchrg" / f"{name}.html").is_file()
-    assert len(list((tmp_path / "torchrg").rglob("*.html"))) == len(found) - 1
-    # The guides have links of their own, and a test of their own.
-    wanting = [line for line in docs.broken_links(tmp_path) if ": guides/" not in line]
-    assert not wanting
-    for guide in GUIDES:
-        for name in guide_pages.names_in(guide.read_text(encoding="utf-8")):
-            place = guide_pages.place_of(name, set(found))
-            page, _, anchor = place.partition("#")
-            assert not anchor or f'id="{anchor}"' in (tmp_path / page).read_text(encoding="utf-8")
-
-
-def test_references_in_docstrings_lead_somewhere():
-    modules = list(docs.modules())
-    assert len(modules) > 100
-    assert not docs.broken_references()
-    assert not docs.leads_somewhere("torchrg.nothing", modules[0])
-
-
-def test_a_link_to_nowhere_is_found(tmp_path):
-    (tmp_path / "a.html").write_text('<p id="here"><a href="b.html#there">b</a> <img src="c.png">')
-    (tmp_path / "b.html").write_text('<a href="a.html#here">a</a> <a href="https://a.b">c</a>')
-    assert docs.broken_links(tmp_path) == [
-        "a.html: b.html#there leads nowhere.",
-        "a.html: c.png leads nowhere.",
-    ]
+def test_guide_runs_and_makes_its_pictures(guide, tmp_path):
+    text = guide_pages.make_page(guide, tmp_path).read_text(encoding="utf-8")
+    assert len(text) >= guide.stat().st_size * 0.9
+    for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
+        assert (tmp_path / picture).is_file()
 
 
 def test_examples_run_share_names_and_show_what_they_print(tmp_path):
@@ -62,14 +44,15 @@ def test_examples_run_share_names_and_show_what_they_print(tmp_path):
     guide.write_text(
         "# A guide\n\n```python hidden\nnumber = 1\n```\n\n```python\nprint(number < 2)\n```\n\n"
         "```bash\ntorchrg sample \\\n  room.npz --num-points 500  # small\n```\n"
-        "Then `torchrg.segment_planes`.\n"
+        "Then `torchrg.segment_planes`: ![it](a.png)\n\n"
+        "```python page\nprint(f'## {number}')\n```\n"
     )
-    text = guide_pages.make_guide(guide, tmp_path / "out", {"torchrg"}).read_text()
-    assert "<title>A guide</title>" in text
-    assert '<pre class="printed">True</pre>' in text
+    text = guide_pages.make_page(guide, tmp_path / "out").read_text()
+    assert "print(number < 2)\n```\n\n```{code-block} text\n:class: printed\n\nTrue\n```" in text
     assert "room.npz: 500 points" in text
     assert "number = 1" not in text
-    assert 'href="../torchrg.html#segment_planes"' in text
+    assert "{py:obj}`torchrg.segment_planes`: ![it](made/guide/a.png)" in text
+    assert text.endswith("\n\n## 1\n")
 
 
 @pytest.mark.parametrize(
@@ -84,4 +67,56 @@ def test_a_failing_example_is_named(tmp_path, block, message):
     guide = tmp_path / "guide.md"
     guide.write_text(f"# A guide\n\n```{block}\n```\n")
     with pytest.raises(RuntimeError, match=message):
-        guide_pages.make_guide(guide, tmp_path / "out", set())
+        guide_pages.make_page(guide, tmp_path / "out")
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("[a](https://a.b)", 0),
+        ("{py:obj}`torchrg.nothing`", 1),
+        ("[a](none.md)", 1),
+        ("![a](none.png)", 1),
+    ],
+)
+def test_what_leads_nowhere_fails_the_site(tmp_path, text, code):
+    pages = tmp_path / "pages"
+    pages.mkdir()
+    (pages / "index.md").write_text(f"# Title\n\n{text}\n")
+    assert docs.build_site(pages, tmp_path / "site") == code
+
+
+@pytest.mark.parametrize("prog", command_page.PROGS)
+def test_the_page_of_commands_says_what_help_says(prog, capsys):
+    with pytest.raises(SystemExit):
+        main([*prog.split()[1:], "--help"])
+    words = " ".join(capsys.readouterr().out.split())
+    flags = command_page.flags_of(command_page.PROGS[prog])
+    assert len(flags) > 1
+    assert not [flag.name for flag in flags if f"{flag.spelling} {flag.text}" not in words]
+
+
+def test_the_page_of_commands_has_each_argument_and_example():
+    page = command_page.command_page()
+    for prog, kind in command_page.PROGS.items():
+        section = page.partition(f"## {prog}\n")[2].partition("\n## ")[0]
+        for flag in command_page.flags_of(kind):
+            assert f"```{{option}} {flag.spelling}\n" in section
+        assert f"\n{prog} " in section
+
+
+def test_commands_that_are_only_shown_have_the_flags_that_they_are_shown_with():
+    shown = [
+        shlex.split(line, comments=True)
+        for text in TEXTS.values()
+        for kind, _, lines in guide_pages.BLOCK.findall(text)
+        if kind == "console"
+        for line in re.sub(r"\\\n\s*", " ", lines).splitlines()
+        if line.startswith("torchrg ")
+    ]
+    assert shown
+    for words in shown:
+        prog = " ".join(words[: 3 if words[1] == "convert" else 2])
+        known = {flag.name for flag in command_page.flags_of(command_page.PROGS[prog])}
+        assert {word for word in words if word.startswith("--")} <= known

@@ -6,9 +6,10 @@ source of clouds and for ``torchrg segment``.
 
 import contextlib
 import hashlib
+import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -32,11 +33,12 @@ from torchrg.datasets.folder import folded_name
 from torchrg.datasets.layouts import LayoutScan, split_name, stem_of, write_layout
 from torchrg.datasets.pointcept import write_arrays, write_pointcept_scene
 from torchrg.errors import FormatError
+from torchrg.io.fields import are_whole
 from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_folder
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
-from torchrg.result import describe_planes
+from torchrg.result import PLANES_FILE, describe_planes, write_table
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints
 
 _LOOKED_AT = 10_000
@@ -98,16 +100,19 @@ class Source:
     Args:
         root: The directory of the data set.
         settings: How to segment.
+        table: Name of a further table of planes in the folder of each scan. Default: none.
     """
 
     root: Path
     settings: PipelineConfig | DepthConfig
+    _: KW_ONLY
+    table: str | None = None
     bytes_per_point: ClassVar[int]
     """Space that the results of one point take, to see beforehand whether the disk has it."""
 
     @property
     def in_place(self) -> bool:
-        """Whether results may go into :attr:`root` itself."""
+        """Whether results may go into ``root`` itself."""
         return False
 
     def describe(self) -> Record:
@@ -168,7 +173,7 @@ class Job:
 
     def describe(self) -> Record:
         """Return what decides the results, as JSON holds it; OSError if an input cannot be read."""
-        root, config = self.source.root, asdict(self.source.settings)
+        root, config, table = self.source.root, asdict(self.source.settings), self.source.table
         # It never changes a result, and lowering it after running out of memory must cost nothing.
         config.pop("chunk_size", None)
         inputs = [
@@ -178,7 +183,7 @@ class Job:
         return {
             "versions": describe_versions(),
             "config": config,
-            "source": self.source.describe(),
+            "source": self.source.describe() | ({"table": table} if table else {}),
             "inputs": [{"name": name} | fingerprint(path) for name, path in inputs],
             "device": "cpu",
         }
@@ -226,11 +231,19 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         if path == job.out:
             break
     check_place(folder / RECORD)
-    earlier = read_record(folder, is_ours=True) or {"outputs": {}}
+    earlier, table = read_record(folder, is_ours=True) or {"outputs": {}}, job.source.table
+    if table is not None and table not in earlier["outputs"] and (folder / table).exists():
+        raise FormatError(
+            f"{folder / table}: was not written by torchrg; move it away, or give another --table."
+        )
     job.clean()
     (folder / RECORD).unlink(missing_ok=True)
     with marked_parts(job.mark):
         report = job.source.convert(job.scan, folder, begin)
+        if table is not None:
+            described = json.loads((folder / PLANES_FILE).read_text("utf-8"))
+            write_table(folder / table, {k: v for k, v in described.items() if k != "written"})
+            report = replace(report, files=(*report.files, table))
         begin("record")
         remove_earlier(folder, earlier, report.files)
         write_record(folder, description, report)
@@ -278,12 +291,14 @@ def segment_cloud(
     orient: CloudOrientation = "auto",
     partition: SuperpointsConfig | None = None,
     voxel: float | None = None,
+    within: NDArray[np.integer] | None = None,
     begin: Begin = lambda stage: None,
 ) -> tuple[Segmentation, Superpoints | None]:
     """Return the planes of a cloud, its normals turned to a side, and its superpoints.
 
-    There are superpoints with a ``partition``; with a ``voxel`` one point of each is segmented.
-    ``begin`` is called with the name of each stage when it starts.
+    There are superpoints with a ``partition``; with a ``voxel`` one point of each is segmented;
+    with objects ``(N,)`` planes are ``within`` them. ``begin`` is called with the name of each
+    stage when it starts.
 
     Raises:
         ConfigError: If normals shall look at scanners, and the cloud does not know of any.
@@ -291,13 +306,46 @@ def segment_cloud(
     check_viewpoint(cloud, orient, "use --orient interior")
     points, superpoints = cloud.points, None
     is_kept = partition is not None
-    seg = segment_planes(points, settings, voxel=voxel, keep_neighbors=is_kept, on_stage=begin)
+    seg = segment_planes(
+        points, settings, voxel=voxel, within=within, keep_neighbors=is_kept, on_stage=begin
+    )
     if partition is not None:
         begin("superpoints")
         colors = cloud.fields.get("color")
         superpoints = make_superpoints(points, seg, partition, colors=colors, voxel=voxel)
     begin("orientation")
     return _oriented(cloud, seg, orient, voxel), superpoints
+
+
+def find_objects(
+    fields: Mapping[str, NDArray[Any]], name: str | None, cloud: Cloud
+) -> NDArray[np.int64] | None:
+    """Return the object of each point of a cloud, the field of a name; None without a name.
+
+    ``segment`` is ``segment20`` where there is only that. Of several labels of a point the first
+    is taken; text and scalar fields of PLY have whole numbers as floats.
+
+    Raises:
+        FormatError: If there is no such field, or it does not hold a whole number for each point.
+
+    Example:
+        >>> cloud = Cloud(np.zeros((2, 3)))
+        >>> find_objects({"instance": np.array([[3, 5], [4, -1]])}, "instance", cloud).tolist()
+        [3, 4]
+    """
+    if name is None:
+        return None
+    values, wanted = fields.get(name, fields.get(f"{name}20")), f"the field {name} of --within"
+    if values is None:
+        names = ", ".join(sorted(fields)) or "none"
+        names += "".join(f" ({note})" for note in cloud.notes if name in note)
+        raise FormatError(f"{cloud.source}: expected {wanted}, got {names}; name one of these.")
+    if values.dtype.kind not in "iubf" or len(values) != len(cloud) or not are_whole(values):
+        raise FormatError(
+            f"{cloud.source}: expected {wanted} to be a whole number for each of {len(cloud):,} "
+            f"points, got {values.dtype} of shape {values.shape}; number the objects."
+        )
+    return values.reshape(len(values), -1)[:, 0].astype(np.int64)
 
 
 def _oriented(
@@ -356,9 +404,8 @@ def write_scan(
     is where the scan is in its data set, which some layouts keep; the default is its name.
     """
     cloud, arrays = reading.cloud, reading.arrays
-    superpoint = None
-    if superpoints is not None:
-        superpoint = [*superpoints.by_level().values()][level]
+    levels = [] if superpoints is None else [*superpoints.by_level().values()][level:]
+    superpoint = levels[0] if levels else None
     if layout == "pointcept" or superpoint is None:
         origin = cloud.origin.tolist()
         if "coord" in arrays:
@@ -377,6 +424,7 @@ def write_scan(
         plane=seg.labels.numpy(),
         given={key: np.asarray(values) for key, values in arrays.items()},
         objects=reading.objects,
+        coarser=levels[1:],
     )
     out = folder.parents[name.count("/")]
     return write_layout(layout, folder, out, scan, seg.planes, cloud.origin)

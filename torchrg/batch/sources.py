@@ -22,6 +22,7 @@ from torchrg.batch.scans import (
     Source,
     check_finite,
     check_stems,
+    find_objects,
     note_on_origin,
     segment_cloud,
     write_results,
@@ -71,6 +72,8 @@ class CloudSource(Source):
         partition: How superpoints are made.
         level: Which of their levels is written.
         orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
+        within: Array of objects that planes are kept within; see
+            :func:`torchrg.batch.scans.find_objects`. Default: planes go across.
     """
 
     settings: PipelineConfig
@@ -80,6 +83,7 @@ class CloudSource(Source):
     partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
     level: int = 0
     orient: CloudOrientation = "auto"
+    within: str | None = None
     bytes_per_point: ClassVar[int] = 104
     """Space of a point in the largest of the layouts."""
     kind: ClassVar[str]
@@ -99,8 +103,14 @@ class CloudSource(Source):
         notes = (*cloud.notes, *check_finite(cloud), *note_on_origin(self.layout, cloud))
         has_superpoints = self.superpoint or self.layout != "pointcept"
         partition = self.partition if has_superpoints else None
+        objects = find_objects({**cloud.fields, **reading.arrays}, self.within, cloud)
         seg, superpoints = segment_cloud(
-            cloud, self.settings, orient=self.orient, partition=partition, begin=begin
+            cloud,
+            self.settings,
+            orient=self.orient,
+            partition=partition,
+            within=objects,
+            begin=begin,
         )
         begin("write")
         what, place = (reading, seg, superpoints), _place_of(scan)
@@ -126,6 +136,8 @@ class CloudSource(Source):
         if (self.partition, self.level) != (SuperpointsConfig(), 0):
             partition = json.loads(json.dumps(dataclasses.asdict(self.partition)))
             changed |= {"partition": partition, "level": self.level}
+        if self.within is not None:
+            changed["within"] = self.within
         return changed
 
     def check_results(self, scans: Sequence[Scan], out: Path) -> None:
@@ -195,7 +207,8 @@ class FolderSource(CloudSource):
         if not scene.path.is_dir():
             return Scan(scene.name, (scene.path,), estimate_points(scene.path))
         # In place, nothing but the coordinates, for superpoints the colours, decides what is added.
-        decisive = ("coord", "color") if self.superpoint else ("coord",)
+        within = self.within or "coord"
+        decisive = ("coord", *["color"] * self.superpoint, within, f"{within}20")
         used = decisive if self.in_place else _COPIED
         files = tuple(file for file in scene.files if file.stem in used)
         return Scan(scene.name, files, estimate_points(scene.path / "coord.npy"))

@@ -38,6 +38,8 @@ RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
 """Flags that decide where and how fast a command runs, never what it finds."""
+NEEDED = "needed"
+"""Title of the arguments that a command does not run without."""
 _RUNNING = "how it runs, without effect on what is found"
 _EXAMPLES = "\n\nExamples:\n"
 _WIDEST = 100
@@ -220,11 +222,24 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str) -> str:
 
     The docstring of the class is the description; the lines of its section "Examples" come last.
     """
-    description, _, examples = (inspect.getdoc(kind) or "").partition(_EXAMPLES)
-    groups: dict[str, list[Flag]] = {title: [] for title in ("needed", "options", _RUNNING)}
+    groups = group_flags(flags)
+    needed = (flag.spelling for flag in groups.get(NEEDED, ()))
+    usage = " ".join(["usage:", prog, *needed, "[options]"])
+    blocks = [usage, *(_wrap(paragraph) for paragraph in describe(kind).split("\n\n"))]
+    for title, members in groups.items():
+        entries = [f"  {f.spelling}\n{_wrap(f.text, indent=6)}" for f in members]
+        blocks.append("\n".join([f"{title}:", *entries]))
+    if examples := example_lines(kind):
+        blocks.append("\n".join(["examples:", *(f"  {line}" for line in examples)]))
+    return "\n\n".join(blocks)
+
+
+def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
+    """Return the arguments of a command by title: needed, often wanted, the rest by part."""
+    groups: dict[str, list[Flag]] = {title: [] for title in (NEEDED, "options", _RUNNING)}
     for flag in flags:
         if flag.is_needed:
-            group = "needed"
+            group = NEEDED
         elif flag.name in RESOURCES:
             group = _RUNNING
         elif not flag.part or flag.name in OFTEN:
@@ -233,17 +248,14 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str) -> str:
             group = f"seldom needed: {flag.part}"
         groups.setdefault(group, []).append(flag)
     # What has no flag comes first, in the order in which it is written.
-    groups["needed"].sort(key=lambda flag: not flag.is_positional)
+    groups[NEEDED].sort(key=lambda flag: not flag.is_positional)
     groups[_RUNNING].sort(key=lambda flag: RESOURCES.index(flag.name))
-    usage = " ".join(["usage:", prog, *(f.spelling for f in groups["needed"]), "[options]"])
-    blocks = [usage, *(_wrap(paragraph) for paragraph in plain(description).split("\n\n"))]
-    for title, members in groups.items():
-        if members:
-            entries = [f"  {f.spelling}\n{_wrap(f.text, indent=6)}" for f in members]
-            blocks.append("\n".join([f"{title}:", *entries]))
-    if examples:
-        blocks.append("\n".join(["examples:", *(f"  {line}" for line in example_lines(kind))]))
-    return "\n\n".join(blocks)
+    return {title: members for title, members in groups.items() if members}
+
+
+def describe(kind: type) -> str:
+    """Return what the docstring of a command says, but for its examples."""
+    return plain((inspect.getdoc(kind) or "").partition(_EXAMPLES)[0])
 
 
 def example_lines(kind: type) -> list[str]:

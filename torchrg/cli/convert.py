@@ -42,23 +42,13 @@ from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FORMATS
 from torchrg.io.files import check_place, free_space, make_folder
+from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
-from torchrg.result import read_result
+from torchrg.result import PLANES_FILE, RECORD, read_result
 
-FrameLayoutName = Literal[
-    "auto",
-    "scannetpp",
-    "arkitscenes",
-    "3rscan",
-    "replica",
-    "tum",
-    "icl-nuim",
-    "scannet",
-    "7-scenes",
-    "nerfstudio",
-    "images",
-]
+_Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
+_Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]
 
 
 @dataclass(frozen=True)
@@ -80,6 +70,9 @@ class Arguments:
     and OUT under the same paths. Default: a cluster that is started for the command."""
     limit_memory: float | None = None
     """Gigabytes of memory that all scans at a time may take. Default: 80 % of what is free."""
+    table: str | None = None
+    """Name of a file with the table of planes in the folder of each scan, as planes.csv: as that of
+    torchrg segment --table. planes.json is written there in any case."""
     only: str | None = None
     """Pattern for the names of the scans to convert, as in a shell: "Area_5/*"."""
     force: bool = False
@@ -109,13 +102,15 @@ class CloudArguments(Arguments):
     """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
     in each level: --superpoint 1000,300."""
     orient: flags.OrientFlag = "auto"
+    within: flags.WithinFlag = None
     level: int = 0
-    """Level of the superpoints that is written; 0 is the finest."""
+    """Level of the superpoints that is written, of layout nag the first one; 0 is the finest."""
     layout: flags.Layout = "pointcept"
     """Files that are written: a folder for each scan (pointcept), bare arrays (npy), or superpoints
     with points, classes and objects where other programs look for them. These are OneFormer3D,
     UniDet3D and ESAM (mmdet3d), SPFormer (spformer), ISBNet, Open3DIS and SphericalMask (isbnet),
-    Mask3D (mask3d), and SAI3D and the preprocessing of others (scannet). The last writes segs.json
+    Mask3D (mask3d), Superpoint Transformer (nag, all levels in one .h5; pip install
+    'torchrg[nag]'), and SAI3D and the preprocessing of others (scannet). The last writes segs.json
     and, of annotated scans, aggregation.json, to replace those of ScanNet; superpoints end at
     objects there. S3DIS has neither scannet nor spformer, ScanNet++ no other with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
@@ -126,7 +121,7 @@ class CloudArguments(Arguments):
     @property
     def output(self) -> dict[str, Any]:
         """What is written of each cloud, as sources take it."""
-        names = ("superpoint", "layout", "partition", "level", "orient")
+        names = ("superpoint", "layout", "partition", "level", "orient", "within")
         return {name: getattr(self, name) for name in names}
 
 
@@ -210,10 +205,9 @@ class RGBDArguments(Arguments):
         torchrg convert rgbd capture results
     """
 
-    layout: FrameLayoutName = "auto"
-    """Data set whose folders ROOT has, auto for the one that its files show; nerfstudio is any
-    transforms.json, as Polycam and COLMAP are imported; images are all depth images below ROOT, of
-    one camera."""
+    layout: Literal["auto", _Benchmark, _Capture, "images"] = "auto"
+    """Data set whose folders ROOT has, auto for what its files show; nerfstudio is transforms.json,
+    as of Polycam and COLMAP; images are all depth images below ROOT, of one camera."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
@@ -268,7 +262,7 @@ def run(argv: list[str]) -> int:
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with warnings_as_lines():
-        source = arguments.source(root, out)
+        source = dataclasses.replace(arguments.source(root, out), table=arguments.table)
         jobs = list_jobs(source, out, only=arguments.only)
     if arguments.dry_run:
         plan = _look_at(jobs, arguments)
@@ -292,6 +286,12 @@ def _check(arguments: Arguments) -> None:
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
     flags.bytes_of_limit(arguments.limit_memory)
+    table = arguments.table or PLANES_FILE
+    if Path(table).name != table or Path(table).suffix not in TABLE_SUFFIXES or table == RECORD:
+        raise ConfigError(
+            "expected --table to be the name of a .csv or .json file in the folder of each scan, "
+            f"got {table}; use planes.csv."
+        )
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address together with --engine ray.")
     if _pages_of(arguments) is not None:

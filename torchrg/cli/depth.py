@@ -14,7 +14,7 @@ from torchrg.batch.sources import orient_image
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn, warnings_as_lines
-from torchrg.cli.loop import check_apart, note_input, output_paths, picture_paths, run_each
+from torchrg.cli.loop import check_apart, note_input, output_paths, paths_beside, run_each
 from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
@@ -28,7 +28,9 @@ from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place, make_folder
+from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import color_planes, write_png
+from torchrg.result import write_table
 from torchrg.structures import Cloud
 
 _COLORED_FROM = 200
@@ -45,8 +47,8 @@ class Arguments:
     """Label the planes of depth images, or of organised clouds taken as such.
 
     Labels are written as a 16-bit PNG (0 is no plane, the first plane is 1) with a coloured picture
-    beside it, or as a cloud in camera coordinates. For folders and sequences of depth images there
-    is torchrg convert rgbd.
+    and a table of the planes, .json, beside it, or as a cloud, all in camera coordinates. For
+    folders and sequences of depth images there is torchrg convert rgbd.
 
     Examples:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
@@ -65,6 +67,7 @@ class Arguments:
     picture: Path | None = None
     """Place of the coloured picture, a .png file; for several inputs a directory. Default: beside
     labels that are written as .png, with _planes in its name."""
+    table: flags.TableFlag = None
     depth: DepthConfig = field(default_factory=DepthConfig)
     """How planes are found."""
     orient: flags.ImageOrientFlag = "auto"
@@ -85,14 +88,17 @@ def run(argv: list[str]) -> int:
     if any(path.is_dir() for path in arguments.inputs) and not arguments.out.suffix:
         make_folder(arguments.out)
     targets = output_paths(inputs, arguments.out, suffix=".png")
-    pictures = picture_paths(targets, arguments.picture, suffixes=(".png",))
+    pictures = paths_beside(targets, arguments.picture, suffixes=(".png",))
     if arguments.picture is None:
         pictures = [t.with_name(f"{t.stem}_planes.png") if _is_png(t) else None for t in targets]
-    drawn = [picture for picture in pictures if picture is not None]
-    check_apart([*targets, *drawn], inputs)
-    for picture in drawn:
-        check_place(picture)
-    return run_each(_label, arguments, inputs, given, targets, pictures)
+    tables = paths_beside(targets, arguments.table, suffixes=TABLE_SUFFIXES)
+    if arguments.table is None:
+        tables = [target.with_suffix(".json") if _is_png(target) else None for target in targets]
+    beside = [path for path in (*pictures, *tables) if path is not None]
+    check_apart([*targets, *beside], [*inputs, Path(arguments.intrinsics or "")])
+    for path in beside:
+        check_place(path)
+    return run_each(_label, arguments, inputs, given, targets, pictures, tables)
 
 
 def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGBDFrame | None:
@@ -115,8 +121,12 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
     if path.suffix.lower() not in DEPTH_SUFFIXES:
         return None
     if camera is None or arguments.depth_scale is None:
-        flag = "--intrinsics fx,fy,cx,cy" if camera is None else "--depth-scale"
-        raise ConfigError(f"{path}: expected {flag}, which depth images do not hold; pass it.")
+        flag, hint = "--depth-scale", "1000 for millimetres, 1 for metres"
+        if camera is None:
+            flag, hint = "--intrinsics fx,fy,cx,cy", "or the file of the camera"
+        raise ConfigError(
+            f"{path}: expected {flag}, which depth images do not hold; pass it, {hint}."
+        )
     return RGBDFrame(path, camera.matrix(image_size(path)), arguments.depth_scale)
 
 
@@ -126,6 +136,7 @@ def _label(
     given: RGBDFrame | Pinhole | None,
     target: Path,
     picture: Path | None,
+    table: Path | None,
 ) -> None:
     """Label an image, or a cloud with its camera, write the result, and print a line about it."""
     begin = time.perf_counter()
@@ -165,6 +176,8 @@ def _label(
         images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}
         rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
         write_cloud(target, cloud, rows, provenance=provenance)
+    if table is not None:
+        write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
     share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
     say(

@@ -51,12 +51,12 @@ def warn(message: str) -> None:
 
 @contextlib.contextmanager
 def warnings_as_lines() -> Iterator[None]:
-    """Print warnings as single lines."""
+    """Print warnings as single lines, each once."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         yield
-    for warning in caught:
-        warn(" ".join(str(warning.message).split()))
+    for line in dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught):
+        warn(line)
 
 
 def end_at_once(*_: object) -> NoReturn:

@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -72,17 +73,14 @@ IntrinsicsFlag = Annotated[
     str | None,
     Argument(
         metavar="CAMERA",
-        text="Camera, as fx,fy,cx,cy in pixels, where the middle of the first pixel is 0,0, or a "
-        "file: Open3D's or nerfstudio's .json, camera_info of ROS as .yaml. Those of images of "
-        "another size are scaled. Default: that of the folder's layout.",
+        text="Camera, as fx,fy,cx,cy in pixels, where the middle of the first pixel is 0,0, or its "
+        "file: Open3D's or nerfstudio's .json, ROS's .yaml. One of larger images is scaled. "
+        "Default: that of the folder.",
     ),
 ]
 DepthScaleFlag = Annotated[
     float | None,
-    Argument(
-        text="Stored value of one metre: 1000 for depth in millimetres, 5000 for TUM, 1 for "
-        "metres. Default: that of the folder's layout.",
-    ),
+    Argument(text="Stored value of one metre: 1000 for millimetres. Default: that of the folder."),
 ]
 ImageOrientFlag = Annotated[
     _Side,
@@ -92,7 +90,26 @@ ImageOrientFlag = Annotated[
         "the camera is known.",
     ),
 ]
-Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "npy"]
+TableFlag = Annotated[
+    Path | None,
+    Argument(
+        metavar="PLANES.csv",
+        text="Table of the planes to write too, .csv or .json; for several inputs a directory. CSV "
+        "has a line for each plane, in the coordinates of the input: role, normal, offset, "
+        "centroid, area, dip, root mean square distance, outline as WKT POLYGON Z. Up is z. Of "
+        "clouds it asks for roles and outlines (pip install 'torchrg[outline]').",
+    ),
+]
+WithinFlag = Annotated[
+    str | None,
+    Argument(
+        metavar="FIELD",
+        text="Field with the object of each point, as instance or segment: no plane has points of "
+        "two of them, and the table of planes names the object of each. Points that have none, "
+        "-1, are an object too. Default: planes go across.",
+    ),
+]
+Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "nag", "npy"]
 
 
 @dataclass(frozen=True)
@@ -116,7 +133,8 @@ class PlaneSettings:
     def asked_for(cls, argv: list[str], up: Up | None = None) -> "PlaneSettings":
         """Return the settings of the preset or the file in the arguments: defaults of the flags.
 
-        ``up`` is the axis that points up in a data set, where they name neither.
+        ``up`` is the axis that points up in a data set, where they name neither. A table of planes
+        has roles and outlines as far as they can be known.
 
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
@@ -130,9 +148,11 @@ class PlaneSettings:
                 values[name] = value if equals else following
         named = values["--config"] or values["--preset"]
         resolved = load_config(named or DEFAULT_PRESET)
-        if not named:
-            planes = dataclasses.replace(resolved.planes, up=up)
-            resolved = dataclasses.replace(resolved, planes=planes)
+        planes = resolved.planes if named else dataclasses.replace(resolved.planes, up=up)
+        if any(argument.partition("=")[0] == "--table" for argument in argv):
+            outline = planes.outline or find_spec("shapely") is not None
+            planes = dataclasses.replace(planes, up=planes.up or "z", outline=outline)
+        resolved = dataclasses.replace(resolved, planes=planes)
         try:
             angle = float(values["--angle-deg"])
         except ValueError:  # It is not given, or a word that the parser refuses.

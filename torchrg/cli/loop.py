@@ -80,29 +80,32 @@ def _file_number(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def picture_paths(
-    results: Sequence[Path], picture: Path | None, *, suffixes: Sequence[str] = DRAWINGS
+def paths_beside(
+    results: Sequence[Path], place: Path | None, *, suffixes: Sequence[str] = DRAWINGS
 ) -> Sequence[Path | None]:
-    """Return where the picture of each result goes, by the rules of :func:`output_paths`."""
-    if picture is None:
+    """Return where the picture or table of each result goes, as :func:`output_paths` does.
+
+    In a directory they end in the first of the suffixes.
+    """
+    if place is None:
         return [None] * len(results)
-    if not picture.is_dir():
-        if len(results) == 1 and picture.suffix:
-            check_drawing(picture, suffixes=suffixes)
-            return [picture]
-        if picture.suffix.lower() in suffixes:
+    if not place.is_dir():
+        if len(results) == 1 and place.suffix:
+            check_beside(place, suffixes=suffixes)
+            return [place]
+        if place.suffix.lower() in suffixes:
             raise FormatError(
-                f"{picture}: expected a directory for {len(results)} pictures, got a file name."
+                f"{place}: expected a directory for {len(results)} files, got a file name."
             )
-    make_folder(picture)
-    pictures = [picture / f"{path.stem}.png" for path in results]
-    for path in pictures:
+    make_folder(place)
+    paths = [place / f"{path.stem}{suffixes[0]}" for path in results]
+    for path in paths:
         check_place(path)
-    return pictures
+    return paths
 
 
-def check_drawing(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
-    """Raise before long work if a picture or page has no place, or cannot be made."""
+def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
+    """Raise before long work if a picture, page or table has no place, or cannot be made."""
     if path.suffix.lower() not in suffixes:
         raise FormatError(f"{path}: expected a file that ends in {' or '.join(suffixes)}.")
     check_place(path)

@@ -19,6 +19,7 @@ from torchrg.batch.scans import (
     Reading,
     check_finite,
     check_stems,
+    find_objects,
     mark_of,
     note_on_origin,
     segment_cloud,
@@ -35,11 +36,12 @@ from torchrg.cli.loop import (
     name_of,
     note_input,
     output_paths,
-    picture_paths,
+    paths_beside,
     run_each,
     stage_bar,
 )
 from torchrg.config import SuperpointsConfig
+from torchrg.datasets.layouts import check_layout
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
@@ -52,9 +54,10 @@ from torchrg.io import (
     write_cloud,
 )
 from torchrg.io.files import check_space
+from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes, write_index
-from torchrg.result import Result
+from torchrg.result import Result, write_table
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 _DATASET = "ScanNet"
@@ -72,7 +75,7 @@ class Arguments:
 
     Examples:
         torchrg segment scan.pcd --out planes.npz
-        torchrg segment scan.laz --out planes.laz --planes.up z --picture planes.png
+        torchrg segment scan.laz --out planes.laz --table planes.csv --picture planes.png
         torchrg segment *.ply --out results --picture pictures --pages
         torchrg segment part1.e57 part2.e57 --merge --out hall.npz --voxel 0.02
         torchrg segment scan.ply --out parts.npz --superpoints 1000,300
@@ -83,6 +86,7 @@ class Arguments:
     picture: Path | None = None
     """Picture (.png) or page for the browser (.html) of the planes, to write too; for several
     inputs a directory of pictures."""
+    table: flags.TableFlag = None
     pages: bool = False
     """Write a page for the browser beside each picture, and index.html, in which each picture links
     to its page; --picture is a directory then (pip install 'torchrg[view]')."""
@@ -103,6 +107,7 @@ class Arguments:
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
     orient: flags.OrientFlag = "auto"
+    within: flags.WithinFlag = None
     merge: bool = False
     """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
     limit_memory: float | None = None
@@ -125,6 +130,7 @@ def run(argv: list[str]) -> int:
             "segment: expected --superpoints with --partition flags, got none; add it."
         )
     flags.check_level(arguments.level, arguments.partition)
+    check_layout(arguments.layout or "pointcept", _DATASET, "clouds")
     if arguments.level and arguments.layout is None:
         raise ConfigError("expected --layout with --level, as other files hold all levels.")
     flags.use_threads(arguments.threads)
@@ -136,12 +142,13 @@ def run(argv: list[str]) -> int:
     firsts = tuple(sources[0] for sources in clouds if sources)
     suffix = ".npz" if arguments.layout is None else ""
     outputs = output_paths(firsts, arguments.out, suffix=suffix)
-    check_apart(outputs, arguments.inputs)
-    pictures = picture_paths(outputs, arguments.picture)
+    pictures = paths_beside(outputs, arguments.picture)
+    tables = paths_beside(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
+    check_apart([*outputs, *filter(None, tables)], arguments.inputs)
     if arguments.pages:
         _check_pages(arguments, pictures)
     with _sharing(arguments, outputs):
-        code = run_each(_segment, arguments, clouds, outputs, pictures)
+        code = run_each(_segment, arguments, clouds, outputs, tables, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
@@ -189,7 +196,11 @@ def _refuse_images(argv: list[str]) -> None:
 
 
 def _segment(
-    arguments: Arguments, sources: tuple[Path, ...], target: Path, picture: Path | None
+    arguments: Arguments,
+    sources: tuple[Path, ...],
+    target: Path,
+    table: Path | None,
+    picture: Path | None,
 ) -> None:
     """Segment a cloud with a progress bar on a terminal, and one line about the result."""
     begin, source = time.perf_counter(), name_of(sources)
@@ -199,6 +210,7 @@ def _segment(
         [read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources]
     )
     where = _arrays_of(arguments, source, target, len(cloud), limit)
+    objects = find_objects(cloud.fields, arguments.within, cloud)
     _check_points(arguments, source, cloud, target)
     stages = (*STAGES, *["superpoints"] * arguments.superpoints, "orientation")
     with stage_bar(sources[0].name, stages) as advance, where:
@@ -208,6 +220,7 @@ def _segment(
             orient=arguments.orient,
             partition=arguments.partition if arguments.superpoints else None,
             voxel=arguments.voxel,
+            within=objects,
             begin=advance,
         )
     if arguments.layout is None:
@@ -215,6 +228,8 @@ def _segment(
         write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)
     else:
         _write_layout(arguments, target, cloud, seg, superpoints)
+    if table is not None:
+        write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))
     if picture is not None:
         _draw(arguments, picture, Result.of(cloud, seg, superpoints))
     if superpoints is not None:
@@ -278,7 +293,7 @@ def _describe(arguments: Arguments, sources: tuple[Path, ...], seg: Segmentation
     """Return the provenance of a cloud of one file or of several."""
     settings = arguments.settings.resolved
     provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
-    options = {"columns": arguments.columns, "voxel": arguments.voxel}
+    options = {name: getattr(arguments, name) for name in ("columns", "voxel", "within")}
     provenance |= {name: value for name, value in options.items() if value is not None}
     if measured := settings.measured(seg.sampling):
         provenance["measured"] = measured

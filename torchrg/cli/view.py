@@ -12,7 +12,7 @@ from torch.nn import functional
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
-from torchrg.cli.loop import check_drawing, is_page
+from torchrg.cli.loop import check_beside, is_page
 from torchrg.errors import ConfigError
 from torchrg.io.fields import WIDEN
 from torchrg.render import (
@@ -83,7 +83,7 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, draw the cloud and write the picture."""
     arguments = parse(Arguments, argv, prog="torchrg view")
-    check_drawing(arguments.out)
+    check_beside(arguments.out)
     files = (arguments.file, arguments.beside, arguments.truth)
     check_columns(arguments.columns, [path for path in files if path is not None])
     write = _write_page if is_page(arguments.out) else _write_picture

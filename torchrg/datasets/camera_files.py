@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,23 +16,31 @@ from torchrg.errors import FormatError
 from torchrg.io.files import DAMAGES, read_text, refusing
 from torchrg.structures import FARTHEST
 
+Record = Mapping[str, Any]
 CAMERA_SUFFIXES = (".json", ".yaml", ".yml")
 """Suffixes of files that hold a camera."""
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Names of the distortion of a lens in nerfstudio's files."""
-_SIDES = (
-    *(("w", "h"), ("width", "height"), ("image_width", "image_height")),
-    ("m_depthWidth", "m_depthHeight"),
+_NUMBERS = {("fl_x", "fl_y", "cx", "cy"): 0.5, ("fx", "fy", "cx", "cy"): 0.0}
+"""Names of focal lengths and optical axis, and where they have the middle of the first pixel."""
+_MATRICES = (
+    *("projection_matrix", "P", "p", "camera_matrix", "K", "k", "intrinsic_matrix", "intrinsic"),
+    "m_calibrationDepthIntrinsic",
 )
+"""Names of camera matrices. Of ROS that of rectified images comes first, which depth images are."""
+_SIDES = {
+    "w": "h",
+    "width": "height",
+    "image_width": "image_height",
+    "m_depthWidth": "m_depthHeight",
+}
 """Names of the width and height of images."""
-Record = Mapping[str, Any]
+_SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
+"""Shapes of cameras, projections and poses by the count of their numbers."""
 
 
 def read_camera(path: Path) -> Pinhole:
     """Read a camera: Open3D's or nerfstudio's JSON, Replica's, or ``camera_info`` of ROS in YAML.
-
-    The middle of the first pixel is 0 in all of them but nerfstudio's, where it is at 0.5. Of ROS
-    the projection matrix is taken, which is that of rectified images, as depth images are.
 
     Raises:
         FormatError: If there is no such file, or no camera in it.
@@ -49,38 +57,25 @@ def read_camera(path: Path) -> Pinhole:
         Pinhole(fx=9.0, fy=9.0, cx=3.5, cy=2.5, size=(8, 6))
     """
     record = read_record(path, "intrinsic", "camera")
-    if "fl_x" in record:
-        warn_of_lens(path, [record])
-        return camera_of_transforms(path, record)
-    if "fx" in record:
-        return camera_of_numbers(path, record)
-    for key in ("projection_matrix", "P", "p", "camera_matrix", "K", "k", "intrinsic_matrix"):
-        if key in record:
-            return camera_of_matrix(path, record, key)
-    got = f"none in {', '.join(map(str, record))[:60]}; pass fx,fy,cx,cy"
-    if "frames" in record:
-        got = "one for each frame, or none; give its folder to torchrg convert rgbd"
-    raise FormatError(f"{path}: expected a camera of Open3D, nerfstudio or ROS, got {got}.")
+    if "frames" in record and "fl_x" not in record:
+        raise FormatError(
+            f"{path}: expected one camera, got one for each frame, or none; give the folder of the "
+            "file to torchrg convert rgbd."
+        )
+    return camera_of(path, record)
 
 
 def read_record(path: Path, *parts: str) -> dict[str, Any]:
-    """Read the names and values of a JSON file, or of the first document of a YAML file.
-
-    Those of a part are taken where there is one of such a name.
-    """
+    """Read the names and values of JSON, or of the first document of YAML, or of a part in it."""
     import yaml
 
-    text = read_text(path)
+    text, is_json = read_text(path), path.suffix.lower() == ".json"
     with refusing(f"{path}: expected JSON or YAML, got: ", yaml.YAMLError, *DAMAGES):
-        if path.suffix.lower() == ".json":
-            content = json.loads(text)
-        else:
-            content = next(iter(yaml.safe_load_all(text)), None)
+        content = json.loads(text) if is_json else next(iter(yaml.safe_load_all(text)), None)
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected names with values, got {type(content).__name__}.")
-    record: dict[str, Any] = content
-    for part in parts:
-        record = record[part] if isinstance(record.get(part), dict) else record
+    inside = (content[part] for part in parts if isinstance(content.get(part), dict))
+    record: dict[str, Any] = next(inside, content)
     return record
 
 
@@ -94,68 +89,55 @@ def read_info(path: Path) -> dict[str, Any]:
     return record
 
 
-def camera_of_numbers(
-    path: Path, record: Record, names: tuple[str, str, str, str] = ("fx", "fy", "cx", "cy")
-) -> Pinhole:
-    """Return the camera whose focal lengths and axis a record has under some names."""
-    fx, fy, cx, cy = (number_of(path, record, name) for name in names)
-    if 0 in (fx, fy):
-        raise FormatError(f"{path}: expected {names[0]} and {names[1]} other than 0.")
-    return Pinhole(fx, fy, cx, cy, _size_of(path, record))
-
-
-def camera_of_transforms(path: Path, record: Record) -> Pinhole:
-    """Return the camera in a record of nerfstudio, whose first pixel has its middle at 0.5."""
-    model = str(record.get("camera_model", "OPENCV"))
+def camera_of(path: Path, record: Record) -> Pinhole:
+    """Return the camera that a record of a file has under any of the names that are known."""
+    size = _size_of(path, record)
+    model = str(record.get("camera_model", ""))
     if "FISHEYE" in model or "EQUIRECT" in model:
         raise FormatError(
             f"{path}: expected images of a pinhole camera, got {model}; undistort them, as the "
             "image_undistorter of COLMAP does."
         )
-    camera = camera_of_numbers(path, record, ("fl_x", "fl_y", "cx", "cy"))
-    return camera._replace(cx=camera.cx - 0.5, cy=camera.cy - 0.5)
-
-
-def warn_of_lens(path: Path, records: Iterable[Record]) -> None:
-    """Warn if a record of nerfstudio has a lens that bends lines, which stay bent here."""
-    given = {name: record[name] for record in records for name in _LENS if record.get(name)}
-    if given:
+    if bent := [name for name in _LENS if record.get(name) and "fl_x" in record]:
         warnings.warn(
-            f"{path}: the distortion of the lens ({', '.join(given)}) is left as it is; undistort "
+            f"{path}: the distortion of the lens ({', '.join(bent)}) is left as it is; undistort "
             "images whose planes bend at the edges.",
             stacklevel=2,
         )
+    for names, middle in _NUMBERS.items():
+        if names[0] in record:
+            fx, fy, cx, cy = (number_of(path, record, name) for name in names)
+            if 0 in (fx, fy):
+                raise FormatError(f"{path}: expected {names[0]} and {names[1]} other than 0.")
+            return Pinhole(fx, fy, cx - middle, cy - middle, size)
+    for name in _MATRICES:
+        if name in record:
+            matrix = matrix_of(path, record, name)[:3, :3]
+            # Open3D's numbers run along columns.
+            matrix = matrix.T if matrix[2, :2].any() else matrix
+            check_camera(f"{path}", matrix)
+            (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
+            return Pinhole(fx, fy, cx, cy, size)
+    raise FormatError(
+        f"{path}: expected a camera, as fl_x, fl_y, cx, cy or a matrix, got none in "
+        f"{', '.join(map(str, record))[:60]}; add it, or pass --intrinsics fx,fy,cx,cy."
+    )
 
 
-def camera_of_matrix(
-    path: Path, record: Record, key: str, size: tuple[int, int] | None = None
-) -> Pinhole:
-    """Return the camera of a matrix in a record, whose values run along rows or columns."""
-    matrix = matrix_of(path, record, key, (3, 3), (3, 4), (4, 4))[:3, :3]
-    matrix = matrix if not matrix[2, :2].any() else matrix.T
-    check_camera(f"{path}: {key}", matrix)
-    (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
-    return Pinhole(fx, fy, cx, cy, size or _size_of(path, record))
-
-
-def matrix_of(path: Path, record: Record, key: str, *shapes: tuple[int, int]) -> Tensor:
-    """Return a matrix of a record, nested or flat, float64, in that of the shapes that it has."""
+def matrix_of(path: Path, record: Record, key: str, columns: int = 3) -> Tensor:
+    """Return a matrix of 3 or 4 rows and at least so many columns, nested or flat in a record."""
     given = record.get(key)
-    given = given.get("data") if isinstance(given, dict) else given
-    try:
-        values = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        values = np.empty(0)
-    for shape in shapes:
-        if values.shape in (shape, (shape[0] * shape[1],)):
-            return torch.from_numpy(values.reshape(shape))
-    wanted = " or ".join(f"{rows} x {columns}" for rows, columns in shapes)
-    raise FormatError(f"{path}: expected {key} of {wanted} numbers, got {str(given)[:60]}.")
+    with suppress(TypeError, ValueError, OverflowError):
+        data = given.get("data") if isinstance(given, dict) else given
+        values = torch.from_numpy(np.asarray(data, dtype=np.float64).ravel())
+        if len(values) in _SHAPES and _SHAPES[len(values)][1] >= columns:
+            return values.view(_SHAPES[len(values)])
+    raise FormatError(f"{path}: expected {key} to be a matrix, got {str(given)[:60]}; repair it.")
 
 
-def number_of(path: Path, record: Record, key: str, default: float | None = None) -> float:
+def number_of(path: Path, record: Record, key: str) -> float:
     """Return a number of a record, finite and not so large that it is none in float64."""
-    value = record.get(key, default)
+    value = record.get(key)
     if not isinstance(value, (int, float)) or not abs(value) <= FARTHEST:
         raise FormatError(f"{path}: expected a number for {key}, got {value!r:.60}; add it.")
     return float(value)
@@ -163,7 +145,7 @@ def number_of(path: Path, record: Record, key: str, default: float | None = None
 
 def _size_of(path: Path, record: Record) -> tuple[int, int] | None:
     """Return width and height of a record's images, None where it names none."""
-    for names in _SIDES:
+    for names in _SIDES.items():
         if names[0] in record:
             width, height = (int(number_of(path, record, name)) for name in names)
             if min(width, height) < 1:

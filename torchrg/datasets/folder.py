@@ -44,7 +44,7 @@ class SceneFiles(NamedTuple):
 class SceneDataset(Dataset[Sample]):
     """A map-style data set whose items are known before they are read.
 
-    A data set sets :attr:`scenes` and :attr:`transform`, and says how to read a sample.
+    A data set sets ``scenes`` and ``transform``, and says how to read a sample.
     """
 
     scenes: list[SceneFiles]

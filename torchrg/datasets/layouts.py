@@ -21,11 +21,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchrg._optional import require
+from torchrg.datasets.nag import encode_nag, make_nag
 from torchrg.datasets.pointcept import write_files
+from torchrg.datasets.s3dis import CLASS_ORDERS
 from torchrg.datasets.scannet import NYU_IDS
 from torchrg.errors import ConfigError, FormatError
-from torchrg.result import describe_planes
-from torchrg.structures import Planes
+from torchrg.plane_table import describe_planes
+from torchrg.structures import UNLABELED, Planes, Superpoints
 
 Files = dict[str, NDArray[Any] | bytes]
 """Contents by paths below the output directory: arrays as ``.npy``, or bytes."""
@@ -66,6 +69,7 @@ class LayoutScan:
             class of each point, -1 for none, ``category``, its number in NYU40, 0 for none, and
             ``instance``, its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
         objects: What :func:`torchrg.datasets.scannet.read_objects` returns; None if unknown.
+        coarser: Coarser levels of superpoints, each shape ``(N,)``.
     """
 
     name: str
@@ -78,6 +82,7 @@ class LayoutScan:
     plane: NDArray[np.integer]
     given: Mapping[str, NDArray[Any]]
     objects: Sequence[tuple[Mapping[str, Any], NDArray[np.integer]]] | None = None
+    coarser: Sequence[NDArray[np.integer]] = ()
 
     @property
     def split(self) -> str:
@@ -132,13 +137,15 @@ def stem_of(layout: str, name: str, folder: str) -> str:
 
 
 def check_layout(layout: str, dataset: str, what: str) -> None:
-    """Raise ConfigError if a layout has no form for a data set, which messages call ``what``."""
+    """Raise if a layout has no form for a data set, called ``what``, or no package to write it."""
     known = [name for name, forms in LAYOUTS.items() if dataset in forms]
     if layout not in ("pointcept", *known):
         raise ConfigError(
             f"expected --layout to be one of pointcept, {', '.join(known)} for {what}, got "
             f"{layout}, whose programs do not know its classes; choose another."
         )
+    if layout == "nag":
+        require("h5py", extra="nag", purpose="write layout nag")
 
 
 def write_layout(
@@ -418,12 +425,34 @@ def _npy(scan: LayoutScan) -> Files:
     }
 
 
+def _nag(scan: LayoutScan) -> Files:
+    """Superpoint Transformer: the points and all levels above them, with counts of its classes."""
+    values: dict[str, Any] = {"rgb": scan.color, "normal": scan.normal}
+    numbers = _NAG_CLASSES.get(scan.dataset)
+    if scan.truth is not None and numbers is not None:
+        # The last column is of points without a class.
+        one_hot = np.eye(len(numbers), dtype=np.int64)[numbers]
+        values["y"] = one_hot[np.where(scan.truth[0] < 0, len(numbers) - 1, scan.truth[0])]
+    fine, *coarse = (torch.from_numpy(part).long() for part in (scan.superpoint, *scan.coarser))
+    parts = Superpoints(fine, torch.full((int(fine.max()) + 1,), UNLABELED), tuple(coarse))
+    levels = make_nag(scan.coord, parts, data=dict, **values)
+    return {f"{scan.listed or 'nag'}/{scan.name}.h5": encode_nag(levels)}
+
+
+_NAG_CLASSES = {
+    "ScanNet": [*range(len(NYU_IDS) + 1)],
+    "S3DIS": [*map(CLASS_ORDERS["spt"].index, CLASS_ORDERS["pointcept"]), 13],
+}
+"""Numbers of classes in Superpoint Transformer, and of none, by those of the data set."""
+
+
 LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
     "scannet": dict.fromkeys(("ScanNet", "ScanNet++", ""), _scannet),
     "mmdet3d": {"ScanNet": _mmdet3d, "S3DIS": _mmdet3d_s3dis},
     "spformer": {"ScanNet": _spformer},
     "isbnet": {"ScanNet": _isbnet, "S3DIS": _isbnet_s3dis},
     "mask3d": {"ScanNet": _mask3d, "S3DIS": _mask3d_s3dis},
+    "nag": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _nag),
     "npy": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _npy),
 }
 """What returns the files of a scan, by the name of the layout and the data set; that without a name

@@ -1,7 +1,8 @@
 """Nested levels of superpoints as Superpoint Transformer takes them: a NAG's list of ``Data``."""
 
 import importlib
-from collections.abc import Callable
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
+from torchrg._optional import require
 from torchrg.errors import MissingDependencyError, ShapeError
 from torchrg.structures import Array, Superpoints
 
@@ -50,7 +52,7 @@ def make_nag(
     Returns:
         Of level 0 ``pos``, the values, and ``super_index``, ``(N,)``, int64; of each level above,
         ``pos``, the mean of its points, ``node_size``, their number, ``sub``, and, but for the
-        last, ``super_index``.
+        last, ``super_index``. Where ``y`` counts classes, ``(N, C)``, so it does above.
 
     Raises:
         ShapeError: If some points have no superpoint, as those that are not finite.
@@ -100,4 +102,41 @@ def make_nag(
         mean = sums.index_add(0, labels, pos.double()) / sizes[:, None]
         sub = cluster(torch.nn.functional.pad(pointers, (1, 0)), order)
         entries, below = {"pos": mean.to(pos.dtype), "node_size": sizes, "sub": sub}, labels
+        counts = values.get("y")
+        if counts is not None and counts.ndim == 2:
+            counts = as_tensor("make_nag", "y", counts)
+            entries["y"] = counts.new_zeros(count, counts.shape[1]).index_add(0, labels, counts)
     return [*levels, data(**entries)]
+
+
+def encode_nag(levels: Iterable[Mapping[str, Any]]) -> bytes:
+    """Return levels of :func:`make_nag`, as dicts, as the HDF5 file that ``NAG.load`` reads.
+
+    Raises:
+        MissingDependencyError: If h5py is not installed.
+    """
+    h5py = require("h5py", extra="nag", purpose="write files of Superpoint Transformer")
+    with io.BytesIO() as stream:
+        with h5py.File(stream, "w") as file:
+            file.attrs["start_i_level"] = 0
+            for number, level in enumerate(levels):
+                for path, values in _entries(level):
+                    file[f"level_{number}/{path}"] = np.asarray(values)
+        return stream.getvalue()
+
+
+def _entries(level: Mapping[str, Any]) -> Iterator[tuple[str, Tensor | Array]]:
+    """Yield the arrays of a level by their paths; clusters and counts are compressed rows."""
+    for name, values in level.items():
+        if isinstance(values, Cluster):
+            yield f"_cluster_/{name}/pointers", values.pointers
+            yield f"_cluster_/{name}/value_0", values.points
+            yield f"_cluster_/{name}/is_index_value", np.ones(1, np.uint8)
+        elif name == "y":
+            rows, columns = np.nonzero(np.asarray(values))
+            yield "_csr_/y/pointers", np.searchsorted(rows, np.arange(len(values) + 1))
+            yield "_csr_/y/columns", columns
+            yield "_csr_/y/values", values[rows, columns]
+            yield "_csr_/y/shape", np.array(values.shape)
+        else:
+            yield name, values

@@ -196,32 +196,18 @@ def _find(
         if camera is None and layout.camera is not None:
             camera, files = layout.camera(folder)
         for frame in layout.frames(folder):
-            given = (depth_scale, frame.depth_scale, layout.depth_scale)
-            scale = next((value for value in given if value is not None), None)
-            if scale is None:
+            own = frame.camera if camera is None else camera
+            scales = (depth_scale, frame.depth_scale, layout.depth_scale)
+            scale = next((value for value in scales if value is not None), None)
+            if own is None or scale is None:
+                missing = "intrinsics" if own is None else "depth_scale"
                 raise ConfigError(
-                    f"{frame.depth}: expected depth_scale, which depth images do not hold; pass "
-                    "it: 1 for metres, 1000 for millimetres."
+                    f"{frame.depth}: expected {missing}, which depth images do not hold; pass it"
+                    f"{': 1 for metres, 1000 for millimetres' if own is not None else ''}."
                 )
+            matrix = own.matrix(image_size(frame.depth)) if isinstance(own, Pinhole) else own
+            name, sources = prefix + frame.name, files + frame.sources
+            no_depth = layout.no_depth
             yield RGBDFrame(
-                frame.depth,
-                _matrix_for(frame.depth, frame.camera if camera is None else camera),
-                scale,
-                prefix + frame.name,
-                frame.color,
-                frame.pose,
-                layout.no_depth,
-                files + frame.sources,
+                frame.depth, matrix, scale, name, frame.color, frame.pose, no_depth, sources
             )
-
-
-def _matrix_for(image: Path, camera: Tensor | Pinhole | None) -> Tensor:
-    """Return the camera matrix of a depth image, whose size may be another than its camera's."""
-    if camera is None:
-        raise ConfigError(
-            f"{image}: expected intrinsics, which depth images do not hold; pass them, or the "
-            "folder of the whole recording."
-        )
-    if isinstance(camera, Tensor):
-        return camera
-    return camera.matrix(None if camera.size is None else image_size(image))

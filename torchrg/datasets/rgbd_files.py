@@ -27,13 +27,14 @@ _CONVERTERS = {
     ".r3d": "unzip it, and save what pyliblzfse reads of its .depth files as .npy, in metres",
     ".exr": "save what OpenEXR reads of it as .npy, usually in metres",
 }
-"""What turns recordings and images that are not read into frames that are."""
+"""What makes frames of recordings and images that are not read."""
 _PNG = b"\x89PNG"
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
 """Width and height in the header of a PNG, and the byte at which they begin."""
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
 """Beginning of a binary PGM: width, height and the largest value."""
-_LONGEST_HEAD, _MOST_OF_A_BYTE = 512, 255
+_LONGEST_HEAD = 512
+_MOST_OF_8_BITS, _MOST_OF_16_BITS = 255, 65535
 _MOST_PIXELS = 1 << 26
 """Pixels of the largest image that is read, 8192 x 8192. No depth camera has as many, and what is
 made of them on the way to metres takes 1.5 GB. A library that has less ends the process."""
@@ -78,19 +79,11 @@ def read_depth(
 
 
 def refuse_recording(path: Path) -> None:
-    """Raise FormatError with the tool that converts it, of a file that holds depth and is not read.
-
-    Example:
-        >>> refuse_recording(Path("walk.bag"))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.FormatError: walk.bag: expected depth images, got .bag; save its frames by...
-    """
-    suffix = path.suffix.lower()
-    if suffix in _CONVERTERS and not path.is_dir():
+    """Raise FormatError with what converts it, of a file that holds depth and is not read."""
+    if (tool := _CONVERTERS.get(path.suffix.lower())) and not path.is_dir():
         raise FormatError(
-            f"{path}: expected depth images, got {suffix}; {_CONVERTERS[suffix]}, and give the "
-            "folder to torchrg convert rgbd."
+            f"{path}: expected depth images, got {path.suffix}; {tool}, and give the folder to "
+            "torchrg convert rgbd."
         )
 
 
@@ -141,24 +134,20 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
     check_file(source)
     content = source.read_bytes()
     found = _PGM.match(content)
-    most = int(found[3]) if found else 0
-    if found is None or not _MOST_OF_A_BYTE < most <= np.iinfo(np.uint16).max:
+    if found is None or not _MOST_OF_8_BITS < int(found[3]) <= _MOST_OF_16_BITS:
         raise FormatError(
             f"{source}: expected a binary PGM of 16 bits, P5, got {content[:16]!r}; depth does not "
             "fit into 8 bits."
         )
-    width, height = int(found[1]), int(found[2])
-    needed, available = 2 * width * height, len(content) - found.end()
-    check_promise(source, found.end(), needed, "its pixels", available=available)
-    values = np.frombuffer(content, ">u2", width * height, found.end())
+    width, height, start = int(found[1]), int(found[2]), found.end()
+    available = len(content) - start
+    check_promise(source, start, 2 * width * height, "its pixels", available=available)
+    values = np.frombuffer(content, ">u2", width * height, start)
     return values.astype(np.uint16).reshape(height, width)
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Return width and height of a depth image, as far as its beginning tells.
-
-    It is None of damage, and of a file that is not there, which reading tells.
-    """
+    """Return width and height by the beginning of a depth image; None if damaged or not there."""
     try:
         if path.suffix.lower() == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape
@@ -201,10 +190,7 @@ def read_matrix(path: Path) -> Tensor:
 
 def read_numbers(path: Path, count: int, what: str) -> list[list[float]]:
     """Read rows of so many numbers; ``what`` says which they are."""
-    rows = _words(path)
-    if not rows or any(len(row) != count for row in rows):
-        raise FormatError(f"{path}: expected {what} in each row.")
-    return _numbers(path, rows)
+    return _numbers(path, _rows(path, count, what))
 
 
 def known_pose(matrix: Tensor) -> Tensor | None:
@@ -226,25 +212,25 @@ def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
     """
     rows = _rows_by_time(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
-    poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
-    poses[:, :3, :3] = _rotations(values[:, 4:])
-    poses[:, :3, 3] = values[:, 1:4]
-    return values[:, 0].tolist(), [known_pose(pose) for pose in poses]
+    return _poses_by_time(values, _rotations(values[:, 4:]), values[:, 1:4])
 
 
 def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor | None]]:
-    """Read rows of ``time rx ry rz tx ty tz``, which lead from world to camera, turns in radians.
-
-    Returns what :func:`read_trajectory` does: poses from camera to world.
-    """
+    """Do as :func:`read_trajectory` with ``time rx ry rz tx ty tz``, from world to camera."""
     from scipy.spatial.transform import Rotation
 
     rows = _rows_by_time(path, 7, "time rx ry rz tx ty tz")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
     back = torch.from_numpy(Rotation.from_rotvec(values[:, 1:4].numpy()).as_matrix()).mT
+    return _poses_by_time(values, back, -(back @ values[:, 4:, None])[..., 0])
+
+
+def _poses_by_time(
+    values: Tensor, turns: Tensor, places: Tensor
+) -> tuple[list[float], list[Tensor | None]]:
+    """Return the times of rows, and matrices of turns ``(n, 3, 3)`` and places ``(n, 3)``."""
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
-    poses[:, :3, :3] = back
-    poses[:, :3, 3] = -(back @ values[:, 4:, None])[..., 0]
+    poses[:, :3, :3], poses[:, :3, 3] = turns, places
     return values[:, 0].tolist(), [known_pose(pose) for pose in poses]
 
 
@@ -285,14 +271,20 @@ def _rotations(quaternions: Tensor) -> Tensor:
 
 def _rows_by_time(path: Path, num_words: int, what: str) -> list[list[str]]:
     """Return the words of each row, which are so many, by the time that the first of them is."""
-    rows = _words(path)
-    if not rows or any(len(row) != num_words for row in rows):
-        raise FormatError(f"{path}: expected {what} in each row.")
+    rows = _rows(path, num_words, what)
     times = [time for (time,) in _numbers(path, [row[:1] for row in rows])]
     wrong = next((time for time in times if not math.isfinite(time)), None)
     if wrong is not None:
         raise FormatError(f"{path}: expected finite times, got {wrong}; repair or delete its row.")
     return [rows[i] for i in sorted(range(len(rows)), key=times.__getitem__)]
+
+
+def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
+    """Return the words of each row, which are so many."""
+    rows = _words(path)
+    if not rows or any(len(row) != num_words for row in rows):
+        raise FormatError(f"{path}: expected {what} in each row.")
+    return rows
 
 
 def _words(path: Path) -> list[list[str]]:

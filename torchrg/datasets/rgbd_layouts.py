@@ -4,25 +4,15 @@ A new shape is a function here that lists the frames of a recording, a row of :d
 name among the choices of ``torchrg convert rgbd``, and a test.
 """
 
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg.datasets.camera_files import (
-    camera_of_matrix,
-    camera_of_numbers,
-    camera_of_transforms,
-    matrix_of,
-    number_of,
-    read_info,
-    read_record,
-    warn_of_lens,
-)
+from torchrg.datasets.camera_files import camera_of, matrix_of, number_of, read_info, read_record
 from torchrg.datasets.folder import check_folder, files_below, listed, natural_key, warn_of_links
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
@@ -34,8 +24,9 @@ from torchrg.datasets.rgbd_files import (
     read_timed,
     read_trajectory,
 )
-from torchrg.depth.camera import Pinhole, check_camera
+from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.files import refusing
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 _TUM_INTRINSICS = {
@@ -47,8 +38,9 @@ _TUM_INTRINSICS = {
 _ICL_NUIM_INTRINSICS = (481.2, -480.0, 319.5, 239.5)
 """The scenes were rendered with y upwards: rows count against it."""
 _SEVEN_SCENES_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
-_SCANNETPP_COLOR = (1920, 1440)
-"""Size of the colour images, which the intrinsics of ScanNet++ are of."""
+_IPHONES = ("", "iphone/", "*/iphone/", "data/*/iphone/")
+_SCANNETPP_COLOR = {"width": 1920, "height": 1440}
+"""Sides of the colour images, which the intrinsics of ScanNet++ are of."""
 _NERFSTUDIO_UNIT = 0.001
 """Metres that one stored value is worth for nerfstudio where no file says another."""
 _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
@@ -56,13 +48,7 @@ _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 
 
 class ListedFrame(NamedTuple):
-    """A frame as a folder lists it.
-
-    Attributes:
-        name: As of :class:`torchrg.datasets.RGBDFrame`, like all that follow.
-        camera: That of the frame alone, where the recording has none for all.
-        depth_scale: That of the frame alone.
-    """
+    """A frame as a folder lists it, with its own camera and scale where a recording has none."""
 
     name: str
     depth: Path
@@ -175,10 +161,7 @@ def _same_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
 def _scannet_camera(folder: Path) -> tuple[Pinhole, tuple[Path, ...]]:
     """Return the camera matrix of a scan."""
     calibration = folder / "intrinsic" / "intrinsic_depth.txt"
-    camera = read_matrix(calibration)[:3, :3]
-    check_camera(str(calibration), camera)
-    (fx, _, cx), (_, fy, cy) = camera[:2].tolist()
-    return Pinhole(fx, fy, cx, cy), (calibration,)
+    return camera_of(calibration, {"intrinsic": read_matrix(calibration)}), (calibration,)
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
@@ -195,23 +178,15 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
     """
     path = folder / "transforms.json"
     shared = read_record(path)
-    frames = shared.get("frames")
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise FormatError(f"{path}: expected a list of frames; is it one of nerfstudio?")
-    records = sorted(
-        ({**shared, **frame} for frame in frames if frame.get("depth_file_path")),
-        key=lambda record: natural_key(str(record["depth_file_path"])),
-    )
-    if not records:
+    frames = shared.get("frames", [])
+    is_list = isinstance(frames, list) and all(isinstance(frame, dict) for frame in frames)
+    if not is_list or not all(frame.get("depth_file_path") for frame in frames):
         raise FormatError(
-            f"{path}: expected depth_file_path in its frames, got none; name the depth images "
-            "there, as ns-process-data polycam --use-depth does."
+            f"{path}: expected a list of frames, each with depth_file_path; name the depth images "
+            "there, as ns-process-data polycam --use-depth does, and leave out frames without."
         )
-    if len(records) < len(frames):
-        left = f"{len(frames) - len(records):,} of {len(frames):,} frames, which name no depth"
-        warnings.warn(f"{path}: left out {left}.", stacklevel=2)
-    warn_of_lens(path, records)
-    for record in records:
+    for frame in sorted(frames, key=lambda frame: natural_key(str(frame["depth_file_path"]))):
+        record = {**shared, **frame}
         image = Path(str(record["depth_file_path"]))
         name = Path(image.as_posix().removesuffix(image.suffix))
         steps = [step for step in name.parts if step not in ("..", name.anchor)]
@@ -219,24 +194,17 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
         unit = None if image.suffix.lower() == ".npy" else _NERFSTUDIO_UNIT
         if "depth_unit_scale_factor" in record:
             unit = number_of(path, record, "depth_unit_scale_factor")
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3] = matrix_of(path, record, "transform_matrix", columns=4)[:3]
         yield ListedFrame(
             "/".join(steps),
             folder / image,
             color if color.suffix.lower() in _COLOR_SUFFIXES and color.is_file() else None,
-            _nerfstudio_pose(path, record),
+            known_pose(pose @ _OPENGL_AXES),
             (path,),
-            camera_of_transforms(path, record),
+            camera_of(path, record),
             unit and 1 / unit,
         )
-
-
-def _nerfstudio_pose(path: Path, record: dict[str, Any]) -> Tensor | None:
-    """Return the pose of a frame in metres, from the axes of our cameras to the world."""
-    pose = torch.eye(4, dtype=torch.float64)
-    given = matrix_of(path, record, "transform_matrix", (4, 4), (3, 4))
-    pose[: len(given)] = given
-    pose[:3, 3] /= number_of(path, record, "applied_scale", 1.0)
-    return known_pose(pose @ _OPENGL_AXES)
 
 
 def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -246,29 +214,23 @@ def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     in ``lowres_wide.traj``.
     """
     images = [*_depth_images(folder, "lowres_depth/*")]
+    with refusing(
+        f"{folder / 'lowres_depth'}: expected seconds at the ends of names: ", ValueError
+    ):
+        times = [float(name.rpartition("_")[2]) for name, _ in images]
     track = folder / "lowres_wide.traj"
-    stamps = [name.rpartition("_") for name, _ in images]
-    try:
-        times = [float(seconds) for _, _, seconds in stamps]
-    except ValueError as error:
-        raise FormatError(f"{folder}: expected names like 40753679_6791.2.png: {error}.") from None
+    tracks = (track,) if track.is_file() else ()
     poses = read_nearest(times, track, read_axis_angles)
-    for (name, image), (video, _, _), time, pose in zip(images, stamps, times, poses, strict=True):
-        cameras = [folder / "lowres_wide_intrinsics" / f"{name}.pincam"]
-        cameras += [
-            cameras[0].with_name(f"{video}_{time + off:.3f}.pincam") for off in (-0.001, 0.001)
-        ]
-        path = next((path for path in cameras if path.is_file()), cameras[0])
+    for (name, image), time, pose in zip(images, times, poses, strict=True):
+        beside = folder / "lowres_wide_intrinsics" / f"{name}.pincam"
+        video = name.rpartition("_")[0]
+        near = [beside.with_name(f"{video}_{time + off:.3f}.pincam") for off in (-0.001, 0.001)]
+        path = next((path for path in (beside, *near) if path.is_file()), beside)
         names = ("width", "height", "fx", "fy", "cx", "cy")
         record = dict(zip(names, read_numbers(path, 6, " ".join(names))[0], strict=True))
-        yield ListedFrame(
-            name,
-            image,
-            _color_image(folder / "lowres_wide" / name),
-            pose,
-            (path, *([track] if track.is_file() else [])),
-            camera_of_numbers(path, record),
-        )
+        camera = camera_of(path, record)
+        color = _color_image(folder / "lowres_wide" / name)
+        yield ListedFrame(name, image, color, pose, (path, *tracks), camera)
 
 
 def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -279,7 +241,7 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     places = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
     calibration = next((path for path in places if path.is_file()), places[0])
     record = read_record(calibration, "camera")
-    camera = camera_of_numbers(calibration, record)
+    camera = camera_of(calibration, record)
     scale = number_of(calibration, record, "scale")
     track = folder / "traj.txt"
     rows = read_numbers(track, 16, "16 numbers, those of a matrix,")
@@ -292,25 +254,24 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
 
 
 def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of an iPhone of ScanNet++, ``depth/frame_000000.png``, in its aligned world.
+    """Yield the frames of an iPhone of ScanNet++, ``depth/frame_000000.png``, in the aligned world.
 
-    Where a frame has no aligned pose, it has none.
+    A frame without an aligned pose has none.
     """
+    path = folder / "pose_intrinsic_imu.json"
     if not (folder / "depth").is_dir():
         raise FormatError(
             f"{folder}: expected images in depth, got none; take them out of depth.bin by "
             "iphone/prepare_iphone_data.py of the data set's toolbox."
         )
-    path = folder / "pose_intrinsic_imu.json"
     records = read_record(path)
     for name, image in _depth_images(folder, "depth/*"):
         record = records.get(name)
         if not isinstance(record, dict):
             raise FormatError(f"{path}: expected {name}, of which there is depth, got no such.")
-        camera = camera_of_matrix(path, record, "intrinsic", _SCANNETPP_COLOR)
-        pose = None
-        if record.get("aligned_pose") is not None:
-            pose = known_pose(matrix_of(path, record, "aligned_pose", (4, 4)))
+        camera = camera_of(path, _SCANNETPP_COLOR | record)
+        has_pose = record.get("aligned_pose") is not None
+        pose = known_pose(matrix_of(path, record, "aligned_pose", 4)) if has_pose else None
         color = _color_image(folder / "rgb" / name)
         yield ListedFrame(name, image, color, pose, (path,), camera)
 
@@ -319,7 +280,7 @@ def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of 3RScan, ``frame-000000.depth.pgm``, without what was rendered beside."""
     path = folder / "_info.txt"
     record = read_info(path)
-    camera = camera_of_matrix(path, record, "m_calibrationDepthIntrinsic")
+    camera = camera_of(path, record)
     scale = number_of(path, record, "m_depthShift")
     for frame in _named_frames("*.depth", "*.color", "*.pose.txt")(folder):
         if frame.depth.suffix.lower() == ".pgm":
@@ -328,16 +289,10 @@ def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
 
 LAYOUTS = {
     "scannetpp": FrameLayout(
-        _scannetpp_frames,
-        "pose_intrinsic_imu.json",
-        depth_scale=1000.0,
-        places=("", "iphone/", "*/iphone/", "data/*/iphone/"),
+        _scannetpp_frames, "pose_intrinsic_imu.json", None, 1000.0, places=_IPHONES
     ),
     "arkitscenes": FrameLayout(
-        _arkitscenes_frames,
-        "lowres_depth",
-        depth_scale=1000.0,
-        places=("", "*/", "*/*/", "*/*/*/"),
+        _arkitscenes_frames, "lowres_depth", None, 1000.0, places=("", "*/", "*/*/", "*/*/*/")
     ),
     "3rscan": FrameLayout(_3rscan_frames, "_info.txt", places=("", "*/", "*/sequence/")),
     "replica": FrameLayout(_replica_frames, "traj.txt"),
@@ -356,34 +311,24 @@ LAYOUTS = {
     "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json"),
     "images": FrameLayout(_all_images),
 }
-"""Shapes of folders of frames by their names, in the order in which :func:`find_layout` looks for
-them: those of C. Yeshwanth et al., ScanNet++, ICCV, 2023; G. Baruch et al., ARKitScenes, NeurIPS,
-2021; J. Wald et al., RIO, ICCV, 2019 (3RScan); Z. Zhu et al., NICE-SLAM, CVPR, 2022 (Replica);
+"""Shapes of folders of frames by their names, as :func:`find_layout` tries them: ScanNet++ (ICCV,
+2023); ARKitScenes (NeurIPS, 2021); 3RScan (RIO, ICCV, 2019); Replica as in NICE-SLAM (CVPR, 2022);
 J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS, 2012; A. Handa et al.,
-A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM, ICRA, 2014; A. Dai et al.,
-ScanNet, CVPR, 2017, as its reader exports it; J. Shotton et al., Scene coordinate regression
-forests, CVPR, 2013; M. Tancik et al., Nerfstudio, SIGGRAPH, 2023; and any other."""
+A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM, ICRA, 2014; ScanNet (CVPR, 2017)
+as its reader exports it; J. Shotton et al., Scene coordinate regression forests, CVPR, 2013;
+Nerfstudio (SIGGRAPH, 2023); and any other."""
 
 
 def find_layout(root: Path) -> str:
-    """Return the layout of the recordings in a folder by their marks; ``images`` where it has none.
+    """Return the layout whose mark a folder has; one that two share tells neither.
 
-    A mark that two layouts share tells neither.
-
-    Example:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> (folder / "transforms.json").touch()
-        >>> find_layout(folder)
-        'nerfstudio'
+    It is ``images`` where there is no mark.
     """
     marks = Counter(layout.mark for layout in LAYOUTS.values())
-    found = (
-        name
-        for name, layout in LAYOUTS.items()
-        if layout.mark and marks[layout.mark] == 1 and any(_marked(root, layout))
-    )
-    return next(found, "images")
+    for name, layout in LAYOUTS.items():
+        if layout.mark and marks[layout.mark] == 1 and any(_marked(root, layout)):
+            return name
+    return "images"
 
 
 def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path]]:
@@ -392,14 +337,11 @@ def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path
     One that is there under several names has the one without links, or else the one that comes
     first.
     """
+    check_folder(root)
     if not layout.mark:
         yield "", root
         return
-    check_folder(root)
-    marked = sorted(
-        {*_marked(root, layout)},
-        key=lambda path: [natural_key(part) for part in path.relative_to(root).parts],
-    )
+    marked = sorted({*_marked(root, layout)}, key=lambda path: natural_key(str(path)))
     own: dict[Path, Path] = {}
     for path in sorted(marked, key=lambda path: path != root and path.is_symlink()):
         own.setdefault(path.resolve(), path)
@@ -413,7 +355,5 @@ def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path
 
 
 def _marked(root: Path, layout: FrameLayout) -> Iterator[Path]:
-    """Yield the folders with the mark of a layout, each perhaps several times."""
-    for place in layout.places:
-        for path in root.glob(place + layout.mark):
-            yield path.parent
+    """Return the folders with the mark of a layout, each perhaps several times."""
+    return (path.parent for place in layout.places for path in root.glob(place + layout.mark))

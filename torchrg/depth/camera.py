@@ -133,15 +133,7 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
 
 
 class Pinhole(NamedTuple):
-    """A pinhole camera as files give it, with the size of the images that its numbers are of.
-
-    Attributes:
-        fx: Focal length along rows in pixels.
-        fy: Focal length along columns in pixels.
-        cx: Place of the optical axis in a row, where the middle of the first pixel is 0.
-        cy: Place of the optical axis in a column.
-        size: Width and height of the images; None where nobody says, so that it fits any.
-    """
+    """A pinhole camera in pixels, of images of a size, width and height, where that is known."""
 
     fx: float
     fy: float
@@ -150,34 +142,28 @@ class Pinhole(NamedTuple):
     size: tuple[int, int] | None = None
 
     def matrix(self, size: tuple[int, int] | None = None) -> Tensor:
-        """Return the camera matrix ``(3, 3)``, float64, for images made smaller or larger.
+        """Return the camera matrix ``(3, 3)``, float64, for images that are resized to ``size``.
 
         Convention:
-            An image that is resized keeps its outer edges, half a pixel beyond the middles of its
-            first and last pixels, so that ``cx + 0.5`` grows as ``fx`` does.
-
-        Args:
-            size: Width and height of the images; None for those that the camera is of.
+            The middle of the first pixel is 0. An image that is resized keeps its outer edges, half
+            a pixel beyond the middles of its outermost pixels: ``cx + 0.5`` grows as ``fx`` does.
 
         Raises:
-            ConfigError: If images of this size do not show what the camera's do, up to a pixel, or
-                a value is that of no camera.
+            ConfigError: If the sides of the images are in another ratio, by more than a pixel.
 
         Example:
             >>> Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((160, 120))[0].tolist()
             [150.0, 0.0, 79.5]
         """
         fx, fy, cx, cy, own = self
-        if size is None or own is None or size == own:
+        if size is None or own is None:
             return make_intrinsics(fx, fy, cx, cy)
-        (width, height), (own_width, own_height) = size, own
-        if abs(width * own_height - height * own_width) > max(own):
+        across, down = size[0] / own[0], size[1] / own[1]
+        if abs(size[0] * own[1] - size[1] * own[0]) > max(own):
             raise ConfigError(
-                f"Pinhole: expected images with the sides of {own_width} x {own_height} pixels, "
-                f"which the camera is of, or in their ratio, got {width} x {height}; pass the "
-                "camera of the depth images."
+                f"Pinhole: expected images of {own[0]} x {own[1]} pixels, as its camera's, or in "
+                f"their ratio, got {size[0]} x {size[1]}; pass the camera of the depth images."
             )
-        across, down = width / own_width, height / own_height
         middle = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
         return make_intrinsics(fx * across, fy * down, *middle)
 

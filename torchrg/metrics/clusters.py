@@ -100,8 +100,8 @@ def score_clusters(
         seed: Seed of the subsample. It does not depend on the order of the points.
 
     Returns:
-        The indices. No cluster: all nan. One cluster: CP, the others nan. A cluster of one point
-        has spread 0. Coinciding centres: ``dbi`` is infinite. All diameters 0: ``dvi`` is
+        The indices. Without a cluster all are nan, and of one cluster all but CP. A cluster of one
+        point has spread 0. Coinciding centres: ``dbi`` is infinite. All diameters 0: ``dvi`` is
         infinite, or 0 if two clusters share a direction.
 
     Raises:

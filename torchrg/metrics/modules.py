@@ -51,8 +51,6 @@ class PlaneMetric(Metric):
     Attributes:
         part: The part of ``METRICS`` that the index is of.
         index: The index; None for all, and so are the others then.
-        unit: Its unit.
-        higher_is_better: Whether more of it is better; None for neither.
 
     Raises:
         ConfigError: If there is no such index, or several parts have one of that name.

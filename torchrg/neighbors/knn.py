@@ -16,6 +16,7 @@ from torchrg._parallel import (
     ROWS_IN_CACHE,
     allowed_threads,
     chunks_of,
+    map_chunks,
     sequential_operations,
 )
 from torchrg.errors import ShapeError
@@ -103,6 +104,29 @@ def search_knn(
         )
     valid = None if outside is None else torch.from_numpy(~outside).to(tensor.device)
     return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
+
+
+def keep_within(neighbors: Neighbors, groups: Tensor, chunk_size: int) -> Neighbors:
+    """Return those neighbours of each point that are of its group ``(N,)``, the nearest first.
+
+    Example:
+        >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
+        >>> kept = keep_within(near, torch.tensor([4, 7, 4]), 3)
+        >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
+        ([[0, 2, 0], [1, 1, 1], [2, 0, 2]], [2, 1, 2])
+    """
+    shape, device = neighbors.indices.shape, groups.device
+    indices, valid = (scratch.empty(shape, kind) for kind in (np.int32, np.bool_))
+
+    def work(rows: slice) -> None:
+        same = (neighbors.of(groups, rows) == groups[rows, None]) & neighbors.counted(rows)
+        order = same.byte().argsort(dim=1, descending=True, stable=True)
+        near, same = neighbors.indices[rows].gather(1, order), same.gather(1, order)
+        indices[rows] = torch.where(same, near, near[:, :1]).numpy(force=True)
+        valid[rows] = same.numpy(force=True)
+
+    map_chunks(work, shape[0], chunk_size, device)
+    return Neighbors(*(torch.from_numpy(part).to(device) for part in (indices, valid)))
 
 
 @sequential_operations()

@@ -2,16 +2,18 @@
 
 :func:`estimate_normals` takes a cloud and the name of one of :data:`ESTIMATORS`:
 
-| name | what it is | what for |
-|---|---|---|
-| ``pca`` | least squares | smooth surfaces, speed |
-| ``jet`` | polynomial of second degree | curved surfaces without edges |
-| ``irls`` | plane by reweighting | edges with little noise |
-| ``fastmcd``, ``mve`` | least determinant or volume, random starts | to compare |
-| ``detmcd`` | least determinant, deterministic starts | many outliers at any point |
-| ``detmm`` | MM-estimator | outliers, and more efficiency than MCD |
-| ``paper`` | ``pca``, then ``detmcd`` at sharp points | the published method |
-| ``consensus`` | ``pca``, then planes that neighbours agree on | the default: edges, noise |
+====================  =============================================  =============================
+name                  what it is                                     what for
+====================  =============================================  =============================
+``pca``               least squares                                  smooth surfaces, speed
+``jet``               polynomial of second degree                    curved surfaces without edges
+``irls``              plane by reweighting                           edges with little noise
+``fastmcd``, ``mve``  least determinant or volume, random starts     to compare
+``detmcd``            least determinant, deterministic starts        many outliers at any point
+``detmm``             MM-estimator                                   outliers, more efficiency
+``paper``             ``pca``, then ``detmcd`` at sharp points       the published method
+``consensus``         ``pca``, then planes that neighbours agree on  the default: edges, noise
+====================  =============================================  =============================
 
 Signs are arbitrary until :func:`orient_normals` chooses them, or :func:`orient_cloud`, which knows
 what the file of a cloud says about its sides. The ``fit_*`` functions take patches

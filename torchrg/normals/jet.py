@@ -87,7 +87,7 @@ def fit_jet(
     through everything but the principal directions, and are finite where two eigenvalues are equal.
 
     Returns:
-        The fit. Terms that the points do not determine are left out, the last ones first: two
+        The fit. Terms that the points do not determine are left out, the last ones first. Two
         straight scan lines have no ``v^2``; fewer than six points have no quadratic terms, which
         leaves the plane of PCA. ``valid`` is that of :func:`torchrg.normals.fit_normals_pca`.
 

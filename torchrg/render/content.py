@@ -12,11 +12,12 @@ from torch.nn import functional
 
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
+from torchrg.plane_table import Json, describe_planes
 from torchrg.regions.table import classify_planes, summarize_planes
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import Sides, find_sides
 from torchrg.render.surface import Surface, sample_surface
-from torchrg.result import Result, describe_planes
+from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
 NUM_STRATA = 8
@@ -137,12 +138,9 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     angle and along which length. Kinds go by the upward direction of the page where the result has
     none.
     """
-    planes, origin = result.planes, result.cloud.origin
+    planes, origin, table = result.planes, result.cloud.origin, describe_shown(result, frame)
     if not planes:
         return []
-    if planes.kind is None:
-        planes = replace(planes, kind=classify_planes(planes, frame.rotation[2]))
-    table = describe_planes(planes, origin=origin.tolist())
     meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
     for found in table.get("adjacency", []):
         for own, other in (found["pair"], found["pair"][::-1]):
@@ -152,15 +150,26 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     return [
         {name: value for name, value in row.items() if name not in _NOT_SHOWN}
         | {
-            "name": label,
+            "name": row["id"],
             "kind": PLANE_KINDS.index(row["kind"]),
             "rings": [rounded(frame.place(ring, origin)) for ring in own or (rectangle,)],
             "meets": met,
         }
-        for row, label, own, rectangle, met in zip(
-            table["planes"], result.names.tolist(), rings, corners, meets, strict=True
-        )
+        for row, own, rectangle, met in zip(table["planes"], rings, corners, meets, strict=True)
     ]
+
+
+def describe_shown(result: Result, frame: Frame) -> Json:
+    """Return the table of a result as a page has it, its ids the labels of the file."""
+    planes = result.planes
+    if not planes:
+        return {"planes": []}
+    if planes.kind is None:
+        planes = replace(planes, kind=classify_planes(planes, frame.rotation[2]))
+    described = describe_planes(planes, origin=result.cloud.origin.tolist())
+    for row, name in zip(described["planes"], result.names.tolist(), strict=True):
+        row["id"] = name
+    return described
 
 
 def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:

@@ -5,11 +5,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from torchrg._optional import require
 from torchrg.errors import ConfigError
+from torchrg.plane_table import describe_planes, tabulate_planes
 from torchrg.render.gallery import draw_planes
 from torchrg.render.page import Page, make_page
-from torchrg.result import Result, describe_planes
-from torchrg.structures import PLANE_KINDS, Cloud, Segmentation
+from torchrg.result import Result
+from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
 
 MOST_ROWS = 12
 """Planes in the table, the largest ones."""
@@ -33,6 +35,12 @@ def _result_of(segmentation: Segmentation) -> Result:
         )
     points = segmentation.points.numpy(force=True).reshape(-1, 3)
     return Result.of(Cloud(points, source="segmentation"), segmentation)
+
+
+def as_frame(planes: Planes) -> Any:  # noqa: ANN401
+    """Return a table of planes as a ``pandas.DataFrame``."""
+    pandas = require("pandas", extra="report", purpose="make data frames")
+    return pandas.DataFrame(tabulate_planes(describe_planes(planes)))
 
 
 def as_html(segmentation: Segmentation) -> str:

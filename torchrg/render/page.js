@@ -602,6 +602,7 @@ function listPlanes() {
   const c = Number($("cloud").value), cloud = page.clouds[c];
   const focused = document.activeElement?.getAttribute?.("aria-label");
   listKinds(c, cloud);
+  $("csv").hidden = !cloud.values.table;
   if (!cloud.order.length) {
     $("planes").replaceChildren(element("p", "This file has no plane labels.", { className: "soft" }));
     return;
@@ -672,6 +673,12 @@ function fillPanel() {
   $("above").onclick = () => home([0, 0, 1]);
   $("level").onclick = () => { state.camera.rotationX = 0; home(); };
   $("showall").onclick = () => page.clouds.forEach((cloud, c) => setHidden(c, cloud.order, false));
+  $("csv").onclick = () => {
+    const cloud = page.clouds[Number($("cloud").value)];
+    const href = URL.createObjectURL(new Blob([cloud.values.table], { type: "text/csv" }));
+    element("a", null, { href, download: `${cloud.name}_planes.csv` }).click();
+    setTimeout(() => URL.revokeObjectURL(href), STILL_MS);
+  };
   page.clouds.forEach((cloud, c) => {
     $("cloud").append(element("option", cloud.name, { value: c }));
     const title = element("div", cloud.name, { className: "name" });

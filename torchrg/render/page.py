@@ -30,6 +30,7 @@ from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
 from torchrg.neighbors.order import restore_rows
+from torchrg.plane_table import encode_csv
 from torchrg.render.channels import MODES, channels_of, encode_directions
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
@@ -37,6 +38,7 @@ from torchrg.render.content import (
     Frame,
     Shown,
     choose_points,
+    describe_shown,
     frame_of,
     planes_of_page,
     radii_of,
@@ -236,6 +238,8 @@ def _describe_cloud(
     arrays["covered"] = covered.numpy()
     radii = radii_of(shown.surface)
     arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
+    if planes:
+        arrays["table"] = np.frombuffer(encode_csv(describe_shown(result, frame)), np.uint8)
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:

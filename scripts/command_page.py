@@ -1,0 +1,51 @@
+"""The page of the commands, made from their parser: see ``guides/commands.md``."""
+
+import dataclasses
+import importlib
+import re
+from collections.abc import Iterator
+
+from torchrg.cli import COMMANDS, convert
+from torchrg.cli.arguments import NEEDED, Flag, describe, example_lines, group_flags, list_flags
+from torchrg.cli.flags import PlaneSettings
+
+PROGS: dict[str, type] = {
+    f"torchrg {name}": importlib.import_module(f"torchrg.cli.{name}").Arguments
+    for name in COMMANDS
+    if name != "convert"
+} | {f"torchrg convert {name}": kind for name, kind in convert.KINDS.items()}
+"""What each command is parsed into, by how it is called."""
+
+
+def command_page() -> str:
+    """Return a section for each command: what it does, examples, and each argument."""
+    return "\n\n".join(line for prog, kind in PROGS.items() for line in _section(prog, kind))
+
+
+def flags_of(kind: type) -> list[Flag]:
+    """Return the arguments of a command; the defaults of settings are those of the preset."""
+    start = None
+    if "settings" in {field.name for field in dataclasses.fields(kind)}:
+        up = kind.up if issubclass(kind, convert.CloudArguments) else None
+        start = {"settings": PlaneSettings.asked_for([], up)}
+    return list(list_flags(kind, start))
+
+
+def _section(prog: str, kind: type) -> Iterator[str]:
+    """Yield the paragraphs on a command, whose arguments can be searched for and linked to."""
+    groups = group_flags(flags_of(kind))
+    needed = " ".join(flag.spelling for flag in groups.get(NEEDED, ()))
+    yield f"## {prog}"
+    yield _escaped(describe(kind))
+    yield f"```text\n{prog} {needed} [options]\n```"
+    yield "\n".join(["Examples:", "", "```console", *example_lines(kind), "```"])
+    yield f"```{{program}} {prog}\n```"
+    for title, flags in groups.items():
+        yield f"```{{rubric}} {title[0].upper()}{title[1:]}\n```"
+        for flag in flags:
+            yield f"```{{option}} {flag.spelling}\n\n{_escaped(flag.text)}\n```"
+
+
+def _escaped(text: str) -> str:
+    """Return plain text as Markdown."""
+    return re.sub(r"([\\*_`<>\[\]#])", r"\\\1", text)
