@@ -1,10 +1,9 @@
 """Large arrays in a file without a name, for clouds that are larger than memory.
 
-Of the memory that a point takes while its planes are found, most is in large arrays: the lists of
-neighbours and the bits of edges. Within :func:`on_disk` these are shared maps of temporary files
-that are unlinked as soon as they are open: they leave with the process, however it ends, and
-nothing can be left behind, be locked or be damaged. Whoever reads or writes such an array does not
-know.
+Of the memory that a point takes while its planes are found, most is in two arrays: the lists of
+neighbours and the edges. Within :func:`on_disk` these are shared maps of temporary files that are
+unlinked as soon as they are open: they leave with the process, however it ends, and nothing can be
+left behind, be locked or be damaged. Whoever reads or writes such an array does not know.
 """
 
 import math
@@ -26,12 +25,10 @@ from torchrg.errors import FormatError
 
 _LEAST_BYTES = 2**24
 """Bytes of the smallest array that goes to the disk; all smaller ones together are few."""
-BYTES_PER_NEIGHBOR = 5
-"""Bytes that a neighbour of a point takes: four in its list, and two bits for the edge to it."""
+BYTES_PER_NEIGHBOR = 9
+"""Bytes that a neighbour of a point takes at most: four in its list, and an edge with a mark."""
 _RELEASE_SECONDS = 0.01
 """How often pages go back to the system. In that time some 20 MB of an array are read."""
-_TIMES_AS_OFTEN = 20
-"""How much more often while reads are scattered: each brings 64 KB into memory."""
 _ZEROS = bytes(2**20)
 """What reserves a disk where the system has no call for that, as on macOS."""
 
@@ -39,7 +36,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 _folder: ContextVar[Path | None] = ContextVar("scratch", default=None)
 _maps: "weakref.WeakSet[mmap.mmap]" = weakref.WeakSet()
-_lock, _is_scattered = threading.Lock(), threading.Event()
+_lock = threading.Lock()
 
 
 @contextmanager
@@ -47,7 +44,7 @@ def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep large arrays on the disk of a folder: results are the same, and memory is bounded.
 
     Segmenting a cloud then takes about 150 bytes of memory a point, beside pages of the files that
-    the system has not yet taken back, and some five bytes of disk for each neighbour of a point.
+    the system has not yet taken back, and up to nine bytes of disk for each neighbour of a point.
     Inside a result there is no such array, so it can be used afterwards. The folder should be on a
     disk, as some ``/tmp`` is not.
 
@@ -108,19 +105,9 @@ def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
-@contextmanager
-def scattered_reads() -> Iterator[None]:
-    """Give pages back more often, as where reads are all over an array many come with each."""
-    _is_scattered.set()
-    try:
-        yield
-    finally:
-        _is_scattered.clear()
-
-
 def _release_until(is_done: threading.Event) -> None:
     """Let the system take back the pages of all maps again and again; it can read them again."""
-    while not is_done.wait(_RELEASE_SECONDS / (_TIMES_AS_OFTEN if _is_scattered.is_set() else 1)):
+    while not is_done.wait(_RELEASE_SECONDS):
         with _lock:
             maps = list(_maps)
         for memory in maps:

@@ -76,6 +76,14 @@ def test_labels_equal_the_literal_algorithm(kind, variant):
     check_all_rules(growing_clouds.KINDS[kind](rng), **VARIANTS[variant])
 
 
+@pytest.mark.parametrize("kind", ["room", "quantized", "sphere", "graded", "plates"])
+def test_whole_levels_of_the_queue_give_the_labels_of_single_steps(kind, monkeypatch):
+    monkeypatch.setattr("torchrg.regions.growth._LONG_QUEUE", 2)
+    rng = np.random.default_rng(7)
+    settings = {"k": 8, "max_angle_deg": 20.0, "curvature_quantile": 0.6, "min_size": 2}
+    check_all_rules(growing_clouds.KINDS[kind](rng), **settings)
+
+
 @pytest.mark.parametrize("kind", growing_clouds.KINDS)
 def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind, monkeypatch):
     rng = np.random.default_rng(list(growing_clouds.KINDS).index(kind))
@@ -91,7 +99,7 @@ def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind, m
             curvature_quantile=float(rng.choice([0.0, 0.3, 0.6, 0.95, 1.0])),
             min_size=int(rng.choice([1, 2, k + 1])),
         )
-        monkeypatch.setattr("torchrg.regions.growth._SEEDS_AT_ONCE", int(rng.choice([1, 32])))
+        monkeypatch.setattr("torchrg.regions.growth._LONG_QUEUE", int(rng.choice([2, 32])))
         valid = torch.from_numpy(rng.random(len(cloud[0])) < 0.9)
         labels = grow_regions(*cloud, config, valid=valid, canonical=True)
         assert labels.tolist() == expected_labels(*cloud, config, valid), config

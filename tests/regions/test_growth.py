@@ -11,7 +11,14 @@ from tests.regions.growing_clouds import papers_growing
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.growth import curvature_limit, grow_first_in_first_out, number_by_size
+from torchrg.regions.edges import EdgeLists
+from torchrg.regions.growth import (
+    chain_of,
+    curvature_limit,
+    first_to_reach,
+    grow_first_in_first_out,
+    number_by_size,
+)
 from torchrg.structures import Neighbors
 
 CLASSIC = papers_growing(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
@@ -143,15 +150,26 @@ def test_exact_and_quantized_walls_do_not_shatter():
         assert (labels == 0).float().mean() > 0.97
 
 
+def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
+    num_points = 200_000
+    edges = EdgeLists(
+        np.arange(num_points + 1, dtype=np.int32).clip(max=num_points - 1),
+        np.arange(1, num_points, dtype=np.int32),
+    )
+    seeds = np.arange(num_points, dtype=np.int32)
+    edges = edges.append(chain_of(seeds, num_points))
+    assert not first_to_reach(edges, num_points).any()
+
+
 def test_no_python_number_is_kept_for_every_point():
-    num_points = 30_000
-    order = torch.arange(num_points - 1, -1, -1, dtype=torch.int32)
-    flags, bits = torch.ones(num_points, dtype=torch.bool), torch.zeros(num_points, 1).long()
+    num_points = 150_000
+    edges = EdgeLists(np.zeros(num_points + 1, dtype=np.int32), np.empty(0, dtype=np.int32))
+    order = np.arange(num_points, dtype=np.int32)[::-1]
     tracemalloc.start()
-    heads = grow_first_in_first_out(order[:, None], bits, None, flags, flags, order, late=False)
+    heads = grow_first_in_first_out(edges, order, np.ones(num_points, dtype=bool))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert torch.equal(heads[order.long()], order)
+    assert (heads[order] == order).all()
     assert peak < 30 * num_points
 
 

@@ -1,6 +1,8 @@
 """Region growing: from points, normals and neighbours to labels."""
 
 import math
+from array import array
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,16 +21,32 @@ from torchrg._parallel import (
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import canonical_order, measure_sampling
+from torchrg.neighbors import blocks, canonical_order, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
-from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
+from torchrg.regions.edges import (
+    EdgeLists,
+    GrowingCloud,
+    chain_of,
+    find_coded_edges,
+    find_edges,
+    first_to_reach,
+    is_order_free,
+    join_edges,
+    mark_edges,
+    neighborhood_radii,
+    promotes_late,
+)
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
+from torchrg.regions.reach import condense, join_condensed
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
-_SEEDS_AT_ONCE = 2**13
-"""Seeds whose edges are gathered at a time; with 50 neighbours some 4 MB."""
+_LONG_QUEUE = 32
+"""From this many waiting seeds on, all of them go through NumPy at once; below, one at a time."""
+
+_CLAIMING_SEEDS = 2**13
+"""Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB."""
 
 
 @of_clouds
@@ -247,42 +265,91 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
         return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
     sizes = np.bincount(old[old >= 0], minlength=len(old))
-    large = np.flatnonzero(sizes >= max(min_size, 1))
-    sizes = sizes[large]
+    kept = np.flatnonzero(sizes >= max(min_size, 1))
+    sizes = sizes[kept]
     # The last entry is what -1 finds.
     numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
-    numbers[large] = np.arange(len(large))
+    numbers[kept] = np.arange(len(kept))
     numbered = numbers[old]
-    firsts = np.full(len(large) + 1, len(old))
+    firsts = np.full(len(kept) + 1, len(old))
     for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
         firsts[numbered[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
     order = np.lexsort((firsts[:-1], -sizes))
-    ranks = np.full(len(large) + 1, UNLABELED, dtype=np.int64)
-    ranks[order] = np.arange(len(large))
+    ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
+    ranks[order] = np.arange(len(kept))
     return torch.from_numpy(ranks[numbered]).to(regions.device)
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
-    """Return the root of each point's region ``(N,)``: the point that the region began with.
+    """Return the root of each point's region ``(N,)``, by whichever way the settings allow.
 
-    Of a point that is not valid it is -1.
+    The root of a region is the point it began with. Of a point that is not valid it is -1.
     """
-    growing, (indices, masked) = cloud.curvature[cloud.valid], cloud.neighbors
-    order = cloud.curvature.cpu().argsort(stable=True).to(torch.int32)
-    order = order[cloud.valid.cpu()[order]]
+    growing = cloud.curvature[cloud.valid]
+    order = cloud.curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
+    order = order[cloud.valid.cpu().numpy()[order]]
     limit = curvature_limit(growing, config.curvature_quantile)
+    seeds = order[: int(torch.count_nonzero(growing <= limit))]
+    indices, masked = cloud.neighbors
+    if kernels.serve(indices, masked, cloud.valid, cloud.curvature) and not scratch.is_active():
+        return _grow_by_bits(cloud, config, order, seeds, limit, chunk_size)
+    if is_order_free(config):
+        roots, others = reach_from_seeds(cloud, config, seeds, limit, chunk_size)
+        if int(config.min_size) <= cloud.neighbors.indices.shape[1]:
+            # Points that no seed reaches may make regions with free neighbours of their own.
+            free = roots < 0
+            left = grow_first_in_first_out(others, order[free[order]], free)
+            roots = np.where(free, left, roots)
+    else:
+        edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
+        valid, lists = cloud.valid.cpu().numpy(), indices.cpu().numpy()
+        roots = grow_first_in_first_out(edges, order, valid, claims, lists)
+    return torch.from_numpy(roots).to(cloud.points.device)
+
+
+def _grow_by_bits(
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    order: NDArray[np.int32],
+    seeds: NDArray[np.int32],
+    limit: Tensor,
+    chunk_size: int,
+) -> Tensor:
+    """Do as :func:`grow` in a kernel: Algorithm 2 on a bit for each neighbour."""
+    indices, late = cloud.neighbors.indices, promotes_late(config)
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
+    begins, is_seed = order, cloud.curvature <= limit
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
         # What a point has around it that no seed reaches is too small a region.
-        order = order[: int(torch.count_nonzero(growing <= limit))]
-    edges = indices, joins, makes_seed, cloud.curvature <= limit, cloud.valid
-    late = promotes_late(config)
-    if scratch.is_active():
-        return_freed_memory()
-    if kernels.serve(indices, masked, cloud.valid, cloud.curvature):
-        with scratch.scattered_reads():
-            return kernels.call("grow_regions", *edges, order, late)[0]
-    return grow_first_in_first_out(*edges, order, late=late)
+        begins = seeds
+    bits = indices, joins, makes_seed, is_seed, cloud.valid
+    return kernels.call("grow_regions", *bits, torch.from_numpy(begins), late)[0]
+
+
+def reach_from_seeds(
+    cloud: GrowingCloud,
+    config: GrowingConfig,
+    seeds: NDArray[np.int32],
+    limit: Tensor,
+    chunk_size: int,
+) -> tuple[NDArray[np.int32], EdgeLists]:
+    """Return the first of the seeds that reaches each point, and the edges of all other points.
+
+    The edges of seeds are one graph, or on a disk the graphs of blocks that :func:`condense`
+    shrinks.
+    """
+    num_points = len(cloud.points)
+    if not scratch.is_active():
+        chain = chain_of(seeds, num_points)
+        edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, more=chain)
+        return first_to_reach(edges, num_points), others
+    parts, rest = [], []
+    for block in chunks_of(num_points, blocks.BLOCK_SIZE):
+        edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, block=block)
+        parts.append(condense(edges, block))
+        rest.append(others)
+    return_freed_memory()
+    return join_condensed(parts, seeds), join_edges(rest)
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
@@ -293,61 +360,90 @@ def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
 
 
 def grow_first_in_first_out(
-    indices: Tensor,
-    joins: Tensor,
-    makes_seed: Tensor | None,
-    is_seed: Tensor,
-    valid: Tensor,
-    order: Tensor,
-    *,
-    late: bool,
-) -> Tensor:
+    edges: EdgeLists,
+    order: NDArray[np.int32],
+    valid: NDArray[np.bool_],
+    claims: NDArray[np.bool_] | None = None,
+    neighbors: NDArray[np.integer] | None = None,
+) -> NDArray[np.int32]:
     """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
 
     A point belongs to the first seed in the queue that has an edge to it. Whether it becomes a seed
-    is a property of that edge, or without ``makes_seed`` its own. With ``late`` promotion any edge
-    of its region may make a point a seed, whichever claimed it. Then the order of the queue does
-    not matter: edges that make seeds come first, and those that merely claim when the seeds of the
-    region are all known.
+    itself is a property of that edge: targets are ``2 * row + (whether it does)``.
 
-    Many waiting seeds are taken at a time, their edges in the order of the queue: this claims
-    exactly what one seed after the other does. The edges are those of :func:`mark_edges`. Returns
-    the root of each point's region, -1 where not valid.
+    With late promotion any edge of its region may make a point a seed, whichever claimed it. Then
+    the order of the queue does not matter: all edges given make seeds, and those ``neighbors``
+    ``(N, K)`` that the seeds of a region merely ``claim`` join when the seeds are all known.
+
+    Of a long queue all waiting seeds are taken at a time, their edges in the order of the queue:
+    this claims exactly what one seed after the other does. Returns the root of each point's region,
+    -1 where not valid.
     """
-    lists, bits, makes_itself = (values.cpu().numpy() for values in (indices, joins, is_seed))
-    promoting = None if makes_seed is None else makes_seed.numpy()
-    free, roots = valid.cpu().numpy().copy(), np.full(len(valid), -1, dtype=np.int32)
-    queue, slots = np.empty_like(roots), np.empty_like(roots)
-    for root in order.numpy():
+    all_codes, starts = edges.targets, memoryview(edges.starts.data)
+    free = bytearray(valid.tobytes())
+    roots = array("i", bytes(4 * len(valid)))
+    free_view = np.frombuffer(free, dtype=np.bool_)
+    roots_view = np.frombuffer(roots, dtype=np.int32)
+    roots_view[:] = -1
+    slots = np.empty(len(valid), dtype=np.int32)
+    for root in _still_free(order, free_view):
         if not free[root]:
             continue
-        free[root], roots[root], queue[0] = False, root, root
-        count = 1
-        for claims in (False, True) if late else (False,):
-            done = 0
-            while done < count:
-                seeds = queue[done : min(done + _SEEDS_AT_ONCE, count)]
-                done += len(seeds)
-                near, joined = lists[seeds], _read_bits(bits[seeds], lists.shape[1])
-                promotes = makes_itself[near]
-                if promoting is not None:
-                    promotes = _read_bits(promoting[seeds], lists.shape[1])
-                if late:
-                    joined &= promotes != claims
-                joined &= free[near]
-                targets, numbers = near[joined], np.arange(np.count_nonzero(joined), dtype=np.int32)
-                # Of several writes to one place the last one stays: the first edge to a point.
-                slots[targets[::-1]] = numbers[::-1]
-                is_first = slots[targets] == numbers
-                targets = targets[is_first]
-                free[targets], roots[targets] = False, root
-                if not claims:
-                    new = targets[promotes[joined][is_first]]
-                    queue[count : count + len(new)] = new
-                    count += len(new)
-    return torch.from_numpy(roots).to(indices.device)
+        free[root] = False
+        roots[root] = root
+        seeds = array("i", [root])
+        done = 0
+        while done < len(seeds):
+            if len(seeds) - done >= _LONG_QUEUE:
+                codes = _edges_of(edges, np.frombuffer(seeds[done:], dtype=np.int32))
+                codes = _first_of_each(codes[free_view[codes >> 1]], slots)
+                done = len(seeds)
+                targets = codes >> 1
+                free_view[targets] = False
+                roots_view[targets] = root
+                seeds.frombytes(targets[(codes & 1).astype(bool)].tobytes())
+                continue
+            seed = seeds[done]
+            done += 1
+            for code in all_codes[starts[seed] : starts[seed + 1]].tolist():
+                target = code >> 1
+                if free[target]:
+                    free[target] = False
+                    roots[target] = root
+                    if code & 1:
+                        seeds.append(target)
+        if claims is not None and neighbors is not None:
+            for first in range(0, len(seeds), _CLAIMING_SEEDS):
+                some = np.frombuffer(seeds[first : first + _CLAIMING_SEEDS], dtype=np.int32)
+                claimed = neighbors[some][claims[some]]
+                claimed = claimed[free_view[claimed]]
+                free_view[claimed] = False
+                roots_view[claimed] = root
+    return roots_view
 
 
-def _read_bits(words: NDArray[np.int64], k: int) -> NDArray[np.bool_]:
-    """Return the first k bits of words ``(n, words)`` as flags ``(n, K)``."""
-    return np.unpackbits(words.view(np.uint8), axis=1, count=k, bitorder="little").view(np.bool_)
+def _still_free(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
+    """Give the points that are free when their chunk begins: a list of all takes 36 bytes each."""
+    for rows in chunks_of(len(order), ROWS_AT_ONCE):
+        some = order[rows]
+        yield from some[free[some]].tolist()
+
+
+def _edges_of(edges: EdgeLists, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the targets of some points' edges, one point after the other."""
+    starts = edges.starts[rows]
+    counts = edges.starts[rows + 1] - starts
+    ends = np.cumsum(counts, dtype=starts.dtype)
+    places = np.repeat(starts - ends + counts, counts)
+    places += np.arange(len(places), dtype=places.dtype)
+    return edges.targets[places]
+
+
+def _first_of_each(codes: NDArray[np.int32], slots: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the first of the codes of each target; ``slots`` has room for every point."""
+    targets = codes >> 1
+    numbers = np.arange(len(targets), dtype=np.int32)
+    # Of several writes to one place the last one stays: in reverse, the first edge to a point.
+    slots[targets[::-1]] = numbers[::-1]
+    firsts: NDArray[np.int32] = codes[slots[targets] == numbers]
+    return firsts
