@@ -293,7 +293,10 @@ class PatchNormals(nn.Module):
         check_choices("PatchNormals", method=(method, Method))
         self.method, self.settings = method, settings
         if method == "irls" and not settings.get("noise", 0) > 0:
-            raise ConfigError("PatchNormals: expected noise > 0 with method='irls', as a setting.")
+            raise ConfigError(
+                "PatchNormals: expected noise > 0 with method='irls', got none; pass noise=, in "
+                "the unit of the points."
+            )
         try:
             self.fit(torch.empty(0, 4, 3))
         except TypeError as error:

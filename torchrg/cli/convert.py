@@ -40,7 +40,7 @@ from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig, Up
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.io import FORMATS
+from torchrg.io import FOLDER_SUFFIXES
 from torchrg.io.files import check_place, free_space, make_folder
 from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
@@ -139,9 +139,9 @@ class FolderArguments(CloudArguments):
     """
 
     columns: flags.ColumnsFlag = None
-    suffixes: tuple[str, ...] = tuple(FORMATS)
-    """Suffixes of the files that are clouds, by default all that torchrg segment reads. Name fewer
-    where two files differ in the suffix alone."""
+    suffixes: tuple[str, ...] = FOLDER_SUFFIXES
+    """Suffixes of the files that are clouds, by default all that torchrg segment reads but .csv.
+    Name fewer where two files differ in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
@@ -293,7 +293,7 @@ def _check(arguments: Arguments) -> None:
             f"got {table}; use planes.csv."
         )
     if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
+        raise ConfigError("expected --ray-address together with --engine ray, got none; add it.")
     if _pages_of(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):
@@ -306,9 +306,14 @@ def _check(arguments: Arguments) -> None:
         has_superpoints = arguments.superpoint or arguments.layout != "pointcept"
         usual = (SuperpointsConfig(), 0)
         if not has_superpoints and (arguments.partition, arguments.level) != usual:
-            raise ConfigError("expected --superpoint with --partition or --level; add it.")
+            raise ConfigError(
+                "expected --superpoint with --partition or --level, got none; add it."
+            )
         if arguments.pages is not None and arguments.layout != "pointcept":
-            raise ConfigError("expected --pages with --layout pointcept, which pages are made of.")
+            raise ConfigError(
+                "expected --pages with --layout pointcept, which pages are made of, got "
+                f"{arguments.layout}; leave one of them out."
+            )
 
 
 def _pages_of(arguments: Arguments) -> Path | None:

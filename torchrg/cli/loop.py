@@ -41,7 +41,10 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         check_place(out) if ending == suffix else check_output(out)
         return [out]
     if ending and ending in (suffix, *FORMATS) and not out.is_dir():
-        raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
+        raise FormatError(
+            f"{out}: expected a directory for {len(inputs)} inputs, got a file name; "
+            "name a directory."
+        )
     results = [out / f"{path.stem}{suffix}" for path in inputs]
     first: dict[str, Path] = {}
     for result, source in zip(results, inputs, strict=True):
@@ -107,7 +110,10 @@ def paths_beside(
 def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
     """Raise before long work if a picture, page or table has no place, or cannot be made."""
     if path.suffix.lower() not in suffixes:
-        raise FormatError(f"{path}: expected a file that ends in {' or '.join(suffixes)}.")
+        known = " or ".join(suffixes)
+        raise FormatError(
+            f"{path}: expected a file that ends in {known}, got {path.suffix!r}; name it so."
+        )
     check_place(path)
     if is_page(path):
         check_library()

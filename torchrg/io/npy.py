@@ -192,11 +192,13 @@ def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Values]:
     """
     paths = {name: folder / f"{name}.npy" for name in names}
     if not paths["coord"].is_file():
-        raise FormatError(f"{folder}: expected coord.npy in this folder, got none.")
+        raise FormatError(
+            f"{folder}: expected coord.npy in this folder, got none; name the folder of a scene."
+        )
     arrays = {name: map_array(path) for name, path in paths.items() if path.is_file()}
     shape = arrays["coord"].shape
     if len(shape) not in (2, 3) or shape[-1] != 3:
-        raise FormatError(f"{paths['coord']}: expected shape (N, 3), got {shape}.")
+        raise FormatError(f"{paths['coord']}: expected shape (N, 3), got {shape}; reshape it.")
     for name, values in arrays.items():
         check_rows(paths[name], values, shape[:-1])
     return arrays
@@ -206,7 +208,9 @@ def check_rows(path: Path, values: Values, shape: tuple[int, ...]) -> None:
     """Check that an array has a row for each point, or for each pixel of an image."""
     if values.shape[: len(shape)] != shape:
         rows = " x ".join(map(str, shape))
-        raise FormatError(f"{path}: expected {rows} rows, got shape {values.shape}.")
+        raise FormatError(
+            f"{path}: expected {rows} rows, got shape {values.shape}; write it of the same points."
+        )
 
 
 def map_array(path: Path) -> Values:

@@ -60,7 +60,8 @@ def entries_of(sample: Sample) -> Entries:
         entries: Entries = sample.to_dict()
         return entries
     raise ConfigError(
-        f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}."
+        f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}; for a "
+        "tensor, pass dict(coord=points)."
     )
 
 
