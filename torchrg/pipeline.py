@@ -229,8 +229,10 @@ def _segment(
         own[labels[labels >= 0]] = objects[labels >= 0]
         planes = replace(planes, object=own)
     begin("done")
-    kept = neighbors if voxel is None else None
-    return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept, sampling)
+    searched = neighbors if voxel is None else None
+    return Segmentation(
+        labels, normals, curvature, sharp, valid, planes, points, searched, sampling
+    )
 
 
 def _has_auto(config: PipelineConfig) -> bool:

@@ -107,10 +107,10 @@ class Cloud:
     @cached_property
     def origin(self) -> NDArray[np.float64]:
         """Origin of :attr:`points`, shape ``(3,)``: that of :func:`origin_of_box`."""
-        kept = self.coordinates[self.finite]
-        if len(kept) == 0:
+        finite = self.coordinates[self.finite]
+        if len(finite) == 0:
             return np.zeros(3)
-        return origin_of_box(kept.min(axis=0), kept.max(axis=0))
+        return origin_of_box(finite.min(axis=0), finite.max(axis=0))
 
     @cached_property
     def points(self) -> Tensor:
@@ -204,9 +204,9 @@ class Neighbors(NamedTuple):
         """Return which entries of some points are neighbours, shape ``(n, K)``, bool."""
         if self.valid is not None:
             return self.valid[rows]
-        own = self.indices[rows, :1]
-        shape = own.shape[0], self.indices.shape[1]
-        return torch.ones(shape, dtype=torch.bool, device=own.device)
+        first = self.indices[rows, :1]
+        shape = first.shape[0], self.indices.shape[1]
+        return torch.ones(shape, dtype=torch.bool, device=first.device)
 
 
 class Sampling(NamedTuple):

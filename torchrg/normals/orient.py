@@ -162,11 +162,11 @@ def orient_normals(
     if len(rows) == 0:
         return upright
     spreading = rows[_evenly_spread(len(rows))]
-    kept, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
-    near = search_knn(kept, min(NUM_NEIGHBORS, len(kept)), canonical=True)
-    signs = turn(kept, units, near)
+    places, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
+    near = search_knn(places, min(NUM_NEIGHBORS, len(places)), canonical=True)
+    signs = turn(places, units, near)
     if len(spreading) < len(rows):
-        signs = _follow(cloud, upright, rows, kept, units * signs[:, None])
+        signs = _follow(cloud, upright, rows, places, units * signs[:, None])
     return upright.index_copy(0, rows, upright[rows] * signs[:, None].to(given.dtype))
 
 
@@ -189,11 +189,11 @@ def _follow(
     tree = cKDTree(nearest.cpu().numpy(), balanced_tree=False, compact_nodes=False)
 
     def follow(chunk: slice) -> Tensor:
-        own = rows[chunk]
-        _, found = tree.query(points[own].cpu().numpy(), min(_NUM_LINKS, tree.n))
-        near = torch.from_numpy(found).to(points.device)
-        arms = nearest[near] - points[own, None]
-        cosine, slope = _agreement(arms, normals[own, None].to(points.dtype), oriented[near])
+        asked = rows[chunk]
+        _, nearest_places = tree.query(points[asked].cpu().numpy(), min(_NUM_LINKS, tree.n))
+        near = torch.from_numpy(nearest_places).to(points.device)
+        arms = nearest[near] - points[asked, None]
+        cosine, slope = _agreement(arms, normals[asked, None].to(points.dtype), oriented[near])
         least = (1 - cosine.abs() + slope).argmin(dim=1, keepdim=True)
         return torch.where(cosine.gather(1, least)[:, 0] < 0, -1.0, 1.0).to(points.dtype)
 
@@ -322,9 +322,9 @@ def propagate_signs(
     starts, ends = (end.cpu().numpy().astype(np.int32) for end in (links.starts, links.ends))
     bends = links.bends.double().cpu().numpy()
     face_bend = max(_FACE_BEND, _USUAL_BENDS * float(np.median(bends))) if len(bends) else 0.0
-    kept = bends <= _PATCH_BEND if within_patches else slice(None)
+    linked = bends <= _PATCH_BEND if within_patches else slice(None)
     # A weight of zero would be no link, so every link weighs one more than its bend.
-    weights, pairs = 1 + bends[kept], (starts[kept], ends[kept])
+    weights, pairs = 1 + bends[linked], (starts[linked], ends[linked])
     tree = spanning_tree(csr_array((weights, pairs), shape=(num_points, num_points)))
     num_patches, patches = connected_components(tree, directed=False)
     flat = tree.data <= 1 + face_bend
