@@ -61,7 +61,7 @@ def draw_frame(path: Path, color: Path, depth: Path) -> None:
     parts = torchrg.make_superpoints(points, seg, config, colors=own).labels
     panels = {
         "points": own,
-        f"{len(seg.planes.count)} planes": color_planes(seg.labels, points),
+        f"{len(seg.planes)} planes": color_planes(seg.labels, points),
         f"{int(parts.amax()) + 1} superpoints": color_planes(parts, points),
     }
     pictures = [

@@ -1,12 +1,16 @@
 """Kinds of tensors: each gives the right result, or one line that says what to do."""
 
+import pickle
+import re
+
+import numpy as np
 import pytest
 import torch
 
 import torchrg
 from tests.test_transformations import FUNCTIONS
 from torchrg.config import NormalsConfig
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.normals import ESTIMATORS, orient_normals
 from torchrg.transforms import SegmentDepth
 
@@ -105,6 +109,44 @@ def test_sparse_tensors_are_refused_with_the_repair(name):
         name = "pca"
     with pytest.raises(ShapeError, match=r"to be dense, got a sparse tensor; pass \w+.to_dense"):
         CALLS[name](argument(name).to_sparse())
+
+
+def test_jagged_patches_are_refused_with_the_repair():
+    jagged = torch.nested.nested_tensor([torch.rand(9, 3), torch.rand(7, 3)], layout=torch.jagged)
+    with pytest.raises(ShapeError, match=r"got a nested tensor; pass torch.nested.to_padded_tens"):
+        torchrg.nn.Covariance()(jagged)
+
+
+@pytest.mark.parametrize(
+    ("transform", "example"),
+    [
+        (torchrg.transforms.SegmentPlanes(), "{'coord': points}"),
+        (torchrg.transforms.CenterCloud(), "{'coord': points}"),
+        (torchrg.transforms.SampleVoxels(0.1), "{'coord': points}"),
+        (torchrg.transforms.SegmentDepth(), "{'depth': depth, 'intrinsics': matrix}"),
+        (torchrg.transforms.DepthToCloud(), "{'depth': depth, 'intrinsics': matrix}"),
+    ],
+)
+def test_a_bare_tensor_says_how_a_sample_is_made(transform, example):
+    name = type(transform).__name__
+    with pytest.raises(ConfigError, match=f"^{name}: .* got Tensor; pass {re.escape(example)}"):
+        transform(torch.rand(50, 3))
+
+
+def test_rows_of_a_data_set_of_lists_say_how_they_become_tensors():
+    with pytest.raises(ShapeError, match=r"coord .* got list; .* with_format\('torch'\)"):
+        torchrg.transforms.SegmentPlanes()({"coord": [[0.0, 0, 0]]})
+
+
+def test_what_users_look_for_elsewhere_is_named():
+    cloud = torchrg.Cloud(np.zeros((2, 3)), {"color": np.zeros((2, 3), np.uint8)})
+    with pytest.raises(AttributeError, match=r"no attribute 'colors'; it has fields\['color'\]"):
+        _ = cloud.colors
+    assert pickle.loads(pickle.dumps(cloud)).fields.keys() == {"color"}
+    with pytest.raises(AttributeError, match=r"'show'; seg.show\(\) shows a result"):
+        _ = torchrg.show
+    with pytest.raises(ShapeError, match=r"got \(9, 6\); pass points\[:, :3\]"):
+        torchrg.segment_planes(torch.rand(9, 6))
 
 
 @pytest.mark.parametrize("name", CLOUDS)

@@ -44,6 +44,10 @@ def test_version_license_and_authors_are_the_same_everywhere():
     assert PROJECT["version"] == __version__
     assert zenodo["license"] == PROJECT["license"]
     assert [creator["name"] for creator in zenodo["creators"]] == authors
+    citation = yaml.safe_load((ROOT / ".github" / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (citation["version"], citation["license"]) == (__version__, PROJECT["license"])
+    assert [author["name"] for author in citation["authors"]] == authors
+    assert citation["title"] == zenodo["title"]
     assert f"{authors[0].lower()}\n" in (ROOT / "LICENSE").read_text(encoding="utf-8").lower()
 
 
@@ -51,6 +55,7 @@ def test_the_paper_is_named_as_in_the_readme():
     (url,) = PROJECT["urls"].values()
     assert url in (ROOT / "README.md").read_text(encoding="utf-8")
     assert url in (ROOT / ".zenodo.json").read_text(encoding="utf-8")
+    assert url in (ROOT / ".github" / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_hooks_use_the_linter_of_the_suite():

@@ -212,6 +212,18 @@ def test_what_does_not_fit_into_an_operation_is_refused(patches):
         torch.vmap(draw)(patches)
 
 
+@functions
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script")
+def test_forward_mode_is_refused_in_our_words(patches, name):
+    patch = patches[0].double()
+    if name == "covariance":
+        torch.func.jacfwd(FUNCTIONS[name])(patch)
+        return
+    for mode in (torch.func.jacfwd, torch.func.hessian):
+        with pytest.raises(NotImplementedError, match="in reverse mode only; use"):
+            mode(lambda x: FUNCTIONS[name](x)[0].sum())(patch)
+
+
 def test_second_derivatives_of_opaque_functions_are_refused(patches):
     hessian = torch.func.jacrev(torch.func.jacrev(lambda x: qn(x)))
     with pytest.raises(NotImplementedError, match="scale_of_rows: has no second derivatives"):

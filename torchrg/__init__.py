@@ -11,9 +11,10 @@ Functions of patches (``covariance``, ``eigh3``, ``median``, ``mad``, ``qn``, ``
 ``fit_normals_pca``, ``fit_normals_jet``, ``fit_normals_irls``, ``fit_normals_robust``,
 ``fit_detmcd``, ``fit_fastmcd``, ``fit_mve``, ``fit_dets``, ``fit_detmm``) are like those of torch:
 they have gradients, and run under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)``,
-``torch.export`` and ``torch.autocast``. The robust fits, scales and ``fit_normals_irls`` are one
-operation of their own to ``vmap``, ``torch.func`` and compilers, and have no
-second derivatives there. Functions of clouds (``search_knn``,
+``torch.export`` and ``torch.autocast``. All but ``covariance`` have derivatives in reverse mode
+only, not in that of ``jacfwd`` and ``hessian``. The robust fits, scales and ``fit_normals_irls``
+are one operation of their own to ``vmap``, ``torch.func`` and compilers, and have no second
+derivatives there. Functions of clouds (``search_knn``,
 ``estimate_normals``, ``orient_normals``, ``grow_regions``, ``segment_planes``,
 ``make_superpoints``, ``segment_depth``) search neighbours and grow regions on the CPU: a compiler
 breaks its graph there and compiles the rest, ``vmap`` and ``torch.func`` are refused in one line,
@@ -71,7 +72,8 @@ else:
                 raise
             module = None
         if module is None:
-            raise AttributeError(f"module 'torchrg' has no attribute {name!r}")
+            repair = "; seg.show() shows a result" if name == "show" else ""
+            raise AttributeError(f"module 'torchrg' has no attribute {name!r}{repair}")
         globals()[name] = getattr(module, name) if name in _MODULES else module
         return globals()[name]
 

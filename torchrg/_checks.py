@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
-from typing import Any, ParamSpec, TypeGuard, TypeVar, get_args
+from typing import Any, NoReturn, ParamSpec, TypeGuard, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -34,9 +34,12 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
     repair = ""
     if isinstance(values, list | tuple):
-        repair = "; torch.tensor makes one of numbers"
+        repair = "; torch.tensor makes one of numbers, with_format('torch') those of a data set"
     elif name == "points" and not isinstance(values, np.ndarray):
-        repair = "; read_cloud(path).points is that of a file"
+        repair = (
+            "; read_cloud(path).points is that of a file, numpy.asarray(cloud.points) that of a "
+            "cloud of Open3D"
+        )
     raise ShapeError(
         f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}{repair}."
     )
@@ -68,6 +71,11 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
             raise ShapeError(
                 f"{caller}: expected {name} of float32 or float64, got {dtype}{repair}."
             )
+        if tensor.is_nested:
+            raise ShapeError(
+                f"{caller}: expected {name} to be dense, got a nested tensor; pass "
+                f"torch.nested.to_padded_tensor({name}, 0.0), and a mask of what is there."
+            )
         if tensor.layout is not torch.strided:
             raise ShapeError(
                 f"{caller}: expected {name} to be dense, got a sparse tensor; pass "
@@ -88,6 +96,11 @@ def check_points(caller: str, points: Tensor) -> None:
         raise ShapeError(
             f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass the depth "
             "of an image to torchrg.transforms.SegmentDepth, or points.reshape(-1, 3)."
+        )
+    if points.ndim == 2 and points.shape[1] > 3:
+        raise ShapeError(
+            f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass "
+            "points[:, :3]."
         )
     check_shapes(caller, points=(points, "N 3"))
     check_floating(caller, points=points)
@@ -155,6 +168,14 @@ def has_values(*tensors: Tensor | None) -> bool:
         return False
 
 
+def refuse_forward_mode(caller: str) -> NoReturn:
+    """Say which derivatives there are, to ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
+    raise NotImplementedError(
+        f"{caller}: has derivatives in reverse mode only; use torch.func.jacrev, vjp or grad in "
+        "place of jacfwd, jvp or hessian."
+    )
+
+
 def _plain(value: object) -> object:
     """Return tensors of a class of somebody's own, whose results would be too, as tensors."""
     return value.as_subclass(Tensor) if is_tensor(value) and type(value) is not Tensor else value
@@ -169,7 +190,7 @@ def made_on_cpu() -> Iterator[None]:
         ...     torch.zeros(2).device
         device(type='cpu')
     """
-    if torch.get_default_device().type == "cpu":
+    if torch.empty(0).device.type == "cpu":
         yield
         return
     with torch.device("cpu"):

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import Arguments, Result, has_values, is_tensor
+from torchrg._checks import Arguments, Result, has_values, is_tensor, refuse_forward_mode
 from torchrg.errors import ConfigError
 
 
@@ -49,7 +49,9 @@ def opaque(
 
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            given: dict[str, Any] = {**dict(zip(parameters, args, strict=False)), **kwargs}
+            # Compilers of torch 2.5 follow neither a zip of unequal lengths nor a union of dicts.
+            given: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
+            given = {**given, **kwargs}
             tensors = {key: given[key] for key in parameters if is_tensor(given.get(key))}
             if has_values(*tensors.values()):
                 return function(*args, **kwargs)
@@ -160,8 +162,6 @@ def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa:
 class _Differentiable(torch.autograd.Function):
     """An opaque function with its gradient, which is another one."""
 
-    generate_vmap_rule = True
-
     @staticmethod
     def forward(call: str, *tensors: Tensor) -> tuple[Tensor, ...]:
         return tuple(_forward(list(tensors), call))
@@ -183,11 +183,19 @@ class _Differentiable(torch.autograd.Function):
             first = _Once.apply(ctx.call, *tensors)  # type: ignore[no-untyped-call]
         return None, first, *[None] * (len(ctx.saved_tensors) - 1)
 
+    @staticmethod
+    def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
+        first = _with_batch_first(info.batch_size, places[1:], list(tensors))
+        outputs = _Differentiable.apply(call, *first)  # type: ignore[no-untyped-call]
+        return outputs, (0,) * len(outputs)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
+        refuse_forward_mode(ctx.call.split("|")[0])
+
 
 class _Once(torch.autograd.Function):
     """The gradient of an opaque function, which has none itself."""
-
-    generate_vmap_rule = True
 
     @staticmethod
     def forward(call: str, *tensors: Tensor) -> Tensor:
@@ -200,4 +208,13 @@ class _Once(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:  # noqa: ANN401
+        raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")
+
+    @staticmethod
+    def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
+        first = _with_batch_first(info.batch_size, places[1:], list(tensors))
+        return _Once.apply(call, *first), 0  # type: ignore[no-untyped-call]
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
         raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")

@@ -49,6 +49,20 @@ _KEPT_BYTES = 31 * 2**20
 """Just below 32 MiB, the largest freed block from which glibc learns what to keep."""
 
 
+@contextmanager
+def in_empty_folder() -> Iterator[None]:
+    """Start processes in a folder without modules, as Python 3.10 and libraries import from there.
+
+    Paths that they are given have to be absolute.
+    """
+    folder = Path.cwd()
+    os.chdir("/")
+    try:
+        yield
+    finally:
+        os.chdir(folder)
+
+
 def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
     """Cut ``num_rows`` rows into slices of at most ``chunk_size`` rows.
 

@@ -657,7 +657,8 @@ def _refuse(config: object, name: str, value: object) -> NoReturn:
     )
 
 
-for _kind in (*_SECTIONS.values(), PipelineConfig, SuperpointsConfig, DepthConfig):
-    _kind.__setattr__ = _refuse  # type: ignore[method-assign, assignment]
+_KINDS: list[Any] = [*_SECTIONS.values(), PipelineConfig, SuperpointsConfig, DepthConfig]
+for _kind in _KINDS:
+    _kind.__setattr__ = _refuse
 # So that torch.load(weights_only=True) reads checkpoints that hold settings.
-torch.serialization.add_safe_globals([*_SECTIONS.values(), PipelineConfig])
+torch.serialization.add_safe_globals(_KINDS)

@@ -222,6 +222,8 @@ class MVE(_Function):
 class DetS(_Function):
     """Deterministic S-estimator of patches, with settings of :func:`torchrg.robust.fit_dets`.
 
+    Its gradients are those of the last step, with the weights of the points held fixed.
+
     Example:
         >>> DetS()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
         tensor(True)
@@ -240,6 +242,8 @@ class DetS(_Function):
 @dataclass(eq=False, repr=False)
 class DetMM(_Function):
     """Deterministic MM-estimator of patches, with settings of :func:`torchrg.robust.fit_detmm`.
+
+    Its gradients are those of the last step, with the weights of the points held fixed.
 
     Example:
         >>> DetMM()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
@@ -293,7 +297,10 @@ class PatchNormals(nn.Module):
         check_choices("PatchNormals", method=(method, Method))
         self.method, self.settings = method, settings
         if method == "irls" and not settings.get("noise", 0) > 0:
-            raise ConfigError("PatchNormals: expected noise > 0 with method='irls', as a setting.")
+            raise ConfigError(
+                "PatchNormals: expected noise > 0 with method='irls', got none; pass noise=, in "
+                "the unit of the points."
+            )
         try:
             self.fit(torch.empty(0, 4, 3))
         except TypeError as error:

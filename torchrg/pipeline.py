@@ -126,7 +126,9 @@ def segment_planes(
         raise ShapeError(
             f"segment_planes: expected within of integers, got {objects.dtype}; number the objects."
         )
-    settings = settings_of("segment_planes", PipelineConfig, config, changes)
+    settings = config
+    if not isinstance(settings, PipelineConfig) or changes:
+        settings = settings_of("segment_planes", PipelineConfig, config, changes)
 
     def begin(stage: str) -> None:
         if scratch.is_active():
@@ -227,8 +229,10 @@ def _segment(
         own[labels[labels >= 0]] = objects[labels >= 0]
         planes = replace(planes, object=own)
     begin("done")
-    kept = neighbors if voxel is None else None
-    return Segmentation(labels, normals, curvature, sharp, valid, planes, points, kept, sampling)
+    searched = neighbors if voxel is None else None
+    return Segmentation(
+        labels, normals, curvature, sharp, valid, planes, points, searched, sampling
+    )
 
 
 def _has_auto(config: PipelineConfig) -> bool:

@@ -65,18 +65,18 @@ def note_on_steps(
     if not is_single and scale == 0:
         return ""
     finite = np.isfinite(points).all(axis=1)
-    known = points if finite.all() else points[finite]
-    if len(known) < 3:
+    finite_points = points if finite.all() else points[finite]
+    if len(finite_points) < 3:
         return ""
     with np.errstate(over="ignore", invalid="ignore"):
-        low, high = np.quantile(known, _QUARTILES, axis=0)
+        low, high = np.quantile(finite_points, _QUARTILES, axis=0)
         width, reach = float((high - low).max()), np.float32(np.abs([low, high]).max())
         single = float(np.spacing(reach)) if is_single else 0.0
     step = max(single, scale)
-    even = width / math.sqrt(len(known))
+    even = width / math.sqrt(len(finite_points))
     if not 0 < width < math.inf or step <= _SURELY_FINE * even:
         return ""
-    spacing = _spacing(known, _CELL * even) if step < even else even
+    spacing = _spacing(finite_points, _CELL * even) if step < even else even
     is_grid = scale > _COARSE_GRID * spacing
     if not is_grid and single <= _COARSE * spacing:
         return ""

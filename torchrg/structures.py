@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, SupportsIndex
+from typing import TYPE_CHECKING, Any, NamedTuple, SupportsIndex
 
 import numpy as np
 import torch
@@ -87,6 +87,13 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.coordinates)
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name):  # noqa: ANN001, ANN204
+            """Say where the values of points are, to who asks for them by name."""
+            known = ", ".join(f"fields[{field!r}]" for field in vars(self).get("fields", ()))
+            raise AttributeError(f"Cloud has no attribute {name!r}; it has {known or 'no fields'}.")
+
     @cached_property
     def finite(self) -> NDArray[np.bool_]:
         """Which points have three finite coordinates, none beyond 1e12, shape ``(N,)``.
@@ -100,10 +107,10 @@ class Cloud:
     @cached_property
     def origin(self) -> NDArray[np.float64]:
         """Origin of :attr:`points`, shape ``(3,)``: that of :func:`origin_of_box`."""
-        kept = self.coordinates[self.finite]
-        if len(kept) == 0:
+        finite = self.coordinates[self.finite]
+        if len(finite) == 0:
             return np.zeros(3)
-        return origin_of_box(kept.min(axis=0), kept.max(axis=0))
+        return origin_of_box(finite.min(axis=0), finite.max(axis=0))
 
     @cached_property
     def points(self) -> Tensor:
@@ -197,9 +204,9 @@ class Neighbors(NamedTuple):
         """Return which entries of some points are neighbours, shape ``(n, K)``, bool."""
         if self.valid is not None:
             return self.valid[rows]
-        own = self.indices[rows, :1]
-        shape = own.shape[0], self.indices.shape[1]
-        return torch.ones(shape, dtype=torch.bool, device=own.device)
+        first = self.indices[rows, :1]
+        shape = first.shape[0], self.indices.shape[1]
+        return torch.ones(shape, dtype=torch.bool, device=first.device)
 
 
 class Sampling(NamedTuple):

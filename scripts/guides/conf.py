@@ -18,6 +18,8 @@ exclude_patterns = ["made"]
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", "PinholeCamera|Template|Arguments")]
 """Types that are only there for type checkers."""
+suppress_warnings = ["ref.python"]
+"""A type that is called as attributes of several classes are, as ``object`` is."""
 smartquotes = False
 """Else flags lose a dash."""
 myst_heading_anchors = 3

@@ -140,9 +140,7 @@ def test_examples_are_understood(prog, capsys):
     for line in examples:
         assert line.startswith(f"{prog} ")
         arguments = shlex.split(line)[len(prog.split()) :]
-        for flag in ("--superpoints", "--superpoint"):
-            arguments = flags.spell_counts(arguments, flag)
-        parse(kind, arguments, prog=prog)
+        parse(kind, flags.spell_counts(arguments), prog=prog)
 
 
 def test_what_is_needed_has_names(capsys):

@@ -144,7 +144,7 @@ def test_points_that_are_not_finite_agree_with_each_other(folder, score, refused
 
 def test_results_of_convert_are_scored_as_files_are(folder_of_clouds, tmp_path, score):
     truth, out = folder_of_clouds("hall.npz", "east/office.ply"), tmp_path / "out"
-    flags = ["--workers", "1", "--preset", "classic", "--superpoint"]
+    flags = ["--workers", "1", "--preset", "classic", "--superpoints"]
     assert main(["convert", "folder", str(truth), str(out), *flags]) == 0
     scores = score(out, truth, "--superpoints")
     assert list(scores["scans"]) == ["east/office", "hall"]

@@ -36,7 +36,9 @@ def test_the_result_holds_every_level(folder):
     assert provenance["superpoints"]["strengths"] == [0.3, 3.0]
 
 
-@pytest.mark.parametrize("flags", [["--superpoints", "300,40"], ["--superpoints=300,40"]])
+@pytest.mark.parametrize(
+    "flags", [["--superpoints", "300,40"], ["--superpoints=300,40"], ["--superpoint", "300,40"]]
+)
 def test_numbers_of_superpoints_are_asked_for_in_a_word(folder, tmp_path, run, flags):
     path = tmp_path / "parts.npz"
     assert run("segment", folder / "room.npz", "--out", path, *flags).code == 0

@@ -172,5 +172,5 @@ def test_an_empty_or_missing_file_is_an_error(file):
 def test_the_reader_is_asked_for_by_name(file, monkeypatch):
     file.write_bytes(GOOD)
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[s3dis\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[text\]'"):
         read_annotation(file)

@@ -55,6 +55,18 @@ def test_samples_that_differ_are_refused():
         collate_offset([])
 
 
+def test_labels_of_clouds_are_counted_on_where_asked():
+    clouds = [[0, -1, 1], [], [-1], [2, 0, 1]]
+    samples = [
+        {"coord": torch.zeros(len(plane), 3), "plane": torch.tensor(plane, dtype=torch.int64)}
+        for plane in clouds
+    ]
+    assert collate_offset(samples)["plane"].tolist() == [0, -1, 1, -1, 2, 0, 1]
+    assert collate_offset(samples, unique=["plane"])["plane"].tolist() == [0, -1, 1, -1, 4, 2, 3]
+    with pytest.raises(ShapeError, match="expected samples with 'superpoint', got coord, plane"):
+        collate_offset(samples, unique=("plane", "superpoint"))
+
+
 def test_what_names_points_names_rows_of_the_batch():
     """Labels of a batch go back to the points of all clouds, and to no point without a voxel."""
     clouds = [torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1, 0, 0]]), torch.eye(3)]

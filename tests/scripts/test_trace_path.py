@@ -1,11 +1,14 @@
 """How many files a newcomer reads to follow a preset from points to planes."""
 
+import sys
+
 import pytest
 import trace_path
 
 from torchrg import kernels
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 names no methods in a trace")
 @pytest.mark.skipif(kernels.name_of_library() is None, reason="needs the kernels")
 @pytest.mark.parametrize("preset", trace_path.LONGEST)
 def test_path_of_a_preset_stays_short(preset, monkeypatch):

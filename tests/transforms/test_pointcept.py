@@ -25,7 +25,7 @@ STAND_INS = ("real", "pointcept", "torch_scatter", "torchvision", "termcolor", O
 SIZES = {"office_1": 2500, "office_2": 2000, "office_3": 1500}
 GRID = {"type": "GridSample", "grid_size": 0.1, "mode": "train", "return_grid_coord": True}
 CROP = {"type": "SphereCrop", "sample_rate": 0.6, "mode": "random"}
-PLANES = {"type": "SegmentPlanes", "config": "classic"}
+PLANES = {"type": "SegmentPlanes", "config": {"base": "classic", "normals": {"k": 50}}}
 KEYS = ("coord", "segment", "plane")
 TAIL = [
     {"type": "ToTensor"},

@@ -9,9 +9,15 @@ import torch
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
 from torchrg.neighbors import restore_points, sample_voxels
-from torchrg.pipeline import segment_planes
+from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.scenes import make_room
-from torchrg.transforms import CenterCloud, KeepFinite, SampleVoxels, SegmentPlanes
+from torchrg.transforms import (
+    CenterCloud,
+    KeepFinite,
+    MakeSuperpoints,
+    SampleVoxels,
+    SegmentPlanes,
+)
 
 SIZE = 0.3
 
@@ -96,6 +102,30 @@ def test_labels_of_a_batch_go_back_to_its_points(pyg, data, clouds):
             assert torch.equal(back[start : start + len(points)], expected)
             start += len(points)
         assert start == len(back)
+
+
+def test_pyg_counts_planes_and_superpoints_on_under_names_of_an_index(pyg):
+    names = {name: f"{name}_index" for name in ("plane", "superpoint")}
+    steps = torch.nn.Sequential(SegmentPlanes("classic", keys=names), MakeSuperpoints(keys=names))
+    rooms = [make_room(900 + 200 * seed, noise=0.003, seed=seed).points for seed in range(3)]
+    rooms[1][5] = torch.nan
+    made = [steps(pyg.data.Data(pos=points)) for points in rooms]
+    for batch in (
+        pyg.data.Batch.from_data_list(made),
+        steps(pyg.data.Batch.from_data_list([pyg.data.Data(pos=points) for points in rooms])),
+    ):
+        ends = batch.ptr[1:-1].tolist()
+        for name, key in names.items():
+            parts = torch.tensor_split(batch[key], ends)
+            known = [set(part[part >= 0].tolist()) for part in parts]
+            assert len(set.union(*known)) == sum(map(len, known))
+            for part, points in zip(parts, rooms, strict=True):
+                seg = segment_planes(points, "classic")
+                own = seg.labels if name == "plane" else make_superpoints(points, seg).labels
+                assert torch.equal(part >= 0, own >= 0)
+                shifts = (part - own)[own >= 0].unique()
+                assert len(shifts) == 1
+        assert torch.equal(batch.to_data_list()[2].plane_index, made[2].plane_index)
 
 
 def test_what_was_added_to_a_batch_stays_with_it(pyg, data, clouds):

@@ -9,7 +9,7 @@ from multiprocessing import connection, get_context, parent_process, resource_tr
 from multiprocessing.connection import Connection
 from threading import Thread
 
-from torchrg._parallel import CHILD_ENVIRONMENT
+from torchrg._parallel import CHILD_ENVIRONMENT, in_empty_folder
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
@@ -88,7 +88,7 @@ class _Worker:
         self.pipe, theirs = context.Pipe()
         # What ends it before its first scan is a line of a report, no traceback on the terminal.
         self.errors, errors = os.pipe()
-        with _environment(), _no_interrupts(), _stderr_to(errors) as stderr:
+        with in_empty_folder(), _environment(), _no_interrupts(), _stderr_to(errors) as stderr:
             self.process = context.Process(target=_serve, args=(theirs, stderr))
             self.process.start()
         os.close(errors)

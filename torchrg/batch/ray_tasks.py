@@ -1,14 +1,12 @@
 """The Ray engine: what Ray knows about retries and nodes serves."""
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchrg._optional import require
-from torchrg._parallel import CHILD_ENVIRONMENT
+from torchrg._parallel import CHILD_ENVIRONMENT, in_empty_folder
 from torchrg.batch.local import BEAT_SECONDS
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
@@ -51,10 +49,7 @@ def run_ray(
         "object_store_memory": _OBJECT_STORE_BYTES,
         "include_dashboard": False,
     }
-    # Ray lets its processes import from the folder it is called in: one where no data are.
-    folder = Path.cwd()
-    os.chdir("/")
-    try:
+    with in_empty_folder():
         ray.init(
             address=address or "local",
             logging_level="error",
@@ -62,8 +57,6 @@ def run_ray(
             runtime_env={"env_vars": CHILD_ENVIRONMENT},
             **({} if address else started),
         )
-    finally:
-        os.chdir(folder)
     pending: dict[Any, Job] = {}
     try:
         largest = max(

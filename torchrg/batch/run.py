@@ -123,7 +123,9 @@ def _check_names(root: Path, scans: Sequence[Scan]) -> None:
     for name in (scan.name for scan in scans):
         key = folded_name(name)
         if name.startswith("/") or ".." in name.split("/"):
-            raise FormatError(f"{root}: expected names of scans below a folder, got {name!r}.")
+            raise FormatError(
+                f"{root}: expected names of scans below a folder, got {name!r}; rename it."
+            )
         if key in taken:
             raise FormatError(
                 f"{root}: expected a folder for each scan, got one for {taken[key]} and {name}, "

@@ -49,7 +49,7 @@ from torchrg.datasets.scannet import MESH_PLUSPLUS, read_objects
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import FORMATS, estimate_points, read_cloud, takes_columns
+from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.npy import map_folder
 from torchrg.normals.sides import CloudOrientation, orient_cloud
 from torchrg.structures import Cloud, Segmentation
@@ -169,12 +169,12 @@ class FolderSource(CloudSource):
             no other folder below it can be.
         columns: Names for the columns of text and of bare ``.npy`` arrays; see
             :func:`torchrg.read_cloud`.
-        suffixes: Which files are clouds. Default: all that can be read.
+        suffixes: Which files are clouds. Default: all that can be read but ``.csv``.
     """
 
     out: Path
     columns: tuple[str, ...] | None = None
-    suffixes: tuple[str, ...] = tuple(FORMATS)
+    suffixes: tuple[str, ...] = FOLDER_SUFFIXES
     kind: ClassVar[str] = "folder"
 
     @property
@@ -393,7 +393,9 @@ class RGBDSource(Source):
         frame = _frame(scan.item)
         depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
         if not bool((depth > 0).any()):
-            raise FormatError(f"{frame.depth}: expected pixels with depth, got none.")
+            raise FormatError(
+                f"{frame.depth}: expected pixels with depth, got none; take this frame out."
+            )
         begin("planes")
         seg = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
         points = points_of_image(depth, frame.intrinsics, frame.pose)

@@ -55,7 +55,7 @@ def run(argv: list[str]) -> int:
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg align", default=start)
     if not any(arguments.up):
-        raise ConfigError(f"expected --up to be a direction, got {arguments.up}.")
+        raise ConfigError(f"expected --up to be a direction, got {arguments.up}; try 0 0 1.")
     flags.use_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
@@ -68,7 +68,9 @@ def run(argv: list[str]) -> int:
 def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None:
     """Refuse a file for the motion that cannot be written, or stands for several."""
     if len(arguments.inputs) > 1:
-        raise ConfigError(f"expected one input with --matrix, got {len(arguments.inputs)}.")
+        raise ConfigError(
+            f"expected one input with --matrix, got {len(arguments.inputs)}; align them one by one."
+        )
     if path.suffix.lower() not in (".npy", ".txt"):
         raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
     check_apart([path], [*arguments.inputs, *outputs])

@@ -38,6 +38,8 @@ RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
 """Flags that decide where and how fast a command runs, never what it finds."""
+ALSO = {"--superpoints": ("--superpoint",)}
+"""Other spellings of flags, which are taken and not shown."""
 NEEDED = "needed"
 """Title of the arguments that a command does not run without."""
 _RUNNING = "how it runs, without effect on what is found"
@@ -144,7 +146,8 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[st
         switches = zip(_switches(flag.name), (True, False), strict=True)
         for name, const in switches if flag.hint is bool else [(flag.name, None)]:
             # Fields are written with underscores too.
-            spellings = dict.fromkeys((name, f"--{name[2:].replace('-', '_')}"))
+            underscored = f"--{name[2:].replace('-', '_')}"
+            spellings = dict.fromkeys((name, underscored, *ALSO.get(name, ())))
             takes: dict[str, Any] = {"nargs": nargs, "required": flag.is_needed}
             if const is not None:
                 takes = {"action": "store_const", "const": const}

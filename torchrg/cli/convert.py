@@ -40,7 +40,7 @@ from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig, Up
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
-from torchrg.io import FORMATS
+from torchrg.io import FOLDER_SUFFIXES
 from torchrg.io.files import check_place, free_space, make_folder
 from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
@@ -98,9 +98,9 @@ class CloudArguments(Arguments):
     pages: Path | None = None
     """Directory for a picture and a page of each scan that is done, and for index.html, in which
     the pictures are links to the pages (pip install 'torchrg[view]'). Default: none are made."""
-    superpoint: bool = False
+    superpoints: bool = False
     """Write superpoints too: a partition of all points, for networks on them. Numbers say how many
-    in each level: --superpoint 1000,300."""
+    in each level: --superpoints 1000,300."""
     orient: flags.OrientFlag = "auto"
     within: flags.WithinFlag = None
     level: int = 0
@@ -121,8 +121,8 @@ class CloudArguments(Arguments):
     @property
     def output(self) -> dict[str, Any]:
         """What is written of each cloud, as sources take it."""
-        names = ("superpoint", "layout", "partition", "level", "orient", "within")
-        return {name: getattr(self, name) for name in names}
+        names = ("layout", "partition", "level", "orient", "within")
+        return {"superpoint": self.superpoints, **{name: getattr(self, name) for name in names}}
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,9 @@ class FolderArguments(CloudArguments):
     """
 
     columns: flags.ColumnsFlag = None
-    suffixes: tuple[str, ...] = tuple(FORMATS)
-    """Suffixes of the files that are clouds, by default all that torchrg segment reads. Name fewer
-    where two files differ in the suffix alone."""
+    suffixes: tuple[str, ...] = FOLDER_SUFFIXES
+    """Suffixes of the files that are clouds, by default all that torchrg segment reads but .csv.
+    Name fewer where two files differ in the suffix alone."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the folder."""
@@ -159,7 +159,7 @@ class S3DISArguments(CloudArguments):
 
     Examples:
         torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --dry-run
-        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --workers 4 --superpoint
+        torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --workers 4 --superpoints
         torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --areas 5 --pages pages
     """
 
@@ -185,7 +185,7 @@ class ScanNetArguments(CloudArguments):
 
     Examples:
         torchrg convert scannet scannet out --dry-run
-        torchrg convert scannet scannet out --workers 4 --superpoint
+        torchrg convert scannet scannet out --workers 4 --superpoints
         torchrg convert scannet scannet out --layout mmdet3d
     """
 
@@ -252,7 +252,7 @@ def run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
         raise SystemExit(0 if argv else USAGE_ERROR)
-    kind, *rest = flags.spell_counts(argv, "--superpoint")
+    kind, *rest = flags.spell_counts(argv)
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     chosen, start = KINDS[kind], {}
@@ -293,7 +293,7 @@ def _check(arguments: Arguments) -> None:
             f"got {table}; use planes.csv."
         )
     if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address together with --engine ray.")
+        raise ConfigError("expected --ray-address together with --engine ray, got none; add it.")
     if _pages_of(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):
@@ -303,12 +303,17 @@ def _check(arguments: Arguments) -> None:
                 "expected --orient auto, interior, up or none, as this data set names no places of "
                 "scanners, got viewpoint; use auto."
             )
-        has_superpoints = arguments.superpoint or arguments.layout != "pointcept"
+        has_superpoints = arguments.superpoints or arguments.layout != "pointcept"
         usual = (SuperpointsConfig(), 0)
         if not has_superpoints and (arguments.partition, arguments.level) != usual:
-            raise ConfigError("expected --superpoint with --partition or --level; add it.")
+            raise ConfigError(
+                "expected --superpoints with --partition or --level, got none; add it."
+            )
         if arguments.pages is not None and arguments.layout != "pointcept":
-            raise ConfigError("expected --pages with --layout pointcept, which pages are made of.")
+            raise ConfigError(
+                "expected --pages with --layout pointcept, which pages are made of, got "
+                f"{arguments.layout}; leave one of them out."
+            )
 
 
 def _pages_of(arguments: Arguments) -> Path | None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 
-from torchrg.cli.arguments import Argument
+from torchrg.cli.arguments import ALSO, Argument
 from torchrg.cli.ending import warnings_as_lines
 from torchrg.config import (
     DEFAULT_PRESET,
@@ -205,18 +205,19 @@ def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) 
         raise ConfigError("expected text or .npy for --columns, got files that name their own.")
 
 
-def spell_counts(argv: Sequence[str], flag: str) -> list[str]:
-    """Return arguments in which numbers after a flag of superpoints have a flag of their own.
+def spell_counts(argv: Sequence[str]) -> list[str]:
+    """Return arguments in which numbers after ``--superpoints`` have a flag of their own.
 
     Example:
-        >>> spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"], "--superpoints")
+        >>> spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
         ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
     """
     spelled: list[str] = []
     for argument in argv:
-        is_after = spelled[-1:] == [flag]
+        names = ("--superpoints", *ALSO["--superpoints"])
+        is_after = spelled[-1:] and spelled[-1] in names
         name, _, numbers = argument.rpartition("=")
-        if re.fullmatch(r"\d+(,\d+)*", numbers) and (name == flag or (is_after and not name)):
+        if re.fullmatch(r"\d+(,\d+)*", numbers) and (name in names or (is_after and not name)):
             spelled += [name] * bool(name) + ["--partition.counts", *numbers.split(",")]
         else:
             spelled.append(argument)

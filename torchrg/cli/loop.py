@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from threading import RLock
 from typing import Any, NoReturn
 
 from tqdm import tqdm
@@ -14,8 +15,12 @@ from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import notes_on_results
 from torchrg.io.files import check_place, make_folder
+from torchrg.io.npy import KEPT_FIELDS
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
+
+# Tqdm's own lock starts a process in Python 3.14, which would import from the folder of a command.
+tqdm.set_lock(RLock())
 
 DRAWINGS = (".png", ".html")
 """Suffixes of pictures and pages."""
@@ -41,7 +46,10 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         check_place(out) if ending == suffix else check_output(out)
         return [out]
     if ending and ending in (suffix, *FORMATS) and not out.is_dir():
-        raise FormatError(f"{out}: expected a directory for {len(inputs)} inputs, got a file name.")
+        raise FormatError(
+            f"{out}: expected a directory for {len(inputs)} inputs, got a file name; "
+            "name a directory."
+        )
     results = [out / f"{path.stem}{suffix}" for path in inputs]
     first: dict[str, Path] = {}
     for result, source in zip(results, inputs, strict=True):
@@ -107,7 +115,10 @@ def paths_beside(
 def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
     """Raise before long work if a picture, page or table has no place, or cannot be made."""
     if path.suffix.lower() not in suffixes:
-        raise FormatError(f"{path}: expected a file that ends in {' or '.join(suffixes)}.")
+        known = " or ".join(suffixes)
+        raise FormatError(
+            f"{path}: expected a file that ends in {known}, got {path.suffix!r}; name it so."
+        )
     check_place(path)
     if is_page(path):
         check_library()
@@ -181,7 +192,8 @@ def note_input(
 
 def left_out(target: Path, fields: Collection[str]) -> str:
     """Return the words for a report on which fields of a cloud its result does not hold."""
-    return f" (without its own {', '.join(fields)})" if fields and is_archive(target) else ""
+    names = [name for name in fields if name not in KEPT_FIELDS and is_archive(target)]
+    return f" (without its own {', '.join(names)})" if names else ""
 
 
 @contextlib.contextmanager

@@ -26,6 +26,7 @@ from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_con
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.fields import put_results
+from torchrg.io.npy import KEPT_FIELDS
 from torchrg.normals import estimate_normals
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 
@@ -106,7 +107,8 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     provenance |= {name: getattr(arguments, name) for name in names}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     results = zip(RESULTS, (turned, fit.curvature, sharp, fit.valid), strict=True)
-    fields = {} if is_archive(target) else cloud.fields
+    every = not is_archive(target)
+    fields = {name: v for name, v in cloud.fields.items() if every or name in KEPT_FIELDS}
     fields = put_results(fields, {name: values.numpy() for name, values in results})
     write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
     num_bad = len(cloud) - int(fit.valid.sum())

@@ -151,7 +151,10 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
         )
         scores["superpoints"] = _known(indices._asdict())
     if not scores.keys() - {"match"}:
-        raise FormatError(f"{predicted}: shares neither labels nor normals with {truth}.")
+        raise FormatError(
+            f"{predicted}: shares neither labels nor normals with {truth}; give the result of "
+            "torchrg segment, and a truth with the fields label or normals."
+        )
     return scores
 
 

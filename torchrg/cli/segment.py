@@ -120,7 +120,7 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _refuse_images(argv)
-    argv = flags.spell_counts(argv, "--superpoints")
+    argv = flags.spell_counts(argv)
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
     if arguments.layout not in (None, "pointcept"):
@@ -132,7 +132,10 @@ def run(argv: list[str]) -> int:
     flags.check_level(arguments.level, arguments.partition)
     check_layout(arguments.layout or "pointcept", _DATASET, "clouds")
     if arguments.level and arguments.layout is None:
-        raise ConfigError("expected --layout with --level, as other files hold all levels.")
+        raise ConfigError(
+            "expected --layout with --level, as other files hold all levels, got none; leave "
+            "--level out."
+        )
     flags.use_threads(arguments.threads)
     flags.bytes_of_limit(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:

@@ -108,7 +108,9 @@ def _read(path: Path, arguments: Arguments) -> Result:
 def _write_picture(arguments: Arguments, result: Result) -> str:
     """Write a picture, or two side by side, and return what there is to say about it."""
     if arguments.truth is not None:
-        raise ConfigError("expected --truth with a page, --out PAGE.html.")
+        raise ConfigError(
+            f"expected --truth with a page, got {arguments.out}; take --out PAGE.html."
+        )
     halves = [_draw(arguments, result)]
     if arguments.beside is not None:
         halves.append(_draw(arguments, _read(arguments.beside, arguments), result))

@@ -15,13 +15,17 @@ from torchrg.transforms.sample import NeighborSearch
 
 
 def collate_offset(
-    samples: Sequence[Entries], *, coord: str = "coord", inverse: str = "inverse"
+    samples: Sequence[Entries],
+    *,
+    coord: str = "coord",
+    inverse: str = "inverse",
+    unique: Sequence[str] = (),
 ) -> SampleDict:
     """Join samples as Pointcept does: arrays end to end, ``offset`` the row each cloud ends before.
 
     Convention:
         Labels stay those of their cloud: plane 0 of the first is another plane than plane 0 of the
-        second.
+        second. Those named in ``unique`` are counted on instead; negative ones, for none, stay.
 
     Args:
         samples: Samples with the same keys. Tensors and arrays are joined along their first axis,
@@ -30,19 +34,25 @@ def collate_offset(
         coord: Key that says how many points a sample has.
         inverse: Key of the numbers of points, as of :class:`torchrg.transforms.SampleVoxels`, that
             shall name rows of the batch.
+        unique: Keys of labels that shall be different in each cloud, as ``("plane",
+            "superpoint")``, so that a network pools over them.
 
     Returns:
         The batch, with ``offset`` ``(B,)`` int64. Samples that are batches themselves, with an
         ``offset`` of their own, are joined into one. ``index_valid_keys`` is one list.
 
     Raises:
-        ShapeError: If there are no samples, or their keys differ.
+        ShapeError: If there are no samples, their keys differ, or one in ``unique`` is missing.
 
     Example:
         >>> samples = [{"coord": torch.zeros(2, 3)}, {"coord": torch.ones(3, 3)}]
         >>> batch = collate_offset(samples)
         >>> batch["coord"].shape, batch["offset"]
         (torch.Size([5, 3]), tensor([2, 5]))
+        >>> for sample in samples:
+        ...     sample["plane"] = torch.arange(len(sample["coord"])) - 1
+        >>> collate_offset(samples, unique=["plane"])["plane"]
+        tensor([-1,  0, -1,  1,  2])
     """
     samples = [{k: v for k, v in s.items() if not isinstance(v, NeighborSearch)} for s in samples]
     keys = list(samples[0]) if samples else []
@@ -51,12 +61,13 @@ def collate_offset(
             different = ", ".join(sorted(set(sample) ^ set(keys)))
             raise ShapeError(
                 f"collate_offset: expected samples with the same keys, got {different} in only one "
-                f"of samples 0 and {i}."
+                f"of samples 0 and {i}; leave it out, or let a transform add it to all."
             )
-    if coord not in keys:
-        raise ShapeError(
-            f"collate_offset: expected samples with {coord!r}, got {', '.join(keys) or 'none'}."
-        )
+    for key in (coord, *unique):
+        if key not in keys:
+            raise ShapeError(
+                f"collate_offset: expected samples with {key!r}, got {', '.join(keys) or 'none'}."
+            )
     counts = [
         torch.as_tensor(s["offset"]).diff(prepend=torch.zeros(1, dtype=torch.int64))
         if "offset" in s
@@ -64,11 +75,14 @@ def collate_offset(
         for s in samples
     ]
     batch = {key: _join(key, [s[key] for s in samples]) for key in keys if key != "offset"}
-    if inverse in batch:
-        starts = itertools.accumulate((len(s[coord]) for s in samples), initial=0)
-        rows = [as_tensor("collate_offset", "inverse", s[inverse]) for s in samples]
-        pairs = zip(rows, starts, strict=False)
-        batch[inverse] = torch.cat([torch.where(r >= 0, r + start, r) for r, start in pairs])
+    for key in dict.fromkeys([*[inverse] * (inverse in batch), *unique]):
+        numbers = [as_tensor("collate_offset", key, s[key]) for s in samples]
+        sizes = [
+            len(s[coord]) if key == inverse else (int(own.max()) + 1 if len(own) else 0)
+            for s, own in zip(samples, numbers, strict=True)
+        ]
+        pairs = zip(numbers, itertools.accumulate(sizes, initial=0), strict=False)
+        batch[key] = torch.cat([torch.where(own >= 0, own + start, own) for own, start in pairs])
     if LISTED in batch:
         names = itertools.chain.from_iterable(listed_keys(s) or () for s in samples)
         batch[LISTED] = list(dict.fromkeys(names))

@@ -15,7 +15,7 @@ from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
 from torchrg.errors import FormatError
-from torchrg.io import FORMATS, read_cloud, takes_columns
+from torchrg.io import FOLDER_SUFFIXES, read_cloud, takes_columns
 from torchrg.transforms.rows import Sample, SampleDict
 
 Transform = Callable[[SampleDict], Sample]
@@ -75,7 +75,8 @@ class FolderOfClouds(SceneDataset):
 
     Args:
         root: The folder.
-        suffixes: Which files are clouds. Default: all of :data:`torchrg.io.FORMATS`.
+        suffixes: Which files are clouds. Default: :data:`torchrg.io.FOLDER_SUFFIXES`,
+            all that can be read but ``.csv``.
         columns: Names for the columns of text and of bare ``.npy`` arrays; see
             :func:`torchrg.read_cloud`.
         transform: Called with each sample.
@@ -94,7 +95,7 @@ class FolderOfClouds(SceneDataset):
         self,
         root: str | os.PathLike[str],
         *,
-        suffixes: Sequence[str] = tuple(FORMATS),
+        suffixes: Sequence[str] = FOLDER_SUFFIXES,
         columns: Sequence[str] | None = None,
         transform: Transform | None = None,
     ) -> None:
@@ -161,7 +162,9 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     """
     paths = [path for path in files_below(Path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
-        raise FormatError(f"{folder}: expected folders with coord.npy, got none.")
+        raise FormatError(
+            f"{folder}: expected folders with coord.npy, got none; name the folder of an area."
+        )
     scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
     for key in _NUMBERED & set(scenes[0]):
         first = 0

@@ -282,8 +282,10 @@ def _rows_by_time(path: Path, num_words: int, what: str) -> list[list[str]]:
 def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
     """Return the words of each row, which are so many."""
     rows = _words(path)
-    if not rows or any(len(row) != num_words for row in rows):
-        raise FormatError(f"{path}: expected {what} in each row.")
+    wrong = next((row for row in rows if len(row) != num_words), [])
+    if wrong or not rows:
+        got = repr(" ".join(wrong)[:60]) if wrong else "none"
+        raise FormatError(f"{path}: expected {what} in each row, got {got}; fetch the file again.")
     return rows
 
 

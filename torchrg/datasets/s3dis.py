@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from torchrg._optional import require
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.arrow import parse_numbers
 from torchrg.io.files import check_file
 from torchrg.transforms.rows import SampleDict
 
@@ -44,7 +45,7 @@ ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 ANNOTATIONS = "Annotations"
 _OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
 """Names of the files of objects, and of their copies."""
-_COLUMNS = ("x", "y", "z", "red", "green", "blue")
+_NUM_COLUMNS = 6
 _CONTROL_BYTES = bytes(sorted(set(range(32)) - set(b"\t\n\r")))
 """Bytes that no text of numbers has."""
 _LOST_BIT = 0x20
@@ -156,7 +157,8 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
         bare = [path.name for path in entries if path not in rooms]
         without = f" ({', '.join(bare)}: no {ANNOTATIONS})" if bare else ""
         warnings.warn(
-            f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}.",
+            f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}; "
+            "fetch the others unless you mean to go without.",
             stacklevel=3,
         )
     return [SceneFiles(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]
@@ -273,26 +275,13 @@ def _repair(path: Path, original: bytes) -> tuple[bytes, list[str]]:
 
 
 def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
-    """Parse lines of six numbers between single spaces; None if they are not."""
+    """Parse lines of six numbers; None if they are not."""
     # A lone CR would end a line here, and a minus that lost its bit is one.
     if content.count(b"\r") != content.count(b"\r\n"):
         return None
-    arrow = require("pyarrow", extra="text", purpose="read S3DIS")
-    csv = require("pyarrow.csv", extra="text", purpose="read S3DIS")
-    try:
-        table = csv.read_csv(
-            arrow.BufferReader(content),
-            csv.ReadOptions(column_names=_COLUMNS, use_threads=torch.get_num_threads() > 1),
-            csv.ParseOptions(delimiter=" ", quote_char=False),
-            csv.ConvertOptions(
-                column_types=dict.fromkeys(_COLUMNS, arrow.float64()),
-                null_values=[],
-                check_utf8=False,
-            ),
-        )
-    except arrow.ArrowInvalid:
-        return None
-    return [column.to_numpy() for column in table.columns] if table.num_rows else None
+    require("pyarrow", extra="text", purpose="read S3DIS")
+    table = parse_numbers(content, _NUM_COLUMNS)
+    return None if table is None or len(table) == 0 else list(table.T)
 
 
 def _are_points(table: list[NDArray[np.float64]]) -> bool:
@@ -314,8 +303,8 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np
             continue
         row = [float(word) for word in words if _NUMBER.fullmatch(word)]
         if (
-            len(words) != 6
-            or len(row) != 6
+            len(words) != _NUM_COLUMNS
+            or len(row) != _NUM_COLUMNS
             or b"\r" in text
             or not _are_points([np.array([x]) for x in row])
         ):

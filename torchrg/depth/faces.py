@@ -67,15 +67,15 @@ def join_strips(
         places = places_of(image[:-1] != image[1:])
         row, column = places // image.shape[1], places % image.shape[1]
         first, second = image[row, column], image[row + 1, column]
-        for some in (first, second, image[0], image[-1]):
-            edges += torch.bincount(some + 1, minlength=num_regions + 1)
+        for side in (first, second, image[0], image[-1]):
+            edges += torch.bincount(side + 1, minlength=num_regions + 1)
         meets = (first >= 0) & (second >= 0)
         row, column = row[meets], column[meets]
         pairs = torch.stack([first[meets], second[meets]], dim=1)
         apart = planes[pairs[:, 0]] - planes[pairs[:, 1]]
         gap = (apart * turned_rays[row, column]).sum(dim=1).abs()
         meetings.append((pairs, apart, gap - _MOST_NOISE * deviation[row, column]))
-    pairs, apart, gap = (torch.cat(part) for part in zip(*meetings, strict=True))
+    pairs, apart, gap = (torch.cat(columns) for columns in zip(*meetings, strict=True))
     count = torch.bincount(labels.flatten() + 1, minlength=num_regions + 1)[1:]
     width = 2 * count / edges[1:]
     pitch = (rays[-1, -1] - rays[0, 0])[:2] / (rays.new_tensor(labels.T.shape) - 1).clamp(min=1)
@@ -87,9 +87,9 @@ def join_strips(
     strip, face = torch.cat(smooth).unbind(dim=1)
     keys, contacts = torch.unique(strip * num_regions + face, return_counts=True)
     strip, face = keys // num_regions, keys % num_regions
-    own, theirs = (normals[part][:, :, None].unbind(dim=1) for part in (strip, face))
+    ours, theirs = (normals[columns][:, :, None].unbind(dim=1) for columns in (strip, face))
     joins = (width[strip] < _MOST_WIDTH) & (width[strip] <= _MOST_SHARE * width[face])
-    joins &= sq_chords(own, theirs).squeeze(1) <= deg_to_sq_chord(_MOST_TURN_DEG)
+    joins &= sq_chords(ours, theirs).squeeze(1) <= deg_to_sq_chord(_MOST_TURN_DEG)
     joins &= contacts >= _LEAST_BESIDE * (count / width)[strip]
     joins &= ~torch.isin(face, strip[joins])
     most = contacts.new_zeros(num_regions).scatter_reduce(0, strip[joins], contacts[joins], "amax")
@@ -124,10 +124,10 @@ def hidden_contacts(
     :func:`torchrg.regions.repair.merge_coplanar` takes them.
     """
     pixels = _Lines(points.view(*seen.shape, 3), seen, labels.view(seen.shape))
-    rows = _Lines(*(part[::_EVERY] for part in pixels))
-    columns = _Lines(*(part[:, ::_EVERY].transpose(0, 1).contiguous() for part in pixels))
+    rows = _Lines(*(values[::_EVERY] for values in pixels))
+    columns = _Lines(*(values[:, ::_EVERY].transpose(0, 1).contiguous() for values in pixels))
     pairs = _aligned_pairs(planes)
-    across, along = (count_lines(some, pairs, planes, reach) for some in (rows, columns))
+    across, along = (count_lines(direction, pairs, planes, reach) for direction in (rows, columns))
     lines = across + along
     lead = lines >= _LEAST_LINES
     return pairs[lead].sort(dim=1).values, lines[lead] * _EVERY

@@ -142,9 +142,9 @@ def _are_on_one_surface(
     max_step, max_sq_chord, wider_sq_chord = limits
     width = len(image.u)
     row, column = here // width, here % width
-    own, other = planes.take(here), planes.take(there)
-    u_slope, v_slope = own.u_slope - other.u_slope, own.v_slope - other.v_slope
-    step = u_slope * image.u[column] + v_slope * image.v[row] + own.origin - other.origin
+    ours, theirs = planes.take(here), planes.take(there)
+    u_slope, v_slope = ours.u_slope - theirs.u_slope, ours.v_slope - theirs.v_slope
+    step = u_slope * image.u[column] + v_slope * image.v[row] + ours.origin - theirs.origin
     next_step = step + torch.where(there // width > row, v_slope, u_slope)
     tolerance = pixels.tolerance.flatten()
     limit = max_step * torch.maximum(tolerance[here], tolerance[there])
@@ -190,7 +190,7 @@ def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:
     height, width = flat.shape
     grid = np.zeros((2 * height - 1, 2 * width - 1), dtype=bool)
     grid[::2, ::2], grid[1::2, ::2], grid[::2, 1::2] = (
-        part.cpu().numpy() for part in (flat, down[:-1], right[:, :-1])
+        flags.cpu().numpy() for flags in (flat, down[:-1], right[:, :-1])
     )
     parts = label(grid)[0][::2, ::2].astype(np.int64)
     return torch.from_numpy(parts.ravel() - 1).to(flat.device)
@@ -255,7 +255,7 @@ def _refine(
         labels = absorb_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
         pairs = zip(beside.contacts(labels), hidden, strict=True)
-        contacts, counts = (torch.cat(part) for part in pairs)
+        contacts, counts = (torch.cat(ends) for ends in pairs)
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
@@ -308,7 +308,7 @@ def fit_inverse_planes(
     region, in even steps.
     """
     shares = Segments(labels, most=most).shares(len(labels) + 1)
-    parts = map_tasks(lambda some: _fit_together(cloud, some), shares, labels.device)
+    parts = map_tasks(lambda share: _fit_together(cloud, share), shares, labels.device)
     planes = RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
     return planes._replace(num_points=torch.bincount(labels + 1, minlength=1)[1:])
 
@@ -394,23 +394,23 @@ def _regions_across(
 ) -> Tensor:
     """Return the region ``(n,)`` that pixels belong to by the creases beside them."""
     x, y, inverse = cloud.points.unbind(dim=1)
-    own, near = labels[rows][:, None], labels[around]
-    other, near = (near >= 0) & (near != own), near.clamp(min=0)
+    label, near = labels[rows][:, None], labels[around]
+    other, near = (near >= 0) & (near != label), near.clamp(min=0)
     ray, around_rays = (x[rows][:, None], y[rows][:, None]), (x[around], y[around])
-    apart = planes[own] - planes[near]
+    apart = planes[label] - planes[near]
     a, b, _ = apart.unbind(dim=2)
     here, there = _over_rays(apart, *ray), _over_rays(apart, *around_rays)
-    mine, theirs = (_over_rays(apart, *middles[which].unbind(dim=2)) for which in (own, near))
+    mine, theirs = (_over_rays(apart, *middles[which].unbind(dim=2)) for which in (label, near))
     slope = (a.square() + b.square()).sqrt()
     step = ((around_rays[0] - ray[0]).square() + (around_rays[1] - ray[1]).square()).sqrt()
     straight = there.abs() - here.abs() >= _STRAIGHT * slope * step
     away = (inverse[rows][:, None] - _over_rays(planes[near], *ray)).abs()
     goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
-    goes = goes & (mine.abs() > reach[near]) & (theirs.abs() > reach[own])
+    goes = goes & (mine.abs() > reach[near]) & (theirs.abs() > reach[label])
     away = torch.where(goes, away, torch.inf)
     least = away.amin(dim=1, keepdim=True)
     nearest = torch.where(goes & (away == least), near, len(planes)).amin(dim=1)
-    return torch.where(nearest < len(planes), nearest, own.squeeze(1))
+    return torch.where(nearest < len(planes), nearest, label.squeeze(1))
 
 
 def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:

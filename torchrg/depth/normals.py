@@ -84,7 +84,7 @@ class PixelPlanes(NamedTuple):
         numbers = self.choice.window.flatten()[places]
         every = (*self.squares.values(), self.narrow)
         columns = zip(*every, strict=True)
-        return Windows(*(torch.cat([part.flatten() for part in c])[numbers] for c in columns))
+        return Windows(*(torch.cat([values.flatten() for values in c])[numbers] for c in columns))
 
     def sides_and_middles(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return rows and columns of the windows of pixels, and the places of their middles.
@@ -101,8 +101,8 @@ class PixelPlanes(NamedTuple):
             parts.append(
                 torch.cat([middles.new_tensor(sides)[:, None].expand_as(middles), middles])
             )
-        found = torch.cat(parts, dim=1).to(places.device)[:, self.choice.window.flatten()[places]]
-        return found[:2], found[2:]
+        windows = torch.cat(parts, dim=1).to(places.device)[:, self.choice.window.flatten()[places]]
+        return windows[:2], windows[2:]
 
 
 def fit_pixels(
@@ -211,9 +211,9 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
     squares, count = deviation.new_zeros(shape), deviation.new_zeros(shape)
     for row in (0, corner):
         for column in (0, corner):
-            part = padded[row : row + 2 * height : 2, column : column + 2 * width : 2]
-            counted = part.isfinite()
-            squares += torch.where(counted, part * part, 0.0)
+            quarter = padded[row : row + 2 * height : 2, column : column + 2 * width : 2]
+            counted = quarter.isfinite()
+            squares += torch.where(counted, quarter * quarter, 0.0)
             count += counted
     return torch.where(count > 0, squares / count, torch.inf).sqrt()
 
@@ -228,14 +228,14 @@ def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first:
     if serves(table):
         pass_over_rows("offer_windows", table.shape[1], *image, table, *choice, size, first)
         return
-    own = torch.arange(windows.mean.numel(), device=table.device).view_as(windows.mean)
+    itself = torch.arange(windows.mean.numel(), device=table.device).view_as(windows.mean)
     least, flattest = least_in_windows(windows.relative, REACH)
     beside = torch.where(least.isfinite(), flattest, -1)
     reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
-    flat = torch.where(windows.relative.isfinite(), own, -1)
+    flat = torch.where(windows.relative.isfinite(), itself, -1)
     offers = [(flat, _OWN_REACH * windows.tolerance), (beside, reach)]
     if size == 1:
-        smooth = torch.where(windows.deviation <= windows.most, own, -1)
+        smooth = torch.where(windows.deviation <= windows.most, itself, -1)
         offers.insert(1, (smooth, torch.full_like(reach, torch.inf)))
     for places, reach in offers:
         pixels = places_of(image.seen & ~choice.flat)
@@ -270,9 +270,9 @@ def choose_narrow(
         cost: Tensor = torch.where(near, relative[window], torch.inf)
         return cost
 
-    own = torch.arange(count, device=pixels.device)
-    own = torch.where(windows.relative[1] < windows.relative[0], own + count, own)
-    takes_own = reached(own).isfinite()
+    around = torch.arange(count, device=pixels.device)
+    around = torch.where(windows.relative[1] < windows.relative[0], around + count, around)
+    takes_around = reached(around).isfinite()
     least, flattest = torch.full_like(relative[:count], torch.inf), torch.full_like(pixels, -1)
     for shape, sides in enumerate(NARROW):
         for _, number in held_pixels(numbers, pixels, *sides):
@@ -280,12 +280,12 @@ def choose_narrow(
             cost = reached(window)
             flattest = torch.where(cost < least, window, flattest)
             least = torch.minimum(least, cost)
-    return torch.where(takes_own, own, flattest), ~takes_own & (flattest >= 0)
+    return torch.where(takes_around, around, flattest), ~takes_around & (flattest >= 0)
 
 
 def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach: Tensor) -> Tensor:
     """Tell which pixels are within the reach of windows, both by place."""
-    u_slope, v_slope, origin = (part.flatten()[places] for part in table[:3])
+    u_slope, v_slope, origin = (values.flatten()[places] for values in table[:3])
     row, column = pixels // len(image.u), pixels % len(image.u)
     on_plane = u_slope * image.u[column] + v_slope * image.v[row]
     away = (image.values[row, column] - (on_plane + origin)).abs()
@@ -332,13 +332,13 @@ def describe_pixels(
     if serves(values):
         curvature, tolerance, noise = (torch.empty_like(values) for _ in range(3))
         normals = values.new_empty(*values.shape, 3)
-        found = Pixels(normals, curvature, tolerance, noise, torch.empty_like(seen))
+        described = Pixels(normals, curvature, tolerance, noise, torch.empty_like(seen))
         fixed = values, seen, x, y, choice.window, choice.flat, *pixels.tables
         numbers = *focal, *pixels.noise
-        pass_over_rows("describe_pixels", len(y), *fixed, *found, *numbers)
-        return found
+        pass_over_rows("describe_pixels", len(y), *fixed, *described, *numbers)
+        return described
     places = torch.arange(values.numel(), device=values.device)
-    windows = Windows(*(part.view(values.shape) for part in pixels.take(places)))
+    windows = Windows(*(column.view(values.shape) for column in pixels.take(places)))
     sides = pixels.sides_and_middles(places)[0].view(2, *values.shape)
     noise = pixels.noise.at(values)
     valid = choice.flat | (seen & windows.deviation.isfinite())
@@ -358,7 +358,7 @@ def describe_pixels(
         along = along + spread * (step * step * rays - 2 / f * step * place + 1 / (f * f))
     total = across + along * z * z
     variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
-    normals = torch.stack([-part / length for part in away], dim=-1)
+    normals = torch.stack([-column / length for column in away], dim=-1)
     return Pixels(
         torch.where(valid[..., None], normals, 0.0),
         torch.where(valid, variation, 0.0),

@@ -22,4 +22,4 @@ def pass_over_rows(name: str, num_rows: int, *arguments: Tensor | float) -> None
     share = max(-(-num_rows // allowed_threads()), _LEAST_ROWS)
     # An even number of them: rows of cells twice as wide belong to one task.
     rows = chunks_of(num_rows, share + share % 2)
-    map_tasks(lambda some: kernels.call(name, *arguments, some.start, some.stop), rows, _CPU)
+    map_tasks(lambda chunk: kernels.call(name, *arguments, chunk.start, chunk.stop), rows, _CPU)

@@ -127,8 +127,8 @@ def _segment(
 def _inverse_cloud(image: Image, pixels: Pixels, x: Tensor, y: Tensor) -> InverseCloud:
     """Return the image as the cloud that regions grow in, from the rays ``(x, y, 1)``."""
     inverse, seen = image.values, image.seen
-    known = inverse.flatten()[places_of(seen)]
-    unit = kth_smallest(known, (len(known) - 1) // 2) if len(known) else inverse.new_ones(())
+    values = inverse.flatten()[places_of(seen)]
+    unit = kth_smallest(values, (len(values) - 1) // 2) if len(values) else inverse.new_ones(())
     columns = [x.expand_as(inverse), y[:, None].expand_as(inverse), inverse / unit]
     points = torch.stack([column.flatten() for column in columns]).T
     return InverseCloud(points, (pixels.noise / unit).flatten(), seen)

@@ -94,7 +94,8 @@ def fit_windows(image: Image) -> dict[int, Tensor]:
     flat = values.new_empty(len(Windows._fields) * sum(shape.numel() for shape in shapes))
     parts = torch.split(flat, [len(Windows._fields) * shape.numel() for shape in shapes])
     tables = {
-        size: part.view(-1, *shape) for size, part, shape in zip(sizes, parts, shapes, strict=True)
+        size: numbers.view(-1, *shape)
+        for size, numbers, shape in zip(sizes, parts, shapes, strict=True)
     }
     if not serves(values):
         ones = seen.to(values.dtype)
@@ -188,7 +189,7 @@ def _planes_of_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
     """Return planes ``(5, *)`` of windows of so many pixels, from sums of moments ``(10, *)``."""
     count = sums[0]
     share = 1 / count.clamp(min=1)
-    u, v, w, uu, uv, vv, uw, vw, ww = (some * share for some in sums[1:])
+    u, v, w, uu, uv, vv, uw, vw, ww = (moment * share for moment in sums[1:])
     uu, uv, vv = uu - u * u, uv - u * v, vv - v * v
     uw, vw, ww = uw - u * w, vw - v * w, ww - w * w
     spread = uu * vv - uv * uv
@@ -261,13 +262,13 @@ def find_jitter(table: Tensor) -> float:
     flat windows deviate least.
     """
     # Windows stand a cell apart and overlap.
-    some = Windows(*table[:, ::REACH, ::REACH])
-    slope = torch.hypot(some.u_slope, some.v_slope)
-    used = some.deviation.isfinite() & (slope > 0)
+    windows = Windows(*table[:, ::REACH, ::REACH])
+    slope = torch.hypot(windows.u_slope, windows.v_slope)
+    used = windows.deviation.isfinite() & (slope > 0)
     slope, order = slope[used].sort()
-    ratio = some.deviation[used][order] / slope
+    ratio = windows.deviation[used][order] / slope
     steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
-    return min([_MOST_JITTER, *(float(_low_quantile(part)) for part in steep if len(part))])
+    return min([_MOST_JITTER, *(float(_low_quantile(ratios)) for ratios in steep if len(ratios))])
 
 
 def _low_quantile(values: Tensor) -> Tensor:
@@ -280,11 +281,11 @@ def _fit_noise(windows: Windows, rounding: float) -> tuple[float, float]:
     used = windows.deviation.isfinite()
     mean, order = windows.mean[used].sort()
     deviation = torch.maximum(windows.deviation[used][order], rounding * mean)
-    bins = [part for part in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(part)]
+    bins = [rows for rows in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(rows)]
     if not bins:
         return 0.0, 0.0
-    x = torch.stack([mean[part].square().mean() for part in bins])
-    q = torch.stack([_low_quantile(deviation[part]) for part in bins])
+    x = torch.stack([mean[rows].square().mean() for rows in bins])
+    q = torch.stack([_low_quantile(deviation[rows]) for rows in bins])
     # Relative errors: a class whose windows are all cluttered counts little.
     p, e = x / q, 1 / q
     spread = (p * p).sum() * (e * e).sum() - (p * e).sum() ** 2

@@ -24,6 +24,7 @@ from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 __all__ = [
+    "FOLDER_SUFFIXES",
     "FORMATS",
     "RESULT_FIELDS",
     "atomic_path",
@@ -67,8 +68,19 @@ FORMATS: dict[str, Format] = {
     ".e57": Format(read_e57, count_e57, None),
     ".xyz": Format(read_text, count_text, write_text, takes_columns=True),
     ".txt": Format(read_text, count_text, write_text, takes_columns=True),
+    ".asc": Format(read_text, count_text, write_text, takes_columns=True),
+    ".pts": Format(read_text, count_text, None, takes_columns=True),
+    ".csv": Format(read_text, count_text, None, takes_columns=True),
 }
-"""Formats that are read, by suffix. All but E57 are written, and hold any field."""
+"""Formats that are read, by suffix. Those that are written hold any field."""
+FOLDER_SUFFIXES = tuple(kind for kind in FORMATS if kind != ".csv")
+"""Suffixes of what is taken for a cloud in folders, where ``.csv`` is mostly a table of others."""
+_CONVERTERS = {
+    ".obj": "a mesh; sample points on it with CloudCompare or pcl_mesh_sampling",
+    ".glb": "a mesh; sample points on it with CloudCompare or Open3D",
+    ".ptx": "a scan that CloudCompare opens; save it there as .e57",
+}
+"""What files are that are not read, by suffix, and the programs that make clouds of them."""
 _PLANES_SUFFIX = ".vg"
 """Suffix of vertex groups, which are written only, and hold coordinates, colours and planes."""
 
@@ -157,17 +169,17 @@ def write_cloud(
         cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. A field of
         the cloud whose name a result takes is kept under another: ``label_input``,
         ``normals_input`` and so on; where there is such a field already, it is that which stays.
-        ``.npz`` holds ``points``, ``labels``, ``normals``, ``curvature``, ``sharp``, ``valid``, the
-        table of planes as
-        :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's
-        coordinates, and ``provenance``. Equal input gives equal bytes. Superpoints are
+        ``.npz`` holds ``points``, ``color`` of the cloud, ``labels``, ``normals``, ``curvature``,
+        ``sharp``, ``valid``, the table of planes as
+        :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's coordinates, and
+        ``provenance``. Equal input gives equal bytes. Superpoints are
         ``superpoints``, and ``superpoints_1`` and so on for the coarser levels; in ``.npz`` also
         ``plane_of_superpoint``. ``.vg`` holds coordinates, colours, normals and the planes as
         vertex groups, see :mod:`torchrg.io.vg`; it is not read.
 
     Args:
         path: The file; an older one is replaced. Its suffix is ``.vg`` or one of :data:`FORMATS`
-            but ``.e57``.
+            but ``.e57``, ``.pts`` and ``.csv``.
         cloud: The cloud.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
         superpoints: What :func:`torchrg.make_superpoints` said about them.
@@ -268,6 +280,8 @@ def estimate_points(path: Path) -> int:
 def _format_of(path: Path, *, is_written: bool = False) -> Format:
     """Return how a file is read, or written, by its suffix."""
     suffix = path.suffix.lower()
+    if suffix in _CONVERTERS and not is_written:
+        raise FormatError(f"{path}: expected points, got {_CONVERTERS[suffix]}.")
     if suffix not in FORMATS:
         known = [kind for kind, format_ in FORMATS.items() if format_.write or not is_written]
         raise FormatError(

@@ -57,8 +57,8 @@ COLUMNS_RULE = (
     "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
     "a unit normal, or a colour of whole numbers from 0 to 255, where the first 1,000 rows fit. Of "
     "seven, the same is asked of the last three and of the three before the last; if one of both "
-    "fits, it is taken, with intensity before a colour. Any other column is column_4, column_5 and "
-    "so on."
+    "fits, it is taken, with intensity before a colour; in .pts, where colours come last, the last "
+    "three alone are asked. Any other column is column_4, column_5 and so on."
 )
 """How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3
@@ -91,7 +91,11 @@ def assemble_cloud(
             raise FormatError(f"{path}: expected fields x, y, z, got {found}; rename or add them.")
         axes = [rest.pop(name) for name in names]
         if any(axis.ndim != 1 for axis in axes):
-            raise FormatError(f"{path}: expected one number a point in each of x, y, z.")
+            shapes = ", ".join(map(_row_shape, axes))
+            raise FormatError(
+                f"{path}: expected one number a point in each of x, y, z, got {shapes}; flatten "
+                "or rename them."
+            )
         places = _stacked(path, axes)
     else:
         places = rest.pop(coordinates)
@@ -112,7 +116,8 @@ def assemble_table(
     """Build a cloud from a table, shape ``(N, C)``, with names of its columns or by the rule."""
     if names is None:
         _check_table(path, table)
-        names = names_by_rule(table[:_GUESSED_ROWS])
+        is_pts = path.suffix.lower() == ".pts"
+        names = names_by_rule(table[:_GUESSED_ROWS], color_last=is_pts)
         if len(names) > 3:
             notes += (
                 f"its columns have no names and are taken as {' '.join(names)}; if they are "
@@ -193,7 +198,7 @@ def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[
     return notes
 
 
-def names_by_rule(rows: Values) -> list[str]:
+def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
     """Name the columns of a table by :data:`COLUMNS_RULE` from its first rows, shape ``(n, C)``.
 
     Of seven columns of small whole numbers, programs mean ``intensity red green blue`` or ``red
@@ -209,7 +214,7 @@ def names_by_rule(rows: Values) -> list[str]:
         return [*names[:3], "intensity"]
     if num_columns not in _GUESSED_WIDTHS:
         return names
-    starts = range(3, num_columns - 2)
+    starts = range(num_columns - 3 if color_last else 3, num_columns - 2)
     triples = {i: triple for i in starts if (triple := _triple_by_values(rows[:, i : i + 3]))}
     if len(triples) == 1:
         ((start, triple),) = triples.items()
@@ -349,7 +354,8 @@ def _labels(path: Path, labels: Values) -> NDArray[np.int64]:
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
     if not are_whole(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
         raise FormatError(
-            f"{path}: expected labels to be whole numbers of 64 bits; rename or remove that field."
+            f"{path}: expected labels to be whole numbers of 64 bits, got others; rename or remove "
+            "that field."
         )
     if flat.dtype.kind == "f" and largest >= LARGEST_WHOLE:
         raise FormatError(

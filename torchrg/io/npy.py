@@ -46,6 +46,8 @@ _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 _COORDINATES = ("points", "coord")
 POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 """What a segmentation says of each point."""
+KEPT_FIELDS = ("color",)
+"""Fields of a cloud that are kept beside its result, as pages and pictures show them."""
 _NOT_PER_POINT = {
     *(f"plane_{name}" for name in (*(part.name for part in fields(Planes)), "of_superpoint")),
     *(f"adjacency_{name}" for name in PlaneAdjacency._fields),
@@ -163,6 +165,7 @@ def write_npz(
                 )
             arrays[name] = values
     else:
+        arrays |= {name: cloud.fields[name] for name in KEPT_FIELDS if name in cloud.fields}
         arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in POINT_RESULTS}
         arrays |= planes_to_arrays(segmentation.planes, cloud.origin)
     if superpoints is not None:
@@ -192,11 +195,13 @@ def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Values]:
     """
     paths = {name: folder / f"{name}.npy" for name in names}
     if not paths["coord"].is_file():
-        raise FormatError(f"{folder}: expected coord.npy in this folder, got none.")
+        raise FormatError(
+            f"{folder}: expected coord.npy in this folder, got none; name the folder of a scene."
+        )
     arrays = {name: map_array(path) for name, path in paths.items() if path.is_file()}
     shape = arrays["coord"].shape
     if len(shape) not in (2, 3) or shape[-1] != 3:
-        raise FormatError(f"{paths['coord']}: expected shape (N, 3), got {shape}.")
+        raise FormatError(f"{paths['coord']}: expected shape (N, 3), got {shape}; reshape it.")
     for name, values in arrays.items():
         check_rows(paths[name], values, shape[:-1])
     return arrays
@@ -206,7 +211,9 @@ def check_rows(path: Path, values: Values, shape: tuple[int, ...]) -> None:
     """Check that an array has a row for each point, or for each pixel of an image."""
     if values.shape[: len(shape)] != shape:
         rows = " x ".join(map(str, shape))
-        raise FormatError(f"{path}: expected {rows} rows, got shape {values.shape}.")
+        raise FormatError(
+            f"{path}: expected {rows} rows, got shape {values.shape}; write it of the same points."
+        )
 
 
 def map_array(path: Path) -> Values:

@@ -1,33 +1,40 @@
-"""Points as text, ``.xyz`` and ``.txt``: one point a line, numbers between spaces or marks.
+"""Points as text, ``.xyz .txt .asc .pts .csv``: one point a line, numbers between spaces or marks.
 
 Marks are commas, semicolons or tabs; decimals may begin with a comma where that is not the mark. A
 first line of names (``x y z red green blue``, with or without ``#`` or ``//``) names the columns,
 unless names are given; without either :data:`torchrg.io.fields.COLUMNS_RULE` does. A line of one
-number before the first point is the count of points that some programs write. The rows of numbers
-in ASCII files of other formats are read here, too.
+number before the first point is the count of points, as Leica's ``.pts`` begins. Plain numbers are
+parsed by pyarrow where it is installed; what it does not take is parsed here, which gives the same
+bits and says what is wrong. The rows of numbers in ASCII files of other formats are read here, too.
 """
 
 import csv
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TextIO
 
 import numpy as np
 
 from torchrg.errors import FormatError
+from torchrg.io.arrow import parse_numbers
 from torchrg.io.columns import Spelling, check_exact, flatten_cloud, slices
-from torchrg.io.fields import Values, assemble_table, check_names
+from torchrg.io.fields import LEFT_OUT, Values, assemble_table, check_names
 from torchrg.io.files import atomic_path, check_promise
 from torchrg.structures import Cloud
 
 LINES_AT_ONCE = 65_536
 """Lines that are parsed or formatted together; bounds memory."""
+CHARACTERS_AT_ONCE = 1 << 22
+"""Characters of a file that are read together; bounds memory, and gives each core some lines."""
 _COUNTED_BYTES = 1 << 16
 """How much of a file is read to tell how long its lines are."""
 _COMMENTS = ("#", "//")
+_COLMAP = "POINT3D_ID, X, Y, Z"
+"""What COLMAP says in a comment above its points, which are followed by the images that see them,
+in ``points3D.txt``."""
 _MOST_DIGITS = 18
 """Most digits of a number of points; no file has room for more points."""
 
@@ -58,17 +65,15 @@ def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cl
     # Letters matter only in the names of columns.
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         opening = _read_opening(path, stream, columns)
-        lines = chain([opening.line], stream)
-        dtype = np.dtype([("row", "f8", (opening.num_columns,))])
-        rows = _read_table(path, lines, dtype, opening.line_number, form=opening.form)
-    if len(rows) < opening.num_points:
+        table = np.concatenate(list(_parse_blocks(path, stream, opening)))
+    if len(table) < opening.num_points:
         raise FormatError(
             f"{path}: expected {opening.num_points:,} points, as the line before them says, "
-            f"got {len(rows):,}; the file is cut off, fetch it again, or delete that line."
+            f"got {len(table):,}; the file is cut off, fetch it again, or delete that line."
         )
     is_comma = opening.form.decimal == ","
     notes = ("its commas are taken as decimal points",) if is_comma else ()
-    return assemble_table(path, rows["row"], opening.names, notes)
+    return assemble_table(path, table, opening.names, notes)
 
 
 def write_text(path: Path, cloud: Cloud) -> None:
@@ -112,7 +117,7 @@ def read_rows(
     content = f"{num_rows:,} {content}"
     check_promise(path, start, least, content, available=available, at_least=True)
     lines = (raw.decode("latin-1") for raw in stream)
-    return _read_table(path, lines, dtype, line_number, num_rows=num_rows)
+    return _read_table(path, lines, dtype, line_number, num_rows)
 
 
 def skip_lines(stream: BinaryIO, count: int) -> int:
@@ -125,33 +130,37 @@ def skip_lines(stream: BinaryIO, count: int) -> int:
 
 
 def _read_table(
-    path: Path,
-    lines: Iterator[str],
-    dtype: np.dtype[Any],
-    line_number: int,
-    *,
-    num_rows: int | None = None,
-    form: _Form | None = None,
+    path: Path, lines: Iterator[str], dtype: np.dtype[Any], line_number: int, num_rows: int
 ) -> Values:
-    """Read rows of numbers, all by default; blank lines do not count.
+    """Read rows of numbers; blank lines do not count.
 
     Lines are read only as far as needed, the first of them has this number in the file.
     """
     parts, count = [np.empty(0, dtype)], 0
-    while num_rows is None or count < num_rows:
-        limit = LINES_AT_ONCE if num_rows is None else min(LINES_AT_ONCE, num_rows - count)
-        block = list(islice(lines, limit))
+    while count < num_rows:
+        block = list(islice(lines, min(LINES_AT_ONCE, num_rows - count)))
         if not block:
-            break
-        parts.append(_parse(path, block, dtype, line_number, form))
+            raise FormatError(
+                f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got "
+                f"{count:,}; the file is cut off or its header is wrong, fetch it again."
+            )
+        parts.append(_parse(path, block, dtype, line_number))
         count += len(parts[-1])
         line_number += len(block)
-    if num_rows is not None and count < num_rows:
-        raise FormatError(
-            f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got {count:,}; "
-            "the file is cut off or its header is wrong, fetch it again."
-        )
     return np.concatenate(parts)
+
+
+def _parse_blocks(path: Path, stream: TextIO, opening: "_Opening") -> Iterator[Values]:
+    """Parse the first point, and the lines that follow it in a stream, into tables."""
+    dtype = np.dtype([("row", "f8", (opening.num_columns,))])
+    line, number = opening.line, opening.line_number
+    while block := line + stream.read(CHARACTERS_AT_ONCE) + stream.readline():
+        table = parse_numbers(block.encode(), opening.num_columns, *opening.form)
+        if table is None:
+            lines = block.split("\n")
+            table = _parse(path, lines, dtype, number, opening.form, opening.left_out)["row"]
+        yield table
+        line, number = "", number + block.count("\n")
 
 
 def _parse(
@@ -159,13 +168,17 @@ def _parse(
     block: Sequence[str],
     dtype: np.dtype[Any],
     line_number: int,
-    form: _Form | None,
+    form: _Form | None = None,
+    left_out: Collection[int] = (),
 ) -> Values:
     """Parse a block of lines, and name the first one that is wrong.
 
-    Without a form numbers stand between white space, and there are no comments.
+    Without a form numbers stand between white space, and there are no comments. Columns that are
+    left out may hold words.
     """
     delimiter, decimal, comments = (None, ".", None) if form is None else (*form, _COMMENTS[0])
+    converters: dict[int | str, Callable[[str], float]] | None
+    converters = dict.fromkeys(left_out, lambda word: np.nan) or None
 
     def parse(lines: list[str]) -> Values:
         if decimal != ".":
@@ -174,7 +187,7 @@ def _parse(
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)
             try:
-                return np.loadtxt(lines, dtype, delimiter=delimiter, comments=comments, ndmin=1)
+                return np.loadtxt(lines, dtype, comments, delimiter, converters, ndmin=1)
             except DeprecationWarning as warning:
                 raise ValueError(str(warning)) from warning
 
@@ -195,14 +208,23 @@ def _parse(
         except (ValueError, OverflowError) as error:
             text = line.strip()
             shown = text if len(text) <= 60 else f"{text[:57]}..."
-            repair = "repair or delete this line"
-            if "," in text and (delimiter, decimal) in ((";", "."), (None, ".")):
-                repair = "write all decimals with points, or all with commas"
             raise FormatError(
                 f"{path}: line {number}: expected {_num_columns(dtype)} numbers, got {shown!r}; "
-                f"{repair}."
+                f"{_repair_of(text, _num_columns(dtype), form)}."
             ) from error
     raise FormatError(f"{path}: line {line_number}: expected rows of numbers; write it again.")
+
+
+def _repair_of(text: str, num_columns: int, form: _Form | None) -> str:
+    """Return what to do about a line that is not numbers of this form."""
+    if "," in text and form in (None, _Form(";"), _Form()):
+        return "write all decimals with points, or all with commas"
+    words = [] if form is None else form.split(text)
+    if len(words) == num_columns and not all(map(_is_number, words)):
+        return (
+            f"repair or delete this line, or leave a column of words out, {LEFT_OUT} in --columns"
+        )
+    return "repair or delete this line"
 
 
 def words_of(raw: bytes) -> list[str]:
@@ -238,6 +260,11 @@ class _Opening(NamedTuple):
     line: str
     line_number: int
 
+    @property
+    def left_out(self) -> list[int]:
+        """Places of the columns that nobody wants."""
+        return [i for i, name in enumerate(self.names or ()) if name == LEFT_OUT]
+
 
 def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None) -> _Opening:
     """Read up to the first line of numbers."""
@@ -249,6 +276,12 @@ def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None)
         form = _form_of(bare)
         words = form.split(bare)
         are_numbers = [_is_number(word) for word in words]
+        if is_comment and _COLMAP in text:
+            raise FormatError(
+                f"{path}: line {number}: expected points, got those of COLMAP with their images; "
+                f"colmap model_converter --input_path {path.parent} --output_path points.ply "
+                "--output_type PLY writes a file that is read."
+            )
         if is_comment:
             header = bare if _name_lists(bare) else header
         elif not bare.strip():

@@ -206,24 +206,24 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
                      Floats normals, Longs pairs, Floats numbers, float* voted,
                      float* voted_offsets, float* meeting, float* meeting_offsets,
                      float* deviations) {
-  if (k < 1 || k > MOST || 4 * num_constants != sizeof(Constants)) return TOO_WIDE;
+  if (4 * num_constants != sizeof(Constants)) return TOO_WIDE;
   Constants constants;
   __builtin_memcpy(&constants, numbers, sizeof constants);
   const float turns = constants.num_alternations;
   if (!(turns >= 1 && turns < MOST && constants.num_refits < MOST)) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
-  Patch patch;
-  for (int64_t i = 0; i < num_rows; i++) {
-    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+  bool inside = true;
+  const int64_t status = visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, Patch& patch) {
     const int count = compact(patch);
     for (int64_t rank = 0; rank < 2 * num_pairs; rank++)
-      if (pairs[rank] < 0 || pairs[rank] >= count) return NO_SUCH_ROW;
+      inside &= pairs[rank] >= 0 && pairs[rank] < count;
+    if (!inside) return;
     const Plane plane =
         vote(patch, patch.weight, noise[i], normals + 3 * i, pairs, num_pairs, constants);
     const Meeting found = meet(patch, plane, noise[i], count, pairs, num_pairs, constants);
     write(plane, voted, i), write(found.plane, meeting, i);
     voted_offsets[i] = plane.offset, meeting_offsets[i] = found.plane.offset;
     deviations[i] = found.deviation;
-  }
-  return DONE;
+  });
+  return inside ? status : NO_SUCH_ROW;
 }

@@ -95,9 +95,8 @@ struct Lists {
   const bool* mask;
 };
 
-// Gathers the neighbours of a list; false if it is none, or names a point that is not there.
+// Gathers the neighbours of a list; false if it names a point that is not there.
 INLINE bool gather(const Lists& lists, int64_t i, Patch& patch) {
-  if (i < 0 || i >= lists.num_lists) return false;
   const int k = int(lists.k);
   const float* points = lists.points;
   const int32_t* row = lists.indices + i * k;
@@ -116,6 +115,19 @@ INLINE bool gather(const Lists& lists, int64_t i, Patch& patch) {
   patch.width = padded(k);
   for (int j = k; j < patch.width; j++) patch.x[j] = patch.y[j] = patch.z[j] = patch.weight[j] = 0;
   return true;
+}
+
+// Calls `visit` with each place, the row there and its patch: of all lists, or of n rows.
+template <class Visit>
+INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
+  if (lists.k < 1 || lists.k > MOST) return TOO_WIDE;
+  Patch patch;
+  for (int64_t q = 0; q < n; q++) {
+    const int64_t i = rows ? rows[q] : q;
+    if (i < 0 || i >= lists.num_lists || !gather(lists, i, patch)) return NO_SUCH_ROW;
+    visit(q, i, patch);
+  }
+  return DONE;
 }
 
 // A plane normal . q = offset, and the eigenvalues of the covariance it comes from.

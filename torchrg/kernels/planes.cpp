@@ -7,11 +7,8 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
                        Flagged mask, Floats resolution, double tolerance, double narrow_share,
                        float* normals, float* curvature, float* residual_rms, bool* valid,
                        bool* narrow) {
-  if (k < 1 || k > MOST) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
-  Patch patch;
-  for (int64_t i = 0; i < num_rows; i++) {
-    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+  return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
     float mean[3], covariance[6];
     moments(patch, patch.weight, patch.width, mean, covariance);
     Plane plane;
@@ -23,8 +20,7 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
     write(valid[i] ? plane : Plane{}, normals, i);
     curvature[i] = valid[i] ? smaller(low / (sum > 0 ? sum : 1), 1 / 3.0f) : 0;
     residual_rms[i] = valid[i] ? square_root(low) : 0;
-  }
-  return DONE;
+  });
 }
 
 namespace {
@@ -53,16 +49,14 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
               Flagged mask, Floats normals, Flagged valid, int64_t few, int64_t more,
               double kurtosis, double breadth, float* offsets, float* radius, float* whole,
               bool* layered, bool* again, float* of_fewer, float* of_more) {
-  if (k < 1 || k > MOST || few < 4 || more < 4) return TOO_WIDE;
+  if (few < 4 || more < 4) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
-  Patch patch;
-  for (int64_t i = 0; i < num_rows; i++, normals += 3) {
-    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+  return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
     again[i] = false;
     for (int j = 1; j < k; j++)
       again[i] |= patch.x[j] == patch.x[j - 1] && patch.y[j] == patch.y[j - 1] &&
                   patch.z[j] == patch.z[j - 1];
-    const float a = normals[0], b = normals[1], c = normals[2];
+    const float a = normals[3 * i], b = normals[3 * i + 1], c = normals[3 * i + 2];
     Lanes number{}, sx{}, sy{}, sz{};
     for (int j = 0; j < patch.width; j += LANES) {
       number += load(patch.weight + j);
@@ -82,16 +76,14 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
     layered[i] = s4 * count < float(kurtosis) * s2 * s2 && is_finite(whole[i]);
     of_fewer[i] = few <= k ? of_few(patch, int(few), float(breadth)) : INFINITE;
     of_more[i] = more <= k ? of_few(patch, int(more), float(breadth)) : INFINITE;
-  }
-  return DONE;
+  });
 }
 
 // torchrg.normals.consensus.noise._neighbor_quantiles.
 KERNEL neighbor_quantiles(int64_t num_points, int64_t num_rows, int64_t k, Floats values,
                           Ints indices, Flagged mask, double quantile, int64_t rank_of_all,
                           float* found) {
-  if (k < 1 || k > MOST) return TOO_WIDE;
-  if (!(quantile >= 0 && quantile <= 1)) return TOO_WIDE;
+  if (k < 1 || k > MOST || !(quantile >= 0 && quantile <= 1)) return TOO_WIDE;
   alignas(32) float near[MOST];
   const int width = padded(int(k));
   for (int64_t i = 0; i < num_rows; i++, indices += k) {

@@ -97,13 +97,10 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
                      Flagged mask, Floats points, Longs rows, int64_t step, double vote_reach,
                      double vote_falloff, double inlier_reach, double cost, float* normals,
                      float* offsets) {
-  if (k < 1 || k > MOST || step < 1) return TOO_WIDE;
+  if (step < 1) return TOO_WIDE;
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  Patch patch;
   alignas(32) float weights[MOST];
-  for (int64_t q = 0; q < num_rows; q++) {
-    const int64_t i = rows[q];
-    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+  return visit_patches(lists, rows, num_rows, [&](int64_t q, int64_t i, const Patch& patch) {
     const int32_t* row = indices + i * k;
     const float most = farthest(patch, patch.weight), far = most > 0 ? most : 1;
     Lanes sum{};
@@ -131,20 +128,15 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
     }
     for (int axis = 0; axis < 3; axis++) normals[3 * q + axis] = best[NORMAL + axis];
     offsets[q] = best_offset;
-  }
-  return DONE;
+  });
 }
 
 // smoothing._inliers: number and covariance eigenvalues of the neighbours near planes.
 KERNEL inliers(int64_t num_points, int64_t k, int64_t num_rows, Floats points, Ints indices,
                Flagged mask, Floats normals, Floats offsets, Floats noise, Longs rows, double reach,
                float* count, float* values) {
-  if (k < 1 || k > MOST) return TOO_WIDE;
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  Patch patch;
-  for (int64_t q = 0; q < num_rows; q++) {
-    const int64_t i = rows[q];
-    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+  return visit_patches(lists, rows, num_rows, [&](int64_t q, int64_t i, Patch& patch) {
     Plane plane = {normals[3 * i], normals[3 * i + 1], normals[3 * i + 2], offsets[i], 0, 0, 0};
     Lanes sum{};
     for (int j = 0; j < patch.width; j += LANES) {
@@ -156,22 +148,17 @@ KERNEL inliers(int64_t num_points, int64_t k, int64_t num_rows, Floats points, I
     count[q] = total(sum);
     values[3 * q] = float(plane.low), values[3 * q + 1] = float(plane.middle);
     values[3 * q + 2] = float(plane.high);
-  }
-  return DONE;
+  });
 }
 
 // torchrg.normals.jet.fit_paraboloids of the neighbourhoods of some rows.
 KERNEL fit_paraboloids(int64_t num_points, int64_t k, int64_t num_rows, Floats points, Ints indices,
                        Flagged mask, Floats normals, Longs rows, double flat_pivot, float* tilted,
                        float* offsets, float* deviations) {
-  if (k < 1 || k > MOST) return TOO_WIDE;
   constexpr int TERMS = 6;
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  Patch patch;
   alignas(32) float us[MOST], vs[MOST], heights[MOST];
-  for (int64_t q = 0; q < num_rows; q++) {
-    const int64_t i = rows[q];
-    if (!gather(lists, i, patch)) return NO_SUCH_ROW;
+  return visit_patches(lists, rows, num_rows, [&](int64_t q, int64_t i, const Patch& patch) {
     const float radius = square_root(farthest(patch, patch.weight));
     const float scale = radius > 0 ? 1 / radius : 0;
     const float x = normals[3 * i], y = normals[3 * i + 1], z = normals[3 * i + 2];
@@ -226,6 +213,5 @@ KERNEL fit_paraboloids(int64_t num_points, int64_t k, int64_t num_rows, Floats p
       tilted[3 * q + axis] =
           (normal[axis] - slope_u * first[axis] - slope_v * second[axis]) / length;
     offsets[q] = solution[0] * radius / length;
-  }
-  return DONE;
+  });
 }

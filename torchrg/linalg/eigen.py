@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import check_floating, check_shapes, has_values
+from torchrg._checks import check_floating, check_shapes, has_values, refuse_forward_mode
 
 _JACOBI_SWEEPS = 5
 """Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding in either
@@ -132,6 +132,10 @@ class _Eigh3(torch.autograd.Function):
         # Only the upper triangle is read, but both stand for one number, as in torch.linalg.eigh.
         return (whole + whole.mT) / 2
 
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
+        refuse_forward_mode("eigh3")
+
 
 def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Do as :func:`eigh3`, without gradient."""
@@ -188,9 +192,9 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     # Where Newton's steps were still on their way, the quotient is right to second order.
     smallest = u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz
     smallest = smallest.clamp(min=0)
-    rest = trace - smallest
-    spread = (rest * rest - 4 * (minors - smallest * rest)).clamp(min=0).sqrt()
-    ordered = torch.stack([smallest, (rest - spread) / 2, (rest + spread) / 2], dim=-1)
+    others = trace - smallest
+    spread = (others * others - 4 * (minors - smallest * others)).clamp(min=0).sqrt()
+    ordered = torch.stack([smallest, (others - spread) / 2, (others + spread) / 2], dim=-1)
     values = ordered.clamp(min=0) * safe[..., None]
     return values.to(matrices.dtype), torch.stack([u, v, w], dim=-1).to(matrices.dtype)
 
@@ -262,11 +266,11 @@ def _across(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tenso
     i, j, k = (~y & ~z).to(a.dtype), (y & ~z).to(a.dtype), z.to(a.dtype)
     u, v, w = b * k - c * j, c * i - a * k, a * j - b * i
     length = (u * u + v * v + w * w).sqrt()
-    some = length > 0
+    exists = length > 0
     return (
-        torch.where(some, u / length, i),
-        torch.where(some, v / length, j),
-        torch.where(some, w / length, k),
+        torch.where(exists, u / length, i),
+        torch.where(exists, v / length, j),
+        torch.where(exists, w / length, k),
     )
 
 

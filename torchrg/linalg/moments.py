@@ -143,11 +143,11 @@ class Segments:
         region = row = 0
         while region < len(ends) or not parts:
             last = max(bisect.bisect_right(ends, row + most), min(region + 1, len(ends)))
-            part = Segments.__new__(Segments)
+            segments = Segments.__new__(Segments)
             end = ends[last - 1] if last else 0
-            part.rows, part.labels = self.rows[row:end], self.labels[row:end] - region
-            part.counts = self.counts[region:last]
-            parts.append(part)
+            segments.rows, segments.labels = self.rows[row:end], self.labels[row:end] - region
+            segments.counts = self.counts[region:last]
+            parts.append(segments)
             region, row = last, end
         return parts
 
@@ -184,8 +184,8 @@ class Segments:
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
             # Products and sums apart: their rounding must not depend on where a block ends.
-            for column, part in zip(about, axis.unbind(dim=1), strict=True):
-                total += column * self.spread(part)
+            for column, component in zip(about, axis.unbind(dim=1), strict=True):
+                total += column * self.spread(component)
             columns.append(total)
         return columns
 
@@ -248,8 +248,8 @@ class Segments:
             return weights, medians, squares
         residuals = torch.zeros_like(columns[0])
         # Products and sums apart: their rounding must not depend on where a block of memory ends.
-        for column, mean, part in zip(columns, means.T, axes.T, strict=True):
-            residuals += (column - self.spread(mean)) * self.spread(part)
+        for column, mean, component in zip(columns, means.T, axes.T, strict=True):
+            residuals += (column - self.spread(mean)) * self.spread(component)
         medians = self.median(residuals.abs())
         cut = factors[1] * torch.maximum(factors[0] * medians, least)
         # A region of one place at the origin has cut 0: its residuals are 0 too.
@@ -269,7 +269,7 @@ class Segments:
     def median(self, values: Tensor) -> Tensor:
         """Return the median of each region's values, the lower one of an even number."""
         parts = torch.split(values, self.counts.tolist())
-        medians = [kth_smallest(part, (len(part) - 1) // 2) for part in parts]
+        medians = [kth_smallest(region, (len(region) - 1) // 2) for region in parts]
         return torch.stack(medians) if parts else values
 
     def _reduce(self, values: Tensor, name: str, reduction: np.ufunc) -> Tensor:
@@ -332,8 +332,8 @@ def sum_neighbors(values: Tensor) -> Tensor:
     width = -(-num_neighbors // _NUM_LANES) * _NUM_LANES
     padded = torch.nn.functional.pad(values, (0, width - values.shape[-1]))
     first, *others = torch.split(padded, _NUM_LANES, dim=-1)
-    for part in others:
-        first = first + part
+    for lanes in others:
+        first = first + lanes
     while first.shape[-1] > 1:
         half = first.shape[-1] // 2
         first = first[..., :half] + first[..., half:]
@@ -354,7 +354,7 @@ def residuals(columns: Columns, normals: Tensor, offsets: Tensor) -> Tensor:
 def along(columns: Columns, axes: Tensor) -> Tensor:
     """Return coordinates of the neighbours along axes ``(*, n, 3)``, shape ``(*, n, K)``."""
     x, y, z = columns
-    a, b, c = (part[..., None] for part in axes.unbind(dim=-1))
+    a, b, c = (component[..., None] for component in axes.unbind(dim=-1))
     # Products and sums apart: a fused multiply-add may round differently at the end of a block.
     return (x * a).add_(y * b).add_(z * c)
 

@@ -85,8 +85,8 @@ _NORMALS = {
 
 def _by_name(fields: tuple[str, ...], meanings: dict[Index, str]) -> Mapping[str, Index]:
     """Return the index of each field."""
-    found = {name: index for index, names in meanings.items() for name in names.split()}
-    return MappingProxyType({name: found[name] for name in fields})
+    index_of = {name: index for index, names in meanings.items() for name in names.split()}
+    return MappingProxyType({name: index_of[name] for name in fields})
 
 
 METRICS: Mapping[str, Mapping[str, Index]] = MappingProxyType(

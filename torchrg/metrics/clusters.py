@@ -182,11 +182,11 @@ def _separation(centers: Tensor, spreads: Tensor) -> tuple[float, float]:
         return math.nan, math.nan
     total, worst, rows = 0.0, 0.0, rows_at_once(count)
     for start in range(0, count, rows):
-        some = slice(start, start + rows)
-        distances = chord_to_angle(chord_table(centers[some], centers))
+        block = slice(start, start + rows)
+        distances = chord_to_angle(chord_table(centers[block], centers))
         total += float(distances.sum())
         distances[distances <= _COINCIDENT] = 0
-        ratios = (spreads[some, None] + spreads) / distances
+        ratios = (spreads[block, None] + spreads) / distances
         ratios[distances == 0] = math.inf
         ratios.diagonal(start).fill_(-math.inf)
         worst += float(ratios.amax(dim=1).sum())
@@ -260,9 +260,9 @@ def _closest_others(points: Tensor, clusters: Tensor) -> Tensor:
     """Return the chord from each point to the closest one of another cluster, shape ``(C,)``."""
     rows = rows_at_once(len(points))
     closest = []
-    for some, own in zip(torch.split(points, rows), torch.split(clusters, rows), strict=True):
-        chords = chord_table(some, points)
-        chords[own[:, None] == clusters] = torch.inf
+    for chunk, owners in zip(torch.split(points, rows), torch.split(clusters, rows), strict=True):
+        chords = chord_table(chunk, points)
+        chords[owners[:, None] == clusters] = torch.inf
         closest.append(chords.amin(dim=1))
     return torch.cat(closest)
 

@@ -127,16 +127,16 @@ def number_labels(labels: Tensor) -> tuple[Tensor, Tensor]:
 
 def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor]:
     """Return label arrays as int64 tensors; a ShapeError if lengths or devices differ."""
-    given = {name: as_tensor(caller, name, values) for name, values in arguments.items()}
-    for name, tensor in given.items():
+    tensors = {name: as_tensor(caller, name, values) for name, values in arguments.items()}
+    for name, tensor in tensors.items():
         if tensor.dtype not in INTEGERS:
             dtype = str(tensor.dtype).removeprefix("torch.")
             raise ShapeError(
                 f"{caller}: expected {name} of integers, got {dtype}; convert with .long()."
             )
-    check_shapes(caller, **{name: (tensor, "N") for name, tensor in given.items()})
-    check_one_device(caller, **given)
-    return [tensor.long() for tensor in given.values()]
+    check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
+    check_one_device(caller, **tensors)
+    return [tensor.long() for tensor in tensors.values()]
 
 
 def check_one_device(caller: str, **arguments: Tensor) -> None:
@@ -147,6 +147,6 @@ def check_one_device(caller: str, **arguments: Tensor) -> None:
         raise ShapeError(f"{caller}: expected {names} on one device, got {' and '.join(devices)}.")
 
 
-def share(part: float, whole: float) -> float:
+def share(count: float, whole: float) -> float:
     """Return ``part / whole``, and 0 where the whole is 0."""
-    return part / whole if whole else 0.0
+    return count / whole if whole else 0.0

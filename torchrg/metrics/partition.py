@@ -131,12 +131,12 @@ def _score_oracle(superpoints: Tensor, truth: Tensor) -> tuple[int, float]:
         0, table.regions, table.overlaps, "amax"
     )
     largest = table.overlaps == most[table.regions]
-    part = torch.full_like(table.region_sizes, num_parts).scatter_reduce(
+    most_frequent = torch.full_like(table.region_sizes, num_parts).scatter_reduce(
         0, table.regions[largest], table.faces[largest], "amin"
     )
-    right = torch.zeros_like(table.face_sizes).index_add(0, part, most)
-    given = torch.zeros_like(table.face_sizes).index_add(0, part, table.region_sizes)
-    iou = right.double() / (given + table.face_sizes - right)
+    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, most)
+    sizes = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, table.region_sizes)
+    iou = right.double() / (sizes + table.face_sizes - right)
     return int(right.sum()), share(float(iou.sum()), num_parts)
 
 
@@ -162,6 +162,6 @@ def _score_borders(
     for of, near in ((theirs, ours), (ours, theirs)):
         # The bound of the search excludes the distance itself.
         limit = np.nextafter(distance, np.inf)
-        found = cKDTree(near).query(of, distance_upper_bound=limit)[0]
-        shares.append(float(np.isfinite(found).mean()))
+        distances = cKDTree(near).query(of, distance_upper_bound=limit)[0]
+        shares.append(float(np.isfinite(distances).mean()))
     return shares[0], shares[1], distance

@@ -107,15 +107,15 @@ def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
     longest = 2 * math.sin(math.radians(max_angle_deg) / 2)
     groups = torch.full((len(centers),), -1, device=centers.device)
     group = 0
-    while len(rest := (groups < 0).nonzero().squeeze(1)):
-        newest = rest[:1]
+    while len(free := (groups < 0).nonzero().squeeze(1)):
+        newest = free[:1]
         while len(newest):
             groups[newest] = group
-            rest = rest[groups[rest] < 0]
-            near = torch.zeros_like(rest, dtype=torch.bool)
-            for some in torch.split(newest, rows_at_once(len(rest))):
-                near |= (chord_table(centers[some], centers[rest]) <= longest).any(dim=0)
-            newest = rest[near]
+            free = free[groups[free] < 0]
+            near = torch.zeros_like(free, dtype=torch.bool)
+            for chunk in torch.split(newest, rows_at_once(len(free))):
+                near |= (chord_table(centers[chunk], centers[free]) <= longest).any(dim=0)
+            newest = free[near]
         group += 1
     return groups
 
@@ -130,12 +130,12 @@ def measure_spreads(
     diameter is.
     """
     means, diameters, num_sampled, exact = [], [], 0, True
-    for part, center in zip(parts, centers, strict=True):
-        ends = _rim(part, center)
-        means.append(_mean_pairwise_angle(_subsample(part, sample_size, seed)))
+    for directions, center in zip(parts, centers, strict=True):
+        ends = _rim(directions, center)
+        means.append(_mean_pairwise_angle(_subsample(directions, sample_size, seed)))
         angles = _upper_angles(_subsample(ends, sample_size, seed))
-        diameters.append(max((float(some.max()) for some in angles), default=0.0))
-        num_sampled += len(part) > sample_size
+        diameters.append(max((float(block.max()) for block in angles), default=0.0))
+        num_sampled += len(directions) > sample_size
         exact = exact and len(ends) <= sample_size
     return centers.new_tensor(means), centers.new_tensor(diameters), num_sampled, exact
 

@@ -76,10 +76,10 @@ def near_boxes(
     is_near = np.zeros(len(boxes.low), dtype=bool)
     about = _about(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
     all_low, all_high = boxes.low[about], boxes.high[about]
-    for some in chunks_of(len(chosen), _BOXES_AT_ONCE):
-        low, high = boxes.low[chosen[some]], boxes.high[chosen[some]]
-        near = _about(all_low, all_high, low, high, reach[some])
-        within = _gaps(all_low[near], all_high[near], low, high) <= reach[some, None] * _ROUNDING
+    for chunk in chunks_of(len(chosen), _BOXES_AT_ONCE):
+        low, high = boxes.low[chosen[chunk]], boxes.high[chosen[chunk]]
+        near = _about(all_low, all_high, low, high, reach[chunk])
+        within = _gaps(all_low[near], all_high[near], low, high) <= reach[chunk, None] * _ROUNDING
         is_near[about[near[within.any(axis=0)]]] = True
     return is_near
 
@@ -152,17 +152,17 @@ def search_block(
     most = max(_CANDIDATES * len(nearest), _LEAST_CANDIDATES) if most is None else most
     waiting = [slice(first, last)]
     while waiting:
-        some = waiting.pop()
-        numbers = np.arange(some.start, some.stop)
+        run = waiting.pop()
+        numbers = np.arange(run.start, run.stop)
         rows = _rows_near(boxes, numbers, reach[numbers - first])
         if len(rows) > most and len(numbers) > 1:
-            middle = (some.start + some.stop) // 2
-            waiting += [slice(some.start, middle), slice(middle, some.stop)]
+            middle = (run.start + run.stop) // 2
+            waiting += [slice(run.start, middle), slice(middle, run.stop)]
             continue
         if len(rows) > most:
-            bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, some.start, k))
+            bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, run.start, k))
             rows = _rows_near(boxes, numbers, bound)
-        asked = slice(boxes.starts[some.start], boxes.starts[some.stop])
+        asked = slice(boxes.starts[run.start], boxes.starts[run.stop])
         into = nearest[asked.start - block.start : asked.stop - block.start]
         if len(rows) > most:
             into[:] = _search_each(points, rows, np.arange(asked.start, asked.stop), k)
@@ -174,17 +174,17 @@ def search_block(
 
 
 def _reach_of_boxes(
-    own: NDArray[np.floating], boxes: Boxes, numbers: slice, k: int
+    inside: NDArray[np.floating], boxes: Boxes, numbers: slice, k: int
 ) -> NDArray[np.float64]:
     """Return distances within which all points of each box of a block have ``k`` neighbours."""
     from scipy.spatial import cKDTree
 
-    if len(own) < k:
+    if len(inside) < k:
         return np.array(
             [farthest_neighbor(boxes, i, k) for i in range(numbers.start, numbers.stop)]
         )
-    firsts = own[boxes.starts[numbers] - boxes.starts[numbers.start]]
-    tree = cKDTree(own, balanced_tree=False, compact_nodes=False)
+    firsts = inside[boxes.starts[numbers] - boxes.starts[numbers.start]]
+    tree = cKDTree(inside, balanced_tree=False, compact_nodes=False)
     sides = boxes.high[numbers] - boxes.low[numbers]
     # Any other point of the box is at most its diagonal away from the first.
     reach: NDArray[np.float64] = tree.query(firsts, [k])[0][:, 0] + np.linalg.norm(sides, axis=1)
@@ -212,17 +212,17 @@ def _search_each(
     nearest = [np.empty(0, dtype=np.int64)] * len(asked)
     keys = [np.empty(0)] * len(asked)
     for chunk in chunks_of(len(rows), ROWS_AT_ONCE):
-        some = rows[chunk]
-        candidates = points[some].astype(np.float64)
-        for i, (own, place) in enumerate(zip(asked, places, strict=True)):
+        numbers = rows[chunk]
+        candidates = points[numbers].astype(np.float64)
+        for i, (number, place) in enumerate(zip(asked, places, strict=True)):
             away = candidates - place
             sq_distances = away[:, 0] ** 2 + away[:, 1] ** 2 + away[:, 2] ** 2
             # The point itself stands first.
-            distances = np.where(some == own, -1.0, np.sqrt(sq_distances))
+            distances = np.where(numbers == number, -1.0, np.sqrt(sq_distances))
             limit = keys[i][-1] if len(keys[i]) == k else np.inf
-            kept = distances <= limit
-            joined = np.append(nearest[i], some[kept])
-            distances = np.append(keys[i], distances[kept])
+            near = distances <= limit
+            joined = np.append(nearest[i], numbers[near])
+            distances = np.append(keys[i], distances[near])
             order = np.lexsort((joined, distances))[:k]
             nearest[i], keys[i] = joined[order], distances[order]
     return np.stack(nearest)

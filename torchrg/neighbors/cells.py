@@ -149,18 +149,18 @@ def _make_grid(columns: NDArray[np.float64], size: float, rows: NDArray[np.int64
     is_asked[rows] = True
     asked = np.flatnonzero(is_asked[order])
     first_asked = _run_starts(keys[asked])
-    own = asked[first_asked]
+    firsts = asked[first_asked]
     # Cells that differ in z alone have consecutive keys: three of them are one range.
     around = np.array([x * width + y for x in (-1, 0, 1) for y in (-1, 0, 1)]) * height
-    starts = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around - 1))]
-    stops = ends[np.searchsorted(cell_keys, keys[own][:, None] + (around + 2))]
+    starts = ends[np.searchsorted(cell_keys, keys[firsts][:, None] + (around - 1))]
+    stops = ends[np.searchsorted(cell_keys, keys[firsts][:, None] + (around + 2))]
     return _CellGrid(
         columns=[np.append(column[order], end) for column, end in zip(columns, far, strict=True)],
         rows=np.append(order, -1).astype(np.int32),
         asked=asked,
         first_asked=first_asked,
         num_asked=np.diff(first_asked, append=len(asked)),
-        centers=low[:, None] + (cell[:, order[own]] - 0.5) * size,
+        centers=low[:, None] + (cell[:, order[firsts]] - 0.5) * size,
         starts=starts,
         lengths=stops - starts,
         size=size,
@@ -201,8 +201,8 @@ def _search_task(
     counts = grid.num_asked[cells]
     lanes = np.repeat(np.arange(len(cells)), counts)
     slots = np.arange(len(lanes)) - np.repeat(np.cumsum(counts) - counts, counts)
-    own = _take(grid.asked, grid.first_asked[cells][lanes] + slots)
-    points = [_take(column, own) for column in grid.columns]
+    askers = _take(grid.asked, grid.first_asked[cells][lanes] + slots)
+    points = [_take(column, askers) for column in grid.columns]
 
     centers = grid.centers[:, cells]
     about = np.stack([c - m[:, None] for c, m in zip(candidates, centers, strict=True)], axis=1)
@@ -226,8 +226,8 @@ def _search_task(
     sq_beyond -= 64 * np.finfo(np.float32).eps * grid.size**2
     border = (1.5 * grid.size - np.abs(offsets).max(axis=1)) * (1 - 1e-6)
     certain = (distances[:, -1] < border) & (distances[:, -1] ** 2 < sq_beyond)
-    kept = np.flatnonzero(certain)
-    return grid.rows[own[kept]], _take(distances, kept), _take(rows, kept)
+    answered = np.flatnonzero(certain)
+    return grid.rows[askers[answered]], _take(distances, answered), _take(rows, answered)
 
 
 def _list_candidates(grid: _CellGrid, cells: NDArray[np.int64]) -> NDArray[np.int64]:

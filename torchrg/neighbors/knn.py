@@ -238,8 +238,8 @@ def _search_cloud(
             left = search_grid(places, wanted, reach, near)
             answered = np.setdiff1d(wanted, left, assume_unique=True)
             for chunk in chunks_of(len(answered), ROWS_IN_CACHE):
-                some = answered[chunk]
-                store(some, np.broadcast_to(0.0, (len(some), k)), near[some])
+                numbers = answered[chunk]
+                store(numbers, np.broadcast_to(0.0, (len(numbers), k)), near[numbers])
     for chunk in chunks_of(len(left), ROWS_AT_ONCE):
         store(left[chunk], *_query(tree, places[left[chunk]], width))
 

@@ -150,4 +150,4 @@ def estimate_normals(
         size = min(settings.k, len(cloud))
         neighbors = search_knn(cloud, size, max_distance=max_distance, canonical=True)
     fit = estimate(cloud, neighbors, settings, chunk_size)
-    return fit.each(lambda part: restore_rows(part, rows, len(tensor)))
+    return fit.each(lambda values: restore_rows(values, rows, len(tensor)))

@@ -57,18 +57,18 @@ class _Offsets(NamedTuple):
 
     def take(self, rows: Tensor | slice) -> "_Offsets":
         """Return some of the rows."""
-        return _Offsets(*(part[rows] for part in self))
+        return _Offsets(*(column[rows] for column in self))
 
     def about(self, centers: Tensor) -> "_Offsets":
         """Return the points relative to other centers, shape ``(n, 3)``."""
         x, y, z = (
-            part - center for part, center in zip(self[:3], centers.T[..., None], strict=True)
+            column - center for column, center in zip(self[:3], centers.T[..., None], strict=True)
         )
         return _Offsets(x, y, z, self.counted)
 
     def distances(self, normals: Tensor) -> Tensor:
         """Return signed distances to planes through the centers, shape ``(n, K)``."""
-        x, y, z = (part * n for part, n in zip(self[:3], normals.T[..., None], strict=True))
+        x, y, z = (column * n for column, n in zip(self[:3], normals.T[..., None], strict=True))
         total: Tensor = x + y + z
         return total
 
@@ -84,7 +84,7 @@ class _Plane(NamedTuple):
 
     def take(self, rows: Tensor | slice) -> "_Plane":
         """Return some of the rows."""
-        return _Plane(*(part[rows] for part in self))
+        return _Plane(*(column[rows] for column in self))
 
 
 class _Solution(NamedTuple):
@@ -170,7 +170,7 @@ def fit_normals_irls(
         mu_decay,
         None if resolution is None else resolution.reshape(-1),
     )
-    return fit.each(lambda part: part.reshape(leading + part.shape[1:]))
+    return fit.each(lambda values: values.reshape(leading + values.shape[1:]))
 
 
 def estimate_irls(
@@ -181,9 +181,9 @@ def estimate_irls(
     The authors ask the user for the noise; here it is estimated from the planes of PCA about each
     point.
     """
-    known = points.detach()
-    planes = fit_points(known, neighbors, fit_normals_pca, chunk_size=chunk_size)
-    noise = survey_noise(known, neighbors, planes, chunk_size=chunk_size).noise
+    fixed = points.detach()
+    planes = fit_points(fixed, neighbors, fit_normals_pca, chunk_size=chunk_size)
+    noise = survey_noise(fixed, neighbors, planes, chunk_size=chunk_size).noise
     fit = partial(fit_normals_irls, mu_decay=config.irls_decay)
     return fit_points(points, neighbors, fit, chunk_size=chunk_size, noise=noise)
 
@@ -201,7 +201,7 @@ def _fit_rows(
     noise = torch.maximum(noise, _LEAST_NOISE * radius)
     is_flat = start.residual_rms <= noise
     flat = (start.valid & is_flat).nonzero().squeeze(-1)
-    plane = replace_rows(plane, flat, start.each(lambda part: part[flat]))
+    plane = replace_rows(plane, flat, start.each(lambda values: values[flat]))
 
     rows = (start.valid & ~is_flat).nonzero().squeeze(-1)
     x, y, z = offsets[rows].unbind(dim=-1)
@@ -209,9 +209,9 @@ def _fit_rows(
     normals, heavy = _fit_edges(points, start.normals[rows], noise[rows, None], decay)
     resolution = None if resolution is None else resolution[rows]
     inliers = fit_normals_pca(patches[rows], heavy | itself[rows], resolution=resolution)
-    known = zip(inliers[1:4], plane[1:4], strict=True)
-    rest = (torch.where(inliers.valid, new, old[rows]) for new, old in known)
-    return replace_rows(plane, rows, NormalFit(normals, *rest))
+    pairs = zip(inliers[1:4], plane[1:4], strict=True)
+    values = (torch.where(inliers.valid, new, old[rows]) for new, old in pairs)
+    return replace_rows(plane, rows, NormalFit(normals, *values))
 
 
 def _fit_edges(
@@ -224,14 +224,14 @@ def _fit_edges(
     normals, heavy = first.normal, first.heavy
 
     rows = (_cosine(start, normals) < _CLOSE_TO_PCA).nonzero().squeeze(-1)
-    part, ours, limit = points.take(rows), normals[rows], limit[rows]
+    turned, ours, limit = points.take(rows), normals[rows], limit[rows]
     axis = torch.linalg.cross(torch.linalg.cross(start[rows], ours), ours)
     across = axis / (axis * axis).sum(dim=-1, keepdim=True).sqrt()
-    mu = _low_quantile(_sq_distances(part, across), part.counted)
-    second = _fit_twice(part, across, mu, mu / 2, limit, decay)
-    known = _Solution(*(field[rows] for field in first))
-    better = (_cosine(known.through, second.through) < _SAME_SOLUTION) & ~_first_wins(
-        known, second, part
+    mu = _low_quantile(_sq_distances(turned, across), turned.counted)
+    second = _fit_twice(turned, across, mu, mu / 2, limit, decay)
+    firsts = _Solution(*(field[rows] for field in first))
+    better = (_cosine(firsts.through, second.through) < _SAME_SOLUTION) & ~_first_wins(
+        firsts, second, turned
     )
     rows = rows[better]
     return (
@@ -310,10 +310,10 @@ def _fit_graduated(
     for done in range(remaining[0] if remaining else 0):
         while remaining[active - 1] <= done:
             active -= 1
-        part = slice(0, active)
-        moved = step(points.take(part), plane.take(part), decay, shift)
-        rest = plane.take(slice(active, None))
-        plane = _Plane(*map(torch.cat, zip(moved, rest, strict=True)))
+        moving = slice(0, active)
+        moved = step(points.take(moving), plane.take(moving), decay, shift)
+        arrived = plane.take(slice(active, None))
+        plane = _Plane(*map(torch.cat, zip(moved, arrived, strict=True)))
     return plane.take(order.argsort())
 
 

@@ -222,14 +222,14 @@ def least_squares(
     basis: list[Tensor] = []
     mixing: list[list[Tensor]] = []
     for column, share in columns:
-        rest, mix = column, []
+        residual, mix = column, []
         for direction in basis:
-            mix.append((direction * rest).sum(dim=-1, keepdim=True))
-            rest = rest - mix[-1] * direction
-        sq_rest = (rest * rest).sum(dim=-1, keepdim=True)
-        kept = sq_rest > share * share * (column * column).sum(dim=-1, keepdim=True)
-        length = torch.where(kept, sq_rest, 1.0).sqrt()
-        basis.append(torch.where(kept, rest / length, 0.0))
+            mix.append((direction * residual).sum(dim=-1, keepdim=True))
+            residual = residual - mix[-1] * direction
+        sq_rest = (residual * residual).sum(dim=-1, keepdim=True)
+        is_independent = sq_rest > share * share * (column * column).sum(dim=-1, keepdim=True)
+        length = torch.where(is_independent, sq_rest, 1.0).sqrt()
+        basis.append(torch.where(is_independent, residual / length, 0.0))
         mixing.append([*mix, length])
     projections = []
     for direction in basis:
@@ -237,11 +237,11 @@ def least_squares(
         target = target - projections[-1] * direction
     coefficients: list[Tensor] = []
     for row in reversed(range(len(basis))):
-        known = sum(
+        total = sum(
             (mixing[row + 1 + i][row] * c for i, c in enumerate(coefficients)),
             start=torch.zeros_like(projections[row]),
         )
-        coefficients.insert(0, (projections[row] - known) / mixing[row][row])
+        coefficients.insert(0, (projections[row] - total) / mixing[row][row])
     return coefficients, target
 
 

@@ -144,7 +144,8 @@ def orient_normals(
         )
     if (towards == "viewpoint") != (viewpoint is not None):
         wanted = "a viewpoint" if viewpoint is None else "no viewpoint"
-        raise ConfigError(f"orient_normals: expected {wanted} with towards={towards!r}.")
+        repair = "" if viewpoint is None else "; pass towards='viewpoint' to look at one"
+        raise ConfigError(f"orient_normals: expected {wanted} with towards={towards!r}{repair}.")
     if viewpoint is not None:
         place = as_tensor("orient_normals", "viewpoint", viewpoint).to(cloud)
         pattern = "3" if place.ndim == 1 else "N 3"
@@ -165,13 +166,13 @@ def orient_normals(
         return upright
     spreads = _evenly_spread(len(rows)).to(rows.device)
     spreading, following = rows[spreads], rows[~spreads]
-    kept, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
-    near = search_knn(kept, min(NUM_NEIGHBORS, len(kept)), canonical=True)
-    oriented = units * turn(kept, units, near)[:, None]
+    places, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
+    near = search_knn(places, min(NUM_NEIGHBORS, len(places)), canonical=True)
+    oriented = units * turn(places, units, near)[:, None]
     turned = upright.index_copy(0, spreading, oriented.to(given.dtype))
     if len(following) == 0:
         return turned
-    signs = _follow(cloud, upright, following, kept, oriented)
+    signs = _follow(cloud, upright, following, places, oriented)
     return turned.index_copy(0, following, upright[following] * signs[:, None].to(given.dtype))
 
 
@@ -196,11 +197,19 @@ def _follow(
     tree = cKDTree(nearest.cpu().numpy(), balanced_tree=False, compact_nodes=False)
 
     def follow(chunk: slice) -> Tensor:
+<<<<<<< HEAD
         own = rows[chunk]
         _, found = tree.query(points[own].cpu().numpy(), min(_NUM_FOLLOWED, tree.n))
         near = torch.from_numpy(found).to(points.device)
         arms = nearest[near] - points[own, None]
         cosine, slope = _agreement(arms, normals[own, None].to(points.dtype), oriented[near])
+=======
+        asked = rows[chunk]
+        _, nearest_places = tree.query(points[asked].cpu().numpy(), min(_NUM_LINKS, tree.n))
+        near = torch.from_numpy(nearest_places).to(points.device)
+        arms = nearest[near] - points[asked, None]
+        cosine, slope = _agreement(arms, normals[asked, None].to(points.dtype), oriented[near])
+>>>>>>> main
         least = (1 - cosine.abs() + slope).argmin(dim=1, keepdim=True)
         return torch.where(cosine.gather(1, least)[:, 0] < 0, -1.0, 1.0).to(points.dtype)
 
@@ -329,9 +338,9 @@ def propagate_signs(
     starts, ends = (end.cpu().numpy().astype(np.int32) for end in (links.starts, links.ends))
     bends = links.bends.double().cpu().numpy()
     face_bend = max(_FACE_BEND, _USUAL_BENDS * float(np.median(bends))) if len(bends) else 0.0
-    kept = bends <= _PATCH_BEND if within_patches else slice(None)
+    linked = bends <= _PATCH_BEND if within_patches else slice(None)
     # A weight of zero would be no link, so every link weighs one more than its bend.
-    weights, pairs = 1 + bends[kept], (starts[kept], ends[kept])
+    weights, pairs = 1 + bends[linked], (starts[linked], ends[linked])
     tree = spanning_tree(csr_array((weights, pairs), shape=(num_points, num_points)))
     num_patches, patches = connected_components(tree, directed=False)
     flat = tree.data <= 1 + face_bend

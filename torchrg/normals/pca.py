@@ -221,12 +221,12 @@ def fit_points(
         chosen = chunk if rows is None else rows[chunk]
         indices, mask = neighbors.at(chosen)
         patches = gather_patches(points, indices)
-        own = {name: values[chosen] for name, values in of_points.items()}
-        return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **own)
+        extra = {name: values[chosen] for name, values in of_points.items()}
+        return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **extra)
 
     num_rows = len(points) if rows is None else len(rows)
     parts = list(zip(*map_chunks(fit_chunk, num_rows, chunk_size, points.device), strict=True))
-    return NormalFit(*(torch.cat(part) for part in parts[:4]))
+    return NormalFit(*(torch.cat(columns) for columns in parts[:4]))
 
 
 def at_all_points(fit: FitPatches, **settings: str) -> Estimator:

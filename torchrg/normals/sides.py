@@ -85,16 +85,16 @@ def _to_front(cloud: Cloud, normals: Tensor) -> Tensor:
     rows = finite_rows(points)
     rows = rows[(normals[rows] != 0).any(dim=-1)]
     is_known = (front[rows] != 0).any(dim=-1)
-    known, lost = rows[is_known], rows[~is_known]
+    seeing, lost = rows[is_known], rows[~is_known]
     turned = turn_towards(normals, front)
     if len(lost) > _FEW * len(rows):
         inside = orient_normals(points, normals, towards="interior")
         return turned.index_copy(0, lost, inside[lost])
     if len(lost):
-        tree, places = cKDTree(points[known].numpy()), points[lost].numpy()
+        tree, places = cKDTree(points[seeing].numpy()), points[lost].numpy()
         distance, _ = tree.query(places)
         # All that are as near, so that their order does not matter.
         near = tree.query_ball_point(places, distance * _AS_NEAR)
-        looks = torch.stack([turned[known[rows]].sum(dim=0) for rows in near])
+        looks = torch.stack([turned[seeing[rows]].sum(dim=0) for rows in near])
         turned = turned.index_copy(0, lost, turn_towards(normals[lost], looks))
     return turned

@@ -81,8 +81,8 @@ def find_adjacency(
     along = torch.linalg.cross(first, second)
     along = along / along.norm(dim=1, keepdim=True)
     length = _length_on_line(points, border, along, sizes / on_line)
-    kept = on_line + on_curve >= LEAST_CONTACTS
-    return PlaneAdjacency(pairs[kept], torch.where(crossing, length, shares)[kept], angle[kept])
+    meets = on_line + on_curve >= LEAST_CONTACTS
+    return PlaneAdjacency(pairs[meets], torch.where(crossing, length, shares)[meets], angle[meets])
 
 
 class NearestPoints:
@@ -106,10 +106,10 @@ class NearestPoints:
         near, counted = self.neighbors.at(rows)
         if counted is None:
             return near
-        own = rows
-        if isinstance(own, slice):
-            own = torch.arange(len(self.neighbors.indices), device=near.device)[own]
-        return torch.where(counted, near, own[:, None].to(near.dtype))
+        numbers = rows
+        if isinstance(numbers, slice):
+            numbers = torch.arange(len(self.neighbors.indices), device=near.device)[numbers]
+        return torch.where(counted, near, numbers[:, None].to(near.dtype))
 
     def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
         """Return those of the rows that have a new one beside them."""
@@ -173,9 +173,9 @@ class _Border:
         touches = torch.zeros_like(labels, dtype=torch.bool)
         # Small tensors kept from each chunk would split the room that glibc has for the next.
         counts: Counter[int] = Counter()
-        for some in chunks_of(len(labels), ROWS_IN_CACHE):
-            places, _, keys = self._edges_of(some)
-            touches[some.start + places // self._width] = True
+        for chunk in chunks_of(len(labels), ROWS_IN_CACHE):
+            places, _, keys = self._edges_of(chunk)
+            touches[chunk.start + places // self._width] = True
             values_of_chunk = torch.unique(keys, return_counts=True)
             counts.update(dict(zip(*(values.tolist() for values in values_of_chunk), strict=True)))
         self._rows = places_of(touches).to(torch.int32)
@@ -190,13 +190,13 @@ class _Border:
 
     def _edges_of(self, rows: slice | Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return where in the lists of some points other regions are, the lists, and the pairs."""
-        own, near = self._labels[rows], self._neighbors.at(rows)
+        label, near = self._labels[rows], self._neighbors.at(rows)
         other = near.of(self._labels)
-        touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
+        touches = (other != label[:, None]) & (other >= 0) & (label >= 0)[:, None]
         if near.valid is not None:
             touches &= near.valid
         places = places_of(touches)
-        first = own.index_select(0, places // self._width)
+        first = label.index_select(0, places // self._width)
         second = other.reshape(-1).index_select(0, places)
         lower, higher = torch.minimum(first, second), torch.maximum(first, second)
         return places, near.indices, lower.long() * self._num_regions + higher
@@ -233,9 +233,11 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
         place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
         cell = torch.where(place.isfinite(), place, 0.0).floor().long()
-        for kept, values in zip(cells, _each_once(contacts.pair, cell), strict=True):
-            kept.frombytes(values.cpu().numpy().tobytes())
-    pair, cell = _each_once(*(torch.from_numpy(np.array(kept)).to(points.device) for kept in cells))
+        for numbers, values in zip(cells, _each_once(contacts.pair, cell), strict=True):
+            numbers.frombytes(values.cpu().numpy().tobytes())
+    pair, cell = _each_once(
+        *(torch.from_numpy(np.array(numbers)).to(points.device) for numbers in cells)
+    )
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
     steps = torch.bincount(pair[1:][is_next], minlength=len(spacing))

@@ -65,15 +65,15 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
         True
     """
     planes = seg.planes if isinstance(seg, Segmentation) else seg
-    given = torch.tensor([float(part) for part in up], dtype=torch.float64)
-    if given.shape != (3,) or not bool(given.isfinite().all() and given.any()):
+    upwards = torch.tensor([float(number) for number in up], dtype=torch.float64)
+    if upwards.shape != (3,) or not bool(upwards.isfinite().all() and upwards.any()):
         raise ConfigError(
             f"align_axes: expected up to be three numbers, not all zero, got {tuple(up)!r}."
         )
-    given = given / given.norm()
+    upwards = upwards / upwards.norm()
     normals = planes.normal.cpu().double()
     areas = torch.where(planes.curved.cpu(), 0.0, planes.area.cpu().double())
-    axis = _find_up(normals, areas, given)
+    axis = _find_up(normals, areas, upwards)
     heading = _find_heading(normals, areas, axis)
     if heading is None:
         warnings.warn(
@@ -81,7 +81,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
             "size; it is turned upright only.",
             stacklevel=3,
         )
-        heading = _horizontal(torch.eye(3, dtype=torch.float64)[given.abs().argmin()], axis)
+        heading = _horizontal(torch.eye(3, dtype=torch.float64)[upwards.abs().argmin()], axis)
     rotation = torch.stack([heading, torch.linalg.cross(axis, heading), axis])
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = rotation
@@ -147,10 +147,10 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
         >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
         ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
     """
-    rotation, coordinates, kept = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
+    rotation, coordinates, finite = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
     # Far from the origin most digits are those of the place, which a turn would spread over all.
     shift = motion[:3, 3].numpy() + rotation @ cloud.origin
-    coordinates[kept] = (cloud.coordinates[kept] - cloud.origin) @ rotation.T + shift
+    coordinates[finite] = (cloud.coordinates[finite] - cloud.origin) @ rotation.T + shift
     fields = dict(cloud.fields)
     for name in ("normals", "normals_input"):
         if name in fields:
@@ -159,13 +159,13 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
     return replace(cloud, coordinates=coordinates, fields=fields, header={}, front=front)
 
 
-def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:
+def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
     """Return the direction that most area is level or upright to; see :func:`align_axes`."""
-    level = (normals @ given).abs() >= math.cos(math.radians(_MOST_TILT_DEG))
+    level = (normals @ upwards).abs() >= math.cos(math.radians(_MOST_TILT_DEG))
     candidates = normals[level & (areas > 0)]
     if not len(candidates):
         # Walls alone say where up is, too: across their normals.
-        upright = (normals @ given).abs() <= math.sin(math.radians(_MOST_TILT_DEG))
+        upright = (normals @ upwards).abs() <= math.sin(math.radians(_MOST_TILT_DEG))
         spread = (areas * upright)[:, None, None] * normals[:, :, None] * normals[:, None, :]
         values, vectors = eigh3_of_few(spread.sum(dim=0))
         if not bool(values[1] > _LEAST_SHARE * values[2]) or values[2] == 0:
@@ -183,7 +183,7 @@ def _find_up(normals: Tensor, areas: Tensor, given: Tensor) -> Tensor:
         spread = normals[:, :, None] * normals[:, None, :]
         matrix = ((across - flat)[:, None, None] * spread).sum(dim=0)
         axis = eigh3_of_few(matrix)[1][:, 0]
-        axis = axis * torch.sign(axis @ given)
+        axis = axis * torch.sign(axis @ upwards)
     return axis
 
 

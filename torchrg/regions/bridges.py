@@ -112,24 +112,24 @@ def find_mixed_regions(
     others = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
     turns = [
         sq_chords(
-            cloud.normals[some].double().unbind(dim=1),
-            planes.normal[labels[some]].unbind(dim=1),
+            cloud.normals[chunk].double().unbind(dim=1),
+            planes.normal[labels[chunk]].unbind(dim=1),
         )
-        for some in torch.split(others, ROWS_AT_ONCE)
+        for chunk in torch.split(others, ROWS_AT_ONCE)
     ]
     turn = torch.cat(turns)
     near, aligned = (
         torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
         for limit in (config.max_angle_deg, _CORE_SHARE * config.max_angle_deg)
     )
-    part = _part_of(cloud, labels, rows)
-    smooth = _are_smooth(part, labels[rows], _SMOOTH_ANGLE * config.max_angle_deg, chunk_size)
-    part = part._replace(
-        valid=part.valid & smooth,
-        reach=None if part.reach is None else _CORE_SHARE * part.reach,
+    faces = _part_of(cloud, labels, rows)
+    smooth = _are_smooth(faces, labels[rows], _SMOOTH_ANGLE * config.max_angle_deg, chunk_size)
+    faces = faces._replace(
+        valid=faces.valid & smooth,
+        reach=None if faces.reach is None else _CORE_SHARE * faces.reach,
         angle_share=_CORE_SHARE,
     )
-    return MixedRegions(rows, part, near, aligned, on_plane)
+    return MixedRegions(rows, faces, near, aligned, on_plane)
 
 
 def cut_bridges(
@@ -211,15 +211,15 @@ def _planes_of(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
 
 
 def _are_smooth(
-    part: GrowingCloud, regions: Tensor, max_angle_deg: float, chunk_size: int
+    cloud: GrowingCloud, regions: Tensor, max_angle_deg: float, chunk_size: int
 ) -> Tensor:
     """Tell at which points the surface bends no more than is usual in their region."""
-    shares = torch.zeros_like(part.curvature, dtype=torch.float64)
+    shares = torch.zeros_like(cloud.curvature, dtype=torch.float64)
     rows, limit = torch.arange(len(shares), device=shares.device), deg_to_sq_chord(max_angle_deg)
-    for some in chunks_of(len(shares), chunk_size):
-        near, counted = part.neighbors.at(some), part.neighbors.counted(some)
-        alike = within_angle(near, rows[some], part.normals.T, limit, signed=False) & counted
-        shares[some] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
+    for chunk in chunks_of(len(shares), chunk_size):
+        near, counted = cloud.neighbors.at(chunk), cloud.neighbors.counted(chunk)
+        alike = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
+        shares[chunk] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
     segments = Segments(regions)
     usual = segments.median(segments.take(shares))
@@ -234,12 +234,12 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
     places = near.of(row_of)
     counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (places >= 0)
     counted &= near.counted()
-    own = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
+    itself = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
     return cloud._replace(
         points=cloud.points.T[:, rows].T,
         normals=cloud.normals.T[:, rows].T,
         curvature=cloud.curvature[rows],
-        neighbors=Neighbors(torch.where(counted, places, own), counted),
+        neighbors=Neighbors(torch.where(counted, places, itself), counted),
         valid=cloud.valid[rows],
         reach=None if cloud.reach is None else cloud.reach[rows],
         colors=None if cloud.colors is None else cloud.colors[rows],
@@ -253,8 +253,8 @@ def _find_edges(
     near = cloud.neighbors.at(rows)
     inside = (near.of(labels) == labels[rows, None]) & near.counted()
     passed = torch.zeros_like(inside)
-    for some in chunks_of(len(rows), chunk_size):
-        passed[some] = accept_edges(cloud, config, rows[some], None)[0]
+    for chunk in chunks_of(len(rows), chunk_size):
+        passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0]
     return _InnerEdges(rows, near.indices.long(), inside, passed & inside)
 
 
@@ -264,9 +264,9 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
     from scipy.sparse.csgraph import connected_components
 
     num_cores = int(cores.max()) + 1
-    own, theirs = cores[edges.rows, None].expand_as(edges.targets), cores[edges.targets]
-    between = edges.inside & (theirs >= 0) & (theirs != own)
-    first, second = own[between], theirs[between]
+    ours, theirs = cores[edges.rows, None].expand_as(edges.targets), cores[edges.targets]
+    between = edges.inside & (theirs >= 0) & (theirs != ours)
+    first, second = ours[between], theirs[between]
     keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
     keys, numbers = torch.unique(keys, return_inverse=True)
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
@@ -290,9 +290,9 @@ def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
     waiting = torch.arange(len(edges.rows), device=cores.device)
     while len(waiting):
         targets = edges.targets[waiting]
-        known = edges.passed[waiting] & (cores[targets] >= 0)
-        nearest = known.to(torch.uint8).argmax(dim=1, keepdim=True)
-        joined = known.any(dim=1)
+        reached = edges.passed[waiting] & (cores[targets] >= 0)
+        nearest = reached.to(torch.uint8).argmax(dim=1, keepdim=True)
+        joined = reached.any(dim=1)
         if not bool(joined.any()):
             break
         cores[edges.rows[waiting[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]

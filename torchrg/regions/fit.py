@@ -94,8 +94,8 @@ class RegionPlanes(NamedTuple):
     @property
     def noise(self) -> Tensor:
         """The thickness where it is known to be noise, shape ``(M,)``, else 0."""
-        known = self.reach.isfinite() & ~self.bent & ~self.curved
-        return torch.where(known, self.thickness, 0.0)
+        is_noise = self.reach.isfinite() & ~self.bent & ~self.curved
+        return torch.where(is_noise, self.thickness, 0.0)
 
     def times_thickness(self, factor: float) -> Tensor:
         """Return a distance from each plane ``(M,)``: NaN, no distance at all, if it is curved."""
@@ -105,10 +105,10 @@ class RegionPlanes(NamedTuple):
         """Return the distance of each point ``(n, 3)`` from the plane of a region ``(n,)``."""
         away = points.new_zeros(len(points), dtype=torch.float64)
         columns = [values.unbind(dim=1) for values in (points, self.center, self.normal)]
-        for some in chunks_of(len(points), ROWS_AT_ONCE):
-            owner = regions[some]
+        for chunk in chunks_of(len(points), ROWS_AT_ONCE):
+            owner = regions[chunk]
             for place, center, normal in zip(*columns, strict=True):
-                away[some] += (place[some].double() - center[owner]) * normal[owner]
+                away[chunk] += (place[chunk].double() - center[owner]) * normal[owner]
         return away.abs_()
 
     def signed_distances(self, points: Tensor, regions: Tensor) -> Tensor:
@@ -130,7 +130,7 @@ def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPla
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
     shares = segments.shares(POINTS_AT_ONCE)
-    parts = map_tasks(lambda some: _fit_together(some, points, normals), shares, points.device)
+    parts = map_tasks(lambda share: _fit_together(share, points, normals), shares, points.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 

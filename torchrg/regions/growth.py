@@ -125,7 +125,9 @@ def grow_regions(
         >>> labels.unique()
         tensor([0])
     """
-    settings = settings_of("grow_regions", GrowingConfig, config, changes)
+    settings = config
+    if not isinstance(settings, GrowingConfig) or changes:
+        settings = settings_of("grow_regions", GrowingConfig, config, changes)
     cloud = checked_cloud(settings, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
     if max_color_distance < math.inf:

@@ -106,16 +106,18 @@ def _drop_scattered(
     small = torch.bincount(labels + 1, minlength=1)[1:] < int(config.min_size)
     small = torch.cat([small, small.new_zeros(1)])
     segments = Segments(torch.where(small[labels], labels, UNLABELED))
-    own, theirs = segments.take_columns(cloud.normals), segments.spread_columns(normal)
-    agrees = segments.mean(sq_chords(own, theirs)) <= deg_to_sq_chord(_AGREE * config.max_angle_deg)
+    ours, theirs = segments.take_columns(cloud.normals), segments.spread_columns(normal)
+    agrees = segments.mean(sq_chords(ours, theirs)) <= deg_to_sq_chord(
+        _AGREE * config.max_angle_deg
+    )
     scattered = segments.rows[~segments.spread(agrees)]
     return labels.index_fill(0, scattered, UNLABELED)
 
 
 def _drop_small(labels: Tensor, min_size: int) -> Tensor:
     """Return labels without regions of fewer points, and without gaps in their numbers."""
-    kept = torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1)
-    numbers = torch.where(kept, kept.cumsum(0) - 1, UNLABELED)
+    is_large = torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1)
+    numbers = torch.where(is_large, is_large.cumsum(0) - 1, UNLABELED)
     return torch.cat([numbers, numbers.new_tensor([UNLABELED])])[labels]
 
 
@@ -153,8 +155,8 @@ def absorb_points(
         distance = planes.signed_distances(points[rows], region).abs()
         fits = (near >= 0) & (distance <= reach[region])
         if normals is not None:
-            own = normals[rows].double()[:, :, None].unbind(dim=1)
-            fits &= sq_chords(own, planes.normal[region].unbind(dim=2)) <= limit
+            ours = normals[rows].double()[:, :, None].unbind(dim=1)
+            fits &= sq_chords(ours, planes.normal[region].unbind(dim=2)) <= limit
         choice, least = _least(torch.where(fits, distance, torch.inf), near)
         joined = least.isfinite()
         rows = rows[joined]
@@ -252,12 +254,12 @@ class _Moments(NamedTuple):
 
 def _moments_of(planes: RegionPlanes) -> _Moments:
     normal = planes.normal
-    own = (normal[:, None] @ planes.covariance @ normal[:, :, None])[:, 0, 0]
+    variance = (normal[:, None] @ planes.covariance @ normal[:, :, None])[:, 0, 0]
     return _Moments(
         planes.num_points.double(),
         planes.center - planes.center[:1],
         planes.covariance,
-        torch.where(planes.curved, 0.0, torch.maximum(own.clamp(min=0).sqrt(), planes.floor)),
+        torch.where(planes.curved, 0.0, torch.maximum(variance.clamp(min=0).sqrt(), planes.floor)),
         planes.noise,
     )
 
@@ -333,9 +335,9 @@ def _joined(a: _Moments, b: _Moments) -> _Moments:
     share_a, share_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
     mean = share_a * a.mean + share_b * b.mean
     covariance = torch.zeros_like(a.covariance)
-    for part, share in ((a, share_a), (b, share_b)):
-        shift = part.mean - mean
-        spread = part.covariance + shift[:, :, None] * shift[:, None, :]
+    for side, share in ((a, share_a), (b, share_b)):
+        shift = side.mean - mean
+        spread = side.covariance + shift[:, :, None] * shift[:, None, :]
         covariance = covariance + share[:, :, None] * spread
     noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
     return _Moments(weight, mean, covariance, torch.maximum(a.scale, b.scale), noise)
@@ -346,12 +348,12 @@ def _misfit(a: _Moments, b: _Moments) -> Tensor:
     both = _joined(a, b)
     normal = eigh3_of_few(both.covariance)[1][:, :, 0]
     misfits = []
-    for part, other in ((a, b), (b, a)):
-        own = (normal[:, None] @ part.covariance @ normal[:, :, None])[:, 0, 0]
-        shift = ((part.mean - both.mean) * normal).sum(dim=1)
-        rms = (own.clamp(min=0) + shift * shift).sqrt()
-        lent = torch.where(other.weight > part.weight, other.noise, 0.0)
-        misfits.append(torch.where(rms > 0, rms / torch.maximum(part.scale, lent), 0.0))
+    for side, other in ((a, b), (b, a)):
+        variance = (normal[:, None] @ side.covariance @ normal[:, :, None])[:, 0, 0]
+        shift = ((side.mean - both.mean) * normal).sum(dim=1)
+        rms = (variance.clamp(min=0) + shift * shift).sqrt()
+        lent = torch.where(other.weight > side.weight, other.noise, 0.0)
+        misfits.append(torch.where(rms > 0, rms / torch.maximum(side.scale, lent), 0.0))
     return torch.maximum(*misfits)
 
 
@@ -359,11 +361,11 @@ def _are_turned(a: _Moments, b: _Moments, max_tilt: float) -> Tensor:
     """Return whether the joint plane is turned too far against that of either."""
     joint = eigh3_of_few(_joined(a, b).covariance)[1][:, :, 0]
     turned = torch.zeros(len(joint), dtype=torch.bool)
-    for part in (a, b):
-        values, vectors = eigh3_of_few(part.covariance)
-        own = (joint[:, None] @ part.covariance @ joint[:, :, None])[:, 0, 0]
+    for side in (a, b):
+        values, vectors = eigh3_of_few(side.covariance)
+        variance = (joint[:, None] @ side.covariance @ joint[:, :, None])[:, 0, 0]
         turned |= unsigned_angle_deg(vectors[:, :, 0], joint) > _FACET_TURN_DEG
-        turned |= own - values[:, 0] > max_tilt**2
+        turned |= variance - values[:, 0] > max_tilt**2
     return turned
 
 
@@ -412,10 +414,10 @@ def _touching(labels: Tensor, beside: NearestPoints) -> Tensor:
     # Narrow numbers are gathered three times as fast.
     narrow = labels.to(torch.int32)
     rows_of_chunks = []
-    for some in chunks_of(len(labels), ROWS_AT_ONCE):
-        near = Neighbors(beside.around(some)).of(narrow)
-        touches = (near != narrow[some, None]) & (near >= 0)
-        rows_of_chunks.append(some.start + places_of(touches.any(dim=1)))
+    for chunk in chunks_of(len(labels), ROWS_AT_ONCE):
+        near = Neighbors(beside.around(chunk)).of(narrow)
+        touches = (near != narrow[chunk, None]) & (near >= 0)
+        rows_of_chunks.append(chunk.start + places_of(touches.any(dim=1)))
     return torch.cat(rows_of_chunks)
 
 
@@ -428,20 +430,22 @@ def _choose(
     near: Tensor,
 ) -> Tensor:
     """Return the region of some points, of labels ``near`` ``(n, 8)`` and their own."""
-    own, place = labels[rows], cloud.points[rows].double()
-    options = torch.cat([own[:, None], near], dim=1)
-    known = options.clamp(min=0)
-    distance = planes.signed_distances(place, known).abs()
-    usable = (options >= 0) & (distance <= reach[known])
-    cost = (distance / planes.thickness[known]).square() + _ROUNDING**2 * (options != own[:, None])
+    label, place = labels[rows], cloud.points[rows].double()
+    options = torch.cat([label[:, None], near], dim=1)
+    region = options.clamp(min=0)
+    distance = planes.signed_distances(place, region).abs()
+    usable = (options >= 0) & (distance <= reach[region])
+    cost = (distance / planes.thickness[region]).square() + _ROUNDING**2 * (
+        options != label[:, None]
+    )
     cost = torch.where(usable, cost, torch.inf)
     first, first_cost = _least(cost, options)
     second, second_cost = _least(torch.where(options == first[:, None], torch.inf, cost), options)
     # A region that the point is far from is growth's choice.
-    kept = ((own >= 0) & ~usable[:, 0]) | first_cost.isinf()
-    choice = torch.where(kept, own, first)
+    remains = ((label >= 0) & ~usable[:, 0]) | first_cost.isinf()
+    choice = torch.where(remains, label, first)
 
-    both = (second_cost.isfinite() & ~kept).nonzero().squeeze(1)
+    both = (second_cost.isfinite() & ~remains).nonzero().squeeze(1)
     first, second, place = first[both], second[both], place[both]
     scale = torch.maximum(planes.thickness[first], planes.thickness[second])
     beyond = (
@@ -451,8 +455,8 @@ def _choose(
     first_cost, second_cost = first_cost[both] + next(beyond), second_cost[both] + next(beyond)
     better = torch.where(second_cost < first_cost, second, first)
     angle = unsigned_angle_deg(planes.normal[first], planes.normal[second])
-    stays = (angle <= PARALLEL_DEG) & (own[both] >= 0)
-    choice[both] = torch.where(stays, own[both], better)
+    stays = (angle <= PARALLEL_DEG) & (label[both] >= 0)
+    choice[both] = torch.where(stays, label[both], better)
     return choice
 
 
@@ -462,21 +466,21 @@ def _beyond(
     planes: RegionPlanes,
     rows: Tensor,
     place: Tensor,
-    own: Tensor,
+    label: Tensor,
     other: Tensor,
 ) -> Tensor:
     """Return how far beyond another plane the feet of points on their own are, where that ends."""
     near = cloud.neighbors.at(rows)
     indices = near.indices.long()
-    inside = (labels[indices] == own[:, None]) & near.counted()
+    inside = (labels[indices] == label[:, None]) & near.counted()
     away = torch.zeros_like(inside, dtype=torch.float64)
     columns = (cloud.points, planes.center[other], planes.normal[other])
-    for x, start, part in zip(*(values.unbind(dim=1) for values in columns), strict=True):
-        away += (x[indices].double() - start[:, None]) * part[:, None]
+    for x, start, slope in zip(*(values.unbind(dim=1) for values in columns), strict=True):
+        away += (x[indices].double() - start[:, None]) * slope[:, None]
     away *= inside
     total = away.sum(dim=1)
-    rounding = _ROUNDING * planes.thickness[own] * inside.sum(dim=1)
+    rounding = _ROUNDING * planes.thickness[label] * inside.sum(dim=1)
     one_sided = total.abs() > (_ONE_SIDED * away.abs().sum(dim=1)).clamp(min=rounding)
-    foot = place - planes.signed_distances(place, own[:, None]) * planes.normal[own]
+    foot = place - planes.signed_distances(place, label[:, None]) * planes.normal[label]
     over = -total.sign() * planes.signed_distances(foot, other[:, None]).squeeze(1)
     return torch.where(one_sided, over.clamp(min=0), 0.0)

@@ -188,10 +188,10 @@ def _listed(edges: Tensor, num_places: int) -> Tensor:
     """Return the first 64 places that edges lead to from each ``(n, K)``; itself where fewer."""
     counts = torch.bincount(edges[:, 0], minlength=num_places)
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
-    kept = column < _MOST_EDGES
+    first = column < _MOST_EDGES
     width = max(int(counts.max()), 1) if len(edges) else 1
     listed = torch.arange(num_places, dtype=torch.int32)[:, None].repeat(1, min(width, _MOST_EDGES))
-    listed[edges[kept, 0], column[kept]] = edges[kept, 1].to(torch.int32)
+    listed[edges[first, 0], column[first]] = edges[first, 1].to(torch.int32)
     return listed
 
 
@@ -499,11 +499,11 @@ def _cheapest_borders(borders: _Borders, cost: Tensor, num_regions: int) -> tupl
 
 
 def _merge(
-    regions: _Regions, borders: _Borders, gone: Tensor, kept: Tensor
+    regions: _Regions, borders: _Borders, gone: Tensor, owners: Tensor
 ) -> tuple[_Regions, _Borders, Tensor]:
     """Make regions part of others that stay; return the new number of each region too."""
     num_regions = len(regions.size)
-    owner = torch.arange(num_regions).index_copy(0, gone, kept)
+    owner = torch.arange(num_regions).index_copy(0, gone, owners)
     stays = owner == torch.arange(num_regions)
     new = (stays.cumsum(0) - 1)[owner]
     first, second = new[borders.first], new[borders.second]

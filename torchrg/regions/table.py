@@ -120,7 +120,7 @@ def summarize_planes(
     first, second = _plane_axes(fit)
 
     shares = segments.shares(POINTS_AT_ONCE)
-    sizes = [len(some.counts) for some in shares]
+    sizes = [len(share.counts) for share in shares]
     frames = zip(*(torch.split(part, sizes) for part in (fit.center, first, second)), strict=True)
     measures = map_tasks(
         lambda part: _measure(points, *part, outline=outline),
@@ -131,19 +131,19 @@ def summarize_planes(
     mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
 
-    def own(values: Tensor) -> Tensor:
+    def as_given(values: Tensor) -> Tensor:
         return values.to(points.dtype)
 
     planes = Planes(
-        normal=own(fit.normal),
-        offset=own((fit.center * fit.normal).sum(dim=1)),
-        centroid=own(fit.center + mean),
-        area=own(area),
+        normal=as_given(fit.normal),
+        offset=as_given((fit.center * fit.normal).sum(dim=1)),
+        centroid=as_given(fit.center + mean),
+        area=as_given(area),
         count=fit.num_points,
-        rms=own(fit.rms),
-        extent=own(sides),
-        axes=own(axes),
-        center=own(fit.center + (middle[:, None] @ axes).squeeze(1)),
+        rms=as_given(fit.rms),
+        extent=as_given(sides),
+        axes=as_given(axes),
+        center=as_given(fit.center + (middle[:, None] @ axes).squeeze(1)),
         curved=fit.curved,
     )
     if up is not None:
@@ -154,7 +154,7 @@ def summarize_planes(
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
-        lengths, angles = own(meeting.boundary_length), own(meeting.dihedral_deg)
+        lengths, angles = as_given(meeting.boundary_length), as_given(meeting.dihedral_deg)
         planes = replace(planes, adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes
 
@@ -256,9 +256,10 @@ def _outlines(
     outlines = []
     counts = segments.counts.tolist()
     parts = torch.split(torch.stack([u, v], dim=1), counts)
-    for part, size, center, first, second in zip(parts, width.tolist(), *frame, strict=True):
+    for places, size, center, first, second in zip(parts, width.tolist(), *frame, strict=True):
         rings = (
-            torch.from_numpy(ring).to(u.device) for ring in trace_outline(part.cpu().numpy(), size)
+            torch.from_numpy(ring).to(u.device)
+            for ring in trace_outline(places.cpu().numpy(), size)
         )
         lifted = (center + ring[:, :1] * first + ring[:, 1:] * second for ring in rings)
         outlines.append(tuple(ring.to(dtype) for ring in lifted))
@@ -302,12 +303,12 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.
 
 def _rings(shapely: Any, shape: Any, min_area: float) -> list[NDArray[np.float64]]:  # noqa: ANN401
     """Return the rings of a polygon or of several, largest polygon first, without specks."""
-    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
-    largest = max((part.area for part in parts), default=0.0)
-    parts = [part for part in parts if part.area >= min(min_area, largest)]
+    parts = [polygon for polygon in shapely.get_parts(shape) if polygon.geom_type == "Polygon"]
+    largest = max((polygon.area for polygon in parts), default=0.0)
+    parts = [polygon for polygon in parts if polygon.area >= min(min_area, largest)]
     rings: list[NDArray[np.float64]] = []
-    for part in sorted(parts, key=lambda part: -part.area):
-        turned = shapely.geometry.polygon.orient(part)
+    for polygon in sorted(parts, key=lambda polygon: -polygon.area):
+        turned = shapely.geometry.polygon.orient(polygon)
         holes = [hole for hole in turned.interiors if shapely.Polygon(hole).area >= min_area]
         rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *holes)]
     return rings

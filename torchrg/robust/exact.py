@@ -61,19 +61,19 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Te
     for vertex in vertices[1:]:
         corners = [column.index_select(0, vertex) for column in columns]
         edge = [corner.sub_(origin) for corner, origin in zip(corners, origins, strict=True)]
-        rest = _reject(edge, axes)
-        height = sum_squares(rest).sqrt()
+        across = _reject(edge, axes)
+        height = sum_squares(across).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
         lanes, near = _majorities(columns, origins, axes, candidates, reach, size)
         if len(lanes):
             on_flat = refine_flat(take_lanes(columns, lanes), near, tolerance[lanes], len(axes))
-            kept = on_flat.sum(dim=0) >= size
-            dimension[lanes[kept]] = len(axes)
-            members[:, lanes[kept]] = on_flat[:, kept]
+            is_full = on_flat.sum(dim=0) >= size
+            dimension[lanes[is_full]] = len(axes)
+            members[:, lanes[is_full]] = on_flat[:, is_full]
         steep = steep & (height > _MIN_EDGE * extent)
         # A short edge is a poor ruler: what rounding moves at its ends grows with the distance.
         reach = torch.maximum(reach, 2 * tolerance * (1 + 2 * extent / height))
-        axes.append([part / height for part in rest])
+        axes.append([part / height for part in across])
     if num_points <= num_coordinates:
         spanned = dimension == num_coordinates
         dimension[spanned] = num_points - 1
@@ -128,7 +128,9 @@ def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tenso
     """Part of vectors, given by their coordinates, across orthonormal directions."""
     for direction in directions:
         along = dot(vectors, direction)
-        vectors = [part - along * axis for part, axis in zip(vectors, direction, strict=True)]
+        vectors = [
+            component - along * axis for component, axis in zip(vectors, direction, strict=True)
+        ]
     return vectors
 
 

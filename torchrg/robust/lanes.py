@@ -61,8 +61,8 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
 def dot(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:
     """Sum of the products of P tensors and P others that fit them."""
     total = parts[0] * factors[0]
-    for part, factor in zip(parts[1:], factors[1:], strict=True):
-        total += part * factor
+    for column, factor in zip(parts[1:], factors[1:], strict=True):
+        total += column * factor
     return total
 
 

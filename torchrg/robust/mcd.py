@@ -285,9 +285,9 @@ def _factors(ellipsoid: Ellipsoid, size: int, settings: _Settings) -> tuple[Tens
     raw = consistency_factor(size / num_points, num_coordinates)
     final = consistency_factor(settings.quantile, num_coordinates)
     if settings.small_sample:
-        known = (num_points, num_coordinates, settings.support_fraction)
-        raw *= small_sample_factor(*known, reweighted=False)
-        final *= small_sample_factor(*known, reweighted=True)
+        sizes = (num_points, num_coordinates, settings.support_fraction)
+        raw *= small_sample_factor(*sizes, reweighted=False)
+        final *= small_sample_factor(*sizes, reweighted=True)
     return torch.full_like(ellipsoid.squares[0], raw), final
 
 

@@ -110,17 +110,17 @@ def _smallest_ellipsoid(
     wide = [column.repeat(1, step) for column in columns]
     floors = floor.repeat(step)
     for first in range(0, len(sets), step):
-        some = sets[first : first + step]
-        marks = columns[0].new_zeros(len(some), num_points).scatter_(1, some, 1.0)
+        tried = sets[first : first + step]
+        marks = columns[0].new_zeros(len(tried), num_points).scatter_(1, tried, 1.0)
         weights = marks.t()[:, :, None].expand(-1, -1, num_lanes).reshape(num_points, -1)
-        lanes = len(some) * num_lanes
+        lanes = len(tried) * num_lanes
         points = [column[:, :lanes] for column in wide]
         ellipsoid = fit_ellipsoid(points, weights, num_coordinates + 1, floors[:lanes])
         value = determinant(ellipsoid, num_coordinates)
         reach = sorted_points(sq_distances(ellipsoid, num_coordinates))[:, size - 1].double()
         for _ in range(num_coordinates):
             value = value * reach
-        value = value.reshape(len(some), num_lanes)
+        value = value.reshape(len(tried), num_lanes)
         index = value.argmin(dim=0)
         least = value.gather(0, index[None]).squeeze(0)
         better = least < best

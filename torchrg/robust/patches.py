@@ -160,10 +160,12 @@ def _with_gradients(fit: RobustFit, patches: Tensor, weights: Tensor) -> RobustF
     mean = (shares * points).sum(dim=-2, keepdim=True)
     offsets = (points - mean).unbind(dim=-1)
     scatter = second_moments(offsets, shares.squeeze(-1))
-    size, own = (
+    size, size_of_scatter = (
         m.detach().diagonal(dim1=-2, dim2=-1).sum(dim=-1) for m in (fit.covariance, scatter)
     )
-    covariance = (size / torch.where(own > 0, own, 1.0))[..., None, None] * scatter
+    covariance = (size / torch.where(size_of_scatter > 0, size_of_scatter, 1.0))[
+        ..., None, None
+    ] * scatter
     mean = mean.squeeze(-2)
     return fit._replace(
         location=fit.location + (mean - mean.detach()),
@@ -253,10 +255,10 @@ def _fit_chunk(
         store_exact(exact, members[:, exact])
     lower = torch.nonzero(dimension < size - 1).squeeze(1)
     if len(lower):
-        rest = ~members[:, lower].t()
+        outside = ~members[:, lower].t()
         fit = _fit_groups(
             patches[lower],
-            rest,
+            outside,
             PATCHES_IN_CACHE,
             lambda chunk: _fit_chunk(chunk, support_fraction, estimator, majority),
         )

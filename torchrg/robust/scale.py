@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from math import comb
 from statistics import NormalDist
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._opaque import opaque
-from torchrg._parallel import CACHE_BYTES, chunks_of, map_chunks, map_rows
+from torchrg._parallel import CACHE_BYTES, map_chunks, map_rows
 from torchrg.errors import ShapeError
 
 MAD_FACTOR = 1.4826
@@ -37,6 +37,9 @@ _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
 
 _TAU_WEIGHT_CUT = 4.5
 """A value that deviates by more than this many median deviations has no weight in the centre."""
+
+_GPU_SHARE = 256
+"""Factor of the work at a time on a GPU, which has the memory for it and is slow to start."""
 
 _TAU_SCALE_CUT = 3.0
 """Deviations are cut off at this many median deviations."""
@@ -303,34 +306,33 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
-        (found,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
-        endless = found.isnan().nonzero().squeeze(1)
+        (differences,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
+        endless = differences.isnan().nonzero().squeeze(1)
         if len(endless):
-            found[endless] = _difference_by_lags(sorted_rows[endless])
-        return found
+            differences[endless] = _difference_by_lags(sorted_rows[endless])
+        return differences
     return _difference_by_lags(sorted_rows)
 
 
 def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
     """Do as :func:`_majority_difference`, for all values and devices."""
-    rank = comb(half_size(sorted_rows.shape[1]), 2)
-    out = sorted_rows.new_empty(len(sorted_rows))
-    n = sorted_rows.shape[1]
-    width = sum(n - lag for lag in range(1, half_size(n)))
-    scale = 1 if sorted_rows.device.type == "cpu" else _GPU_SHARE
-    size = max(1, scale * CACHE_BYTES // (width * sorted_rows.element_size()))
+    n, on_cpu = sorted_rows.shape[1], sorted_rows.device.type == "cpu"
+    lags = range(1, half_size(n))
+    rank, width = comb(half_size(n), 2), sum(n - lag for lag in lags)
+    size = (1 if on_cpu else _GPU_SHARE) * CACHE_BYTES // (width * sorted_rows.element_size())
 
-    def fill(share: slice) -> None:
-        # With one buffer a thread.
-        rows, into = sorted_rows[share], out[share]
-        lagged = _Lagged(rows, min(size, len(rows)))
-        for chunk in chunks_of(len(rows), size):
-            into[chunk] = lagged.select(rows[chunk], rank)
+    def select(chunk: slice) -> Tensor:
+        rows = sorted_rows[chunk]
+        differences = torch.cat([rows[:, lag:] - rows[:, : n - lag] for lag in lags], dim=1)
+        # Of two infinite values, which are beyond all others.
+        differences.nan_to_num_(nan=torch.inf, posinf=torch.inf)
+        if on_cpu:
+            differences.numpy().partition(rank - 1, axis=1)
+            return differences[:, rank - 1].clone()
+        return differences.kthvalue(rank, dim=1).values
 
-    num_rows = len(sorted_rows)
-    map_chunks(fill, num_rows, max(num_rows, 1), sorted_rows.device, least=size)
-    out[sorted_rows[:, -1].isnan()] = torch.nan
-    return out
+    parts = map_chunks(select, len(sorted_rows), max(size, 1), sorted_rows.device)
+    return torch.where(sorted_rows[:, -1].isnan(), torch.nan, torch.cat(parts))
 
 
 def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
@@ -340,81 +342,9 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
     place = torch.searchsorted(rows, rows + difference[:, None])
     last = rows.shape[1] - 1
     partners = torch.stack([(place + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
-    own = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
+    numbers = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
     gaps = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
-    is_pair = (gaps == difference[:, None, None]) & (partners > own)
+    is_pair = (gaps == difference[:, None, None]) & (partners > numbers)
     pick = is_pair.flatten(1).to(torch.uint8).argmax(dim=1, keepdim=True)
-    low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (own, partners))
+    low, high = (sorted_rows.gather(1, i.flatten(1).gather(1, pick)) for i in (numbers, partners))
     return torch.where(difference.isfinite(), (high - low).squeeze(1), difference)
-
-
-_MOST_LAGS = 8
-"""Lags of one subtraction at most; all become as wide as the first of them."""
-
-_GPU_SHARE = 256
-"""Factor of the work at a time on a GPU, which has the memory for it and is slow to start."""
-
-
-class _Lagged:
-    """A buffer for the differences at lags 1 to h - 1 of the rows of a chunk, side by side."""
-
-    def __init__(self, rows: Tensor, size: int) -> None:
-        n = rows.shape[1]
-        pitch = n + half_size(n)
-        self.on_cpu = rows.device.type == "cpu"
-        runs = _lay_out(n)
-        width = -(-runs[-1].stop // 8) * 8
-        # Windows that reach beyond the end of a row find infinity there.
-        self.rows = rows.new_full((size, pitch), torch.inf)
-        self.differences = rows.new_full((size, width), torch.inf)
-        self._steps: list[tuple[Tensor, Tensor, Tensor]] = []
-        for run in runs:
-            shape = (size, run.num_lags, run.width)
-            far = self.rows.as_strided(shape, (pitch, 1, 1), run.lag)
-            out = self.differences[:, run.start : run.stop].view(shape)
-            self._steps.append((far, self.rows[:, None, : run.width], out))
-        self._pad = self.differences[:, runs[-1].stop :]
-
-    def _fill(self, rows: Tensor) -> Tensor:
-        """Write the differences of up to a chunk of sorted rows."""
-        count, n = rows.shape
-        steps = self._steps
-        if count < len(self.rows):
-            steps = [(far[:count], near[:count], out[:count]) for far, near, out in steps]
-        self.rows[:count, :n] = rows
-        for far, near, out in steps:
-            torch.sub(far, near, out=out)
-        self._pad.fill_(torch.inf)
-        return self.differences[:count]
-
-    def select(self, rows: Tensor, rank: int) -> Tensor:
-        """The ``rank``-th smallest difference of each row."""
-        differences = self._fill(rows)
-        if self.on_cpu:
-            differences.numpy().partition(rank - 1, axis=1)
-            return differences[:, rank - 1]
-        return differences.kthvalue(rank, dim=1).values
-
-
-class _Run(NamedTuple):
-    """Consecutive lags whose differences are one subtraction of overlapping windows."""
-
-    lag: int
-    num_lags: int
-    width: int
-    start: int
-
-    @property
-    def stop(self) -> int:
-        """Where its differences end."""
-        return self.start + self.num_lags * self.width
-
-
-def _lay_out(n: int) -> list[_Run]:
-    """Lay lags 1 to h - 1 out in runs."""
-    runs: list[_Run] = []
-    start = 0
-    for lag in range(1, half_size(n), _MOST_LAGS):
-        runs.append(_Run(lag, min(_MOST_LAGS, half_size(n) - lag), n - lag, start))
-        start = runs[-1].stop
-    return runs

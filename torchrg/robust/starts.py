@@ -100,8 +100,8 @@ def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
     last = deviations.shape[1] - 1
     for level in (0.9875, *(level / 100 for level in range(95, 49, -5))):
         low = int(level * last)
-        high, part = min(low + 1, last), level * last - low
-        quantile = deviations[:, low] * (1 - part) + deviations[:, high] * part
+        high, weight = min(low + 1, last), level * last - low
+        quantile = deviations[:, low] * (1 - weight) + deviations[:, high] * weight
         quantile = quantile / NormalDist().inv_cdf((level + 1) / 2)
         positive = torch.where(quantile > 0, quantile, positive)
     return scale.index_copy(0, zero, positive)
@@ -138,17 +138,17 @@ def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
     shape = (len(columns[0]), *loadings.shape[:2])
     sphered: list[Tensor] = []
     for directions in loadings.unbind(dim=3):
-        axis = [part.contiguous() for part in directions.unbind(dim=2)]
+        axis = [values.contiguous() for values in directions.unbind(dim=2)]
         score = dot([column[:, None] for column in columns], axis).flatten(1)
         rows = sorted_points(score)
         score /= _positive_scale(rows, median_of_sorted(rows))
         for i, factor in enumerate(axis):
-            part = score * factor.flatten()
+            values = score * factor.flatten()
             if i == len(sphered):
-                sphered.append(part)
+                sphered.append(values)
             else:
-                sphered[i] += part
-    return sum_squares([part - median_points(part) for part in sphered]).view(shape)
+                sphered[i] += values
+    return sum_squares([values - median_points(values) for values in sphered]).view(shape)
 
 
 def _correlation(columns: list[Tensor]) -> Tensor:
@@ -219,9 +219,9 @@ def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
     sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
     scores = []
     for first in range(0, len(sets), _PLANES_AT_ONCE):
-        some = sets[first : first + _PLANES_AT_ONCE]
-        nearest = sorted_points(_sq_residuals(columns, some[:, :, None]))[:, size - 1]
-        scores.append(nearest.reshape(len(some), num_lanes))
+        tried = sets[first : first + _PLANES_AT_ONCE]
+        nearest = sorted_points(_sq_residuals(columns, tried[:, :, None]))[:, size - 1]
+        scores.append(nearest.reshape(len(tried), num_lanes))
     score = torch.cat(scores)
     starts = []
     for _ in range(min(_NUM_PLANE_STARTS, len(sets))):
@@ -259,12 +259,12 @@ def _across(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
         matrix = torch.stack([torch.stack(edge, dim=-1) for edge in edges], dim=-2)
         minors = []
         for j in range(size):
-            kept = [i for i in range(size) if i != j]
-            minors.append(torch.linalg.det(matrix[..., kept]) * (-1) ** j)
+            others = [i for i in range(size) if i != j]
+            minors.append(torch.linalg.det(matrix[..., others]) * (-1) ** j)
         normal = minors
     length = sum_squares(normal).sqrt()
     length = torch.where(length > 0, length, 1.0)
-    return [part / length for part in normal]
+    return [component / length for component in normal]
 
 
 def _rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:

@@ -329,17 +329,17 @@ def free_places(
         ConfigError: If there is no free space.
     """
     length, width, _ = layout.size
-    found: list[Array] = []
+    places: list[Array] = []
     for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
-        for _ in range(_PLACE_TRIES if len(found) == number else 0):
+        for _ in range(_PLACE_TRIES if len(places) == number else 0):
             x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
             place = room.moved(x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)).origin
             near = place + clearance * (2 * rng.random((64, 3)) - 1)
             if not is_occupied(parts, near).any():
-                found.append(place)
+                places.append(place)
                 break
-    if len(found) < layout.num_viewpoints:
+    if len(places) < layout.num_viewpoints:
         raise ConfigError(
             "build_room: expected free space for a scanner in the room, got none; enlarge it."
         )
-    return np.stack(found)
+    return np.stack(places)

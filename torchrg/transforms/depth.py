@@ -14,7 +14,7 @@ from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.structures import UNLABELED
-from torchrg.transforms.rows import Entries, SampleDict
+from torchrg.transforms.rows import Entries, SampleDict, check_sample
 from torchrg.transforms.sample import SampleTransform
 
 
@@ -31,6 +31,8 @@ class DepthTransform(SampleTransform):
 
     def read_images(self, sample: Entries) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
+        example = "{'depth': depth, 'intrinsics': matrix}"
+        check_sample(type(self).__name__, sample, example)
         key = self.key(sample, "intrinsics")
         if key in sample:
             sample = {**sample, key: read_intrinsics(type(self).__name__, sample[key])}

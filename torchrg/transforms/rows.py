@@ -32,7 +32,7 @@ _USUAL_KEYS = {
     *POINTCEPT_KEYS,
     *OUR_KEYS,
     *("grid_coord", "displacement", "index", "intensity", "labels"),
-    *("pos", "x", "y", "rgb", "norm", "batch"),
+    *("pos", "x", "y", "rgb", "norm", "batch", "plane_index", "superpoint_index"),
 }
 """Entries that have a row for each point where they are as long as the cloud; PyG's come last."""
 _WHOLE_KEYS = ("offset", "ptr", "origin", "pose", "inverse", "inverse_index", LISTED)
@@ -53,15 +53,19 @@ may have as many rows."""
 
 
 def entries_of(sample: Sample) -> Entries:
-    """Return what a sample holds by key, or say that it is none."""
-    if isinstance(sample, Mapping):
-        return sample
-    if callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__"):
-        entries: Entries = sample.to_dict()
-        return entries
-    raise ConfigError(
-        f"expected a sample that is a dict or a PyG Data, got {type(sample).__name__}."
-    )
+    """Return what a sample holds by key."""
+    entries: Entries = sample if isinstance(sample, Mapping) else sample.to_dict()
+    return entries
+
+
+def check_sample(caller: str, sample: Sample, example: str) -> None:
+    """Raise if something is no sample, and say by an example what is one."""
+    is_data = callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__")
+    if not (isinstance(sample, Mapping) or is_data):
+        raise ConfigError(
+            f"{caller}: expected a sample that is a dict or a PyG Data, got "
+            f"{type(sample).__name__}; pass {example}."
+        )
 
 
 def listed_keys(entries: Entries) -> list[str] | None:

@@ -26,6 +26,7 @@ from torchrg.transforms.rows import (
     Sample,
     SampleDict,
     check_in_step,
+    check_sample,
     entries_of,
     follow_points,
     recognized_keys,
@@ -40,15 +41,17 @@ KEYS = (
 )  # fmt: skip
 """Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
-"""Names that a PyG ``Data`` has instead of ours, unless others are given. PyG makes entries with
-``index`` in their name refer to the rows of the batch."""
+"""Names that a PyG ``Data`` has instead of ours, unless others are given. Of entries with ``index``
+in their name PyG counts on when it batches, as it does ``edge_index``: ``inverse_index`` names rows
+of the batch, and planes and superpoints of several clouds stay apart with ``keys={"plane":
+"plane_index", "superpoint": "superpoint_index"}``."""
 _LINE = 90
 """Characters of a line of settings."""
 _MADE_BY_BATCHING = ("batch", "ptr", "num_nodes")
 """Entries that PyG makes when it joins clouds."""
 _NEVER_A_ROW = torch.iinfo(torch.int64).min
-"""Stands for no row in a PyG ``Data``, where -1 would not: it is still negative when PyG has added
-the rows of the clouds before."""
+"""Stands for none in entries that PyG counts on, where -1 would not: it is still negative when PyG
+has added the rows of the clouds before."""
 
 
 class SampleTransform(nn.Module):
@@ -86,6 +89,7 @@ class SampleTransform(nn.Module):
     @of_clouds
     def forward(self, sample: Sample) -> Sample:
         """Return a new sample; the given one is not changed."""
+        check_sample(type(self).__name__, sample, "{'coord': points}")
         if is_separable(sample):
             return with_each(sample, self.forward)
         num_points = len(self.read(sample, "coord"))
@@ -113,6 +117,8 @@ class SampleTransform(nn.Module):
         tensor = as_tensor(caller, key, entries[key])
         if name == "coord":
             check_shapes(caller, **{key: (tensor, "N 3")})
+        if "index" in key and not isinstance(sample, Mapping):
+            tensor = tensor.clamp(min=UNLABELED)
         # Pointcept keeps one number a point with two axes.
         return tensor.squeeze(-1) if name in OUR_KEYS and tensor.ndim == 2 else tensor
 
@@ -130,7 +136,8 @@ class SampleTransform(nn.Module):
         if not isinstance(sample, Mapping):
             other = copy.copy(sample)
             for key, value in values.items():
-                other[key] = value
+                is_counted_on = "index" in key and isinstance(value, Tensor)
+                other[key] = value.where(value >= 0, _NEVER_A_ROW) if is_counted_on else value
             return other
         is_numpy = isinstance(sample.get(self.key(sample, "coord")), np.ndarray)
         new = {
@@ -341,8 +348,6 @@ class SampleVoxels(SampleTransform):
             inverse.append(torch.where(voxels.inverse >= 0, voxels.inverse + num_voxels, UNLABELED))
             num_voxels += len(voxels.rows)
         voxel_of = torch.cat(inverse)
-        if not isinstance(sample, Mapping):
-            voxel_of = voxel_of.where(voxel_of >= 0, _NEVER_A_ROW)
         selected = self.selected(sample, torch.cat(rows), len(coord))
         found = {self.key(sample, "inverse"): voxel_of} | self.moved_inverse(sample, voxel_of)
         return self.changed(sample, selected | found)

@@ -98,8 +98,8 @@ def estimate_consensus(
 
 def _share_of_noise(survey: Survey) -> Tensor:
     """Return the noise by the radius of each neighbourhood, shape ``(N,)``; NaN where unknown."""
-    known = survey.noise.isfinite() & (survey.radius > 0)
-    return torch.where(known, survey.noise / survey.radius, torch.nan)
+    is_told = survey.noise.isfinite() & (survey.radius > 0)
+    return torch.where(is_told, survey.noise / survey.radius, torch.nan)
 
 
 def wanted_neighbors(shares: Tensor, count: int, config: NormalsConfig) -> int:
@@ -113,8 +113,8 @@ def wanted_neighbors(shares: Tensor, count: int, config: NormalsConfig) -> int:
         >>> wanted_neighbors(shares, 50, NormalsConfig(adaptive_k=300))
         200
     """
-    known = shares[~shares.isnan()]
-    if config.adaptive_k is None or len(known) == 0:
+    finite = shares[~shares.isnan()]
+    if config.adaptive_k is None or len(finite) == 0:
         return count
-    wanted = round(count * (float(known.median()) / constants.ADAPTIVE_NOISE) ** 2)
+    wanted = round(count * (float(finite.median()) / constants.ADAPTIVE_NOISE) ** 2)
     return min(max(count, wanted), config.adaptive_k, len(shares))

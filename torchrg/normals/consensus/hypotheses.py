@@ -51,9 +51,9 @@ def vote_planes(
     reach = constants.VOTE_REACH * noise
     ranks = candidate_ranks(sq_distances.shape[1]).to(noise.device)
     normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
-    for some in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(ranks)), 1)):
-        own = columns[0][some], columns[1][some], columns[2][some]
-        normals[some] = _most_supported(own, weights[some], start[some], reach[some], ranks)
+    for chunk in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(ranks)), 1)):
+        near = columns[0][chunk], columns[1][chunk], columns[2][chunk]
+        normals[chunk] = _most_supported(near, weights[chunk], start[chunk], reach[chunk], ranks)
     for _ in range(constants.NUM_REFITS):
         normals, offsets = _refitted(*columns, weights, normals, offsets, reach)
     weights = (1 - constants.FIT_FALLOFF * nearness) * counted
@@ -178,15 +178,15 @@ def fit_meeting_planes(
     wedge = fit_wedges(columns, normals, offsets, noise)
     two = wedge.planes
     rows = (two.deviations > constants.CORNER_LIMIT * noise).nonzero().squeeze(-1)
-    some = (columns[0][rows], columns[1][rows], columns[2][rows])
-    start = MeetingPlanes(*(part[rows] for part in two))
+    corners = (columns[0][rows], columns[1][rows], columns[2][rows])
+    start = MeetingPlanes(*(values[rows] for values in two))
     least = constants.CORNER_SHARE * start.deviations
     best = start._replace(deviations=least)
     for groups in (
         split_off(wedge.first[rows], wedge.outer[rows], noise[rows]),
-        split_by_votes(some, normals[rows], offsets[rows], noise[rows]),
+        split_by_votes(corners, normals[rows], offsets[rows], noise[rows]),
     ):
-        best = _better(best, fit_corners(some, groups))
+        best = _better(best, fit_corners(corners, groups))
     improved = best.deviations < least
     rows = rows[improved]
     merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(two, best, strict=True)]
@@ -283,7 +283,7 @@ def _corner(
     outer = torch.minimum(added, wedge) * side[:, None]
     third = above(wedge, added)
     first = above(inside[1], inside[0]).mul_(1 - third)
-    fitted = (part for plane in planes for part in plane)
+    fitted = (values for plane in planes for values in plane)
     return first, 1 - third - first, third, outer, present, side, *fitted
 
 
@@ -301,13 +301,13 @@ def split_by_votes(
     The plane of the rest passes through the nearest of its points.
     """
     first = _near(residuals(columns, normals, offsets), noise)
-    rest = 1 - first
-    anchor = rest.argmax(dim=1, keepdim=True)
+    others = 1 - first
+    anchor = others.argmax(dim=1, keepdim=True)
     moved = tuple(column - column.gather(1, anchor) for column in columns)
     about: Columns = (moved[0], moved[1], moved[2])
-    plane = vote_planes(about, noise, fit_weighted_planes(about, rest)[0], rest)
-    second = _near(residuals(about, *plane), noise) * rest
-    return first, second, rest - second
+    plane = vote_planes(about, noise, fit_weighted_planes(about, others)[0], others)
+    second = _near(residuals(about, *plane), noise) * others
+    return first, second, others - second
 
 
 def _near(rests: Tensor, noise: Tensor) -> Tensor:

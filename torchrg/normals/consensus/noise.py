@@ -73,8 +73,10 @@ def survey_noise(
         )
         layered[block] = torch.inf
         if len(rows := places_of(low)):
-            near, own = Neighbors(indices, mask).at(rows), rows + block.start
-            layered[own] = _layered_deviations(points, near, fit.normals[own], whole[own])
+            near, numbers = Neighbors(indices, mask).at(rows), rows + block.start
+            layered[numbers] = _layered_deviations(
+                points, near, fit.normals[numbers], whole[numbers]
+            )
         for values, deviations in zip(small, nearest, strict=True):
             values[block] = deviations
         if len(rows := places_of(again)):
@@ -174,10 +176,10 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole:
     offsets = dot(normals, torch.stack(center, dim=-1))
     upper = above(residuals(columns, normals, offsets), 0) * counted
     for _ in range(constants.NUM_REFITS):
-        normals, two, rest = fit_parallel_planes(columns, (upper, counted - upper))
+        normals, two, squares = fit_parallel_planes(columns, (upper, counted - upper))
         upper = above(along(columns, normals), two.mean(dim=0)[:, None]) * counted
     num_upper = upper.sum(dim=1)
-    deviations = (rest * count / (count - _LAYER_PARAMETERS).clamp_(min=1)).sqrt_()
+    deviations = (squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1)).sqrt_()
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
     layered &= deviations <= constants.MAX_LAYERED_SHARE * whole
     return torch.where(layered, deviations, torch.inf)

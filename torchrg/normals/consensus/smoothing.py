@@ -90,8 +90,8 @@ def _smoothed(
     """Return the smoothed planes of some points; ``parts`` are the columns of all normals."""
     near = Neighbors(indices, valid).at(rows)
     columns = gather_columns(points, near.indices)
-    x, y, z = (near.of(part) for part in parts.unbind())
-    a, b, c = (part.index_select(0, rows)[:, None] for part in parts.unbind())
+    x, y, z = (near.of(column) for column in parts.unbind())
+    a, b, c = (column.index_select(0, rows)[:, None] for column in parts.unbind())
     cosines = x * a + y * b + z * c
     sign = signs(cosines)
     rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
@@ -105,7 +105,7 @@ def _smoothed(
     if near.valid is not None:
         weights *= near.valid
     weights = _balanced(columns, weights) * sign
-    mean = torch.stack([sum_neighbors(weights * part) for part in (x, y, z)], dim=-1)
+    mean = torch.stack([sum_neighbors(weights * column) for column in (x, y, z)], dim=-1)
     length = square_root(dot(mean, mean))
     has_mean = length > 0
     safe = torch.where(has_mean, length, 1.0)
@@ -185,10 +185,10 @@ def _chosen(
     reach = constants.VOTE_REACH * scale
     x, y, z = (column[:, None] for column in columns)
     rests = along((x, y, z), axes / reach[:, :, None]) - (moved / reach)[:, :, None]
-    own = moved / scale
+    away = moved / scale
     support = support_scores(rests, weights[:, None]) / sum_neighbors(weights)[:, None]
-    score = support - constants.CHOICE_COST * own * own
-    usable = (own.abs() < constants.INLIER_REACH) & (dot(axes, axes) > 0)
+    score = support - constants.CHOICE_COST * away * away
+    usable = (away.abs() < constants.INLIER_REACH) & (dot(axes, axes) > 0)
     best = torch.where(usable, score, -torch.inf).argmax(dim=1, keepdim=True)
     has_choice = usable.gather(1, best)
     normal = axes.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)

@@ -72,16 +72,16 @@ def fit_surfaces(
         by_votes.normals[rows], by_votes.offsets[rows] = voted
         meeting.normals[rows], meeting.offsets[rows] = planes.normals, planes.offsets
         explained[rows] = planes.deviations <= constants.MEETING_LIMIT * scale
-        known = planes.deviations.isfinite()
-        rest = torch.where(known, planes.deviations, scale)
-        unit = torch.maximum(scale, rest)
-        drop = (bent[rows] / unit).square() - (rest / unit).square()
+        has_planes = planes.deviations.isfinite()
+        residual = torch.where(has_planes, planes.deviations, scale)
+        unit = torch.maximum(scale, residual)
+        drop = (bent[rows] / unit).square() - (residual / unit).square()
         num_neighbors: int | Tensor = neighbors.indices.shape[1]
         if neighbors.valid is not None:
             num_neighbors = neighbors.valid[rows].sum(dim=1)
         drop *= num_neighbors - _PARABOLOID_PARAMETERS
         most = constants.MAX_GAIN
-        gain[rows] = torch.where(known, drop, -most).clamp_(-most, most)
+        gain[rows] = torch.where(has_planes, drop, -most).clamp_(-most, most)
 
     asked = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
     for same in _by_count(asked, neighbors):
@@ -106,10 +106,10 @@ def broken_planes(
     """
     if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
         count = near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
-        found = kernels.call(
+        fits = kernels.call(
             "broken_planes", points, *near, noise, normals, candidate_ranks(count), _numbers()
         )
-        return TangentPlanes(*found[:2]), MeetingPlanes(*found[2:])
+        return TangentPlanes(*fits[:2]), MeetingPlanes(*fits[2:])
     columns = _gather_counted(points, near)
     voted = vote_planes(columns, noise, normals, torch.ones_like(columns[0]))
     return TangentPlanes(*voted), fit_meeting_planes(columns, *voted, noise)
@@ -176,13 +176,13 @@ def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> T
     """Return the mean of values over the nearest neighbours."""
     means = torch.empty_like(values)
 
-    def work(part: slice) -> None:
-        near = Neighbors(neighbors.indices[part, : constants.NUM_POOLED]).of(values)
+    def work(chunk: slice) -> None:
+        near = Neighbors(neighbors.indices[chunk, : constants.NUM_POOLED]).of(values)
         if neighbors.valid is None:
-            means[part] = near.mean(dim=1)
+            means[chunk] = near.mean(dim=1)
             return
-        counted = neighbors.valid[part, : constants.NUM_POOLED]
-        means[part] = (near * counted).sum(dim=1) / counted.sum(dim=1).clamp_(min=1)
+        counted = neighbors.valid[chunk, : constants.NUM_POOLED]
+        means[chunk] = (near * counted).sum(dim=1) / counted.sum(dim=1).clamp_(min=1)
 
     map_chunks(work, len(values), chunk_size, values.device)
     return means
