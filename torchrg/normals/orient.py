@@ -197,19 +197,11 @@ def _follow(
     tree = cKDTree(nearest.cpu().numpy(), balanced_tree=False, compact_nodes=False)
 
     def follow(chunk: slice) -> Tensor:
-<<<<<<< HEAD
-        own = rows[chunk]
-        _, found = tree.query(points[own].cpu().numpy(), min(_NUM_FOLLOWED, tree.n))
-        near = torch.from_numpy(found).to(points.device)
-        arms = nearest[near] - points[own, None]
-        cosine, slope = _agreement(arms, normals[own, None].to(points.dtype), oriented[near])
-=======
         asked = rows[chunk]
-        _, nearest_places = tree.query(points[asked].cpu().numpy(), min(_NUM_LINKS, tree.n))
+        _, nearest_places = tree.query(points[asked].cpu().numpy(), min(_NUM_FOLLOWED, tree.n))
         near = torch.from_numpy(nearest_places).to(points.device)
         arms = nearest[near] - points[asked, None]
         cosine, slope = _agreement(arms, normals[asked, None].to(points.dtype), oriented[near])
->>>>>>> main
         least = (1 - cosine.abs() + slope).argmin(dim=1, keepdim=True)
         return torch.where(cosine.gather(1, least)[:, 0] < 0, -1.0, 1.0).to(points.dtype)
 
