@@ -79,8 +79,8 @@ def estimate_consensus(
     if config.noise_scope == "auto":
         config = config.at_sampling(measure_sampling(points, neighbors))
     if config.noise_scope == "regional":
-        import os
-        noise = torch.minimum(noise, float(os.environ.get("RF", "1")) * regional_noise(noise, neighbors))
+        share = constants.REGIONAL_SHARE
+        noise = torch.minimum(noise, share * regional_noise(noise, neighbors))
         survey = survey._replace(noise=noise)
 
     planes, sharp, voted = fit_surfaces(points, neighbors, fit, survey, chunk_size=size)
