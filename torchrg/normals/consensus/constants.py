@@ -38,7 +38,7 @@ REGIONAL_QUANTILE = 0.1
 """Share. Quantile over the neighbours in each of these steps: higher ones do not leave the slope of
 a step, as a neighbourhood at its end lies on it for the most part."""
 REGIONAL_SHARE = 0.8
-"""Share of the noise of the region that counts: a step between two faces of a mesh deviates from one
+"""Ratio. What counts of the noise of the region: both faces at a step of a mesh deviate from one
 plane by little more than its bumps do, and what is looked at closely loses nothing."""
 MAX_LAYERED_KURTOSIS = 2.2
 """Ratio. Kurtosis of the residuals from one plane up to which two parallel planes are tried. It is
