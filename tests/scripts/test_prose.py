@@ -1,6 +1,7 @@
 """Guides can be read aloud: short sentences, words that a dictionary knows, commands that exist."""
 
 import ast
+import itertools
 import re
 import subprocess
 import sys
@@ -56,7 +57,7 @@ def docstrings_of_constants(code):
         for node in ast.walk(ast.parse(code))
         if isinstance(node, (ast.Module, ast.ClassDef))
     ]
-    pairs = [pair for body in bodies for pair in zip(body, body[1:], strict=False)]
+    pairs = [pair for body in bodies for pair in itertools.pairwise(body)]
     return [
         text.value.value
         for constant, text in pairs
