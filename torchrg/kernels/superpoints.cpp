@@ -12,12 +12,12 @@ INLINE void widen(const float* values, double* wide) {
 }
 
 // Shell's sort: few rows, or many in next to no order, without memory.
-void sort_by_second(int64_t count, int64_t* second, double* contacts, double* differences) {
+void sort_by_second(int64_t count, int32_t* second, double* contacts, double* differences) {
   int64_t gap = 1;
   while (gap < count / 3) gap = 3 * gap + 1;
   for (; gap > 0; gap /= 3)
     for (int64_t i = gap; i < count; i++) {
-      const int64_t key = second[i];
+      const int32_t key = second[i];
       const double contact = contacts[i], difference = differences[i];
       int64_t j = i;
       for (; j >= gap && second[j - gap] > key; j -= gap)
@@ -57,9 +57,9 @@ KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floa
 
 // superpoints._gather_borders: rows by the smaller of their regions, equal ones added up, then those
 // of a region sorted by the larger.
-KERNEL gather_borders(int64_t num_rows, int64_t num_starts, Longs a, Longs b,
+KERNEL gather_borders(int64_t num_rows, int64_t num_starts, Ints a, Ints b,
                       const double* contacts, const double* differences, int64_t* starts,
-                      int64_t* slots, int64_t* order, int64_t* first, int64_t* second,
+                      int64_t* slots, int64_t* order, int32_t* first, int32_t* second,
                       double* sum_contacts, double* sum_differences, int64_t* count) {
   for (int64_t r = 0; r < num_starts; r++) starts[r] = 0, slots[r] = -1;
   for (int64_t e = 0; e < num_rows; e++) {
@@ -79,7 +79,8 @@ KERNEL gather_borders(int64_t num_rows, int64_t num_starts, Longs a, Longs b,
         slots[high] = end, first[end] = low, second[end] = high;
         sum_contacts[end] = sum_differences[end] = 0, end++;
       }
-      sum_contacts[slots[high]] += contacts[e], sum_differences[slots[high]] += differences[e];
+      sum_contacts[slots[high]] += contacts ? contacts[e] : 1;
+      sum_differences[slots[high]] += differences[e];
     }
     sort_by_second(end - begin, second + begin, sum_contacts + begin, sum_differences + begin);
   }
@@ -90,7 +91,7 @@ KERNEL gather_borders(int64_t num_rows, int64_t num_starts, Longs a, Longs b,
 // superpoints._costs
 KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, int64_t num_borders,
                      const double* size, const double* means, const double* low,
-                     const double* high, Longs first, Longs second, const double* contacts,
+                     const double* high, Ints first, Ints second, const double* contacts,
                      const double* differences, double least, double bound, double* costs) {
   for (int64_t e = 0; e < num_borders; e++) {
     const int64_t a = first[e], b = second[e];
@@ -112,7 +113,7 @@ KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, in
 }
 
 // superpoints._cheapest_borders
-KERNEL cheapest_borders(int64_t num_borders, int64_t num_regions, Longs first, Longs second,
+KERNEL cheapest_borders(int64_t num_borders, int64_t num_regions, Ints first, Ints second,
                         const double* costs, double* least, int64_t* best) {
   for (int64_t r = 0; r < num_regions; r++) best[r] = num_borders;
   for (int64_t e = 0; e < num_borders; e++)

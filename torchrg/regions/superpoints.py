@@ -156,10 +156,12 @@ def _partition_places(
     regions = torch.arange(len(places))
     if config.planes == "whole":
         regions = _whole_planes(labels, nearest)
-    graph = _Graph(
-        _describe(regions, places, spacing, normals, colors, config),
-        _describe_borders(regions, places, normals, labels, nearest),
-    )
+    graphs = [
+        _Graph(
+            _describe(regions, places, spacing, normals, colors, config),
+            _describe_borders(regions, places, normals, labels, nearest),
+        )
+    ]
     levels: list[Callable[..., tuple[_Graph, Tensor]]]
     if config.counts is None:
         levels = [partial(_merge_to_strength, strength) for strength in config.strengths]
@@ -168,8 +170,8 @@ def _partition_places(
     bound = math.inf if config.max_extent is None else config.max_extent
     partitions = []
     for merge in levels:
-        graph, merged = merge(graph, config.min_size, bound)
-        regions = merged[regions]
+        graph, merged = merge(graphs, config.min_size, bound)
+        graphs, regions = [graph], merged[regions]
         partitions.append(regions)
     return partitions
 
@@ -208,7 +210,10 @@ class _Regions(NamedTuple):
 
 
 class _Borders(NamedTuple):
-    """Pairs of regions that touch, ``first < second``, ascending, and sums over their contacts."""
+    """Pairs of regions that touch, ``first < second``, ascending, and sums over their contacts.
+
+    The pairs are int32, the sums float64.
+    """
 
     first: Tensor
     second: Tensor
@@ -284,10 +289,10 @@ def _describe(
 def _joined(regions: _Regions, new: Tensor) -> _Regions:
     """Return regions of regions: the sums and boxes of those that become the same one ``(R,)``."""
     # bincount adds one element after the other.
-    size, *features = (
-        torch.bincount(new, weights=sums)
-        for sums in (regions.size, *regions.features.unbind(dim=1))
-    )
+    size = torch.bincount(new, weights=regions.size)
+    features = regions.features.new_empty(len(size), regions.features.shape[1])
+    for column, sums in zip(features.unbind(dim=1), regions.features.unbind(dim=1), strict=True):
+        column.copy_(torch.bincount(new, weights=sums))
     rows = new[:, None].expand(regions.low.shape)
     low, high = (
         corners.new_empty(len(size), corners.shape[1]).scatter_reduce(
@@ -295,22 +300,23 @@ def _joined(regions: _Regions, new: Tensor) -> _Regions:
         )
         for side, corners in (("amin", regions.low), ("amax", regions.high))
     )
-    return _Regions(size, torch.stack(features, dim=1), low, high)
+    return _Regions(size, features, low, high)
 
 
 def _describe_borders(
     regions: Tensor, places: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
 ) -> _Borders:
     """Return the borders of the first regions: a contact leads from a point to a near one."""
+    difference = torch.empty(nearest.shape, dtype=torch.float64)
 
-    def measure(rows: slice) -> Tensor:
-        return _contact_differences(rows, places, normals, labels, nearest)
+    def measure(rows: slice) -> None:
+        difference[rows] = _contact_differences(rows, places, normals, labels, nearest)
 
-    parts = map_chunks(measure, len(regions), ROWS_AT_ONCE, regions.device)
-    difference = torch.cat(parts).flatten()
+    map_chunks(measure, len(regions), ROWS_AT_ONCE, regions.device)
+    regions = regions.int()
     source = regions[:, None].expand(nearest.shape).reshape(-1)
-    target = regions[nearest.flatten()]
-    return _gather_borders(source, target, torch.ones_like(difference), difference)
+    target = regions.index_select(0, nearest.reshape(-1))
+    return _gather_borders(source, target, None, difference.flatten())
 
 
 def _contact_differences(
@@ -343,38 +349,43 @@ def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
     return x * u + y * v + z * w
 
 
-def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor, difference: Tensor) -> _Borders:
-    """Return one row for each pair of different regions, with the sums of its rows."""
+def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor) -> _Borders:
+    """Return one row for each pair of different regions, with the sums of its rows.
+
+    Without numbers of contacts each row is one.
+    """
     if len(a) == 0:
-        return _Borders(a, b, contacts, difference)
+        return _Borders(a, b, difference, difference)
     width = int(torch.maximum(a.max(), b.max())) + 1
     if kernels.serve():
-        buffers = a.new_empty(2, width + 1)
+        buffers = torch.empty(2, width + 1, dtype=torch.int64)
         rows = kernels.call("gather_borders", a, b, contacts, difference, *buffers)
         return _Borders(*(column[: int(rows[-1])] for column in rows[1:-1]))
+    contacts = torch.ones_like(difference) if contacts is None else contacts
     different = places_of(a != b)
     a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
     if len(a) == 0:
         return _Borders(a, b, contacts, difference)
+    a, b = a.long(), b.long()
     keys, order = (torch.minimum(a, b) * width + torch.maximum(a, b)).sort(stable=True)
     keys, counts = torch.unique_consecutive(keys, return_counts=True)
     contacts, difference = (
         torch.segment_reduce(part[order], "sum", lengths=counts) for part in (contacts, difference)
     )
-    return _Borders(keys // width, keys % width, contacts, difference)
+    return _Borders((keys // width).int(), (keys % width).int(), contacts, difference)
 
 
 def _merge_to_strength(
-    strength: float, graph: _Graph, min_size: int, bound: float
+    strength: float, graphs: list[_Graph], min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
     """Merge pairs that cost at most ``strength``, then small regions; return what each became."""
-    graph, become = _last(_merging(graph, bound, lambda cost, graph: cost <= strength))
-    graph, merged = _last(_merging(graph, bound, partial(_joins_small, min_size)))
+    graph, become = _last(_merging(graphs, bound, lambda cost, graph: cost <= strength))
+    graph, merged = _last(_merging([graph], bound, partial(_joins_small, min_size)))
     return graph, merged[become]
 
 
 def _merge_to_count(
-    count: int, graph: _Graph, min_size: int, bound: float
+    count: int, graphs: list[_Graph], min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
     """Merge the pairs that cost least until ``count`` regions are left, none of them too small.
 
@@ -382,14 +393,13 @@ def _merge_to_count(
     that points have become regions, and early enough to count only what stays. Returns what
     :func:`_merge_to_strength` returns.
     """
-    num_large, chosen = 0, (graph, torch.arange(len(graph.regions.size)))
-    for state in _merging(graph, bound, _is_cheap, count):
+    num_large = 0
+    for state in _merging(graphs, bound, _is_cheap, count):
         num_enough = int((state[0].regions.size >= min_size).sum())
         if num_enough >= min(num_large, count):
-            num_large, chosen = num_enough, state
-    graph, become = chosen
-    graph, merged = _last(_merging(graph, bound, partial(_joins_small, min_size)))
-    graph, again = _last(_merging(graph, bound, _is_cheap, count))
+            num_large, (graph, become) = num_enough, state
+    graph, merged = _last(_merging([graph], bound, partial(_joins_small, min_size)))
+    graph, again = _last(_merging([graph], bound, _is_cheap, count))
     return graph, again[merged[become]]
 
 
@@ -410,12 +420,16 @@ def _is_cheap(cost: Tensor, graph: _Graph) -> Tensor:
 
 
 def _merging(
-    graph: _Graph,
+    graphs: list[_Graph],
     bound: float,
     is_eligible: Callable[[Tensor, _Graph], Tensor],
     count: int = 1,
 ) -> Iterator[tuple[_Graph, Tensor]]:
-    """Yield the graph and what regions become while eligible pairs merge to ``count``."""
+    """Yield the graph and what regions become while eligible pairs merge to ``count``.
+
+    The graph leaves its list, so that nobody else keeps the first, which is the largest.
+    """
+    graph = graphs.pop()
     # Two that fit into the box of a third one by one may not fit together.
     ratio = _MUCH_LARGER if bound == math.inf else math.inf
     become = torch.arange(len(graph.regions.size))
@@ -426,10 +440,11 @@ def _merging(
         if most <= 0 or len(borders.first) == 0:
             return
         cost = _costs(regions, borders, bound)
-        cost = cost.where(is_eligible(cost, graph), math.inf)
-        if not bool(cost.isfinite().any()):
+        cost.masked_fill_(~is_eligible(cost, graph), math.inf)
+        if not bool((cost < math.inf).any()):
             return
         chosen = _choose_pairs(borders, cost, regions.size, ratio, most)
+        del cost
         regions, borders, new = _merge(regions, borders, *chosen)
         graph, become = _Graph(regions, borders), new[become]
 
@@ -468,7 +483,7 @@ def _choose_pairs(
     num_regions, num_borders = len(size), len(cost)
     least, best = _cheapest_borders(borders, cost, num_regions)
     asking = (best < num_borders).nonzero().squeeze(1)
-    wanted = borders.first[best[asking]] + borders.second[best[asking]] - asking
+    wanted = borders.first[best[asking]] - asking + borders.second[best[asking]]
     joins = size[wanted] >= ratio * size[asking]
     is_joining = torch.zeros(num_regions, dtype=torch.bool).index_copy(0, asking, joins)
     joins &= ~is_joining[wanted]
@@ -490,7 +505,7 @@ def _cheapest_borders(borders: _Borders, cost: Tensor, num_regions: int) -> tupl
     if kernels.serve():
         (best,) = kernels.call("cheapest_borders", borders.first, borders.second, cost, least)
         return least, best
-    ends, costs = torch.cat([borders.first, borders.second]), cost.repeat(2)
+    ends, costs = torch.cat([borders.first, borders.second]).long(), cost.repeat(2)
     least = least.scatter_reduce(0, ends, costs, "amin")
     rows = torch.arange(len(cost)).repeat(2)
     is_least = (costs == least[ends]) & costs.isfinite()
@@ -506,9 +521,14 @@ def _merge(
     owner = torch.arange(num_regions).index_copy(0, gone, owners)
     stays = owner == torch.arange(num_regions)
     new = (stays.cumsum(0) - 1)[owner]
-    first, second = new[borders.first], new[borders.second]
-    merged = _joined(regions, new)
-    return merged, _gather_borders(first, second, borders.contacts, borders.difference), new
+    narrow = new.int()
+    merged = _gather_borders(
+        narrow.index_select(0, borders.first),
+        narrow.index_select(0, borders.second),
+        borders.contacts,
+        borders.difference,
+    )
+    return _joined(regions, new), merged, new
 
 
 def _unit_colors(colors: Tensor) -> Tensor:
