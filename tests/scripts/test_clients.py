@@ -41,6 +41,7 @@ OPENED = {
     "Pointcept": ["Pointcept/data/s3dis/Area_5/office_1/plane.npy"],
     "SGIFormer": ["Pointcept/data/scannetpp/train/0a5c013435/superpoint.npy"],
     "SPFormer": ["SPFormer/data/scannetv2/train/scene0000_00_inst_nostuff.pth"],
+    "Your own scans in SPFormer": ["SPFormer/data/scannetv2/test/hall_inst_nostuff.pth"],
     "ISBNet": [
         "ISBNet/dataset/scannetv2/superpoints/scene0000_00.pth",
         "ISBNet/dataset/s3dis/preprocess/Area_5_office_1_inst_nostuff.pth",
@@ -145,7 +146,9 @@ def releases(tmp_path_factory):
                 for number, word in enumerate(("wall", "floor", "table", "clutter"))
             },
         )
-    write_cloud(root / "scan.ply", Cloud(coord, {"color": color}))
+    for path in (root / "scan.ply", root / "scans" / "hall.ply"):
+        path.parent.mkdir(exist_ok=True)
+        write_cloud(path, Cloud(coord, {"color": color}))
     return root
 
 
@@ -220,7 +223,7 @@ def test_the_lines_of_a_recipe_write_what_its_program_opens(title, workplace):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("title", OPENED)
+@pytest.mark.parametrize("title", sorted(OPENED.keys() - {"Your own scans in SPFormer"}))
 def test_the_program_makes_its_first_batch(title, programs):
     printed = follow(title, *programs)
     lines = re.findall(r"^(?:python3?|sh) ", recipes()[title], re.MULTILINE)
