@@ -27,7 +27,7 @@ BEGIN = "<!-- figures: made by scripts/readme_tables.py, not by hand -->"
 END = "<!-- end of figures -->"
 
 WORK = {
-    "planes by `classic`, PCL's own method": ("torchrg-classic", "pclrg", "open3d-planes"),
+    "planes by `classic`, as PCL's": ("torchrg-classic", "pclrg", "open3d-planes"),
     "planes by `paper`": ("torchrg-paper", "pclrg", "open3d-planes"),
     "planes by `consensus`, the default": ("torchrg-consensus", "pclrg", "open3d-planes"),
     "normals by `pca`": ("torchrg-pca", "pclrg normals", "open3d-pca"),
@@ -48,15 +48,19 @@ IMAGES = "4 frames"
 """Clouds that torchrg sees as images."""
 FEW = 300
 """Superpoints at which they are compared."""
+PARTITIONED = ("office_parts", "room on voxels of 3 cm", "depth frames fused")
+"""Clouds whose superpoints are shown."""
+ORDERS = ("random", "sorted")
+"""Orders of the points of the room: at random, and along a space-filling curve."""
 
 Figures = dict[str, Any]
 
 
 def take_figures(peers: Figures, accuracy: Figures, superpoints: Figures) -> Figures:
     """Return what the tables show, of the files of the three benchmarks."""
+    rooms = {cloud.split()[-1]: by for cloud, by in peers["results"].items()}
     times = {
-        f"{work}, {cloud.split()[-1]} order": [_time(by, name) for name in names]
-        for cloud, by in peers["results"].items()
+        work: [_time(rooms[order], name) for order in ORDERS for name in names]
         for work, names in WORK.items()
     }
     quality = {title: _shares(accuracy["results"], kind) for kind, title in KINDS.items()}
@@ -65,6 +69,7 @@ def take_figures(peers: Figures, accuracy: Figures, superpoints: Figures) -> Fig
             at_count(by[name][0]["levels"], FEW, "asa") for name in (OURS, PEER)
         ]
         for cloud, by in superpoints["results"].items()
+        if cloud in PARTITIONED
     }
     made_with = {name: peers["made_with"][name] for name in ("commit", "processor", "cores")}
     return {
@@ -96,27 +101,26 @@ def to_section(figures: Figures) -> str:
     """Return the tables in Markdown."""
     made = figures["made_with"]
     times = [
-        [work, "1", *(f"{other / seconds:.1f}" for other in others)]
-        for work, (seconds, *others) in figures["times"].items()
+        [work, "1", *(f"{row[i] / row[i - i % 3]:.1f}" for i in (1, 2, 4, 5))]
+        for work, row in figures["times"].items()
     ]
     quality = [
         [title, *(f"{share:.2f}" for share in shares), ""]
         for title, shares in figures["quality"].items()
     ]
     quality += [
-        [title, f"{ours:.3f}", "", "", f"{peer:.3f}"]
+        [title, f"{ours:.2f}", "", "", f"{peer:.2f}"]
         for title, (ours, peer) in figures["superpoints"].items()
     ]
     return "\n\n".join(
         [
-            "Time for a million points as a multiple of torchrg's, with two threads, on "
-            f"{made['processor']} with {made['cores']} cores (`scripts/bench.py peers`, commit "
-            f"{made['commit']}). PCL computes normals and runs `RegionGrowing`; Open3D computes\n"
-            "normals and detects planar patches:",
-            markdown(["work", "torchrg", "PCL", "Open3D"], times),
-            "Share of the true faces that are found at an IoU of 0.5 by the default (frames by "
-            "`torchrg depth`; `scripts/bench.py\naccuracy`), and of the points in a superpoint of "
-            f"their own object, of some {FEW} superpoints (`scripts/bench.py superpoints`):",
+            "Time for a million points as a multiple of torchrg's, with two threads of "
+            f"{made['processor']} (`scripts/bench.py peers`, commit\n{made['commit']}). "
+            "PCL computes normals and runs `RegionGrowing`, Open3D normals and planar patches:",
+            markdown(["work", "torchrg", "PCL", "Open3D", "PCL, sorted", "Open3D, sorted"], times),
+            "Share of the true faces that the default finds at an IoU of 0.5, or `torchrg depth` in"
+            " single frames (`scripts/bench.py\naccuracy`), and of the points in a superpoint of "
+            f"their own object, of some {FEW} (`scripts/bench.py superpoints`):",
             markdown(["data", "torchrg", "PCL", "Open3D", "cut pursuit"], quality),
         ]
     )

@@ -1,6 +1,7 @@
 """Whatever the loader is given, a kernel gets what its signature says, or an error says why not."""
 
 import math
+import os
 import random
 import subprocess
 import sys
@@ -110,3 +111,14 @@ def test_kernels_serve_plain_tensors_of_single_precision_alone():
     assert not kernels.serve(plain.detach(), k=kernels.MOST_NEIGHBORS + 1)
     assert not kernels.serve(torch.rand(3, device="meta"))
     assert not any(torch.vmap(lambda row: torch.tensor(kernels.serve(row)))(torch.rand(2, 3)))
+
+
+def test_a_library_that_is_older_than_its_sources_is_not_used(tmp_path):
+    library, source = tmp_path / "libkernels-base.library", tmp_path / "scale.cpp"
+    assert not kernels._is_stale(library)
+    for path, second in ((library, 2), (source, 1)):
+        path.touch()
+        os.utime(path, (second, second))
+    assert not kernels._is_stale(library)
+    os.utime(source, (3, 3))
+    assert kernels._is_stale(library)

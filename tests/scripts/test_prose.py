@@ -76,8 +76,7 @@ def test_docstrings_of_constants_begin_with_what_they_are():
     texts = [text for path in MODULES for text in docstrings_of_constants(path.read_text("utf-8"))]
     assert len(texts) > 500
     others = [text for text in texts if text.split()[0] in {"And", "Of", "What"}]
-    # The help of a flag of torchrg convert s3dis.
-    assert {text.split(".")[0] for text in others} <= {"What the numbers in segment"}
+    assert not others
 
 
 def test_vague_words_are_rare():

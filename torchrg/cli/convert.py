@@ -166,7 +166,7 @@ class S3DISArguments(CloudArguments):
     areas: tuple[int, ...] = ()
     """Numbers of the areas. Default: those that are there."""
     class_order: Literal["pointcept", "spt"] = "pointcept"
-    """What the numbers in segment.npy mean. Other layouts have the order pointcept."""
+    """Meaning of the numbers in segment.npy. Other layouts have the order pointcept."""
     up: ClassVar[Up | None] = "z"
 
     def source(self, root: Path, out: Path) -> Source:

@@ -9,6 +9,7 @@ once for those with AVX2. Both give the same bits.
 """
 
 import ctypes
+import math
 import os
 import warnings
 from functools import cache, lru_cache
@@ -199,12 +200,26 @@ def _kind() -> str:
     return "avx2" if is_wide else "base"
 
 
+def _is_stale(library: Path) -> bool:
+    """Tell whether sources beside a library, as in an editable install, are newer than it."""
+    sources = [*library.parent.glob("*.cpp"), *library.parent.glob("*.h")]
+    built = library.stat().st_mtime if library.exists() else math.inf
+    return any(source.stat().st_mtime > built for source in sources)
+
+
 @lru_cache(maxsize=1)
 def _library() -> ctypes.CDLL | None:
     """Load the library, or say once that there is none."""
     if os.environ.get("TORCHRG_NO_KERNELS", "0") not in ("", "0"):
         return None
     path = Path(__file__).parent / f"libkernels-{_kind()}.library"
+    if _is_stale(path):
+        warnings.warn(
+            "torchrg runs without its kernels, which are older than their sources; install it anew: "
+            "pip install -e .",
+            stacklevel=2,
+        )
+        return None
     if path.exists():
         try:
             library = ctypes.CDLL(str(path))
