@@ -23,7 +23,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
 
-from reproduction import method, normals, readme, segmentation, study, times
+from reproduction import method, normals, segmentation, study, summary, times
 from reproduction.cells import Folder, Record, is_committed, made_with
 from reproduction.clouds import TITLES
 from reproduction.report import write_report
@@ -62,9 +62,9 @@ def main() -> None:
         print(f"== {name}: {time.perf_counter() - begin:.0f} s", flush=True)
     report = write_report(folder, list(PARTS), quick=arguments.quick)
     print(f"Look at {folder.path / 'report.html'} (also .json)")
-    if arguments.readme:
+    if arguments.keep:
         try:
-            readme.update(report)
+            summary.keep(report)
         except ValueError as error:
             sys.exit(f"reproduce_paper.py: {error}")
 
@@ -82,7 +82,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="small clouds, a few minutes")
     parser.add_argument("--threads", type=int, help="threads of torch; default: as torch decides")
     parser.add_argument(
-        "--readme", action="store_true", help="put the main numbers into the README"
+        "--keep", action="store_true", help="keep the main numbers for the documentation"
     )
     for key, title in TITLES.items():
         words = f"the paper's {title}; labels and normals in the file are its truth"

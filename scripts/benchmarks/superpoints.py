@@ -122,7 +122,7 @@ class Case(Benchmark):
             levels = {name: runs[0]["levels"] for name, runs in by.items()}
             for rival in [name for name in levels if name != OURS] or [OURS]:
                 for row in sorted(levels[rival], key=lambda row: row["count"]):
-                    ours = [f"{_at_count(levels[OURS], row['count'], name):.3f}" for name in SHOWN]
+                    ours = [f"{at_count(levels[OURS], row['count'], name):.3f}" for name in SHOWN]
                     theirs = [f" ({rival} {row[name]:.3f})" * (rival != OURS) for name in SHOWN]
                     cells = [a + b for a, b in zip(ours, theirs, strict=True)]
                     rows.append([cloud, row["count"], *cells])
@@ -181,7 +181,7 @@ def _score(cloud: Labelled, partitions: Sequence[Tensor], seconds: list[float]) 
     return {"points": len(points), "seconds": seconds, "levels": levels}
 
 
-def _at_count(rows: Sequence[Figures], count: float, name: str) -> float:
+def at_count(rows: Sequence[Figures], count: float, name: str) -> float:
     """Return a score at so many superpoints, between those measured by their logarithms."""
     ordered = sorted(rows, key=lambda row: row["count"])
     counts = np.log([row["count"] for row in ordered])

@@ -16,6 +16,7 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource, ScanNetSource
 from torchrg.config import DepthConfig, load_config
+from torchrg.depth.camera import Pinhole
 from torchrg.io import read_cloud, write_cloud
 from torchrg.render import write_png
 from torchrg.structures import Cloud
@@ -195,7 +196,7 @@ def test_converted_frames_look_at_the_camera_in_the_world(tmp_path):
     write_png(tmp_path / "in" / "seq-01" / "frame-000000.depth.png", depth)
     pose = np.array([[0, 0, 1, 5.0], [-1, 0, 0, 6], [0, -1, 0, 7], [0, 0, 0, 1]])
     np.savetxt(tmp_path / "in" / "seq-01" / "frame-000000.pose.txt", pose)
-    camera = (tmp_path / "in", DepthConfig(), "7-scenes", (50.0, 50.0, 19.5, 14.5), 1000.0)
+    camera = (tmp_path / "in", DepthConfig(), "7-scenes", Pinhole(50.0, 50.0, 19.5, 14.5), 1000.0)
     (normals,) = convert(RGBDSource(*camera), tmp_path / "out").values()
     points = np.load(next((tmp_path / "out").rglob("coord.npy")))
     known = normals.any(axis=-1)

@@ -10,6 +10,7 @@ from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource
 from torchrg.config import load_config
 from torchrg.depth import DepthConfig
+from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, FormatError
 from torchrg.scenes import make_room
 
@@ -162,7 +163,7 @@ def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
 def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
     for name in ("1.npy", "1.png"):
         (root / name).touch()
-    source = RGBDSource(root, DepthConfig(), "images", (5.0, 5.0, 2.0, 1.0), 1000)
+    source = RGBDSource(root, DepthConfig(), "images", Pinhole(5.0, 5.0, 2.0, 1.0), 1000)
     with pytest.raises(ConfigError, match=r"got '1' twice, for .*1.npy and .*1.png; move or"):
         list_jobs(source, tmp_path / "out")
 

@@ -112,10 +112,13 @@ def test_convert_keeps_its_tables_and_never_replaces_those_of_others(scans, tmp_
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ("planes.txt", "planes.txt: expected a file that ends in .csv or .json."),
+        (
+            "planes.txt",
+            "planes.txt: expected a file that ends in .csv or .json, got '.txt'",
+        ),
         ("no/planes.csv", "there is no folder"),
-        ("out.npz", "expected a file that ends in .csv or .json."),
-        ("room.xyz", "expected a file that ends in .csv or .json."),
+        ("out.npz", "expected a file that ends in .csv or .json, got '."),
+        ("room.xyz", "expected a file that ends in .csv or .json, got '."),
     ],
 )
 def test_a_table_without_a_place_is_refused_before_the_work(scans, tmp_path, run, table, message):

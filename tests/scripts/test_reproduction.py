@@ -222,23 +222,14 @@ def test_normals_hold_only_if_they_do_for_every_seed():
     assert bad[0]["fails"]
 
 
-def test_results_in_the_readme_are_what_the_script_makes():
-    from reproduction import readme
-
-    text = readme.README.read_text(encoding="utf-8")
-    results = json.loads(readme.RESULTS.read_text(encoding="utf-8"))
-    assert readme.insert(text, results) == text
-    assert f"{readme.BEGIN}\n{readme.to_section(results)}\n{readme.END}" in text
-
-
 def test_results_of_code_that_is_not_committed_are_refused(monkeypatch):
-    from reproduction import readme
+    from reproduction import summary
 
-    monkeypatch.setattr(readme, "_write", lambda path, text: pytest.fail("written"))
+    monkeypatch.setattr(summary, "atomic_path", lambda path: pytest.fail("written"))
     for commit in ("2f26e94-dirty", "unknown", "2f26e94, ad1e777"):
         report = {"quick": False, "made_with": f"torchrg 0.1.0; commit {commit}; python 3"}
         with pytest.raises(ValueError, match=f"expected a report of one commit, got {commit}"):
-            readme.update(report)
+            summary.keep(report)
 
 
 def test_full_report_of_a_tree_with_changes_is_refused(tmp_path, monkeypatch):
@@ -250,20 +241,8 @@ def test_full_report_of_a_tree_with_changes_is_refused(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_readme_is_updated_between_the_markers_only(tmp_path, monkeypatch):
-    from reproduction import readme
+def test_only_reports_with_scores_are_kept():
+    from reproduction import summary
 
-    numbers = {"ari": 0.5, "f1_large": 90.0, "mean_best_iou": 0.25, "faces": 3}
-    one = {"cloud": "cory", "title": "Cory", **numbers}
-    rows = [{**one, "method": method} for method in METHODS]
-    results = {"quick": False, "made_with": "torchrg", "scores": rows}
-    text = f"before\n{readme.BEGIN}\nold\n{readme.END}\nafter\n"
-    made = readme.insert(text, results)
-    assert made.startswith(f"before\n{readme.BEGIN}\nAdjusted Rand index")
-    assert made.endswith(f"\n{readme.END}\nafter\n")
-    assert "old" not in made
-    assert "| Cory (3 faces) | 0.50 / 90 / 0.25 |" in made
-    with pytest.raises(ValueError, match="expected a README with"):
-        readme.insert("no markers", results)
     with pytest.raises(ValueError, match="expected the part segmentation"):
-        readme.take_results({"parts": {"normals": {}}})
+        summary.take_results({"parts": {"normals": {}}})
