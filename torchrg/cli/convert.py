@@ -81,10 +81,10 @@ class Arguments:
     """Say what would be done and why, and write nothing."""
     unit: ClassVar[str] = "scan"
     """Name for one of them in messages."""
-    seconds_per_million: ClassVar[tuple[float, str]] = (33.0, "points, as consensus takes")
-    """Time of one core of an Intel Xeon for a million points, and what it is the time of: the table
-    of README.md that ``scripts/bench.py steady`` measures. There ``classic`` takes a third of it,
-    and ``paper`` half as much again."""
+    seconds_per_million: ClassVar[tuple[float, str]] = (10.0, "points, as consensus takes")
+    """Time of one core of an AMD EPYC for a million points, and what it is the time of: ``torchrg
+    segment`` of a made room of four million. ``classic`` takes six tenths of it, ``paper`` half as
+    much again, and all take some three times as long without kernels."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the data set, both paths absolute."""
@@ -214,8 +214,9 @@ class RGBDArguments(Arguments):
     """How planes are found in depth images."""
     orient: flags.ImageOrientFlag = "auto"
     unit: ClassVar[str] = "frame"
-    seconds_per_million: ClassVar[tuple[float, str]] = (3.0, "pixels")
-    """As that of clouds, by the 0.9 s of a frame of 640 x 480 pixels in README.md."""
+    seconds_per_million: ClassVar[tuple[float, str]] = (0.4, "pixels")
+    """As that of clouds, by the 0.12 s of a frame of 640 x 480 pixels (``scripts/bench.py
+    steady``)."""
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the frames."""
