@@ -6,10 +6,16 @@ import shlex
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from torchrg.cli import COMMANDS, convert
+from tests.datasets.s3dis_tree import text_of, write_objects
+from torchrg.cli import COMMANDS, convert, main
 from torchrg.cli.arguments import list_flags
+from torchrg.io import write_cloud
+from torchrg.render import write_png
+from torchrg.scenes import make_room
+from torchrg.structures import Cloud
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -47,6 +53,35 @@ def test_commands_have_the_flags_that_they_are_shown_with():
         )
         known = {flag.name for flag in list_flags(kind)}
         assert {word for word in rest if word.startswith("--")} <= known
+
+
+@pytest.mark.slow
+def test_commands_run_in_their_order(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pydeck", reason="needs the extra view")
+    monkeypatch.chdir(tmp_path)
+    room = make_room(4_000, noise=0.003, seed=1)
+    points = room.points.numpy()
+    write_cloud("scan.ply", Cloud(points))
+    write_cloud("truth.npz", Cloud(points, {"labels": room.labels.numpy()}))
+    write_png(Path("frame.png"), np.full((48, 64), 2000))
+    camera = {"fl_x": 53.0, "fl_y": 53.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    Path("camera.json").write_text(json.dumps(camera))
+    for area in range(1, 7):
+        folder = Path("Stanford3dDataset_v1.2") / f"Area_{area}" / "office_1"
+        write_objects(folder, {"wall_1.txt": text_of(np.hstack([points, 0 * points]))})
+    lines = [shlex.split(line, comments=True) for line in "".join(blocks_of("bash")).splitlines()]
+    for _, *words in [line for line in lines if line[:1] == ["torchrg"]]:
+        assert main(words) == 0, (words, capsys.readouterr().err)
+    for name in (
+        "planes.npz",
+        "planes.csv",
+        "planes.html",
+        "normals.ply",
+        "labels.png",
+        "parts.npz",
+    ):
+        assert Path(name).stat().st_size > 0
+    assert not Path("s3dis").exists()
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda path: path.name)

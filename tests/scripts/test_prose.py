@@ -1,4 +1,4 @@
-"""Guides can be read aloud: short sentences, words that a dictionary knows, commands that exist."""
+"""README and guides can be read aloud: short sentences, words of a dictionary, known commands."""
 
 import ast
 import itertools
@@ -9,7 +9,8 @@ import sys
 import guide_pages
 import pytest
 
-GUIDES = guide_pages.guide_files()
+README = guide_pages.GUIDES.parents[1] / "README.md"
+PAGES = [README, *guide_pages.guide_files()]
 MOST_WORDS = 35
 MODULES = sorted((guide_pages.GUIDES.parents[1] / "torchrg").rglob("*.py"))
 VAGUE = re.compile(r"\b(?:found|given|some|own|part|rest|kept|known)\b")
@@ -34,9 +35,9 @@ def test_sentences_are_told_apart():
     assert sentences_of(text) == found
 
 
-@pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
-def test_sentences_are_short(guide):
-    text = guide.read_text(encoding="utf-8").replace("```{glossary}", "")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_sentences_are_short(page):
+    text = page.read_text(encoding="utf-8").replace("```{glossary}", "")
     long = [line for line in sentences_of(text) if len(line.split()) > MOST_WORDS]
     assert not long
 
@@ -44,9 +45,7 @@ def test_sentences_are_short(guide):
 def test_words_are_spelled_right():
     places = ["README.md", ".github", "scripts", "torchrg", "tests"]
     command = [sys.executable, "-m", "codespell_lib", *places]
-    done = subprocess.run(
-        command, cwd=guide_pages.GUIDES.parents[1], capture_output=True, text=True
-    )
+    done = subprocess.run(command, cwd=README.parent, capture_output=True, text=True)
     assert (done.stdout, done.returncode) == ("", 0)
 
 
