@@ -48,7 +48,7 @@ IMAGES = "4 frames"
 """Clouds that torchrg sees as images."""
 FEW = 300
 """Superpoints at which they are compared."""
-PARTITIONED = ("office_parts", "room on voxels of 3 cm", "depth frames fused")
+PARTITIONED = ("office_parts", "depth frames fused")
 """Clouds whose superpoints are shown."""
 ORDERS = ("random", "sorted")
 """Orders of the points of the room: at random, and along a space-filling curve."""
@@ -114,13 +114,11 @@ def to_section(figures: Figures) -> str:
     ]
     return "\n\n".join(
         [
-            "Time for a million points as a multiple of torchrg's, with two threads of "
-            f"{made['processor']} (`scripts/bench.py peers`, commit\n{made['commit']}). "
-            "PCL computes normals and runs `RegionGrowing`, Open3D normals and planar patches:",
+            "Time for the normals and planes of a million points, as a multiple of torchrg's, on "
+            f"{made['processor']} (`bench.py peers`, {made['commit']}):",
             markdown(["work", "torchrg", "PCL", "Open3D", "PCL, sorted", "Open3D, sorted"], times),
-            "Share of the true faces that the default finds at an IoU of 0.5, or `torchrg depth` in"
-            " single frames (`scripts/bench.py\naccuracy`), and of the points in a superpoint of "
-            f"their own object, of some {FEW} (`scripts/bench.py superpoints`):",
+            "Share of true faces found at an IoU of 0.5 (`bench.py accuracy`), or of points in a "
+            f"superpoint of their own object, of {FEW}:",
             markdown(["data", "torchrg", "PCL", "Open3D", "cut pursuit"], quality),
         ]
     )

@@ -114,7 +114,7 @@ def test_figures_are_medians_means_and_what_lies_between_two_partitions():
     by = {name: [run(1.0, 2.0)] for name in names}
     by["pclrg"] = [run(3.0, 5.0), run(4.0, 9.0), run(5.0, 6.0)]
     made = {"commit": "2f26e94", "processor": "a processor", "cores": 2}
-    peers = {"made_with": made, "results": {"room 1000000 random": by}}
+    peers = {"made_with": made, "results": {"room random": by, "room sorted": by}}
     shares = {"consensus": [{"recall_iou50": 0.8}], "PCL": [{"recall_iou50": 0.5}]}
     other = {"consensus": [{"recall_iou50": 0.6}], "PCL": [{"recall_iou50": 0.1}]}
     for clouds in (shares, other):
@@ -122,9 +122,11 @@ def test_figures_are_medians_means_and_what_lies_between_two_partitions():
     accuracy = {"results": {"room, 1 mm": shares, "rooms/room_2": other}}
     levels = [{"count": 100, "asa": 0.5}, {"count": 900, "asa": 0.7}]
     parts = {"torchrg": [{"levels": levels}], "cut pursuit": [{"levels": levels}]}
-    figures = readme_tables.take_figures(peers, accuracy, {"results": {"a_scan": parts}})
+    figures = readme_tables.take_figures(
+        peers, accuracy, {"results": {"office_parts": parts, "another": parts}}
+    )
     section = readme_tables.to_section(figures)
-    assert "| planes by `paper`, random order | 1 | 3.0 | 1.0 |" in section
-    assert "| normals by `pca`, random order | 1 | 2.0 | 1.0 |" in section
+    assert "| planes by `paper` | 1 | 3.0 | 1.0 | 3.0 | 1.0 |" in section
+    assert "| normals by `pca` | 1 | 2.0 | 1.0 | 2.0 | 1.0 |" in section
     assert "| made rooms, seven noises and densities | 0.70 | 0.30 | 0.30 |  |" in section
-    assert "| superpoints: a scan | 0.600 |  |  | 0.600 |" in section
+    assert "| superpoints: office parts | 0.60 |  |  | 0.60 |" in section

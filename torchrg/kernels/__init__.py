@@ -215,8 +215,8 @@ def _library() -> ctypes.CDLL | None:
     path = Path(__file__).parent / f"libkernels-{_kind()}.library"
     if _is_stale(path):
         warnings.warn(
-            "torchrg runs without its kernels, which are older than their sources; install it anew: "
-            "pip install -e .",
+            "torchrg runs without its kernels, which are older than their sources; install it "
+            "again: pip install -e .",
             stacklevel=2,
         )
         return None
