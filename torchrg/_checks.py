@@ -57,14 +57,14 @@ def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
     """
     for name, (value, kind) in arguments.items():
         if value not in get_args(kind):
-            known = ", ".join(get_args(kind))
-            raise ConfigError(f"{caller}: expected {name} to be one of {known}, got {value!r}.")
+            choices = ", ".join(get_args(kind))
+            raise ConfigError(f"{caller}: expected {name} to be one of {choices}, got {value!r}.")
 
 
 def check_floating(caller: str, **arguments: Tensor | None) -> None:
     """Check that tensors hold float32 or float64, all the same, on one device; None is skipped."""
-    given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
-    for name, tensor in given.items():
+    tensors = {name: tensor for name, tensor in arguments.items() if tensor is not None}
+    for name, tensor in tensors.items():
         if tensor.dtype not in (torch.float32, torch.float64):
             dtype = str(tensor.dtype).removeprefix("torch.")
             repair = f"; pass {name}.float()" if tensor.is_floating_point() else ""
@@ -82,9 +82,9 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
                 f"{name}.to_dense()."
             )
     for what in ("dtype", "device"):
-        kinds = [str(getattr(tensor, what)).removeprefix("torch.") for tensor in given.values()]
+        kinds = [str(getattr(tensor, what)).removeprefix("torch.") for tensor in tensors.values()]
         if len(set(kinds)) > 1:
-            names = " and ".join(given)
+            names = " and ".join(tensors)
             raise ShapeError(
                 f"{caller}: expected {names} of one {what}, got {' and '.join(kinds)}."
             )
@@ -124,10 +124,10 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     for name, (tensor, pattern) in arguments.items():
         if tensor is None:
             continue
-        shape, known = tuple(tensor.shape), dict(bound)
+        shape, sizes = tuple(tensor.shape), dict(bound)
         if not _bind(shape, pattern.split(), bound):
-            given = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in known.items())
-            expected = f"({', '.join(pattern.split())})" + (f" with {given}" if given else "")
+            fixed = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in sizes.items())
+            expected = f"({', '.join(pattern.split())})" + (f" with {fixed}" if fixed else "")
             raise ShapeError(f"{caller}: expected {name} of shape {expected}, got {shape}.")
 
 
@@ -162,8 +162,8 @@ def has_values(*tensors: Tensor | None) -> bool:
     if torch.compiler.is_compiling():
         return False
     try:
-        given = [t for t in tensors if t is not None and t.layout is torch.strided]
-        return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in given)
+        strided = [t for t in tensors if t is not None and t.layout is torch.strided]
+        return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in strided)
     except RuntimeError:  # the answer of what stands for another tensor
         return False
 
@@ -210,7 +210,7 @@ def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
             uncompiled = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
             result: Result = uncompiled(*args, **kwargs)
             return result
-        if not has_values(*(given for given in (*args, *kwargs.values()) if is_tensor(given))):
+        if not has_values(*(value for value in (*args, *kwargs.values()) if is_tensor(value))):
             raise ShapeError(
                 f"{function.__name__}: expected points with values, got those of vmap, torch.func "
                 "or the meta device; functions of clouds run outside of them."

@@ -50,13 +50,13 @@ def opaque(
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             # Compilers of torch 2.5 follow neither a zip of unequal lengths nor a union of dicts.
-            given: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
-            given = {**given, **kwargs}
-            tensors = {key: given[key] for key in parameters if is_tensor(given.get(key))}
+            arguments: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
+            arguments = {**arguments, **kwargs}
+            tensors = {key: arguments[key] for key in parameters if is_tensor(arguments.get(key))}
             if has_values(*tensors.values()):
                 return function(*args, **kwargs)
             parts = [name, ",".join(tensors)]
-            for key, value in given.items():
+            for key, value in arguments.items():
                 if key not in tensors and value is not None:
                     _check_literal(name, key, value)
                     parts.append(f"{key}={value!r}")

@@ -113,14 +113,14 @@ def map_rows(
         >>> map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3))
         [tensor([4., 4.])]
     """
-    first, *rest = map_chunks(
+    first, *more = map_chunks(
         lambda rows: work(*(column[rows] for column in columns), *others),
         len(columns[0]),
         max(len(columns[0]), 1),
         columns[0].device,
     )
-    parts = zip(first, *rest, strict=True)
-    return [torch.cat(same) for same in parts] if rest else list(first)
+    parts = zip(first, *more, strict=True)
+    return [torch.cat(same) for same in parts] if more else list(first)
 
 
 def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:

@@ -113,9 +113,9 @@ class GrowingConfig:
     """Two points are connected when they share at least this fraction of their k neighbours. None:
     not tested."""
     connectivity_scope: Literal["region", "seed"] = "seed"
-    """What a neighbour that is not connected may not do: join the region (region, Algorithm 2 as
-    printed), or only become a seed (seed, the paper's text). In the latter case it becomes one as
-    soon as a seed of its region that is connected to it reaches it."""
+    """The step that a neighbour which is not connected may not take: join the region (region,
+    Algorithm 2 as printed), or only become a seed (seed, the paper's text). In the latter case it
+    becomes one as soon as a seed of its region that is connected to it reaches it."""
     coplanarity: bool = True
     """Whether a neighbour joins only if its distance to the plane of the seed is at most median + 2
     Qn of the distances in the neighbourhood (eq. 11)."""
@@ -261,7 +261,7 @@ class PipelineConfig:
     """Number of points that are handled at a time. It bounds the memory of each stage and never
     changes a result."""
     planes: PlanesConfig = field(default_factory=PlanesConfig)
-    """What the table of planes says."""
+    """Contents of the table of planes."""
 
     def __post_init__(self) -> None:
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
@@ -283,8 +283,8 @@ class PipelineConfig:
         """
         _check_angle("PipelineConfig", angle_deg)
         parts = {
-            part: dataclasses.replace(getattr(self, part), **{name: angle_deg})
-            for part, name in _ANGLES.items()
+            section: dataclasses.replace(getattr(self, section), **{name: angle_deg})
+            for section, name in _ANGLES.items()
         }
         return dataclasses.replace(self, **parts)
 
@@ -321,16 +321,16 @@ class PipelineConfig:
             return {}
         chosen = self.at_sampling(sampling)
         settings = {
-            f"{part}.{name}": getattr(getattr(chosen, part), name)
-            for part in ("normals", "growing")
+            f"{section}.{name}": getattr(getattr(chosen, section), name)
+            for section in ("normals", "growing")
             for name in ("noise_scope", "facet_tolerance", "min_size")
-            if getattr(getattr(self, part), name, None) == "auto"
+            if getattr(getattr(self, section), name, None) == "auto"
         }
         return {"sampling": sampling._asdict(), "settings": settings}
 
 
 AnyConfig = PipelineConfig | Mapping[str, Any] | str | Path
-"""What stands for a whole configuration: see :func:`load_config`."""
+"""Whatever stands for a whole configuration: see :func:`load_config`."""
 _SECTIONS = {"normals": NormalsConfig, "growing": GrowingConfig, "planes": PlanesConfig}
 """The parts of a configuration."""
 _ANGLES = {"normals": "sharp_angle_deg", "growing": "max_angle_deg"}
@@ -399,7 +399,7 @@ class DepthConfig:
 
     def __post_init__(self) -> None:
         parts = (1.0,) if self.noise is None else self.noise
-        is_noise = all(0 <= part < math.inf for part in parts) and sum(parts) > 0
+        is_noise = all(0 <= number < math.inf for number in parts) and sum(parts) > 0
         _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
         _require(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
@@ -477,7 +477,7 @@ def settings_of(
         config = kind()
     if isinstance(config, PipelineConfig) and is_part:
         parts = (config, config.normals, config.growing, config.planes)
-        config = next(part for part in parts if isinstance(part, kind))
+        config = next(item for item in parts if isinstance(item, kind))
     if not isinstance(config, kind):
         presets = f", or a preset, one of {', '.join(preset_names())}" if is_part else ""
         raise ConfigError(
@@ -538,28 +538,30 @@ def _changed(config: Settings, values: object, where: str) -> Settings:
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of settings, got {values!r}.")
-    kind, given = type(config), dict[str, Any]()
+    kind, settings = type(config), dict[str, Any]()
     hints, dotted = typing.get_type_hints(kind), dict[str, dict[str, Any]]()
     for key, value in values.items():
         section, dot, name = str(key).partition(".")
         if dot:
             dotted.setdefault(section, {})[name] = value
         else:
-            given[section] = value
-    if isinstance(config, PipelineConfig) and "angle_deg" in given:
-        angle = _checked(given.pop("angle_deg"), float, f"{where}: angle_deg")
+            settings[section] = value
+    if isinstance(config, PipelineConfig) and "angle_deg" in settings:
+        angle = _checked(settings.pop("angle_deg"), float, f"{where}: angle_deg")
         _check_angle(where, angle)
         # What is called by its own name stays.
         config = typing.cast(Settings, config.at_angle(angle))
-    for key, value in given.items():
+    for key, value in settings.items():
         if key not in hints:
             raise ConfigError(f"{where}: unknown setting {key!r}; {_repair(key, value, kind)}.")
-        own = getattr(config, key)
+        current = getattr(config, key)
         at = f"{where}: {key}"
-        is_section = dataclasses.is_dataclass(own) and not dataclasses.is_dataclass(value)
-        given[key] = _changed(own, value, at) if is_section else _checked(value, hints[key], at)
+        is_section = dataclasses.is_dataclass(current) and not dataclasses.is_dataclass(value)
+        settings[key] = (
+            _changed(current, value, at) if is_section else _checked(value, hints[key], at)
+        )
     try:
-        changed = dataclasses.replace(config, **given)  # type: ignore[type-var]
+        changed = dataclasses.replace(config, **settings)  # type: ignore[type-var]
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
     return _changed(changed, dotted, where) if dotted else changed
@@ -571,14 +573,14 @@ _WORDS_OF_OTHERS = {
     "offset": "torchrg.transforms takes batches with an offset",
     "n": "numbers of superpoints are counts",
 }
-"""What other programs call something, and what it is here."""
+"""Words of other programs for settings, and what they are called here."""
 
 
 def _repair(key: str, value: object, kind: type) -> str:
     """Return what to write in place of a key that is no setting of a kind."""
     names = own_names = [*typing.get_type_hints(kind), *["angle_deg"] * (kind is PipelineConfig)]
-    for section, own in _SECTIONS.items() if kind is PipelineConfig else ():
-        names = [*names, *(f"{section}.{name}" for name in typing.get_type_hints(own))]
+    for section, section_kind in _SECTIONS.items() if kind is PipelineConfig else ():
+        names = [*names, *(f"{section}.{name}" for name in typing.get_type_hints(section_kind))]
     tails = {name.rpartition(".")[2]: name for name in reversed(names)}
     if key in tails:
         return f"it is {tails[key]}, as in **{{{tails[key]!r}: {value!r}}}"
@@ -603,7 +605,7 @@ def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
             kind, *others = typing.get_args(choice)
             parts = tuple(value) if isinstance(value, Iterable) else (value,)
             if others == [...] or len(parts) == len(others) + 1:
-                return tuple(_checked(part, kind, where) for part in parts)
+                return tuple(_checked(item, kind, where) for item in parts)
         elif type(value) is choice:
             return value
     allowed = [_spelled(choice) for choice in choices]
@@ -649,7 +651,7 @@ def _preset_folder() -> Path:
 def _refuse(config: object, name: str, value: object) -> NoReturn:
     """Say how settings are changed: not in place."""
     kind = type(config)
-    section = next((key for key, own in _SECTIONS.items() if own is kind), "")
+    section = next((key for key, type_ in _SECTIONS.items() if type_ is kind), "")
     whole = f"load_config(config, **{{'{section}.{name}': {value!r}}})"
     raise dataclasses.FrozenInstanceError(
         f"{kind.__name__}: settings are not changed in place; "

@@ -5,7 +5,7 @@ repair.
 """
 
 OUT_OF_MEMORY = "out of memory; use a machine with more, or a smaller part of the data."
-"""What is said where memory could not be had, whatever for."""
+"""Message where memory could not be had, whatever for."""
 
 
 class TorchrgError(Exception):

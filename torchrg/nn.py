@@ -100,8 +100,8 @@ class Eigh(_Function):
 
     def forward(self, matrices: Tensor | RobustFit) -> Eigen:
         """Return eigenvalues and eigenvectors of matrices ``(*, P, P)``; P = 3 for ``jacobi``."""
-        given = matrices.covariance if isinstance(matrices, RobustFit) else matrices
-        return Eigen(*(eigh3(given) if self.method == "jacobi" else torch.linalg.eigh(given)))
+        tensor = matrices.covariance if isinstance(matrices, RobustFit) else matrices
+        return Eigen(*(eigh3(tensor) if self.method == "jacobi" else torch.linalg.eigh(tensor)))
 
 
 class Normal(_Function):
@@ -322,5 +322,5 @@ class PatchNormals(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the settings as text."""
-        given = {"method": self.method, **self.settings}
-        return ", ".join(f"{name}={value!r}" for name, value in given.items())
+        options = {"method": self.method, **self.settings}
+        return ", ".join(f"{name}={value!r}" for name, value in options.items())

@@ -50,7 +50,7 @@ BYTES_PER_POINT_ON_DISK = 150
 
 _STRENGTH_OF_K = 100.0
 """Strength of superpoints for a threshold of 1 of ScanNet's Segmentator. At its usual 0.01 there
-are about as many as of its own in depth frames with noise, meshed, and more in exact ones."""
+shall be about as many superpoints as it makes segments of meshed depth frames."""
 
 
 @of_clouds
@@ -225,9 +225,9 @@ def _segment(
         planes = describe(points[rows], normals[rows], labels[rows])
         planes = replace(planes, adjacency=adjacency)
     if objects is not None:
-        own = objects.new_zeros(len(planes))
-        own[labels[labels >= 0]] = objects[labels >= 0]
-        planes = replace(planes, object=own)
+        of_plane = objects.new_zeros(len(planes))
+        of_plane[labels[labels >= 0]] = objects[labels >= 0]
+        planes = replace(planes, object=of_plane)
     begin("done")
     searched = neighbors if voxel is None else None
     return Segmentation(
@@ -254,7 +254,7 @@ def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacen
         return None
     pairs = place[adjacency.pairs].sort(dim=-1).values
     order = (pairs[:, 0] * len(place) + pairs[:, 1]).argsort()
-    return PlaneAdjacency(*(part[order] for part in (pairs, *adjacency[1:])))
+    return PlaneAdjacency(*(column[order] for column in (pairs, *adjacency[1:])))
 
 
 @of_clouds
@@ -326,11 +326,14 @@ def make_superpoints(
         )
     rows, inverse = sample_voxels(tensor, voxel)
     shades = None if shades is None else shades[rows]
-    found = partition_points(tensor[rows], seg.normals[rows], seg.labels[rows], settings, shades)
-    labels, *levels = (
-        restore_points(level, inverse, fill=UNLABELED) for level in (found.labels, *found.levels)
+    partition = partition_points(
+        tensor[rows], seg.normals[rows], seg.labels[rows], settings, shades
     )
-    return Superpoints(labels, found.plane, tuple(levels))
+    labels, *levels = (
+        restore_points(level, inverse, fill=UNLABELED)
+        for level in (partition.labels, *partition.levels)
+    )
+    return Superpoints(labels, partition.plane, tuple(levels))
 
 
 @of_clouds

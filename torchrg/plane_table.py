@@ -62,7 +62,7 @@ def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
         for name, values in planes.adjacency._asdict().items():
             arrays[f"adjacency_{name}"] = values.numpy(force=True)
     if planes.outline is not None:
-        rings = [(plane, ring) for plane, own in enumerate(planes.outline) for ring in own]
+        rings = [(plane, ring) for plane, outline in enumerate(planes.outline) for ring in outline]
         arrays["outline_points"] = moved(torch.cat([planes.center[:0], *(r for _, r in rings)]))
         arrays["outline_ring_sizes"] = np.array([len(r) for _, r in rings], dtype=np.int64)
         arrays["outline_ring_planes"] = np.array([plane for plane, _ in rings], dtype=np.int64)
@@ -86,8 +86,8 @@ def planes_from_arrays(
         return values
 
     def tensor(values: Array) -> Tensor:
-        found = torch.from_numpy(np.ascontiguousarray(values))
-        return found.to(dtype) if found.is_floating_point() else found
+        column = torch.from_numpy(np.ascontiguousarray(values))
+        return column.to(dtype) if column.is_floating_point() else column
 
     num_planes = len(arrays["plane_count"])
     columns = {
@@ -96,8 +96,8 @@ def planes_from_arrays(
     }
     columns["offset"] = columns["offset"] - columns["normal"] @ origin
     columns |= {name: columns[name] - origin for name in ("centroid", "center")}
-    known: Json = {name: tensor(values) for name, values in columns.items()}
-    table = Planes(**known)
+    typed: Json = {name: tensor(values) for name, values in columns.items()}
+    table = Planes(**typed)
     if "plane_kind" in arrays:
         kinds = [PLANE_KINDS.index(word) for word in read("plane_kind", "U", (num_planes,))]
         table = replace(table, kind=torch.tensor(kinds, dtype=torch.int64))
@@ -164,7 +164,7 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     if planes.outline is not None:
         ends = arrays["outline_ring_sizes"].cumsum()[:-1]
         rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
-        columns["outline"] = [[next(rings) for _ in own] for own in planes.outline]
+        columns["outline"] = [[next(rings) for _ in outline] for outline in planes.outline]
     table: Json = {"planes": _rows(columns)}
     if planes.adjacency is not None:
         pairs = _lists(arrays, "adjacency_")

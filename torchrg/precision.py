@@ -86,8 +86,10 @@ def note_on_steps(
 
 def warn_of_steps(caller: str, points: Tensor) -> None:
     """Warn the user, above a public function and its decorators, of :func:`note_on_steps`."""
-    given = points.detach().cpu().numpy()
-    note = note_on_steps(given, cure="pass float64, or subtract an offset before it is float32")
+    coordinates = points.detach().cpu().numpy()
+    note = note_on_steps(
+        coordinates, cure="pass float64, or subtract an offset before it is float32"
+    )
     if note:
         warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=_ABOVE_DECORATORS)
 

@@ -116,15 +116,15 @@ class Result:
                 f"Result: expected a segmentation of {len(cloud):,} points, got "
                 f"{segmentation.labels.numel():,}; pass the points that were segmented."
             )
-        found = {
+        results = {
             name: getattr(segmentation, name)
             .numpy(force=True)
             .reshape(len(cloud), *_KINDS[name][1])
             for name in POINT_RESULTS
         }
         if superpoints is not None:
-            found |= superpoints.by_level()
-        labelled = replace(cloud, fields=put_results(cloud.fields, found))
+            results |= superpoints.by_level()
+        labelled = replace(cloud, fields=put_results(cloud.fields, results))
         plane_of_superpoint = None if superpoints is None else superpoints.plane
         neighbors = segmentation.neighbors
         return cls(labelled, segmentation.planes, plane_of_superpoint, neighbors=neighbors)
@@ -158,9 +158,9 @@ class Result:
         """
         fields = {**self.fields, "labels": self.labels} if self.planes is not None else self.fields
         origin = torch.from_numpy(self.cloud.origin)[None]
-        found = {key: fields[name] for key, name in _FOLDER_FIELDS.items() if name in fields}
+        arrays = {key: fields[name] for key, name in _FOLDER_FIELDS.items() if name in fields}
         table = {} if self.planes is None else {"planes": self.planes}
-        return {"coord": self.cloud.points, "origin": origin, **found, **table}
+        return {"coord": self.cloud.points, "origin": origin, **arrays, **table}
 
     @cached_property
     def _numbering(self) -> tuple[Tensor, Tensor]:
@@ -168,8 +168,8 @@ class Result:
         labels = self.fields.get("labels", torch.full((len(self.cloud),), UNLABELED)).long()
         if self.table is not None:
             return torch.arange(len(self.table)), labels
-        known = torch.from_numpy(self.cloud.finite) & (labels >= 0)
-        return number_labels(torch.where(known, labels, UNLABELED))
+        is_labeled = torch.from_numpy(self.cloud.finite) & (labels >= 0)
+        return number_labels(torch.where(is_labeled, labels, UNLABELED))
 
     @property
     def names(self) -> Tensor:
@@ -195,17 +195,17 @@ class Result:
         if "labels" not in self.fields or (table is not None and table.adjacency is not None):
             return table
         rows = finite_rows(self.cloud.points)
-        some, neighbors = rows, self.neighbors
+        sampled, neighbors = rows, self.neighbors
         if neighbors is None and bool((self.labels[rows] >= 0).any()):
             places = np.random.default_rng(0).permutation(len(rows))[:_MOST_SEARCHED]
-            some = rows[torch.from_numpy(places).sort().values]
-            k = min(_NEIGHBORS, len(some))
-            neighbors = search_knn(self.cloud.points[some], k, canonical=True)
-        points, (present, labels) = self.cloud.points[some], number_labels(self.labels[some])
+            sampled = rows[torch.from_numpy(places).sort().values]
+            k = min(_NEIGHBORS, len(sampled))
+            neighbors = search_knn(self.cloud.points[sampled], k, canonical=True)
+        points, (present, labels) = self.cloud.points[sampled], number_labels(self.labels[sampled])
         if table is None:
             has_normals = "normals" in self.fields
             cloud = (self.cloud.points, self._normals, self.labels)
-            whole = neighbors if has_normals and len(some) == len(rows) else None
+            whole = neighbors if has_normals and len(sampled) == len(rows) else None
             table = summarize_planes(*(values[rows] for values in cloud), neighbors=whole)
             table = replace(table, curved=table.curved & has_normals)
         if neighbors is None or not len(present) or table.adjacency is not None:
@@ -362,7 +362,7 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
 def _record(text: str) -> dict[str, Any]:
     """Return the record that a text holds, empty if it holds none."""
     try:
-        found = json.loads(text)
+        content = json.loads(text)
     except DAMAGES:
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}

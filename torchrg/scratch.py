@@ -30,7 +30,7 @@ BYTES_PER_NEIGHBOR = 9
 _RELEASE_SECONDS = 0.01
 """How often pages go back to the system. In that time some 20 MB of an array are read."""
 _ZEROS = bytes(2**20)
-"""What reserves a disk where the system has no call for that, as on macOS."""
+"""Bytes that reserve a disk where the system has no call for that, as on macOS."""
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 

@@ -72,12 +72,14 @@ class Cloud:
     front: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        given: object = self.coordinates
-        if not isinstance(given, np.ndarray):
-            repair = "its numpy() is one" if isinstance(given, Tensor) else "numpy.array makes one"
+        coordinates: object = self.coordinates
+        if not isinstance(coordinates, np.ndarray):
+            repair = (
+                "its numpy() is one" if isinstance(coordinates, Tensor) else "numpy.array makes one"
+            )
             raise ShapeError(
                 "Cloud: expected coordinates to be a NumPy array, got "
-                f"{type(given).__name__}; {repair}."
+                f"{type(coordinates).__name__}; {repair}."
             )
         if self.front is not None and self.front.shape != (len(self), 3):
             raise ShapeError(
@@ -91,8 +93,8 @@ class Cloud:
 
         def __getattr__(self, name):  # noqa: ANN001, ANN204
             """Say where the values of points are, to who asks for them by name."""
-            known = ", ".join(f"fields[{field!r}]" for field in vars(self).get("fields", ()))
-            raise AttributeError(f"Cloud has no attribute {name!r}; it has {known or 'no fields'}.")
+            names = ", ".join(f"fields[{field!r}]" for field in vars(self).get("fields", ()))
+            raise AttributeError(f"Cloud has no attribute {name!r}; it has {names or 'no fields'}.")
 
     @cached_property
     def finite(self) -> NDArray[np.bool_]:
@@ -137,10 +139,10 @@ class Cloud:
         origin, or as LAS with too coarse a scale, or reach too far for float32 about any origin.
         """
         scale = float(max(getattr(self.header.get("las"), "scales", (0.0,))))
-        known = self.coordinates if self.finite.all() else self.coordinates[self.finite]
-        if note := note_on_steps(known, scale=scale):
+        finite = self.coordinates if self.finite.all() else self.coordinates[self.finite]
+        if note := note_on_steps(finite, scale=scale):
             return note
-        if known.dtype == np.float32:
+        if finite.dtype == np.float32:
             return ""
         cure = "leave out points that are far off, or cut the cloud into parts"
         return note_on_steps(self._local.numpy(), cure=cure)
@@ -252,7 +254,7 @@ class NormalFit(NamedTuple):
     def each(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
         """Return a fit whose tensors are changed by one function, None left alone."""
         sharp = None if self.sharp is None else change(self.sharp)
-        normals, curvature, valid, residual_rms = (change(part) for part in self[:4])
+        normals, curvature, valid, residual_rms = (change(values) for values in self[:4])
         return NormalFit(normals, curvature, valid, residual_rms, sharp)
 
 
@@ -379,11 +381,11 @@ class Planes:
         except IndexError:
             raise IndexError(f"Planes: expected one of {len(self)} planes, got {row}.") from None
         columns = {name: getattr(self, name)[row] for name in PLANE_COLUMNS}
-        own = {name: value if value.ndim else value.item() for name, value in columns.items()}
+        values = {name: value if value.ndim else value.item() for name, value in columns.items()}
         kind = None if self.kind is None else PLANE_KINDS[int(self.kind[row])]
         outline = None if self.outline is None else self.outline[row]
         within = None if self.object is None else int(self.object[row])
-        return Plane(row, **own, kind=kind, outline=outline, object=within)
+        return Plane(row, **values, kind=kind, outline=outline, object=within)
 
     def to(self, device: torch.device | str) -> "Planes":
         """Return the table on a device."""
@@ -403,7 +405,7 @@ def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401
     if isinstance(value, Tensor | Planes):
         return value.to(device)
     if isinstance(value, tuple):
-        parts = [moved(part, device) for part in value]
+        parts = [moved(item, device) for item in value]
         return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
     return value
 
@@ -453,7 +455,7 @@ class Segmentation(NamedTuple):
 
     def to(self, device: torch.device | str) -> "Segmentation":
         """Return the segmentation on a device."""
-        return Segmentation(*(moved(part, device) for part in self))
+        return Segmentation(*(moved(item, device) for item in self))
 
     def cpu(self) -> "Segmentation":
         """Return the segmentation on the CPU."""

@@ -1,5 +1,7 @@
 """Guides can be read aloud: short sentences, words that a dictionary knows, commands that exist."""
 
+import ast
+import itertools
 import re
 import subprocess
 import sys
@@ -9,6 +11,9 @@ import pytest
 
 GUIDES = guide_pages.guide_files()
 MOST_WORDS = 35
+MODULES = sorted((guide_pages.GUIDES.parents[1] / "torchrg").rglob("*.py"))
+VAGUE = re.compile(r"\b(?:found|given|some|own|part|rest|kept|known)\b")
+MOST_VAGUE = 1000
 
 
 def sentences_of(markdown):
@@ -43,3 +48,38 @@ def test_words_are_spelled_right():
         command, cwd=guide_pages.GUIDES.parents[1], capture_output=True, text=True
     )
     assert (done.stdout, done.returncode) == ("", 0)
+
+
+def docstrings_of_constants(code):
+    """Return the texts right after assignments of a module and of its classes."""
+    bodies = [
+        node.body
+        for node in ast.walk(ast.parse(code))
+        if isinstance(node, (ast.Module, ast.ClassDef))
+    ]
+    pairs = [pair for body in bodies for pair in itertools.pairwise(body)]
+    return [
+        text.value.value
+        for constant, text in pairs
+        if isinstance(constant, (ast.Assign, ast.AnnAssign))
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+    ]
+
+
+def test_docstrings_of_constants_are_read():
+    code = 'A = 1\n"""One."""\nB = 2\n\nclass C:\n    """C."""\n    d: int\n    """Two."""\n'
+    assert docstrings_of_constants(code) == ["One.", "Two."]
+
+
+def test_docstrings_of_constants_begin_with_what_they_are():
+    texts = [text for path in MODULES for text in docstrings_of_constants(path.read_text("utf-8"))]
+    assert len(texts) > 500
+    others = [text for text in texts if text.split()[0] in {"And", "Of", "What"}]
+    # The help of a flag of torchrg convert s3dis.
+    assert {text.split(".")[0] for text in others} <= {"What the numbers in segment"}
+
+
+def test_vague_words_are_rare():
+    counts = {path: len(VAGUE.findall(path.read_text(encoding="utf-8"))) for path in MODULES}
+    assert sum(counts.values()) <= MOST_VAGUE, sorted(counts.items(), key=lambda item: -item[1])[:5]

@@ -78,7 +78,7 @@ def _run(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_OVERVIEW)
         return 0 if arguments else USAGE_ERROR
-    name, *rest = arguments
+    name, *remaining = arguments
     if name == "--version":
         from torchrg.version import __version__
 
@@ -92,5 +92,5 @@ def _run(arguments: list[str]) -> int:
     with raising_interrupts(), warnings.catch_warnings():
         # Commands tell of the precision of each file as a line: see check_finite.
         warnings.simplefilter("ignore", PrecisionWarning)
-        code: int = command.run(rest)
+        code: int = command.run(remaining)
     return code

@@ -152,7 +152,7 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[st
             if const is not None:
                 takes = {"action": "store_const", "const": const}
             parser.add_argument(*spellings, dest=flag.path, **takes)
-    given, left = parser.parse_known_args(arguments)
+    namespace, left = parser.parse_known_args(arguments)
     if left:
         names = [flag.name for flag in flags] if left[0].startswith("--") else []
         near = difflib.get_close_matches(left[0], names, n=1)
@@ -160,7 +160,7 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[st
             near = [f"./{left[0]}"]
         question = f" Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"Unrecognized options: {', '.join(left)}.{question}")
-    values = vars(given)
+    values = vars(namespace)
     return {flag.path: _value_of(flag, values[flag.path]) for flag in flags if flag.path in values}
 
 
@@ -182,11 +182,11 @@ def _kinds(hint: object) -> list[Any]:
     return [kind for kind in kinds if kind is not NoneType] if is_union else [hint]
 
 
-def _value_of(flag: Flag, given: bool | str | list[str]) -> object:
+def _value_of(flag: Flag, typed: bool | str | list[str]) -> object:
     """Return the value that is written for a flag."""
-    if isinstance(given, bool):
-        return given
-    words = [given] if isinstance(given, str) else given
+    if isinstance(typed, bool):
+        return typed
+    words = [typed] if isinstance(typed, str) else typed
     if words == [_NONE] and NoneType in typing.get_args(flag.hint):
         return None
     kind, *others = _kinds(flag.hint)
@@ -209,14 +209,14 @@ def _value_of(flag: Flag, given: bool | str | list[str]) -> object:
     return tuple(values) if parts else values[0]
 
 
-def _build(kind: Any, default: Any, given: Mapping[str, object], prefix: str = "") -> Any:  # noqa: ANN401
+def _build(kind: Any, default: Any, typed: Mapping[str, object], prefix: str = "") -> Any:  # noqa: ANN401
     """Return a dataclass with the values that are given, and otherwise those that it has."""
     values, hints = {}, typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
         value, path = _default_of(field, default), f"{prefix}{field.name}"
-        if any(name.startswith(f"{path}.") for name in given):
-            value = _build(hints[field.name], value, given, f"{path}.")
-        values[field.name] = given.get(path, () if value is dataclasses.MISSING else value)
+        if any(name.startswith(f"{path}.") for name in typed):
+            value = _build(hints[field.name], value, typed, f"{path}.")
+        values[field.name] = typed.get(path, () if value is dataclasses.MISSING else value)
     return kind(**values)
 
 

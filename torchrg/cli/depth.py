@@ -80,7 +80,7 @@ def run(argv: list[str]) -> int:
     flags.use_threads(arguments.threads)
     camera = flags.parse_intrinsics(arguments.intrinsics)
     frames = [_find_frame(arguments, camera, path) for path in arguments.inputs]
-    given = [camera if frame is None else frame for frame in frames]
+    sources = [camera if frame is None else frame for frame in frames]
     inputs = [
         path if frame is None else frame.depth
         for path, frame in zip(arguments.inputs, frames, strict=True)
@@ -98,7 +98,7 @@ def run(argv: list[str]) -> int:
     check_apart([*targets, *beside], [*inputs, Path(arguments.intrinsics or "")])
     for path in beside:
         check_place(path)
-    return run_each(_label, arguments, inputs, given, targets, pictures, tables)
+    return run_each(_label, arguments, inputs, sources, targets, pictures, tables)
 
 
 def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGBDFrame | None:
@@ -173,7 +173,7 @@ def _label(
             "depth_scale": scale,
             "orient": arguments.orient,
         }
-        images = {name: part for name, part in seg._asdict().items() if name not in _NO_IMAGES}
+        images = {name: values for name, values in seg._asdict().items() if name not in _NO_IMAGES}
         rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
         write_cloud(target, cloud, rows, provenance=provenance)
     if table is not None:

@@ -57,19 +57,19 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
     facts = {"points": f"{len(cloud):,} of {cloud.coordinates.dtype}"}
     if cloud.grid_shape:
         facts["grid"] = f"{cloud.grid_shape[0]} rows x {cloud.grid_shape[1]} columns"
-    kept = cloud.coordinates[cloud.finite]
-    facts["not finite"] = f"{len(cloud) - len(kept):,}"
-    if len(kept):
-        low, high = kept.min(axis=0), kept.max(axis=0)
+    finite = cloud.coordinates[cloud.finite]
+    facts["not finite"] = f"{len(cloud) - len(finite):,}"
+    if len(finite):
+        low, high = finite.min(axis=0), finite.max(axis=0)
         digits = _DIGITS[cloud.coordinates.dtype.itemsize]
         for name, values in (("lowest", low), ("highest", high), ("extent", high - low)):
             facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
-        ordered = kept - cloud.origin
+        ordered = finite - cloud.origin
         ordered = ordered[canonical_order(ordered).numpy()]
         is_first = np.ones(len(ordered), dtype=bool)
         is_first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
         places = ordered[is_first]
-        facts["duplicates"] = f"{len(kept) - len(places):,}"
+        facts["duplicates"] = f"{len(finite) - len(places):,}"
         facts["spacing"] = "none"
         if len(places) > 1:
             near = search_knn(places, min(_NUM_NEIGHBORS, len(places)), canonical=True)

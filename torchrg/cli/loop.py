@@ -115,9 +115,9 @@ def paths_beside(
 def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
     """Raise before long work if a picture, page or table has no place, or cannot be made."""
     if path.suffix.lower() not in suffixes:
-        known = " or ".join(suffixes)
+        endings = " or ".join(suffixes)
         raise FormatError(
-            f"{path}: expected a file that ends in {known}, got {path.suffix!r}; name it so."
+            f"{path}: expected a file that ends in {endings}, got {path.suffix!r}; name it so."
         )
     check_place(path)
     if is_page(path):

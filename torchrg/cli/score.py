@@ -223,8 +223,8 @@ def _mean(scans: Mapping[str, Scores]) -> Scores:
         rows = [scores[part] for scores in scans.values() if part in scores]
         means[part] = {"scans": len(rows)}
         for name in dict.fromkeys(name for row in rows for name in row):
-            known = [value for row in rows if (value := row.get(name)) is not None]
-            means[part][name] = math.fsum(known) / len(known) if known else None
+            values = [value for row in rows if (value := row.get(name)) is not None]
+            means[part][name] = math.fsum(values) / len(values) if values else None
     return means
 
 

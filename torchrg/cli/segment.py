@@ -336,8 +336,8 @@ def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
 def _report(source: str, seg: Segmentation, cloud: Cloud, target: str, seconds: float) -> None:
     """Print the line about a result, after a warning if there is no plane in it."""
     if len(seg.planes) == 0:
-        known = cloud.coordinates[cloud.finite]
-        is_place = (known == known[0]).all()
+        finite = cloud.coordinates[cloud.finite]
+        is_place = (finite == finite[0]).all()
         reason = "all points are equal" if is_place else "no region is large enough"
         warn(f"{source}: no plane found: {reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes)

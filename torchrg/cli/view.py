@@ -57,7 +57,7 @@ class Arguments:
     """Picture (.png) or page (.html; pip install 'torchrg[view]') to write. A page is one file that
     opens without a network."""
     color: PageColorBy | None = None
-    """What the colours show, at first on a page, where they can be switched. Default: the planes,
+    """Meaning of the colours, at first on a page, where they can be switched. Default: the planes,
     or the first thing that the file has. Errors need --truth, and a page."""
     view: Literal["cutaway", "above", "outside", "sensor"] = "cutaway"
     """Where the picture is taken from: from outside without ceiling and near walls (cutaway), from

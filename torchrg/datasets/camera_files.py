@@ -74,7 +74,7 @@ def read_record(path: Path, *parts: str) -> dict[str, Any]:
         content = json.loads(text) if is_json else next(iter(yaml.safe_load_all(text)), None)
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected names with values, got {type(content).__name__}.")
-    inside = (content[part] for part in parts if isinstance(content.get(part), dict))
+    inside = (content[section] for section in parts if isinstance(content.get(section), dict))
     record: dict[str, Any] = next(inside, content)
     return record
 
@@ -126,13 +126,13 @@ def camera_of(path: Path, record: Record) -> Pinhole:
 
 def matrix_of(path: Path, record: Record, key: str, columns: int = 3) -> Tensor:
     """Return a matrix of 3 or 4 rows and at least so many columns, nested or flat in a record."""
-    given = record.get(key)
+    value = record.get(key)
     with suppress(TypeError, ValueError, OverflowError):
-        data = given.get("data") if isinstance(given, dict) else given
+        data = value.get("data") if isinstance(value, dict) else value
         values = torch.from_numpy(np.asarray(data, dtype=np.float64).ravel())
         if len(values) in _SHAPES and _SHAPES[len(values)][1] >= columns:
             return values.view(_SHAPES[len(values)])
-    raise FormatError(f"{path}: expected {key} to be a matrix, got {str(given)[:60]}; repair it.")
+    raise FormatError(f"{path}: expected {key} to be a matrix, got {str(value)[:60]}; repair it.")
 
 
 def number_of(path: Path, record: Record, key: str) -> float:

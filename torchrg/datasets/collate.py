@@ -78,11 +78,11 @@ def collate_offset(
     for key in dict.fromkeys([*[inverse] * (inverse in batch), *unique]):
         numbers = [as_tensor("collate_offset", key, s[key]) for s in samples]
         sizes = [
-            len(s[coord]) if key == inverse else (int(own.max()) + 1 if len(own) else 0)
-            for s, own in zip(samples, numbers, strict=True)
+            len(s[coord]) if key == inverse else (int(ids.max()) + 1 if len(ids) else 0)
+            for s, ids in zip(samples, numbers, strict=True)
         ]
         pairs = zip(numbers, itertools.accumulate(sizes, initial=0), strict=False)
-        batch[key] = torch.cat([torch.where(own >= 0, own + start, own) for own, start in pairs])
+        batch[key] = torch.cat([torch.where(ids >= 0, ids + start, ids) for ids, start in pairs])
     if LISTED in batch:
         names = itertools.chain.from_iterable(listed_keys(s) or () for s in samples)
         batch[LISTED] = list(dict.fromkeys(names))

@@ -19,7 +19,7 @@ from torchrg.io import FOLDER_SUFFIXES, read_cloud, takes_columns
 from torchrg.transforms.rows import Sample, SampleDict
 
 Transform = Callable[[SampleDict], Sample]
-"""What data sets call with each sample."""
+"""A function that data sets call with each sample."""
 _NUMBERED = {"instance", "plane", "superpoint"}
 """Arrays whose numbers begin again in each scene."""
 _FIELD_KEYS = {"normals": "normal"}
@@ -102,11 +102,11 @@ class FolderOfClouds(SceneDataset):
         self.root = Path(root)
         self.transform = transform
         self.columns = columns
-        known = {suffix.lower() for suffix in suffixes}
+        endings = {suffix.lower() for suffix in suffixes}
         paths = [
             path
             for path in files_below(self.root, is_item=is_scene)
-            if path.is_dir() or path.suffix.lower() in known
+            if path.is_dir() or path.suffix.lower() in endings
         ]
         if not paths:
             raise FormatError(
@@ -206,7 +206,7 @@ def files_below(
         UserWarning: If something is passed over because it is there under another name.
     """
     check_folder(folder)
-    found: list[Path] = []
+    files: list[Path] = []
     seen: set[str] = set()
     links: list[Path] = []
     passed: list[Path] = []
@@ -217,7 +217,7 @@ def files_below(
             return
         seen.add(real)
         if not path.is_dir() or is_item(path):
-            found.append(path)
+            files.append(path)
             return
         for entry in listed(path):
             if entry.is_symlink() and not entry.name.startswith("."):
@@ -234,7 +234,7 @@ def files_below(
         else:
             take(link, str(target))
     warn_of_links(folder, passed)
-    return sorted(found, key=lambda path: [natural_key(p) for p in path.relative_to(folder).parts])
+    return sorted(files, key=lambda path: [natural_key(p) for p in path.relative_to(folder).parts])
 
 
 def warn_of_links(folder: Path, passed: Sequence[Path]) -> None:
@@ -262,7 +262,7 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     """
     parts = re.split(r"([0-9]+)", name)
     key: list[tuple[int, int | str]] = [
-        (0, int(part)) if part.isdigit() else (1, part.lower()) for part in parts if part
+        (0, int(piece)) if piece.isdigit() else (1, piece.lower()) for piece in parts if piece
     ]
     # Names that differ in case or leading zeros only still have one order.
     return (*key, (2, name))

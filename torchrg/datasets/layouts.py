@@ -138,10 +138,10 @@ def stem_of(layout: str, name: str, folder: str) -> str:
 
 def check_layout(layout: str, dataset: str, what: str) -> None:
     """Raise if a layout has no form for a data set, called ``what``, or no package to write it."""
-    known = [name for name, forms in LAYOUTS.items() if dataset in forms]
-    if layout not in ("pointcept", *known):
+    layouts = [name for name, forms in LAYOUTS.items() if dataset in forms]
+    if layout not in ("pointcept", *layouts):
         raise ConfigError(
-            f"expected --layout to be one of pointcept, {', '.join(known)} for {what}, got "
+            f"expected --layout to be one of pointcept, {', '.join(layouts)} for {what}, got "
             f"{layout}, whose programs do not know its classes; choose another."
         )
     if layout == "nag":
@@ -195,8 +195,8 @@ def _scannet(scan: LayoutScan) -> Files:
             "sceneId": f"scannet.{scan.name}",
             "appId": "torchrg",
             "segGroups": [
-                {**known, "segments": np.unique(parts[rows]).tolist()}
-                for known, rows in scan.objects
+                {**entry, "segments": np.unique(parts[rows]).tolist()}
+                for entry, rows in scan.objects
             ],
             "segmentsFile": f"scannet.{scan.name}_vh_clean_2.0.010000.segs.json",
         }
@@ -433,7 +433,7 @@ def _nag(scan: LayoutScan) -> Files:
         # The last column is of points without a class.
         one_hot = np.eye(len(numbers), dtype=np.int64)[numbers]
         values["y"] = one_hot[np.where(scan.truth[0] < 0, len(numbers) - 1, scan.truth[0])]
-    fine, *coarse = (torch.from_numpy(part).long() for part in (scan.superpoint, *scan.coarser))
+    fine, *coarse = (torch.from_numpy(level).long() for level in (scan.superpoint, *scan.coarser))
     parts = Superpoints(fine, torch.full((int(fine.max()) + 1,), UNLABELED), tuple(coarse))
     levels = make_nag(scan.coord, parts, data=dict, **values)
     return {f"{scan.listed or 'nag'}/{scan.name}.h5": encode_nag(levels)}
@@ -455,8 +455,8 @@ LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
     "nag": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _nag),
     "npy": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _npy),
 }
-"""What returns the files of a scan, by the name of the layout and the data set; that without a name
-has labels whose classes nobody knows. Clouds without labels are written as those of ScanNet."""
+"""Functions for the files of a scan, by the layout and the data set. That without a name has
+labels whose classes nobody knows. Clouds without labels are written as those of ScanNet."""
 
 
 def _pickled(content: Any) -> bytes:  # noqa: ANN401

@@ -21,7 +21,7 @@ from torchrg.io import atomic_path
 from torchrg.io.files import make_folder, marked_parts, refusing, remove_leftovers
 
 Entry = dict[str, Any]
-"""What a scan leaves for a list."""
+"""An entry that a scan leaves for a list, by its keys."""
 Entries = Mapping[str, Sequence[Entry]]
 """Entries of the scans of a list, by the folder that they are in."""
 
@@ -79,17 +79,17 @@ def _write_all(layout: str, dataset: str, out: Path) -> None:
 
 def _write_names(out: Path, folders: Iterable[str]) -> None:
     """Write lists of names for MMDetection3D, which asks for all of them, also for empty ones."""
-    found = {folder: [e["name"] for e in _read_entries(out, folder)] for folder in folders}
-    for folder, own in found.items() if any(found.values()) else ():
+    listed_in = {folder: [e["name"] for e in _read_entries(out, folder)] for folder in folders}
+    for folder, scans in listed_in.items() if any(listed_in.values()) else ():
         path = out / f"{folder}.txt"
         with refusing(f"{path}: expected a name a line, got: ", ValueError):
             text = path.read_text(encoding="utf-8") if path.is_file() else ""
         listed = [line.strip() for line in text.splitlines() if line.strip()]
-        others = set(listed) - set(own)
-        missing = [name for name in own if name not in listed]
+        others = set(listed) - set(scans)
+        missing = [name for name in scans if name not in listed]
         if missing or not others:
             # A list of the program itself keeps its order; one of ours has that of the entries.
-            names = [*listed, *missing] if others else own
+            names = [*listed, *missing] if others else scans
             _write(out, path.relative_to(out), "".join(f"{name}\n" for name in names))
 
 
@@ -122,7 +122,7 @@ def _mask3d(entries: Entries) -> dict[str, object]:
     train, validation, test = (entries[f"{mode}_database"] for mode in MODES.values())
     labels = zip(NYU_IDS, CLASSES, strict=True)
     return {
-        **{f"{folder}.yaml": [*found] for folder, found in entries.items()},
+        **{f"{folder}.yaml": [*scans] for folder, scans in entries.items()},
         "train_validation_database.yaml": [*train, *validation],
         "color_mean_std.yaml": _color_mean_std(train or [*validation, *test]),
         "label_database.yaml": {n: {"name": name, "validation": True} for n, name in labels},
@@ -131,9 +131,9 @@ def _mask3d(entries: Entries) -> dict[str, object]:
 
 def _mask3d_s3dis(entries: Entries) -> dict[str, object]:
     """Databases of the areas of S3DIS and, for each, of all others, which are trained on."""
-    contents: dict[str, object] = {f"{folder}.yaml": [*found] for folder, found in entries.items()}
+    contents: dict[str, object] = {f"{folder}.yaml": [*scans] for folder, scans in entries.items()}
     for folder, own in entries.items():
-        others = [entry for name, found in entries.items() if name != folder for entry in found]
+        others = [entry for name, scans in entries.items() if name != folder for entry in scans]
         contents[f"train_{folder}.yaml"] = others
         area = folder.removesuffix("_database")
         contents[f"{area}_color_mean_std.yaml"] = _color_mean_std(others or own)

@@ -104,13 +104,13 @@ def write_pointcept_scene(
     arrays = _arrays_of(place, sample, segmentation, superpoint=superpoint)
     owned = _owned(place)
     # What only torchrg makes is never kept: one from elsewhere is in the way.
-    kept = {
+    inputs = {
         name
         for name in arrays.keys() - {"plane", "curvature", "superpoint"}
         if f"{name}.npy" not in owned and (place / f"{name}.npy").exists()
     }
-    _check_kept(place, arrays, kept)
-    new = {name: values for name, values in arrays.items() if name not in kept}
+    _check_kept(place, arrays, inputs)
+    new = {name: values for name, values in arrays.items() if name not in inputs}
     return write_arrays(place, new, describe_planes(segmentation.planes, origin=origin))
 
 
@@ -178,17 +178,17 @@ def _arrays_of(
     superpoint: Tensor | NDArray[np.integer] | None,
 ) -> dict[str, Array]:
     """Return the arrays of a scene in Pointcept's types."""
-    found: dict[str, object] = {"normal": segmentation.normals}
-    found |= {name: sample[name] for name in GIVEN_ARRAYS if name in sample}
-    found |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
+    entries: dict[str, object] = {"normal": segmentation.normals}
+    entries |= {name: sample[name] for name in GIVEN_ARRAYS if name in sample}
+    entries |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
     if superpoint is not None:
-        found["superpoint"] = superpoint
+        entries["superpoint"] = superpoint
     dtypes = {"color": np.uint8, "plane": np.int32, "superpoint": np.int32}
     arrays: dict[str, Array] = {}
-    for name in (name for name in POINT_ARRAYS if name in found):
-        values = as_tensor("write_pointcept_scene", name, found[name]).detach().cpu().numpy()
+    for name in (name for name in POINT_ARRAYS if name in entries):
+        values = as_tensor("write_pointcept_scene", name, entries[name]).detach().cpu().numpy()
         check_rows(place / f"{name}.npy", values, segmentation.labels.shape)
-        if name in _SCANNET or (name == "instance" and not found.keys().isdisjoint(_SCANNET)):
+        if name in _SCANNET or (name == "instance" and not entries.keys().isdisjoint(_SCANNET)):
             arrays[name] = values.astype(np.int64)
         elif name in ("segment", "instance"):
             arrays[name] = _short(values).reshape(len(values), -1)
@@ -226,9 +226,9 @@ def _written(place: Path) -> list[str]:
         ) from error
 
 
-def _check_kept(place: Path, arrays: Mapping[str, Array], kept: set[str]) -> None:
+def _check_kept(place: Path, arrays: Mapping[str, Array], inputs: set[str]) -> None:
     """Check that what stays in a folder belongs to the points that are written."""
-    for name in sorted(kept):
+    for name in sorted(inputs):
         path = place / f"{name}.npy"
         values = map_array(path)
         check_rows(path, values, arrays[name].shape[:1])

@@ -162,8 +162,8 @@ class RGBDFrames(SceneDataset):
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
         frames = [*_find(folder, LAYOUTS[name], intrinsics, depth_scale)]
         if not frames:
-            known = " ".join(DEPTH_SUFFIXES)
-            raise FormatError(f"{root}: expected depth images ({known}), got none.")
+            suffixes = " ".join(DEPTH_SUFFIXES)
+            raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
         return cls(frames, transform=transform)
 
     def read_sample(self, index: int) -> SampleDict:
@@ -196,16 +196,18 @@ def _find(
         if camera is None and layout.camera is not None:
             camera, files = layout.camera(folder)
         for frame in layout.frames(folder):
-            own = frame.camera if camera is None else camera
+            chosen = frame.camera if camera is None else camera
             scales = (depth_scale, frame.depth_scale, layout.depth_scale)
             scale = next((value for value in scales if value is not None), None)
-            if own is None or scale is None:
-                missing = "intrinsics" if own is None else "depth_scale"
+            if chosen is None or scale is None:
+                missing = "intrinsics" if chosen is None else "depth_scale"
                 raise ConfigError(
                     f"{frame.depth}: expected {missing}, which depth images do not hold; pass it"
-                    f"{': 1 for metres, 1000 for millimetres' if own is not None else ''}."
+                    f"{': 1 for metres, 1000 for millimetres' if chosen is not None else ''}."
                 )
-            matrix = own.matrix(image_size(frame.depth)) if isinstance(own, Pinhole) else own
+            matrix = (
+                chosen.matrix(image_size(frame.depth)) if isinstance(chosen, Pinhole) else chosen
+            )
             name, sources = prefix + frame.name, files + frame.sources
             no_depth = layout.no_depth
             yield RGBDFrame(

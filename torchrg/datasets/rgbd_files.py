@@ -27,7 +27,7 @@ _CONVERTERS = {
     ".r3d": "unzip it, and save what pyliblzfse reads of its .depth files as .npy, in metres",
     ".exr": "save what OpenEXR reads of it as .npy, usually in metres",
 }
-"""What makes frames of recordings and images that are not read."""
+"""Ways to frames from recordings and images that are not read, by suffix."""
 _PNG = b"\x89PNG"
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
 """Width and height in the header of a PNG, and the byte at which they begin."""
@@ -65,9 +65,10 @@ def read_depth(
     readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16}
     reader = readers.get(source.suffix.lower())
     if reader is None:
-        known = " ".join(DEPTH_SUFFIXES)
+        suffixes = " ".join(DEPTH_SUFFIXES)
         raise FormatError(
-            f"{source}: expected a depth image that ends in one of {known}, got {source.suffix!r}."
+            f"{source}: expected a depth image that ends in one of {suffixes}, got "
+            f"{source.suffix!r}."
         )
     stored = reader(source)
     depth = stored.astype(np.float64)
@@ -119,9 +120,9 @@ def _read_image(source: Path, kinds: str) -> Array:
     from kornia_rs import io
 
     check_file(source)
-    if source.suffix.lower() == ".png" and (given := num_pixels(source)) > _MOST_PIXELS:
+    if source.suffix.lower() == ".png" and (count := num_pixels(source)) > _MOST_PIXELS:
         raise FormatError(
-            f"{source}: expected an image of at most {_MOST_PIXELS:,} pixels, got {given:,} in its "
+            f"{source}: expected an image of at most {_MOST_PIXELS:,} pixels, got {count:,} in its "
             "header; the file is damaged, fetch it again, or make it smaller."
         )
     with refusing(f"{source}: expected a {kinds} image, got: ", Exception):
@@ -133,13 +134,13 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
     """Return the values of a binary PGM of 16 bits, shape ``(H, W)``."""
     check_file(source)
     content = source.read_bytes()
-    found = _PGM.match(content)
-    if found is None or not _MOST_OF_8_BITS < int(found[3]) <= _MOST_OF_16_BITS:
+    header = _PGM.match(content)
+    if header is None or not _MOST_OF_8_BITS < int(header[3]) <= _MOST_OF_16_BITS:
         raise FormatError(
             f"{source}: expected a binary PGM of 16 bits, P5, got {content[:16]!r}; depth does not "
             "fit into 8 bits."
         )
-    width, height, start = int(found[1]), int(found[2]), found.end()
+    width, height, start = int(header[1]), int(header[2]), header.end()
     available = len(content) - start
     check_promise(source, start, 2 * width * height, "its pixels", available=available)
     values = np.frombuffer(content, ">u2", width * height, start)
@@ -159,8 +160,8 @@ def image_size(path: Path) -> tuple[int, int] | None:
             return width, height
     except (OSError, *DAMAGES):
         return None
-    found = _PGM.match(head)
-    return (int(found[1]), int(found[2])) if found else None
+    header = _PGM.match(head)
+    return (int(header[1]), int(header[2])) if header else None
 
 
 def num_pixels(path: Path) -> int:
@@ -242,15 +243,15 @@ def read_nearest(
     It is None everywhere if there is no such file.
     """
     others, values = read(path) if path.is_file() else ([], [])
-    found: list[Value | None] = []
+    nearest: list[Value | None] = []
     for time in times:
         place = bisect_left(others, time)
         around = range(max(place - 1, 0), min(place + 1, len(others)))
         best = min(around, key=lambda i: abs(others[i] - time), default=None)
         if best is not None and abs(others[best] - time) > _MOST_SECONDS:
             best = None
-        found.append(None if best is None else values[best])
-    return found
+        nearest.append(None if best is None else values[best])
+    return nearest
 
 
 def _rotations(quaternions: Tensor) -> Tensor:
@@ -262,10 +263,10 @@ def _rotations(quaternions: Tensor) -> Tensor:
 
     matrices = torch.full((len(quaternions), 3, 3), torch.nan, dtype=torch.float64)
     lengths = quaternions.norm(dim=1)
-    known = (lengths > 0) & lengths.isfinite()
-    if known.any():
-        found = Rotation.from_quat(quaternions[known].numpy()).as_matrix()
-        matrices[known] = torch.from_numpy(found)
+    is_rotation = (lengths > 0) & lengths.isfinite()
+    if is_rotation.any():
+        rotations = Rotation.from_quat(quaternions[is_rotation].numpy()).as_matrix()
+        matrices[is_rotation] = torch.from_numpy(rotations)
     return matrices
 
 

@@ -130,8 +130,8 @@ def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterato
     def frames(folder: Path) -> Iterator[ListedFrame]:
         for name, image in _depth_images(folder, depth):
             path = folder / pose.replace("*", name)
-            known = (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
-            yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *known)
+            posed = (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
+            yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *posed)
 
     return frames
 
@@ -342,14 +342,14 @@ def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path
         yield "", root
         return
     marked = sorted({*_marked(root, layout)}, key=lambda path: natural_key(str(path)))
-    own: dict[Path, Path] = {}
+    first_names: dict[Path, Path] = {}
     for path in sorted(marked, key=lambda path: path != root and path.is_symlink()):
-        own.setdefault(path.resolve(), path)
-    found = [path for path in marked if own[path.resolve()] == path]
-    warn_of_links(root, [path for path in marked if path not in found])
-    if not found:
+        first_names.setdefault(path.resolve(), path)
+    folders = [path for path in marked if first_names[path.resolve()] == path]
+    warn_of_links(root, [path for path in marked if path not in folders])
+    if not folders:
         raise FormatError(f"{root}: expected recordings with {layout.mark} in them, got none.")
-    for folder in found:
+    for folder in folders:
         inside = folder.resolve().name if folder == root else folder.relative_to(root).as_posix()
         yield f"{inside}/", folder
 

@@ -143,8 +143,8 @@ class S3DIS(SceneDataset):
 def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
     """Return the rooms of an area, and warn if there are not as many as in the release."""
     if area not in ROOMS_PER_AREA:
-        known = ", ".join(map(str, ROOMS_PER_AREA))
-        raise ConfigError(f"S3DIS: expected areas among {known}, got {area!r}.")
+        choices = ", ".join(map(str, ROOMS_PER_AREA))
+        raise ConfigError(f"S3DIS: expected areas among {choices}, got {area!r}.")
     folder = root / f"Area_{area}"
     check_folder(root)
     if not folder.is_dir():

@@ -243,18 +243,18 @@ def _find(root: Path, name: str) -> Path | None:
 
 def _lists(root: Path) -> dict[str, tuple[str, Path]]:
     """Return the split of each scan that is on a list, and the list."""
-    found = ((split, _find(root, name)) for split, names in _SPLITS.items() for name in names)
+    paths = ((split, _find(root, name)) for split, names in _SPLITS.items() for name in names)
     return {
         name: (split, path)
-        for split, path in found
+        for split, path in paths
         if path is not None
         for name in read_text(path).split()
     }
 
 
-def _warn_of_others(lists: Mapping[str, tuple[str, Path]], known: set[str]) -> None:
+def _warn_of_others(lists: Mapping[str, tuple[str, Path]], scans: set[str]) -> None:
     """Warn of names on the lists that are no scans, if there are any."""
-    others = [name for name in lists if name not in known]
+    others = [name for name in lists if name not in scans]
     if others:
         first = others[0]
         warnings.warn(
@@ -288,34 +288,34 @@ def _alignment(path: Path) -> Arrays:
 def _labels(files: Mapping[str, Path], root: Path, count: int) -> Arrays:
     """Return the labels of a scan of ScanNet."""
     words = _read_categories(root)
-    found: Arrays = {}
+    arrays: Arrays = {}
     if "groups" in files and "segments" in files:
         instance = np.full(count, _NONE, dtype=np.int64)
         numbers = np.zeros((count, 2), dtype=np.int64)
         for label, (number,), rows in _groups(files, count, ["id"], np.iinfo(np.int32).max):
             instance[rows] = number
             numbers[rows] = words.get(label, (0, 0))
-        found["instance"] = instance
+        arrays["instance"] = instance
         if words:
-            found |= {"category": numbers[:, 0], "segment200": _places(numbers[:, 1], IDS_200)}
+            arrays |= {"category": numbers[:, 0], "segment200": _places(numbers[:, 1], IDS_200)}
     if "categories" in files:
-        given = read_cloud(files["categories"]).fields.get("labels")
-        if given is None or given.shape != (count,):
+        labels = read_cloud(files["categories"]).fields.get("labels")
+        if labels is None or labels.shape != (count,):
             raise FormatError(
                 f"{files['categories']}: expected a label of each of {count:,} vertices, got "
-                f"{'none' if given is None else f'{len(given):,}'}; fetch it again."
+                f"{'none' if labels is None else f'{len(labels):,}'}; fetch it again."
             )
-        category = given.astype(np.int64)
+        category = labels.astype(np.int64)
         wrong = np.flatnonzero((category < 0) | (category > _LARGEST_CLASS))
         if len(wrong):
             raise FormatError(
                 f"{files['categories']}: vertex {wrong[0]:,}: expected a label from 0 to "
                 f"{_LARGEST_CLASS:,}, got {category[wrong[0]]}; fetch it again."
             )
-        found["category"] = category
-    if "category" in found:
-        found["segment20"] = _places(found["category"], NYU_IDS)
-    return found
+        arrays["category"] = category
+    if "category" in arrays:
+        arrays["segment20"] = _places(arrays["category"], NYU_IDS)
+    return arrays
 
 
 def _labels_plus(mesh: Path, root: Path, count: int) -> Arrays:
@@ -362,16 +362,16 @@ def _groups(
     path = files["groups"]
     for place, group in enumerate(_read_list(path, "segGroups")):
         entries = group if isinstance(group, dict) else {}
-        label, own = entries.get("label"), entries.get("segments")
-        found = [entries.get(key) for key in keys]
-        numbers = [n for n in found if type(n) is int and 0 <= n <= most]
-        if not (isinstance(label, str) and isinstance(own, list) and len(numbers) == len(keys)):
+        label, members = entries.get("label"), entries.get("segments")
+        values = [entries.get(key) for key in keys]
+        numbers = [n for n in values if type(n) is int and 0 <= n <= most]
+        if not (isinstance(label, str) and isinstance(members, list) and len(numbers) == len(keys)):
             raise FormatError(
                 f"{path}: object {place}: expected a label, a number from 0 to {most:,} as "
                 f"{' and '.join(keys)}, and a list of segments, got {shortened(group)}; fetch it "
                 "again."
             )
-        whole = _whole(path, f"segments of object {place}", own)
+        whole = _whole(path, f"segments of object {place}", members)
         yield label, numbers, np.flatnonzero(np.isin(of_vertices, whole))
 
 
@@ -379,10 +379,10 @@ def _read_list(path: Path, key: str) -> list[Any]:
     """Return the list that a file of JSON has under a key."""
     message = f"{path}: expected JSON with a list {key}, got: "
     with refusing(message, *DAMAGES, repair="; fetch it again"):
-        found = json.loads(read_text(path))
-        if not isinstance(found, dict) or not isinstance(found.get(key), list):
-            raise TypeError(shortened(found))
-        values: list[Any] = found[key]
+        content = json.loads(read_text(path))
+        if not isinstance(content, dict) or not isinstance(content.get(key), list):
+            raise TypeError(shortened(content))
+        values: list[Any] = content[key]
         return values
 
 
@@ -463,8 +463,8 @@ def _classes_plus(root: Path) -> dict[str | None, int]:
     return {name.strip(): number for number, name in enumerate(filter(str.strip, lines))}
 
 
-def _places(numbers: NDArray[np.integer], known: tuple[int, ...]) -> NDArray[np.int64]:
+def _places(numbers: NDArray[np.integer], ids: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the place of each number in an ascending list, -1 for those that are not in it."""
-    places = np.searchsorted(known, numbers).clip(max=len(known) - 1)
-    found: NDArray[np.int64] = np.where(np.array(known)[places] == numbers, places, _NONE)
-    return found
+    places = np.searchsorted(ids, numbers).clip(max=len(ids) - 1)
+    classes: NDArray[np.int64] = np.where(np.array(ids)[places] == numbers, places, _NONE)
+    return classes

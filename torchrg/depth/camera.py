@@ -57,10 +57,10 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
     return points.to(poses.dtype) @ poses[:, None, :3, :3].mT + poses[:, None, None, :3, 3]
 
 
-def read_intrinsics(caller: str, given: Any) -> Tensor:  # noqa: ANN401
+def read_intrinsics(caller: str, source: Any) -> Tensor:  # noqa: ANN401
     """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)`` of pinhole cameras without skew.
 
-    ``given`` are such matrices, tensors or arrays, those of 4 x 4 as kornia has them, or its
+    ``source`` are such matrices, tensors or arrays, those of 4 x 4 as kornia has them, or its
     ``PinholeCamera``, of which the intrinsics are taken and nothing else.
 
     Raises:
@@ -71,7 +71,7 @@ def read_intrinsics(caller: str, given: Any) -> Tensor:  # noqa: ANN401
         >>> read_intrinsics("f", torch.eye(4)[None]).shape
         torch.Size([1, 3, 3])
     """
-    tensor = as_tensor(caller, "intrinsics", getattr(given, "camera_matrix", given))
+    tensor = as_tensor(caller, "intrinsics", getattr(source, "camera_matrix", source))
     tensor = tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
     if tensor.shape[-2:] == (3, 3) and has_values(tensor):
         check_camera(caller, tensor)
@@ -155,13 +155,14 @@ class Pinhole(NamedTuple):
             >>> Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((160, 120))[0].tolist()
             [150.0, 0.0, 79.5]
         """
-        fx, fy, cx, cy, own = self
-        if size is None or own is None:
+        fx, fy, cx, cy, calibrated = self
+        if size is None or calibrated is None:
             return make_intrinsics(fx, fy, cx, cy)
-        across, down = size[0] / own[0], size[1] / own[1]
-        if abs(size[0] * own[1] - size[1] * own[0]) > max(own):
+        across, down = size[0] / calibrated[0], size[1] / calibrated[1]
+        if abs(size[0] * calibrated[1] - size[1] * calibrated[0]) > max(calibrated):
             raise ConfigError(
-                f"Pinhole: expected images of {own[0]} x {own[1]} pixels, as its camera's, or in "
+                f"Pinhole: expected images of {calibrated[0]} x {calibrated[1]} pixels, as its "
+                f"camera's, or in "
                 f"their ratio, got {size[0]} x {size[1]}; pass the camera of the depth images."
             )
         middle = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5

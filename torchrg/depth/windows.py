@@ -222,7 +222,7 @@ class WindowNoise(NamedTuple):
 
 
 def noise_by_size(
-    tables: Mapping[int, Tensor], given: tuple[float, float] | None, dtype: torch.dtype
+    tables: Mapping[int, Tensor], noise: tuple[float, float] | None, dtype: torch.dtype
 ) -> dict[int, WindowNoise]:
     """Return the noise of inverse depth as windows of each size see it.
 
@@ -234,8 +234,8 @@ def noise_by_size(
     depth.
     """
     rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING)
-    if given is not None:
-        constant, growth = given
+    if noise is not None:
+        constant, growth = noise
         return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
     windows = {size: Windows(*table) for size, table in tables.items()}
     # Windows stand a cell apart and overlap; of the smallest a quarter are as many as of the next.

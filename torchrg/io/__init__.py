@@ -80,7 +80,7 @@ _CONVERTERS = {
     ".glb": "a mesh; sample points on it with CloudCompare or Open3D",
     ".ptx": "a scan that CloudCompare opens; save it there as .e57",
 }
-"""What files are that are not read, by suffix, and the programs that make clouds of them."""
+"""Kinds of files that are not read, by suffix, and the programs that make clouds of them."""
 _PLANES_SUFFIX = ".vg"
 """Suffix of vertex groups, which are written only, and hold coordinates, colours and planes."""
 
@@ -120,8 +120,8 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
         ((2, 3), [[255, 0, 0], [0, 255, 0]])
     """
     source = Path(path)
-    size, found = check_file(source), _format_of(source)
-    if columns is not None and not found.takes_columns:
+    size, form = check_file(source), _format_of(source)
+    if columns is not None and not form.takes_columns:
         raise FormatError(
             f"{source}: expected text or .npy for names of columns, got a file that has its own; "
             "leave them out."
@@ -130,7 +130,7 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
     try:
         # Files may hold any bits as numbers: those that overflow or signal are kept, not reported.
         with np.errstate(over="ignore", invalid="ignore"):
-            return found.read(source, size, *names)
+            return form.read(source, size, *names)
     except OSError as error:
         raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
     except MemoryError as error:
@@ -147,8 +147,8 @@ def takes_columns(path: str | os.PathLike[str]) -> bool:
         >>> takes_columns("scan.txt"), takes_columns("scan.ply")
         (True, False)
     """
-    found = FORMATS.get(Path(path).suffix.lower())
-    return found is not None and found.takes_columns
+    form = FORMATS.get(Path(path).suffix.lower())
+    return form is not None and form.takes_columns
 
 
 def write_cloud(
@@ -198,10 +198,10 @@ def write_cloud(
         [0, 0, -1]
     """
     target = Path(path)
-    given: object = cloud
-    if not isinstance(given, Cloud):
+    value: object = cloud
+    if not isinstance(value, Cloud):
         raise FormatError(
-            f"{target}: expected a Cloud, got {type(given).__name__}; "
+            f"{target}: expected a Cloud, got {type(value).__name__}; "
             "Cloud(coordinates) makes one of a NumPy array."
         )
     check_output(target, cloud)
@@ -252,9 +252,9 @@ def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> No
     target = Path(path)
     _writer_of(target)
     check_place(path)
-    found = FORMATS.get(target.suffix.lower())
-    if found is not None and found.check is not None:
-        found.check(target, cloud)
+    form = FORMATS.get(target.suffix.lower())
+    if form is not None and form.check is not None:
+        form.check(target, cloud)
 
 
 def estimate_points(path: Path) -> int:
@@ -283,9 +283,10 @@ def _format_of(path: Path, *, is_written: bool = False) -> Format:
     if suffix in _CONVERTERS and not is_written:
         raise FormatError(f"{path}: expected points, got {_CONVERTERS[suffix]}.")
     if suffix not in FORMATS:
-        known = [kind for kind, format_ in FORMATS.items() if format_.write or not is_written]
+        suffixes = [kind for kind, format_ in FORMATS.items() if format_.write or not is_written]
         raise FormatError(
-            f"{path}: expected a file that ends in one of {' '.join(known)}, got {path.suffix!r}."
+            f"{path}: expected a file that ends in one of {' '.join(suffixes)}, got "
+            f"{path.suffix!r}."
         )
     return FORMATS[suffix]
 

@@ -134,11 +134,11 @@ def count_e57(path: Path, size: int) -> int:
 def _joined(blocks: Sequence[_Block], name: str, counts: Sequence[int]) -> Values:
     """Return a column of all scans, zero where one lacks it, and take it out of the scans."""
     parts = [block.pop(name, None) for block in blocks]
-    dtype = np.result_type(*(np.uint8 if part is None else part for part in parts))
+    dtype = np.result_type(*(np.uint8 if column is None else column for column in parts))
     joined = np.zeros(sum(counts), dtype)
-    for part, rows in zip(parts, _rows_of_scans(counts), strict=True):
-        if part is not None:
-            joined[rows] = part
+    for column, rows in zip(parts, _rows_of_scans(counts), strict=True):
+        if column is not None:
+            joined[rows] = column
     return joined
 
 
@@ -156,8 +156,8 @@ def _fronts(scans: Sequence[ScanPose], counts: Sequence[int], cloud: Cloud) -> F
     if not any(scan.is_moved for scan in scans) or not cloud.finite.any():
         return None, ()
     places = np.array([scan.translation for scan in scans])
-    kept = cloud.coordinates[cloud.finite]
-    inside = ((kept.min(axis=0) <= places) & (places <= kept.max(axis=0))).all(axis=1)
+    finite = cloud.coordinates[cloud.finite]
+    inside = ((finite.min(axis=0) <= places) & (places <= finite.max(axis=0))).all(axis=1)
     notes: tuple[str, ...] = ()
     if not inside.all():
         notes = (

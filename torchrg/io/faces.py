@@ -47,13 +47,13 @@ def find_fronts(
     """
     places, count = coordinates.astype(np.float64, copy=False), len(coordinates)
     sums, areas = np.zeros((3, count)), np.zeros(count)
-    for part in (block.astype(np.int64) for block in faces):
-        if part.size and not 0 <= part.min() <= part.max() < count:
-            wrong = part.min() if part.min() < 0 else part.max()
+    for corners in (block.astype(np.int64) for block in faces):
+        if corners.size and not 0 <= corners.min() <= corners.max() < count:
+            wrong = corners.min() if corners.min() < 0 else corners.max()
             raise FormatError(f"expected faces of {count:,} vertices, got vertex {wrong:,}")
-        at_once = max(_CORNERS_AT_ONCE // max(part.shape[1], 1), 1)
-        for start in range(0, len(part) if part.shape[1] > 2 else 0, at_once):
-            block = part[start : start + at_once]
+        at_once = max(_CORNERS_AT_ONCE // max(corners.shape[1], 1), 1)
+        for start in range(0, len(corners) if corners.shape[1] > 2 else 0, at_once):
+            block = corners[start : start + at_once]
             block = block[finite[block].all(axis=1)]
             normals = _vector_areas(places, block)
             sizes = np.linalg.norm(normals, axis=1)

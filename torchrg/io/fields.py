@@ -82,14 +82,16 @@ def assemble_cloud(
 
     ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, where these are no columns.
     """
-    rest = dict(columns)
+    remaining = dict(columns)
     if coordinates is None:
-        exact = all(axis in rest for axis in "xyz")
+        exact = all(axis in remaining for axis in "xyz")
         names = [axis if exact else axis.upper() for axis in "xyz"]
-        if not all(name in rest for name in names):
-            found = ", ".join(map(ascii, rest)) or "none"
-            raise FormatError(f"{path}: expected fields x, y, z, got {found}; rename or add them.")
-        axes = [rest.pop(name) for name in names]
+        if not all(name in remaining for name in names):
+            present = ", ".join(map(ascii, remaining)) or "none"
+            raise FormatError(
+                f"{path}: expected fields x, y, z, got {present}; rename or add them."
+            )
+        axes = [remaining.pop(name) for name in names]
         if any(axis.ndim != 1 for axis in axes):
             shapes = ", ".join(map(_row_shape, axes))
             raise FormatError(
@@ -98,11 +100,11 @@ def assemble_cloud(
             )
         places = _stacked(path, axes)
     else:
-        places = rest.pop(coordinates)
+        places = remaining.pop(coordinates)
     points = checked_coordinates(path, places)
     fields = {
-        name: _stacked(path, [rest[part] for part in parts])
-        for name, parts in _sources_of(rest).items()
+        name: _stacked(path, [remaining[column] for column in parts])
+        for name, parts in _sources_of(remaining).items()
     }
     for name, check in (("labels", _labels), ("normals", _normals), ("color", _color)):
         if name in fields:
@@ -178,19 +180,19 @@ def put_results(fields: Mapping[str, Values], results: Mapping[str, Values]) -> 
         >>> {name: values.tolist() for name, values in again.items()}
         {'label_input': [7], 'labels': [1]}
     """
-    kept = {name: values for name, values in fields.items() if name not in results}
+    others = {name: values for name, values in fields.items() if name not in results}
     aside = {name_aside(name): fields[name] for name in results if name in fields}
-    return {**aside, **kept, **results}
+    return {**aside, **others, **results}
 
 
 def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[str]:
     """Return what to tell people of fields that :func:`put_results` renames or leaves out."""
     shown = {name: "label" if name == "labels" else name for name in results if name in fields}
-    kept = [name for name in shown if name_aside(name) not in fields]
-    lost = [name for name in shown if name not in kept]
+    moved = [name for name in shown if name_aside(name) not in fields]
+    lost = [name for name in shown if name not in moved]
     notes = []
-    if kept:
-        names = ", ".join(f"{shown[name]} as {name_aside(name)}" for name in kept)
+    if moved:
+        names = ", ".join(f"{shown[name]} as {name_aside(name)}" for name in moved)
         notes.append(f"its own fields are kept beside the result's: {names}")
     if lost:
         names, stay = ", ".join(shown[name] for name in lost), ", ".join(map(name_aside, lost))
@@ -275,18 +277,18 @@ def _sources_of(columns: Columns) -> dict[str, list[str]]:
     Triples and numbered columns are joined, the others renamed. Shapes and types decide, no values.
     """
     plain = {_plain(name): name for name in columns if columns[name].ndim == 1}
-    rest, fields = dict(columns), dict[str, list[str]]()
+    remaining, fields = dict(columns), dict[str, list[str]]()
     for parts, target in _TRIPLES.items():
-        if target not in fields and all(part in plain for part in parts):
-            fields[target] = [plain[part] for part in parts]
-            for part in fields[target]:
-                del rest[part]
-    for name, members in _numbered(rest).items():
-        if name not in fields and name not in rest:
+        if target not in fields and all(column in plain for column in parts):
+            fields[target] = [plain[column] for column in parts]
+            for column in fields[target]:
+                del remaining[column]
+    for name, members in _numbered(remaining).items():
+        if name not in fields and name not in remaining:
             fields[name] = members
             for member in members:
-                del rest[member]
-    for name, values in rest.items():
+                del remaining[member]
+    for name, values in remaining.items():
         fields[_free_name(name, values, fields)] = [name]
     return fields
 
@@ -315,11 +317,11 @@ def _numbered(columns: Columns) -> dict[str, list[str]]:
         if match and values.ndim == 1:
             numbers.setdefault(match[1], {})[int(match[2])] = name
     return {
-        name: [found[i] for i in range(len(found))]
-        for name, found in numbers.items()
-        if len(found) > 1
-        and max(found) == len(found) - 1
-        and len({columns[member].dtype for member in found.values()}) == 1
+        name: [by_number[i] for i in range(len(by_number))]
+        for name, by_number in numbers.items()
+        if len(by_number) > 1
+        and max(by_number) == len(by_number) - 1
+        and len({columns[member].dtype for member in by_number.values()}) == 1
     }
 
 

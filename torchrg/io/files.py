@@ -31,7 +31,7 @@ DAMAGES = (
     tokenize.TokenError,
     struct.error,
 )
-"""Errors that libraries raise of damaged files beside their own, found by flipping bytes."""
+"""Errors that libraries raise of damaged files beside their own, as where bytes are flipped."""
 ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
 """Errors that reading a damaged archive raises."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)

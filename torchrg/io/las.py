@@ -86,7 +86,7 @@ def read_las(path: Path, size: int) -> Cloud:
         records[:] = [r for r in records if r.user_id not in _PACKING]
     standard = set(header.point_format.standard_dimension_names)
     names = list(parts[0])
-    unused = {n for n in names if n in standard and not any(part[n].any() for part in parts)}
+    unused = {n for n in names if n in standard and not any(chunk[n].any() for chunk in parts)}
     if not unused.issuperset(_SPELLING.color):
         unused.difference_update(_SPELLING.color)
     extra = header.point_format.extra_dimensions
@@ -94,7 +94,7 @@ def read_las(path: Path, size: int) -> Cloud:
     columns = {
         # Taken out of the parts, so that a column is not there twice for long.
         name.removesuffix(_UNFIT) if name in ours else name: np.concatenate(
-            [part.pop(name) for part in parts]
+            [chunk.pop(name) for chunk in parts]
         )
         for name in names
         if name not in unused
@@ -204,13 +204,13 @@ def _add_dimensions(
     values exactly. A column that the standard dimension of its name cannot hold gets one more.
     """
     dimensions, params = dict[str, Values](), list[Any]()
-    for own in _own_dimensions(cloud.header.get("las"), columns):
-        if own.holds(columns):
-            known = own.dimension
-            more = (known.description, known.offsets, known.scales, known.no_data)
-            params.append(laspy.ExtraBytesParams(known.name, known.dtype, *more))
-            dimensions[known.name] = own.join(columns)
-            columns = {name: c for name, c in columns.items() if name not in own.columns}
+    for extra in _own_dimensions(cloud.header.get("las"), columns):
+        if extra.holds(columns):
+            dimension = extra.dimension
+            more = (dimension.description, dimension.offsets, dimension.scales, dimension.no_data)
+            params.append(laspy.ExtraBytesParams(dimension.name, dimension.dtype, *more))
+            dimensions[dimension.name] = extra.join(columns)
+            columns = {name: c for name, c in columns.items() if name not in extra.columns}
     standard = set(header.point_format.dimension_names)
     for name, column in columns.items():
         if name in ("x", "y", "z"):
@@ -269,18 +269,18 @@ def _own_dimensions(header: Any, columns: Columns) -> list[_Own]:  # noqa: ANN40
 
     A field that was put aside for a result takes its dimension along, under its new name.
     """
-    own = list[_Own]()
+    extras = list[_Own]()
     dimensions = [] if header is None else [*header.point_format.extra_dimensions]
     names = {dimension.name for dimension in dimensions}
     for dimension in dimensions:
         parts = list[str]()
-        for part in _parts_of(dimension):
-            aside = _ASIDE.get(part, f"{part}_input")
-            parts.append(aside if aside in columns and aside not in names else part)
-        if all(part in columns for part in parts):
+        for column in _parts_of(dimension):
+            aside = _ASIDE.get(column, f"{column}_input")
+            parts.append(aside if aside in columns and aside not in names else column)
+        if all(column in columns for column in parts):
             name = parts[0] if len(parts) == 1 else dimension.name
-            own.append(_Own(dimension._replace(name=name), tuple(parts)))
-    return own
+            extras.append(_Own(dimension._replace(name=name), tuple(parts)))
+    return extras
 
 
 def _parts_of(dimension: Any) -> list[str]:  # noqa: ANN401

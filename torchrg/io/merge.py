@@ -88,11 +88,11 @@ def _kind(name: str, cloud: Cloud) -> object:
 def _note_sizes(clouds: Sequence[Cloud]) -> list[str]:
     """Say which clouds differ so much in size that their units may, too."""
     finite = [(cloud.source, cloud.coordinates[cloud.finite]) for cloud in clouds]
-    sizes = [(float(np.ptp(kept, axis=0).max()), name) for name, kept in finite if len(kept)]
-    known = [size for size in sizes if size[0] > 0]
-    if not known:
+    sizes = [(float(np.ptp(values, axis=0).max()), name) for name, values in finite if len(values)]
+    positive = [size for size in sizes if size[0] > 0]
+    if not positive:
         return []
-    (small, smallest), (large, largest) = min(known), max(known)
+    (small, smallest), (large, largest) = min(positive), max(positive)
     if large < _SUSPICIOUS_RATIO * small:
         return []
     return [

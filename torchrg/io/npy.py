@@ -45,7 +45,7 @@ _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
 _COORDINATES = ("points", "coord")
 POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
-"""What a segmentation says of each point."""
+"""Arrays of a segmentation that have a row for each point."""
 KEPT_FIELDS = ("color",)
 """Fields of a cloud that are kept beside its result, as pages and pictures show them."""
 _NOT_PER_POINT = {

@@ -196,23 +196,23 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
             case ["element", name, count] if (
                 count.isascii() and count.isdecimal() and len(count) < 19
             ):
-                known = [element.name for element in elements]
+                names = [element.name for element in elements]
                 elements.append(_Element(name, int(count), []))
             case ["property", "list", length, code, name] if (
                 elements and code in _READ_TYPES and _READ_TYPES.get(length, "f")[0] != "f"
             ):
-                known = [prop.name for prop in elements[-1].properties]
+                names = [prop.name for prop in elements[-1].properties]
                 new = _Property(name, _READ_TYPES[code], _READ_TYPES[length])
                 elements[-1].properties.append(new)
             case ["property", code, name] if elements and code in _READ_TYPES:
-                known = [prop.name for prop in elements[-1].properties]
+                names = [prop.name for prop in elements[-1].properties]
                 elements[-1].properties.append(_Property(name, _READ_TYPES[code]))
             case _:
                 raise FormatError(
                     f"{path}: line {number}: expected a line of a PLY header, got {_shown(raw)}; "
                     "write the file again."
                 )
-        if name in known:
+        if name in names:
             raise FormatError(
                 f"{path}: line {number}: expected names that differ, got {name!r} twice; "
                 "rename one."

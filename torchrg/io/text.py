@@ -33,8 +33,8 @@ _COUNTED_BYTES = 1 << 16
 """How much of a file is read to tell how long its lines are."""
 _COMMENTS = ("#", "//")
 _COLMAP = "POINT3D_ID, X, Y, Z"
-"""What COLMAP says in a comment above its points, which are followed by the images that see them,
-in ``points3D.txt``."""
+"""Comment of COLMAP above its points, which are followed by the images that see them, in
+``points3D.txt``."""
 _MOST_DIGITS = 18
 """Most digits of a number of points; no file has room for more points."""
 
@@ -266,7 +266,7 @@ class _Opening(NamedTuple):
         return [i for i, name in enumerate(self.names or ()) if name == LEFT_OUT]
 
 
-def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None) -> _Opening:
+def _read_opening(path: Path, lines: Iterable[str], columns: Sequence[str] | None) -> _Opening:
     """Read up to the first line of numbers."""
     header, counts = "", list[int]()
     for number, line in enumerate(lines, start=1):
@@ -295,7 +295,7 @@ def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None)
                     "second count, as in PTX files; export PTS, E57 or PLY."
                 )
         elif not any(are_numbers) and not header:
-            if not _name_lists(bare) and given is None:
+            if not _name_lists(bare) and columns is None:
                 raise FormatError(
                     f"{path}: line {number}: expected numbers or names of columns with x, y and z, "
                     f"got {text[:60]!r}; name the columns there or with --columns, or mark the "
@@ -308,9 +308,9 @@ def _read_opening(path: Path, lines: Iterable[str], given: Sequence[str] | None)
                 "repair or delete this line."
             )
         else:
-            if given is not None:
-                check_names(path, given, len(words))
-                names: list[str] | None = list(given)
+            if columns is not None:
+                check_names(path, columns, len(words))
+                names: list[str] | None = list(columns)
             else:
                 names = _names_of(path, header, words, number) if header else None
             return _Opening(names, form, len(words), max(counts, default=0), line, number)
@@ -330,7 +330,7 @@ def _name_lists(text: str) -> list[list[str]]:
 
     Names may be in quotes and then hold what is between the others.
     """
-    found = []
+    rows = []
     for mark in ";,\t ":
         try:
             (row,) = csv.reader([text.replace("\t", " ") if mark == " " else text], delimiter=mark)
@@ -338,8 +338,8 @@ def _name_lists(text: str) -> list[list[str]]:
             return []
         words = [word.strip().strip("\"'") for word in row if mark != " " or word]
         if {"x", "y", "z"} <= {word.lower() for word in words} and len(set(words)) == len(words):
-            found.append(words)
-    return found
+            rows.append(words)
+    return rows
 
 
 def _names_of(path: Path, header: str, words: Sequence[str], number: int) -> list[str]:

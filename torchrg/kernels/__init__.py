@@ -64,7 +64,7 @@ SIGNATURES = {
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",
     "count_lines": "d[3nL] b[nL] l[nL] d[M3] d[M3] d[M] l[p2] x -> l[p] l[M] l[M]",
 }
-"""What each kernel takes and returns.
+"""Arguments and results of each kernel.
 
 A letter for the dtype (f and d float32 and float64, i and l int32 and int64, b bool, x and n a
 number with and without a fraction) and one for each axis, equal letters for equal lengths; a
@@ -79,7 +79,7 @@ _DTYPES = {
     "l": torch.int64,
     "b": torch.bool,
 }
-"""Of a tensor, by its letter in a signature."""
+"""Types of the elements of a tensor, by their letters in a signature."""
 
 
 def name_of_library() -> str | None:
@@ -96,16 +96,16 @@ def serve(*tensors: Tensor | None, k: int = 1) -> bool:
         >>> serve(torch.zeros(3, dtype=torch.float64))
         False
     """
-    given = [tensor for tensor in tensors if tensor is not None]
+    present = [tensor for tensor in tensors if tensor is not None]
     return (
         _library() is not None
         and 0 < k <= MOST_NEIGHBORS
-        and has_values(*given)
+        and has_values(*present)
         and all(
             tensor.device.type == "cpu"
             and not tensor.requires_grad
             and tensor.dtype in (torch.float32, torch.int32, torch.bool)
-            for tensor in given
+            for tensor in present
         )
     )
 

@@ -124,7 +124,7 @@ class Segments:
                 for end, count in zip(ends, self.counts.tolist(), strict=True)
             ]
             self.rows = self.rows[torch.cat(parts)] if parts else self.rows
-            sizes = [len(part) for part in parts]
+            sizes = [len(block) for block in parts]
             self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
         self.labels = torch.repeat_interleave(self.counts)
 

@@ -74,8 +74,8 @@ class PlaneMetric(Metric):
 
     def __init__(self, index: str, **settings: Any) -> None:  # noqa: ANN401
         part, name = _find_index(index)
-        known = inspect.signature(_SCORES[part]).parameters
-        super().__init__(**{key: settings.pop(key) for key in settings.keys() - known.keys()})
+        parameters = inspect.signature(_SCORES[part]).parameters
+        super().__init__(**{key: settings.pop(key) for key in settings.keys() - parameters.keys()})
         self.part, self.index, self.settings = part, name, settings
         zeros = torch.zeros(len(METRICS[self.part]), dtype=torch.float64)
         self.add_state("total", zeros, dist_reduce_fx="sum")
@@ -100,10 +100,10 @@ class PlaneMetric(Metric):
         """
         score = _SCORES[self.part](*tensors, **named, **self.settings)._asdict()
         values = (math.nan if score[name] is None else score[name] for name in METRICS[self.part])
-        known = torch.tensor([*map(float, values)], dtype=torch.float64, device=self.total.device)
+        indices = torch.tensor([*map(float, values)], dtype=torch.float64, device=self.total.device)
         # An index that the scan does not define is nan, and left out.
-        self.total += known.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
-        self.scans += ~known.isnan()
+        self.total += indices.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
+        self.scans += ~indices.isnan()
 
     def compute(self) -> Tensor | dict[str, Tensor]:
         """Return the mean over the scans, nan where no scan defines it; scalar float64 tensors."""

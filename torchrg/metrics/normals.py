@@ -109,12 +109,12 @@ def score_normals(
 
 def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return errors in degrees, which points have both normals, and which a true one, ``(N,)``."""
-    found = []
+    blocks = []
     for estimates, truths in zip(
         torch.split(normals, _CHUNK), torch.split(truth, _CHUNK), strict=True
     ):
         estimated, has_estimate = unit_vectors(estimates)
         true, has_truth = unit_vectors(truths)
-        found.append((unsigned_angle_deg(estimated, true), has_estimate & has_truth, has_truth))
-    errors, scored, has_truth = (torch.cat(parts) for parts in zip(*found, strict=True))
+        blocks.append((unsigned_angle_deg(estimated, true), has_estimate & has_truth, has_truth))
+    errors, scored, has_truth = (torch.cat(parts) for parts in zip(*blocks, strict=True))
     return errors, scored, has_truth

@@ -126,7 +126,7 @@ def keep_within(neighbors: Neighbors, groups: Tensor, chunk_size: int) -> Neighb
         valid[rows] = same.numpy(force=True)
 
     map_chunks(work, shape[0], chunk_size, device)
-    return Neighbors(*(torch.from_numpy(part).to(device) for part in (indices, valid)))
+    return Neighbors(*(torch.from_numpy(column).to(device) for column in (indices, valid)))
 
 
 @sequential_operations()

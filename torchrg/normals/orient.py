@@ -133,10 +133,10 @@ def orient_normals(
         tensor([0., 0., 1.])
     """
     cloud = as_tensor("orient_normals", "points", points).detach()
-    given = as_tensor("orient_normals", "normals", normals)
-    check_shapes("orient_normals", points=(cloud, "N 3"), normals=(given, "N 3"))
+    vectors = as_tensor("orient_normals", "normals", normals)
+    check_shapes("orient_normals", points=(cloud, "N 3"), normals=(vectors, "N 3"))
     check_floating("orient_normals", points=cloud)
-    check_floating("orient_normals", normals=given)
+    check_floating("orient_normals", normals=vectors)
     if towards not in get_args(Orientation):
         names = ", ".join(get_args(Orientation))
         raise ConfigError(
@@ -150,16 +150,16 @@ def orient_normals(
         place = as_tensor("orient_normals", "viewpoint", viewpoint).to(cloud)
         pattern = "3" if place.ndim == 1 else "N 3"
         check_shapes("orient_normals", points=(cloud, "N 3"), viewpoint=(place, pattern))
-        return turn_towards(given, (place - cloud).to(given.dtype))
+        return turn_towards(vectors, (place - cloud).to(vectors.dtype))
     if towards not in ("consistent", "interior"):
-        axis = torch.zeros(3, dtype=given.dtype, device=given.device)
+        axis = torch.zeros(3, dtype=vectors.dtype, device=vectors.device)
         axis["xyz".index(towards[1])] = 1.0 if towards[0] == "+" else -1.0
-        return turn_towards(given, axis)
-    upright = _upright(given)
+        return turn_towards(vectors, axis)
+    upright = _upright(vectors)
     turn = _turn_outwards if towards == "consistent" else _turn_inside
     if neighbors is not None:
         signs = turn(cloud, upright.detach().to(cloud.dtype), neighbors)
-        return upright * signs[:, None].to(given.dtype)
+        return upright * signs[:, None].to(vectors.dtype)
     rows = finite_rows(cloud)
     rows = rows[(upright[rows] != 0).any(dim=-1)]
     if len(rows) == 0:
@@ -169,11 +169,11 @@ def orient_normals(
     places, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
     near = search_knn(places, min(NUM_NEIGHBORS, len(places)), canonical=True)
     oriented = units * turn(places, units, near)[:, None]
-    turned = upright.index_copy(0, spreading, oriented.to(given.dtype))
+    turned = upright.index_copy(0, spreading, oriented.to(vectors.dtype))
     if len(following) == 0:
         return turned
     signs = _follow(cloud, upright, following, places, oriented)
-    return turned.index_copy(0, following, upright[following] * signs[:, None].to(given.dtype))
+    return turned.index_copy(0, following, upright[following] * signs[:, None].to(vectors.dtype))
 
 
 def _evenly_spread(num_points: int) -> Tensor:
@@ -352,7 +352,9 @@ def propagate_signs(
     parents = parents[:num_points].copy()
     parents[first] = first
     signs = _signs_to_root(points, normals, torch.from_numpy(parents).long().to(points.device))
-    patches, faces = (torch.from_numpy(part).long().to(points.device) for part in (patches, faces))
+    patches, faces = (
+        torch.from_numpy(numbers).long().to(points.device) for numbers in (patches, faces)
+    )
     return signs, patches, faces
 
 
@@ -368,11 +370,11 @@ class _Links(NamedTuple):
 def _find_links(points: Tensor, normals: Tensor, neighbors: Neighbors) -> _Links:
     """Return the links between each point and its nearest neighbours."""
     indices = neighbors.indices[:, 1 : 1 + _NUM_LINKS].long()
-    own = torch.arange(len(points), device=points.device)[:, None].expand_as(indices)
-    linked = indices != own
+    rows = torch.arange(len(points), device=points.device)[:, None].expand_as(indices)
+    linked = indices != rows
     if neighbors.valid is not None:
         linked &= neighbors.valid[:, 1 : 1 + _NUM_LINKS]
-    here, there = own[linked], indices[linked]
+    here, there = rows[linked], indices[linked]
     keys = torch.minimum(here, there) * len(points) + torch.maximum(here, there)
     keys = torch.unique(keys)
     low, high = keys // len(points), keys % len(points)
@@ -391,10 +393,10 @@ def _agreement(links: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def _signs_to_root(points: Tensor, normals: Tensor, parents: Tensor) -> Tensor:
     """Multiply signs along the way to each root, doubling the stride of the way each time."""
-    own = torch.arange(len(points), device=points.device)
+    rows = torch.arange(len(points), device=points.device)
     cosine, _ = _agreement(points[parents] - points, normals, normals[parents])
     signs = torch.where(cosine < 0, -1.0, 1.0).to(normals.dtype)
-    signs[parents == own] = 1.0
+    signs[parents == rows] = 1.0
     while True:
         further = parents[parents]
         signs = signs * signs[parents]
@@ -460,7 +462,7 @@ def _near_obstacles(points: Tensor, normals: Tensor, neighbors: Neighbors) -> tu
         return ahead, behind
 
     parts = map_chunks(measure, len(points), CHUNK_SIZE, points.device)
-    front, back = (torch.cat(part) for part in zip(*parts, strict=True))
+    front, back = (torch.cat(ends) for ends in zip(*parts, strict=True))
     return front, back
 
 

@@ -47,7 +47,7 @@ region, as the panel that a moulding runs around. Smaller ones belong to the ben
 
 _OPEN_SHARE = 0.1
 """A surface goes on between two cores if at least this share of the edges between them passes the
-criteria; across a bridge a few in a hundred do."""
+criteria; across a bridge few do."""
 
 _LEAST_MISFIT = 2.0
 """Two cores lie on one plane if their misfit to it is below this many thicknesses, as it is for

@@ -130,7 +130,7 @@ def mark_edges(
             _write_bits(seeds[rows], _become_seeds(cloud, config, rows, limit, connected))
 
     map_chunks(mark, num_points, chunk_size, cloud.points.device)
-    bits, of_seeds = (torch.from_numpy(part.view(np.int64)) for part in (joins, seeds))
+    bits, of_seeds = (torch.from_numpy(marks.view(np.int64)) for marks in (joins, seeds))
     return bits, None if free else of_seeds
 
 
@@ -164,16 +164,16 @@ def find_edges(
         return [_pick(targets, joins & seeds), _pick(coded, joins & ~seeds)]
 
     block = slice(0, len(cloud.points)) if block is None else block
-    edges, rest = _pack(find, cloud, block, more, chunk_size)
-    targets, counts = zip(*rest, strict=True)
+    edges, others = _pack(find, cloud, block, more, chunk_size)
+    targets, counts = zip(*others, strict=True)
     return edges, EdgeLists(np.concatenate([[0], *counts]).cumsum(), np.concatenate(targets))
 
 
 def join_edges(parts: Sequence[EdgeLists]) -> EdgeLists:
     """Return the edges of successive blocks of points as those of all of them."""
-    counts = np.concatenate([np.diff(part.starts) for part in parts])
+    counts = np.concatenate([np.diff(edges.starts) for edges in parts])
     starts = np.concatenate([[0], counts]).cumsum()
-    return EdgeLists(starts, np.concatenate([part.targets for part in parts]))
+    return EdgeLists(starts, np.concatenate([edges.targets for edges in parts]))
 
 
 def _become_seeds(
@@ -216,9 +216,9 @@ def accept_edges(
     the two are connected, only known where it joins, None without ``connect``, which tells it of
     the edges that it is asked for.
     """
-    own = rows
-    if isinstance(own, slice):
-        own = torch.arange(own.start, own.stop, device=cloud.points.device)
+    ids = rows
+    if isinstance(ids, slice):
+        ids = torch.arange(ids.start, ids.stop, device=cloud.points.device)
     near, signed = cloud.neighbors.at(rows), cloud.signed_normals
     max_angle_deg = cloud.angle_share * config.max_angle_deg
     angle = distance = None
@@ -230,19 +230,19 @@ def accept_edges(
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
         numbers = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
         (joins,) = kernels.call(
-            "pass_edges", *columns, cloud.valid, cloud.reach, *near, own.long(), *numbers, signed
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids.long(), *numbers, signed
         )
     else:
-        joins = are_valid(near, own, cloud.valid)
+        joins = are_valid(near, ids, cloud.valid)
         if angle is not None:
-            joins &= within_angle(near, own, columns[1], angle, signed=signed)
+            joins &= within_angle(near, ids, columns[1], angle, signed=signed)
         if distance is not None:
-            joins &= within_distance(near, own, columns[0], distance)
+            joins &= within_distance(near, ids, columns[0], distance)
         if cloud.reach is not None:
-            joins &= on_planes(near, own, *columns, cloud.reach)
+            joins &= on_planes(near, ids, *columns, cloud.reach)
     if cloud.colors is not None:
         limit = cloud.points.new_tensor(cloud.max_color_distance**2)
-        joins &= within_distance(near, own, cloud.colors.T, limit)
+        joins &= within_distance(near, ids, cloud.colors.T, limit)
     connected: Tensor | None = None
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
@@ -304,7 +304,7 @@ def _pack(
     # As long as it can get: memory that is not used is not touched.
     size = num_points * cloud.neighbors.indices.shape[1] + spare
     targets = scratch.empty((size,), np.int32)
-    counts, rest, used = [], [], 0
+    counts, remainder, used = [], [], 0
 
     def append(edges: _Edges) -> None:
         nonlocal used
@@ -315,11 +315,11 @@ def _pack(
     for first in range(0, len(chunks), at_once):
         for edges, *others in map_tasks(find, chunks[first : first + at_once], cloud.points.device):
             append(edges)
-            rest += others
+            remainder += others
     if more is not None:
         append(_Edges(more.targets, np.diff(more.starts)))
     dtype = np.int32 if len(targets) < 2**31 else np.int64
-    return EdgeLists(np.concatenate([[0], *counts]).cumsum(dtype=dtype), targets[:used]), rest
+    return EdgeLists(np.concatenate([[0], *counts]).cumsum(dtype=dtype), targets[:used]), remainder
 
 
 def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
@@ -333,9 +333,9 @@ def within_angle(
     near: Neighbors, rows: Tensor, normals: Tensor, max_sq_chord: Tensor | float, *, signed: bool
 ) -> Tensor:
     """Tell which neighbours' normals ``(3, N)`` are within an angle of the point's, eq. (8)."""
-    own = [column[rows][:, None] for column in normals.unbind()]
+    ours = [column[rows][:, None] for column in normals.unbind()]
     theirs = [near.of(column) for column in normals.unbind()]
-    return sq_chords(own, theirs, signed=signed) <= max_sq_chord
+    return sq_chords(ours, theirs, signed=signed) <= max_sq_chord
 
 
 def within_distance(
@@ -353,12 +353,12 @@ def on_planes(
     near: Neighbors, rows: Tensor, points: Tensor, normals: Tensor, reach: Tensor
 ) -> Tensor:
     """Tell which neighbours are within reach ``(N,)`` of the point's plane, and it of theirs."""
-    own = theirs = points.new_zeros(())
+    ours = theirs = points.new_zeros(())
     for place, normal in zip(points.unbind(), normals.unbind(), strict=True):
         away = near.of(place) - place[rows][:, None]
-        own = (away * normal[rows][:, None]).add_(own)
+        ours = (away * normal[rows][:, None]).add_(ours)
         theirs = away.mul_(near.of(normal)).add_(theirs)
-    on_own = own.abs_() <= reach[rows][:, None]
+    on_own = ours.abs_() <= reach[rows][:, None]
     return on_own & (theirs.abs_() <= near.of(reach))
 
 

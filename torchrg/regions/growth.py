@@ -267,18 +267,18 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
         return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
     sizes = np.bincount(old[old >= 0], minlength=len(old))
-    kept = np.flatnonzero(sizes >= max(min_size, 1))
-    sizes = sizes[kept]
+    large = np.flatnonzero(sizes >= max(min_size, 1))
+    sizes = sizes[large]
     # The last entry is what -1 finds.
     numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
-    numbers[kept] = np.arange(len(kept))
+    numbers[large] = np.arange(len(large))
     numbered = numbers[old]
-    firsts = np.full(len(kept) + 1, len(old))
+    firsts = np.full(len(large) + 1, len(old))
     for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
         firsts[numbered[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
     order = np.lexsort((firsts[:-1], -sizes))
-    ranks = np.full(len(kept) + 1, UNLABELED, dtype=np.int64)
-    ranks[order] = np.arange(len(kept))
+    ranks = np.full(len(large) + 1, UNLABELED, dtype=np.int64)
+    ranks[order] = np.arange(len(large))
     return torch.from_numpy(ranks[numbered]).to(regions.device)
 
 
@@ -345,13 +345,13 @@ def reach_from_seeds(
         chain = chain_of(seeds, num_points)
         edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, more=chain)
         return first_to_reach(edges, num_points), others
-    parts, rest = [], []
+    parts, more = [], []
     for block in chunks_of(num_points, blocks.BLOCK_SIZE):
         edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, block=block)
         parts.append(condense(edges, block))
-        rest.append(others)
+        more.append(others)
     return_freed_memory()
-    return join_condensed(parts, seeds), join_edges(rest)
+    return join_condensed(parts, seeds), join_edges(more)
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
@@ -416,8 +416,8 @@ def grow_first_in_first_out(
                         seeds.append(target)
         if claims is not None and neighbors is not None:
             for first in range(0, len(seeds), _CLAIMING_SEEDS):
-                some = np.frombuffer(seeds[first : first + _CLAIMING_SEEDS], dtype=np.int32)
-                claimed = neighbors[some][claims[some]]
+                chunk = np.frombuffer(seeds[first : first + _CLAIMING_SEEDS], dtype=np.int32)
+                claimed = neighbors[chunk][claims[chunk]]
                 claimed = claimed[free_view[claimed]]
                 free_view[claimed] = False
                 roots_view[claimed] = root
@@ -427,8 +427,8 @@ def grow_first_in_first_out(
 def _still_free(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
     """Give the points that are free when their chunk begins: a list of all takes 36 bytes each."""
     for rows in chunks_of(len(order), ROWS_AT_ONCE):
-        some = order[rows]
-        yield from some[free[some]].tolist()
+        chunk = order[rows]
+        yield from chunk[free[chunk]].tolist()
 
 
 def _edges_of(edges: EdgeLists, rows: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -73,15 +73,15 @@ def condense(edges: EdgeLists, block: slice) -> Condensed:
 
 def join_condensed(parts: list[Condensed], seeds: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return for each point of all blocks the first of the seeds that reaches it, -1 for none."""
-    counts = [int(part.components.max(initial=-1)) + 1 for part in parts]
+    counts = [int(block.components.max(initial=-1)) + 1 for block in parts]
     offsets = np.cumsum([0, *counts])
     node_of = np.concatenate(
-        [part.components + np.int32(start) for part, start in zip(parts, offsets, strict=False)]
+        [block.components + np.int32(start) for block, start in zip(parts, offsets, strict=False)]
     )
     sources = np.concatenate(
-        [part.sources + np.int32(start) for part, start in zip(parts, offsets, strict=False)]
+        [block.sources + np.int32(start) for block, start in zip(parts, offsets, strict=False)]
     )
-    targets = node_of[np.concatenate([part.targets for part in parts])]
+    targets = node_of[np.concatenate([block.targets for block in parts])]
     first_seeds, places = np.unique(node_of[seeds], return_index=True)
     by_seed = np.argsort(places)
     nodes, places = first_seeds[by_seed], places[by_seed]

@@ -22,8 +22,8 @@ from torchrg.structures import UNLABELED, Neighbors
 
 _AGREE = 0.3
 """Share of the largest angle. Regions too small before absorption whose normals are off by less,
-root mean square, are faces: of a small one half is border. Without this a cluttered office has 490
-regions instead of 306."""
+root mean square, are faces: of a small one half is border. Others would
+make many regions of clutter."""
 
 _MAX_PASSES = 10
 """Passes over the borders at most. Points that moved lead to the next: narrow strips fill from

@@ -62,11 +62,11 @@ _LEAST_WIDTH_SHARE = 0.2
 """A wall is at least this wide, as a share of the cloud's height."""
 
 _TOP_SHARE = 0.1
-"""A wall reaches into the top tenth of the cloud; a tall window ended 14 % below the top."""
+"""A wall reaches into this share of the cloud at its top; a tall window ends below."""
 
 _WALL_AREA_SHARE = 0.25
-"""A wall that ends below has at least this share of the largest vertical plane's area;
-doors and sides of cabinets have up to a sixth."""
+"""A wall that ends below has at least this share of the largest vertical plane's area,
+which is more than doors and sides of cabinets have."""
 
 _MOST_BEND = 0.02
 """A region whose points are off its plane by at most this share of its short side is flat enough to

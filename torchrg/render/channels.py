@@ -38,7 +38,7 @@ OUTCOMES = {
     "other": ((205, 45, 60), "in the region of another face"),
     "none": ((50, 95, 190), "in no region"),
 }
-"""What can become of a point: colour, and what it means."""
+"""Fates of a point against the truth: colour, and what it means."""
 
 _OCTAHEDRON_STEPS = 254
 """Steps along the sides of the square onto which directions are mapped: about one degree. An even
@@ -190,9 +190,9 @@ def outcomes_of(
     outcome = torch.full_like(regions, 3)
     labeled = regions != UNLABELED
     places = torch.searchsorted(table.region_labels, regions[labeled])
-    own = faces[labeled]
+    face = faces[labeled]
     outcome[labeled] = torch.where(
-        partner[places] == own, 0, torch.where(main[places] == own, 1, 2)
+        partner[places] == face, 0, torch.where(main[places] == face, 1, 2)
     )
     return outcome
 

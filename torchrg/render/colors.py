@@ -68,7 +68,7 @@ _WITHOUT_CONE = 0.5
 """Weight of what the colour-blind see. With less, planes side by side look alike to them; with
 more, to all others."""
 _AXES_WITHOUT_CONE = ((0.0, 1.0), (1.07, 0.56))
-"""What is left of the axes a and b of CIE Lab to eyes without one kind of cones: blue against
+"""Directions in the axes a and b of CIE Lab that eyes without one kind of cones see: blue against
 yellow without the long or the middle ones, red against cyan without the short ones. Fitted to the
 palette seen by the model of Machado et al., A physiologically-based model for simulation of color
 vision deficiency, 2009."""

@@ -85,10 +85,12 @@ def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
     start[int(third.abs().argmin())] = 1
     first = functional.normalize(start - (start @ third) * third, dim=0)
     rotation = torch.stack([first, torch.linalg.cross(third, first), third])
-    kept = cloud.coordinates[cloud.finite]
-    if len(kept) == 0:
+    finite = cloud.coordinates[cloud.finite]
+    if len(finite) == 0:
         return Frame(torch.zeros(3, dtype=torch.float64), rotation, 1.0)
-    low, high = (torch.from_numpy(end(axis=0).astype(np.float64)) for end in (kept.min, kept.max))
+    low, high = (
+        torch.from_numpy(end(axis=0).astype(np.float64)) for end in (finite.min, finite.max)
+    )
     extent = float((high - low).amax())
     return Frame(low + (high - low) / 2, rotation, extent / PAGE_EXTENT if extent > 0 else 1.0)
 
@@ -98,8 +100,8 @@ def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
     cloud = result.cloud
     finite = finite_rows(cloud.points)
     mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
-    strata = [part.sort().values for part in mixed.tensor_split(NUM_STRATA)]
-    levels = torch.tensor([len(part) for part in strata]).cumsum(0).tolist()
+    strata = [stratum.sort().values for stratum in mixed.tensor_split(NUM_STRATA)]
+    levels = torch.tensor([len(stratum) for stratum in strata]).cumsum(0).tolist()
     rows = finite[torch.cat(strata)]
     fields = {
         name: result.fields[name][rows] for _, name in MODES.values() if name in result.fields
@@ -142,9 +144,11 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     if not planes:
         return []
     meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
-    for found in table.get("adjacency", []):
-        for own, other in (found["pair"], found["pair"][::-1]):
-            meets[own].append((other, round(found["dihedral_deg"], 1), found["boundary_length"]))
+    for contact in table.get("adjacency", []):
+        for plane, other in (contact["pair"], contact["pair"][::-1]):
+            meets[plane].append(
+                (other, round(contact["dihedral_deg"], 1), contact["boundary_length"])
+            )
     rings = planes.outline or _trace(planes, shown.rows, result)
     corners = _rectangles(planes)
     return [
@@ -152,10 +156,10 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
         | {
             "name": row["id"],
             "kind": PLANE_KINDS.index(row["kind"]),
-            "rings": [rounded(frame.place(ring, origin)) for ring in own or (rectangle,)],
+            "rings": [rounded(frame.place(ring, origin)) for ring in outline or (rectangle,)],
             "meets": met,
         }
-        for row, own, rectangle, met in zip(table["planes"], rings, corners, meets, strict=True)
+        for row, outline, rectangle, met in zip(table["planes"], rings, corners, meets, strict=True)
     ]
 
 

@@ -95,7 +95,7 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
         # Else a few voxels at a corner join two walls, which as one are none.
         config = replace(config, growing=replace(config.growing, cut_bridges=True))
         labels = segment_planes(centers, config).labels[surface.voxel_of]
-    known, of_points = number_labels(labels.clamp(min=UNLABELED))
+    present, of_points = number_labels(labels.clamp(min=UNLABELED))
     of_voxels = of_points[surface.first]
     planes = summarize_planes(centers, surface.normals, number_labels(of_voxels)[1])
     altitude = centers @ up
@@ -109,10 +109,10 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
     directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
     powers = 1 << torch.arange(MOST_SIDES, device=centers.device)
     by_place = (covered * powers).sum(dim=1)
-    own = of_points >= 0
-    inside = torch.zeros(len(known) + 1, MOST_SIDES, device=centers.device)
-    inside.index_add_(0, of_points[own], covered[surface.voxel_of[own]].float())
-    counts = torch.bincount(of_points[own], minlength=len(inside))
+    is_labeled = of_points >= 0
+    inside = torch.zeros(len(present) + 1, MOST_SIDES, device=centers.device)
+    inside.index_add_(0, of_points[is_labeled], covered[surface.voxel_of[is_labeled]].float())
+    counts = torch.bincount(of_points[is_labeled], minlength=len(inside))
     of_planes = ((2 * inside > counts[:, None]) * powers).sum(dim=1)
     voxels = torch.where(of_voxels < 0, by_place, of_planes[of_voxels])
     points = torch.where(of_points < 0, by_place[surface.voxel_of], of_planes[of_points])

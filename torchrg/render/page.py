@@ -199,8 +199,8 @@ def check_library() -> None:
 
 def _read_library() -> str:
     """Return the JavaScript of deck.gl."""
-    found = require("pydeck", extra="view", purpose="write pages")
-    source = Path(str(found.__file__)).parent / _LIBRARY
+    module = require("pydeck", extra="view", purpose="write pages")
+    source = Path(str(module.__file__)).parent / _LIBRARY
     if not source.is_file():
         raise MissingDependencyError(
             f"pydeck with {_LIBRARY} is needed to write pages; install it with: "

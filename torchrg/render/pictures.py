@@ -52,18 +52,18 @@ decide what the picture shows."""
 def draw_picture(
     camera: "PinholeCamera",
     surface: Surface,
-    kept: Tensor,
+    is_shown: Tensor,
     colors: Tensor,
     normals: Tensor | None,
     *,
     supersampling: int,
 ) -> Tensor:
-    """Draw the kept points of a cloud as discs, close gaps, shade, and average pixels.
+    """Draw points of a cloud as discs, close gaps, shade, and average pixels.
 
     Args:
         camera: A batch of one, with the size of the picture.
         surface: The cloud, of at least one finite point.
-        kept: Which of its n points to draw, shape ``(n,)``, bool.
+        is_shown: Which of its n points to draw, shape ``(n,)``, bool.
         colors: Colours of all points, shape ``(N, 3)``, uint8.
         normals: Normals of all points, shape ``(N, 3)``. Default: those of the voxels.
         supersampling: Pixels along the side of each pixel of the picture.
@@ -74,25 +74,25 @@ def draw_picture(
     width, height = int(camera.width), int(camera.height)
     project = projection_of(camera, surface.origin, finer=supersampling)
     lengths = _RADIUS * surface.spacing.clamp(max=_LARGEST * float(surface.spacing.median()))
-    places = kept.nonzero().squeeze(-1)
+    places = is_shown.nonzero().squeeze(-1)
     radius, length = _usual_radius(project, surface.points, lengths, places)
     widest = supersampling * max(_ALWAYS, _WIDEST * width)
     buffer = DepthBuffer(
         width * supersampling, height * supersampling, max_radius=widest, device=places.device
     )
 
-    def discs_of(some: Tensor) -> Discs:
-        rows = surface.rows[some]
-        slant = surface.normals_at(some) if normals is None else normals[rows]
-        place, least = surface.points[some], supersampling / 2
-        return _discs(project, place, colors[rows], slant.float(), lengths[some], least=least)
+    def discs_of(chunk: Tensor) -> Discs:
+        rows = surface.rows[chunk]
+        slant = surface.normals_at(chunk) if normals is None else normals[rows]
+        place, least = surface.points[chunk], supersampling / 2
+        return _discs(project, place, colors[rows], slant.float(), lengths[chunk], least=least)
 
     parts = torch.split(places, _POINTS_AT_ONCE)
-    for some in parts:
-        buffer.draw(discs_of(some))
+    for chunk in parts:
+        buffer.draw(discs_of(chunk))
     buffer.end_drawing()
-    for some in parts:
-        buffer.paint(discs_of(some))
+    for chunk in parts:
+        buffer.paint(discs_of(chunk))
     reach = max(1, round(_GAP * min(radius, widest)))
     depth, paint = depth_and_colors(close_gaps(buffer.keys(), reach=reach, thickness=length))
     brightness = shade_hollows(
@@ -226,7 +226,7 @@ def render_cloud(
     if len(surface.rows) == 0:
         return _white(height or round(0.75 * width), width, cloud.device)
     near = surface.spacing <= _FAR_APART * surface.spacing.median()
-    kept = torch.ones_like(near)
+    is_shown = torch.ones_like(near)
     if view == "sensor":
         camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
     else:
@@ -235,11 +235,11 @@ def render_cloud(
         viewpoint = choose_viewpoint(
             surface, sides, view, upward, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
         )
-        kept = (sides.of_points & viewpoint.cut) == 0
-        shown = surface.points[kept & near].double() + surface.origin
+        is_shown = (sides.of_points & viewpoint.cut) == 0
+        shown = surface.points[is_shown & near].double() + surface.origin
         axes = view_axes(viewpoint.toward, viewpoint.up)
         camera = fit_camera(shown, axes, width=width, height=height)
-    return draw_picture(camera, surface, kept, paint, slant, supersampling=supersampling)
+    return draw_picture(camera, surface, is_shown, paint, slant, supersampling=supersampling)
 
 
 def render_points(
@@ -280,8 +280,8 @@ def render_points(
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
         return _white(int(camera.height), int(camera.width), cloud.device)
-    kept = torch.ones_like(surface.rows, dtype=torch.bool)
-    return draw_picture(camera, surface, kept, paint, slant, supersampling=supersampling)
+    is_shown = torch.ones_like(surface.rows, dtype=torch.bool)
+    return draw_picture(camera, surface, is_shown, paint, slant, supersampling=supersampling)
 
 
 def _white(height: int, width: int, device: torch.device) -> Tensor:

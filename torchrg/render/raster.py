@@ -28,7 +28,7 @@ _DOME = 0.1
 is that with the nearest middle."""
 _FLAT = 0.1
 """Radii of a disc, in depth. Noise puts middles of one face off the planes of its discs. With 0
-twice as many pixels of noisy boxes have the colour of another face."""
+more pixels of noisy boxes would have the colour of another face."""
 _LIGHT = (-0.45, -0.7, -0.55)
 """Direction toward the light in the axes of the camera: from the left, above, and behind it."""
 _DARKEST = 0.62
@@ -78,9 +78,9 @@ class Discs(NamedTuple):
 
     def at(self, rows: Tensor) -> "Discs":
         """Return some of the discs."""
-        some = Discs(*(values.index_select(0, rows) for values in self))
+        discs = Discs(*(values.index_select(0, rows) for values in self))
         # Columns in one piece are read faster.
-        return some._replace(slopes=some.slopes.T.contiguous().T)
+        return discs._replace(slopes=discs.slopes.T.contiguous().T)
 
 
 class DepthBuffer:
@@ -167,8 +167,8 @@ class DepthBuffer:
         for dx, dy, count in _pixels_of(sizes):
             place = places[:count] + self._step(dx, dy)
             x, y, at_middle, front = self._nearest.index_select(0, place).unbind(dim=1)
-            own = _depth_beside(shown, start, dx, dy, count)
-            seen = own.add_(shown.max_change[:count], alpha=_OVERHANG) >= front
+            depth = _depth_beside(shown, start, dx, dy, count)
+            seen = depth.add_(shown.max_change[:count], alpha=_OVERHANG) >= front
             seen &= x.mul_(slope_x[:count]) + y.mul_(slope_y[:count]) + corner[:count] >= at_middle
             sq_distance = (away_x[:count] - dx).square_()
             sq_distance += (away_y[:count] - dy).square_()

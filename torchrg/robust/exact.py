@@ -73,7 +73,7 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Te
         steep = steep & (height > _MIN_EDGE * extent)
         # A short edge is a poor ruler: what rounding moves at its ends grows with the distance.
         reach = torch.maximum(reach, 2 * tolerance * (1 + 2 * extent / height))
-        axes.append([part / height for part in across])
+        axes.append([component / height for component in across])
     if num_points <= num_coordinates:
         spanned = dimension == num_coordinates
         dimension[spanned] = num_points - 1
@@ -98,7 +98,7 @@ def _majorities(
         points - origin[simplex, lane]
         for points, origin in zip(take_lanes(columns, lane), origins, strict=True)
     ]
-    across = _reject(offsets, [[part[simplex, lane] for part in axis] for axis in axes])
+    across = _reject(offsets, [[component[simplex, lane] for component in axis] for axis in axes])
     near = sum_squares(across) <= reach[simplex, lane] ** 2
     # The best ruler among the full ones: a poor one may collect points beside the flat as well.
     ruler = torch.where(near.sum(dim=0) >= size, reach[simplex, lane], torch.inf)

@@ -67,7 +67,7 @@ def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
         _sphered_distances(standard, eigenvectors(matrices))
         for matrices in torch.split(_scatter_matrices(standard), _STARTS_AT_ONCE)
     ]
-    sets = [smallest_points(part.flatten(1), size).view_as(part) for part in distances]
+    sets = [smallest_points(group.flatten(1), size).view_as(group) for group in distances]
     return torch.cat(sets, dim=1)
 
 
@@ -170,8 +170,8 @@ def _pairwise_qn(columns: list[Tensor]) -> Tensor:
     for i in range(size):
         for j in range(i + 1, size):
             total = _scale(sorted_points(columns[i] + columns[j]))
-            rest = _scale(sorted_points(columns[i] - columns[j]))
-            matrix[:, i, j] = matrix[:, j, i] = (total * total - rest * rest) / 4
+            difference = _scale(sorted_points(columns[i] - columns[j]))
+            matrix[:, i, j] = matrix[:, j, i] = (total * total - difference * difference) / 4
     return matrix
 
 

@@ -25,7 +25,7 @@ from torchrg.scenes.surfaces import Hole, rectangle
 
 T = TypeVar("T")
 Furniture = Callable[[np.random.Generator, Frame], Part]
-"""What draws an object on a place of the floor."""
+"""A function that draws an object on a place of the floor."""
 
 _ROOM = 100
 """Purpose of the random numbers: sizes and places in a room."""

@@ -171,8 +171,8 @@ def _draw_places(
         for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
             tried = model.surfaces[face].sample(rng, int(count))
             outwards = model.surfaces[face].normals_at(tried)
-            kept = model.is_visible(face, tried, outwards)
-            points, normals = to_float32(tried[kept]), to_float32(outwards[kept])
+            is_seen = model.is_visible(face, tried, outwards)
+            points, normals = to_float32(tried[is_seen]), to_float32(outwards[is_seen])
             drawn.append((points, normals, np.full(len(points), face)))
             num_kept += len(points)
         missing -= num_kept

@@ -57,13 +57,15 @@ class DepthTransform(SampleTransform):
 
     def _one_each(self, name: str, values: Tensor, shape: tuple[int, int, int]) -> Tensor:
         """Return a matrix for each image; one of shape ``(n, n)`` serves all."""
-        given = values.expand(shape) if values.ndim == 2 and values.shape == shape[1:] else values
-        if given.shape != shape:
+        expanded = (
+            values.expand(shape) if values.ndim == 2 and values.shape == shape[1:] else values
+        )
+        if expanded.shape != shape:
             raise ShapeError(
                 f"{type(self).__name__}: expected {name} of shape {shape[1:]} or {shape}, got "
                 f"{tuple(values.shape)}."
             )
-        return given
+        return expanded
 
 
 class DepthToCloud(DepthTransform):
@@ -165,16 +167,16 @@ class SegmentDepth(DepthTransform):
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)
         segment = partial(segment_depth, config=self.config)
-        found = [
+        segmentations = [
             segment(image, camera, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
         ]
         batch, added = self.is_batch(sample), SampleDict(sample)
-        for name, part in (("plane", "labels"), ("normal", "normals"), ("curvature", "curvature")):
-            images = [getattr(seg, part) for seg in found]
+        for name, field in (("plane", "labels"), ("normal", "normals"), ("curvature", "curvature")):
+            images = [getattr(seg, field) for seg in segmentations]
             added[self.key(sample, name)] = torch.stack(images) if batch else images[0]
         if self.planes:
-            tables = [seg.planes for seg in found]
+            tables = [seg.planes for seg in segmentations]
             added[self.key(sample, "planes")] = tables if batch else tables[0]
         return added
 
@@ -220,8 +222,8 @@ class FusedFrames(NamedTuple):
         each = restore_points(values, self.inverse)
         images = [values.new_full((*seen.shape, *values.shape[1:]), fill) for seen in self.seen]
         parts = torch.split(each, [int(seen.sum()) for seen in self.seen])
-        for image, seen, part in zip(images, self.seen, parts, strict=True):
-            image[seen] = part
+        for image, seen, pixels in zip(images, self.seen, parts, strict=True):
+            image[seen] = pixels
         return images
 
 

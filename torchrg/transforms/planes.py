@@ -105,10 +105,10 @@ class OrientNormals(CloudTransform):
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keep_neighbors=keep_neighbors, keys=keys)
-        known = (*get_args(Orientation), "up")
-        if towards not in known:
+        sides = (*get_args(Orientation), "up")
+        if towards not in sides:
             raise ConfigError(
-                f"OrientNormals: expected towards to be one of {', '.join(known)}, got {towards!r}."
+                f"OrientNormals: expected towards to be one of {', '.join(sides)}, got {towards!r}."
             )
         if viewpoint is not None and (towards != "viewpoint" or len(viewpoint) != 3):
             raise ConfigError(
@@ -130,7 +130,7 @@ class OrientNormals(CloudTransform):
         if len(places) not in (1, len(parts)):
             return places
         of_clouds = places.expand(len(parts), -1)
-        counts = [part.stop - part.start for part in parts]
+        counts = [rows.stop - rows.start for rows in parts]
         return of_clouds.repeat_interleave(torch.tensor(counts, device=places.device), dim=0)
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
@@ -284,10 +284,10 @@ class MakeSuperpoints(CloudTransform):
         colors = None if self.white is None else cloud["color"].double() / self.white
         points, plane = cloud["coord"], cloud["plane"].reshape(-1)
         near = search.recall(points[finite_rows(points)]) if search.known else None
-        found = partition_points(
+        partition = partition_points(
             points, cloud["normal"], plane, self.config, colors, neighbors=near
         )
-        return {"superpoint": found.labels}
+        return {"superpoint": partition.labels}
 
 
 class AlignAxes(SampleTransform):

@@ -92,7 +92,7 @@ _TRANSFORMS = (
     MakeSuperpoints,
     OrientNormals,
 )
-"""What configs can name."""
+"""Transforms that configs can name."""
 _OWN: dict[str, Callable[..., SampleDict]] = {}
 """Pointcept's own functions, behind those that take their places."""
 
@@ -109,8 +109,8 @@ def _make_known() -> None:
     from pointcept.datasets import transform, utils
     from pointcept.datasets.builder import DATASETS
 
-    for known in _TRANSFORMS:
-        transform.TRANSFORMS.register_module(module=known, force=True)
+    for replaced in _TRANSFORMS:
+        transform.TRANSFORMS.register_module(module=replaced, force=True)
     for data_set in DATASETS.module_dict.values():
         for assets in ("VALID_ASSETS", "PC_VALID_ASSETS"):
             files = getattr(data_set, assets, None)

@@ -19,13 +19,13 @@ from torchrg.structures import Array
 Sample = Any
 """A sample: a dict of tensors, NumPy arrays and others, or a PyG ``Data`` or ``Batch``."""
 Entries = Mapping[str, Any]
-"""What a sample holds by key."""
+"""Contents of a sample by key."""
 SampleDict = dict[str, Any]
 """A sample as data sets give it."""
 LISTED = "index_valid_keys"
 """The entry that names those with a row for each point."""
 POINTCEPT_KEYS = ("coord", "color", "normal", "superpoint", "strength", "segment", "instance")
-"""What Pointcept puts into a sample's list when it first takes points out, if there is none."""
+"""Entries on the list that Pointcept makes for a sample without one when it takes points out."""
 OUR_KEYS = ("plane", "curvature", "residual")
 """Entries that torchrg adds."""
 _USUAL_KEYS = {
@@ -105,15 +105,15 @@ def _sort_keys(
     """Return the entries with a row for each point, and those that may have one."""
     by_name = _USUAL_KEYS.union(listed_keys(entries) or ())
     by_length = num_points > _FEW and not _has_chosen_list(entries)
-    found: list[str] = []
+    in_rows: list[str] = []
     ambiguous: list[str] = []
     for key, value in entries.items():
         is_whole = key in _WHOLE_KEYS or key in whole or str(key).startswith(_EARLIER)
         if is_whole or num_points == 0 or not _is_as_long(value, num_points):
             continue
         is_array = isinstance(value, Tensor | np.ndarray)
-        (found if is_array and (by_length or key in by_name) else ambiguous).append(key)
-    return found, ambiguous
+        (in_rows if is_array and (by_length or key in by_name) else ambiguous).append(key)
+    return in_rows, ambiguous
 
 
 def check_in_step(caller: str, entries: Entries, num_points: int) -> None:
@@ -158,14 +158,14 @@ def select_points(
                 f"{caller}: expected a sample without {key} to take points out of, got one; apply "
                 f"the transform {repair}."
             )
-    found, ambiguous = _sort_keys(entries, num_points, whole)
+    in_rows, ambiguous = _sort_keys(entries, num_points, whole)
     if ambiguous:
         raise ConfigError(
             f"{caller}: cannot tell whether {', '.join(map(str, ambiguous))} of the sample has a "
             f"row for each of {num_points} points; make it an array and name it in "
             f"{LISTED!r}, or leave it out."
         )
-    chosen: SampleDict = {key: _take(entries[key], rows) for key in found}
+    chosen: SampleDict = {key: _take(entries[key], rows) for key in in_rows}
     ends = torch.tensor(_cloud_ends(sample, num_points), device=rows.device)
     ends = torch.searchsorted(rows, ends)
     if entries.get("offset") is not None:

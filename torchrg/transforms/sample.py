@@ -381,13 +381,13 @@ def with_each(batch: Sample, change: Callable[[Sample], Sample]) -> Sample:
     """
     clouds, whole = batch.to_data_list(), {}
     followed = [key for key in batch._slice_dict if f"{key}_ptr" in batch]  # noqa: SLF001
-    made = {*_MADE_BY_BATCHING, *(f"{key}_{part}" for key in followed for part in ("batch", "ptr"))}
+    made = {*_MADE_BY_BATCHING, *(f"{key}_{end}" for key in followed for end in ("batch", "ptr"))}
     for key in set(batch.keys()) - set(batch._slice_dict) - made:  # noqa: SLF001
         value = batch[key]
         if isinstance(value, Tensor) and value.ndim and len(value) == batch.num_nodes:
             counts = torch.bincount(batch.batch, minlength=batch.num_graphs).tolist()
-            for cloud, part in zip(clouds, torch.split(value, counts), strict=True):
-                cloud[key] = part
+            for cloud, rows in zip(clouds, torch.split(value, counts), strict=True):
+                cloud[key] = rows
         else:
             whole[key] = value
     join = importlib.import_module("torch_geometric.data").Batch.from_data_list

@@ -24,8 +24,8 @@ NOISE_FACTOR_OF_ALL = 1.04
 """Per deviation. Turns that quantile into noise where the deviations are those of all neighbours
 together."""
 NOISE_LIMITS = (0.3425, 0.398)
-"""Radii. Measured on noisy planes: as the true noise grows, noise from each size of neighbourhood
-tends to this share of the radius, so nothing beyond it can be measured."""
+"""Radii. On planes, as the true noise grows, noise from each size of neighbourhood tends to this
+share of the radius, so nothing beyond it can be measured."""
 COMMON_QUANTILE = 0.15
 """Share. Quantile of the noise of the neighbours that counts as their common noise. A corner goes
 by it, as no neighbourhood is flat there."""
@@ -33,7 +33,7 @@ MAX_ABOVE_COMMON = 3.0
 """Times. Noise that is larger than the common noise by this factor is taken for shape."""
 REGIONAL_STEPS = 4
 """Steps. So many from neighbour to neighbour away is noise that counts as that of the region, where
-it is asked for: with three, more small faces of fused meshes stay part of the one behind them."""
+it is asked for: fewer leave small faces of fused meshes in the one behind them."""
 REGIONAL_QUANTILE = 0.1
 """Share. Quantile over the neighbours in each of these steps: higher ones do not leave the slope of
 a step, as a neighbourhood at its end lies on it for the most part."""
@@ -56,9 +56,8 @@ grows until its noise is this share of its radius."""
 FLAT_LIMIT = 1.05
 """s. A plane stands if the neighbours deviate from it by no more than this."""
 CURVED_LIMIT = 1.2
-"""s. A paraboloid stands if the neighbours deviate from it by no more than this. At this value one
-of 200 points that have an edge is missed, and half of the points without an edge are spared the
-fits that come later."""
+"""s. A paraboloid stands if the neighbours deviate from it by no more than this. A larger one
+misses edges; a smaller one spares fewer points without an edge the fits that come later."""
 CURVED_SHARE = 0.15
 """Deviations of the plane. Where there is next to no noise, a paraboloid stands if it leaves no
 more than this. A symmetric edge has 0.27."""

@@ -348,9 +348,9 @@ def _summary(
     """Return the plane whose group each point is in, and the deviation from all planes."""
     normals, offsets = planes[0]
     for (normal, offset), group in zip(planes[1:], groups[1:], strict=True):
-        own = group[:, 0] > 0
-        normals = torch.where(own[:, None], normal, normals)
-        offsets = torch.where(own, offset, offsets)
+        has_group = group[:, 0] > 0
+        normals = torch.where(has_group[:, None], normal, normals)
+        offsets = torch.where(has_group, offset, offsets)
     freedom = max(outer.shape[1] - _PLANE_PARAMETERS * len(planes), 1)
     deviations = square_root(sum_neighbors(outer * outer) / freedom)
     deviations = torch.where(present & _all_present(groups), deviations, torch.inf)
