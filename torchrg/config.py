@@ -209,7 +209,7 @@ class GrowingConfig:
 
 WHITENESS = 0.4, 0.6
 """Whiteness up to which faces are in facets or bent, and from which on noise is white."""
-_VARIATION = 0.34
+_VARIATION = 0.38
 """Variation of spacing below which points are vertices of a mesh or of a grid."""
 _FACETS_BY_HEIGHT, _FACETS_BY_REACH = 1 / 240, 0.3
 """Tolerance of facets by the height of the cloud, and at most by the reach of 50 neighbours, that
@@ -294,7 +294,7 @@ class PipelineConfig:
         Where whiteness is below 0.4, faces are bent or in facets, and ``facet_tolerance`` is 1/240
         of the height of the cloud, but at most 0.3 of the reach of 50 neighbours; from 0.6 on noise
         is white, and there is none; between, it falls evenly. The noise of a region counts where it
-        is white and distances to the nearest point vary by less than 0.34, as only those of
+        is white and distances to the nearest point vary by less than 0.38, as only those of
         vertices and grids do. The least region is a square of a 27th of the height, of a 13th where
         points are drawn from a mesh, whose facets on curved things are no planes.
 
