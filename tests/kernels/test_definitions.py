@@ -95,10 +95,9 @@ def test_survey_is_that_of_the_definition(points, masked):
         alike = (found[place] - expected[place]).abs() <= 1e-5 * radius
         alike |= found[place].isinf() & expected[place].isinf()
         assert alike.float().mean() > 0.95
+    # The deviations from two layers, and where places repeat.
+    assert torch.equal(found[3], expected[3])
     assert torch.equal(found[4], expected[4])
-    alike = (found[3] - expected[3]).abs() <= 1e-5 * radius
-    alike |= found[3].isinf() & expected[3].isinf()
-    assert alike.float().mean() > 0.999
 
 
 def test_quantiles_of_neighbors_are_those_of_the_definition_to_the_bit(points, masked):

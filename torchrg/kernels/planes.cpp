@@ -54,7 +54,8 @@ INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_ref
     }
     for (int side = 0; side < 2; side++)
       numbers[side] = moments(patch, sides[side], patch.width, means[side], covariances[side]);
-    if (turn == num_refits) return smaller(numbers[0], numbers[1]) < least ? INFINITE : float(plane.low);
+    if (turn == num_refits)
+      return smaller(numbers[0], numbers[1]) < least ? INFINITE : float(plane.low);
     for (int i = 0; i < 6; i++)
       pooled[i] = numbers[0] / count * covariances[0][i] + numbers[1] / count * covariances[1][i];
     decompose(pooled, plane);
@@ -74,7 +75,7 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
               double breadth, double kurtosis, double share, int64_t num_refits, int64_t least,
               float* offsets, float* radius, float* whole, float* layered, bool* again,
               float* of_fewer, float* of_more) {
-  if (few < 4 || more < 4) return TOO_WIDE;
+  if (few < 4 || more < 4 || uint64_t(num_refits) > MOST) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
     again[i] = false;

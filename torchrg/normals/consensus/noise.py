@@ -187,7 +187,7 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole:
         normals, two, squares = fit_parallel_planes(columns, (upper, counted - upper))
         upper = above(along(columns, normals), two.mean(dim=0)[:, None]) * counted
     num_upper = upper.sum(dim=1)
-    deviations = (squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1)).sqrt_()
+    deviations = square_root(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
     layered &= deviations <= constants.MAX_LAYERED_SHARE * whole
     return torch.where(layered, deviations, torch.inf)
