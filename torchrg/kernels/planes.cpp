@@ -127,24 +127,24 @@ INLINE float of_key(int32_t key) {
 }
 
 // The key of some rank, from 1, among the k of each lane.
-INLINE Flags select(const Flags* keys, int k, Flags ranks) {
-  Flags low = keys[0], high = keys[0];
+INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
+  Flags low = load(keys), high = low;
   for (int j = 1; j < k; j++) {
-    low = keys[j] < low ? keys[j] : low;
-    high = keys[j] > high ? keys[j] : high;
+    const Flags key = load(keys + LANES * j);
+    low = smaller(key, low), high = larger(key, high);
   }
   while (total(low < high)) {
     const Flags middle = (low & high) + ((low ^ high) >> 1);
     Flags count{}, below = low, above = high;
     for (int j = 0; j < k; j++) {
-      const Flags key = keys[j], within = key <= middle;
+      const Flags key = load(keys + LANES * j), within = key <= middle;
       count -= within;
-      below = (within & (key > below)) ? key : below;
-      above = (~within & (key < above)) ? key : above;
+      below = where(within, larger(key, below), below);
+      above = where(within, above, smaller(key, above));
     }
-    const Flags is_high = count >= ranks, is_exact = count == ranks, is_next = count == ranks - 1;
-    low = is_exact ? below : is_high ? low : above;
-    high = is_next ? above : is_high ? below : high;
+    const Flags is_high = count >= ranks;
+    low = where(is_high, where(count == ranks, below, low), above);
+    high = where(is_high, below, where(count == ranks - 1, above, high));
   }
   return low;
 }
@@ -156,10 +156,9 @@ KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_r
                           Floats values, Ints indices, Flagged mask, double quantile,
                           int64_t rank_of_all, float* found) {
   if (k < 1 || k > MOST || !(quantile >= 0 && quantile <= 1)) return TOO_WIDE;
-  Flags keys[MOST];
+  alignas(32) int32_t keys[MOST * LANES], ranks[LANES];
   const int64_t num_found = num_rows * num_columns;
   for (int64_t start = 0; start < num_found; start += LANES) {
-    Flags ranks{};
     for (int lane = 0; lane < LANES; lane++) {
       const int64_t place = smaller(start + lane, num_found - 1), i = place / num_columns;
       const int32_t* row = indices + i * k;
@@ -170,12 +169,12 @@ KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_r
       for (int j = 0; j < k; j++) {
         const bool counts = !counted || counted[j];
         count += counts;
-        keys[j][lane] = as_key(counts ? column[num_columns * row[j]] : INFINITE);
+        keys[LANES * j + lane] = as_key(counts ? column[num_columns * row[j]] : INFINITE);
       }
       ranks[lane] = int(rank_of_all);
       if (mask) ranks[lane] = larger(int(__builtin_ceilf(float(quantile) * float(count))), 1);
     }
-    const Flags selected = select(keys, int(k), ranks);
+    const Flags selected = select(keys, int(k), load(ranks));
     for (int lane = 0; lane < LANES && start + lane < num_found; lane++)
       found[start + lane] = of_key(selected[lane]);
   }
