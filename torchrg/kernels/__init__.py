@@ -64,7 +64,7 @@ SIGNATURES = {
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
     "absorb_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",
-    "count_lines": "d[3nL] b[nL] l[nL] d[M3] d[M3] d[M] l[p2] x -> l[p] l[M] l[M]",
+    "count_lines": "d[3P] b[hw] l[hw] d[M3] d[M3] d[M] l[p2] n x -> l[p] l[M] l[M]",
 }
 """Arguments and results of each kernel.
 
