@@ -46,7 +46,7 @@ BYTES_PER_POINT = 1_100
 """Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
 that of :func:`torchrg.depth.segment_depth`, which takes half of it."""
 BYTES_PER_POINT_ON_DISK = 150
-"""Memory that a point adds where neighbours and edges are on a disk; see :mod:`torchrg.scratch`."""
+"""Memory that a point adds where lists of neighbours are on a disk; see :mod:`torchrg.scratch`."""
 
 _STRENGTH_OF_K = 100.0
 """Strength of superpoints for a threshold of 1 of ScanNet's Segmentator. At its usual 0.01 there

@@ -1,9 +1,9 @@
 """Large arrays in a file without a name, for clouds that are larger than memory.
 
-Of the memory that a point takes while its planes are found, most is in two arrays: the lists of
-neighbours and the edges. Within :func:`on_disk` these are shared maps of temporary files that are
-unlinked as soon as they are open: they leave with the process, however it ends, and nothing can be
-left behind, be locked or be damaged. Whoever reads or writes such an array does not know.
+Of the memory that a point takes while its planes are found, most is in the lists of neighbours.
+Within :func:`on_disk` these are shared maps of temporary files that are unlinked as soon as they
+are open: they leave with the process, however it ends, and nothing can be left behind, be locked or
+be damaged. Whoever reads or writes such an array does not know.
 """
 
 import math
@@ -26,7 +26,8 @@ from torchrg.errors import FormatError
 _LEAST_BYTES = 2**24
 """Bytes of the smallest array that goes to the disk; all smaller ones together are few."""
 BYTES_PER_NEIGHBOR = 9
-"""Bytes that a neighbour of a point takes at most: four in its list, and an edge with a mark."""
+"""Bytes that a neighbour of a point takes at most: four in its list, and four and a mark in that of
+the neighbours of the same object."""
 _RELEASE_SECONDS = 0.01
 """How often pages go back to the system. In that time some 20 MB of an array are read."""
 _ZEROS = bytes(2**20)

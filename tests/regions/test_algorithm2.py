@@ -1,5 +1,6 @@
 """The library's labels against a literal Algorithm 2, for every combination of settings."""
 
+import contextlib
 import dataclasses
 import itertools
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 from pypcd4 import PointCloud
 
+from tests.kernels.clouds import definitions
 from tests.regions import algorithm2, growing_clouds
 from tests.regions.growing_clouds import papers_growing
 from torchrg.neighbors import search_knn
@@ -63,8 +65,11 @@ def check_all_rules(coordinates, k=8, ties=0, f32=False, **settings):
     cloud = growing_clouds.prepare(coordinates, k, dtype=dtype, ties=ties)
     for rules in RULES:
         config = papers_growing(**rules, **settings)
-        labels = grow_regions(*cloud, config, canonical=True, chunk_size=64)
-        assert labels.tolist() == expected_labels(*cloud, config), config
+        expected = expected_labels(*cloud, config)
+        for way in (contextlib.nullcontext(), definitions()):
+            with way:
+                labels = grow_regions(*cloud, config, canonical=True, chunk_size=64)
+            assert labels.tolist() == expected, config
 
 
 @pytest.mark.parametrize(
@@ -76,16 +81,8 @@ def test_labels_equal_the_literal_algorithm(kind, variant):
     check_all_rules(growing_clouds.KINDS[kind](rng), **VARIANTS[variant])
 
 
-@pytest.mark.parametrize("kind", ["room", "quantized", "sphere", "graded", "plates"])
-def test_whole_levels_of_the_queue_give_the_labels_of_single_steps(kind, monkeypatch):
-    monkeypatch.setattr("torchrg.regions.growth._LONG_QUEUE", 2)
-    rng = np.random.default_rng(7)
-    settings = {"k": 8, "max_angle_deg": 20.0, "curvature_quantile": 0.6, "min_size": 2}
-    check_all_rules(growing_clouds.KINDS[kind](rng), **settings)
-
-
 @pytest.mark.parametrize("kind", growing_clouds.KINDS)
-def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind, monkeypatch):
+def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind):
     rng = np.random.default_rng(list(growing_clouds.KINDS).index(kind))
     for _ in range(15):
         k, ties = int(rng.integers(4, 12)), int(rng.choice([0, 3, 6]))
@@ -99,9 +96,9 @@ def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind, m
             curvature_quantile=float(rng.choice([0.0, 0.3, 0.6, 0.95, 1.0])),
             min_size=int(rng.choice([1, 2, k + 1])),
         )
-        monkeypatch.setattr("torchrg.regions.growth._LONG_QUEUE", int(rng.choice([2, 32])))
         valid = torch.from_numpy(rng.random(len(cloud[0])) < 0.9)
-        labels = grow_regions(*cloud, config, valid=valid, canonical=True)
+        with rng.choice([contextlib.nullcontext(), definitions()]):
+            labels = grow_regions(*cloud, config, valid=valid, canonical=True)
         assert labels.tolist() == expected_labels(*cloud, config, valid), config
 
 

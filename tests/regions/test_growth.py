@@ -11,14 +11,7 @@ from tests.regions.growing_clouds import papers_growing
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.edges import EdgeLists
-from torchrg.regions.growth import (
-    chain_of,
-    curvature_limit,
-    first_to_reach,
-    grow_first_in_first_out,
-    number_by_size,
-)
+from torchrg.regions.growth import curvature_limit, grow_first_in_first_out, number_by_size
 from torchrg.structures import Neighbors
 
 CLASSIC = papers_growing(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
@@ -151,26 +144,26 @@ def test_exact_and_quantized_walls_do_not_shatter():
 
 
 def test_a_long_chain_of_one_way_edges_is_followed_to_its_end():
-    num_points = 200_000
-    edges = EdgeLists(
-        np.arange(num_points + 1, dtype=np.int32).clip(max=num_points - 1),
-        np.arange(1, num_points, dtype=np.int32),
-    )
-    seeds = np.arange(num_points, dtype=np.int32)
-    edges = edges.append(chain_of(seeds, num_points))
-    assert not first_to_reach(edges, num_points).any()
+    roots = grow_chain(20_000, joins=1)
+    assert not roots.any()
 
 
 def test_no_python_number_is_kept_for_every_point():
-    num_points = 150_000
-    edges = EdgeLists(np.zeros(num_points + 1, dtype=np.int32), np.empty(0, dtype=np.int32))
-    order = np.arange(num_points, dtype=np.int32)[::-1]
+    num_points = 30_000
     tracemalloc.start()
-    heads = grow_first_in_first_out(edges, order, np.ones(num_points, dtype=bool))
+    roots = grow_chain(num_points, joins=0)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert (heads[order] == order).all()
-    assert peak < 30 * num_points
+    assert roots.tolist() == list(range(num_points))
+    assert peak < 60 * num_points
+
+
+def grow_chain(num_points, joins):
+    """Grow from each point in turn, whose only neighbour is the next one, joined or not."""
+    following = (torch.arange(num_points, dtype=torch.int32) + 1).clamp(max=num_points - 1)
+    bits = torch.full((num_points, 1), joins)
+    every, order = torch.ones(num_points, dtype=torch.bool), torch.arange(num_points)
+    return grow_first_in_first_out(following[:, None], bits, None, every, every, order, late=False)
 
 
 def test_neighbours_across_a_gap_join_only_within_the_distance():

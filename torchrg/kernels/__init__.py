@@ -29,7 +29,7 @@ SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
     "are_coplanar": "f[3N] i[nk] b[nk]? f[n3] b[nk] b[nk]? x x -> b[nk]",
     "fit_normals_pca": "f[N3] i[nk] b[nk]? f[n] x x -> f[n3] f[n] f[n] b[n] b[n]",
-    "survey": "f[N3] i[nk] b[nk]? f[n3] b[n] n n x x -> f[n] f[n] f[n] b[n] b[n] f[n] f[n]",
+    "survey": "f[N3] i[nk] b[nk]? f[n3] b[n] n n x x x n n -> f[n] f[n] f[n] f[n] b[n] f[n] f[n]",
     "broken_planes": "f[N3] i[nk] b[nk]? f[n] f[n3] l[p2] f[c] -> f[n3] f[n] f[n3] f[n] f[n]",
     "smooth_planes": "f[N8] i[Nk] b[Nk]? f[N] l[n] x x x x x -> f[n3] f[n]",
     "choose_planes": "f[N8] i[Nk] b[Nk]? f[N3] l[n] n x x x x -> f[n3] f[n]",
@@ -39,12 +39,13 @@ SIGNATURES = {
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n -> i[N] i[N]",
+    "meet_others": "i[N] i[n] i[nk] b[nk]? -> b[n]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
     "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",
     "gather_borders": "i[e] i[e] d[e]? d[e] L[r] L[r] -> l[e] i[e] i[e] d[e] d[e] l[1]",
     "merging_costs": "d[R] d[RF] d[Rc] d[Rc] i[E] i[E] d[E] d[E] x x -> d[E]",
     "cheapest_borders": "i[E] i[E] d[E] D[R] -> l[R]",
-    "neighbor_quantiles": "f[N] i[nk] b[nk]? x n -> f[n]",
+    "neighbor_quantiles": "f[Nc] i[nk] b[nk]? x n -> f[nc]",
     "fit_pixel_windows": "d[hw] b[hw] d[w] d[h] D[5hw] D[mpq] x x n n -> ",
     "fit_cell_windows": "d[mhw] D[5hw] D[mpq] x x n n -> ",
     "rate_windows": "D[9hw] d[pq] x x x x x x x x x n n n -> ",
@@ -63,7 +64,7 @@ SIGNATURES = {
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
     "absorb_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",
-    "count_lines": "d[3nL] b[nL] l[nL] d[M3] d[M3] d[M] l[p2] x -> l[p] l[M] l[M]",
+    "count_lines": "d[3P] b[hw] l[hw] d[M3] d[M3] d[M] l[p2] n x -> l[p] l[M] l[M]",
 }
 """Arguments and results of each kernel.
 

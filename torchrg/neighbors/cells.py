@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from torchrg import kernels
 from torchrg._parallel import CACHE_BYTES, ROWS_IN_CACHE, chunks_of, map_tasks
+from torchrg.structures import bounding_box
 
 Store = Callable[[NDArray[np.integer], NDArray[np.float64], NDArray[np.integer]], None]
 """Takes rows ``(n,)``, distances ``(n, k)`` and neighbours ``(n, k)``."""
@@ -329,7 +330,8 @@ def search_grid(
     Returns:
         The rows that are left, ascending. What is in ``found`` for them means nothing.
     """
-    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    low, high = bounding_box(points)
+    extent = high - low
     places = torch.from_numpy(np.ascontiguousarray(points))
     into, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
     certain = torch.zeros(len(points), dtype=torch.bool, device="cpu")

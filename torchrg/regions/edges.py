@@ -6,7 +6,7 @@ the line of :func:`accept_edges` that calls it.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import kernels, scratch
-from torchrg._parallel import allowed_threads, chunks_of, map_chunks, map_tasks, places_of
+from torchrg import kernels
+from torchrg._parallel import map_chunks
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.neighbors import gather_patches
@@ -24,10 +24,6 @@ from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbo
 from torchrg.robust import median, qn
 from torchrg.robust.scale import QN_FACTOR
 from torchrg.structures import Neighbors, Rows
-
-_CHUNKS_A_THREAD = 4
-"""Chunks that each thread tests before their edges are stored. Threads wait for each other at that
-moment, so it should come rarely."""
 
 
 class GrowingCloud(NamedTuple):
@@ -70,46 +66,6 @@ def promotes_late(config: GrowingConfig) -> bool:
     return config.connectivity is not None and config.connectivity_scope == "seed"
 
 
-class EdgeLists(NamedTuple):
-    """Edges of a directed graph in compressed rows.
-
-    The edges of node i are ``starts[i]`` to ``starts[i + 1]`` of the targets, or codes of targets.
-    """
-
-    starts: NDArray[np.signedinteger]
-    targets: NDArray[np.int32]
-
-    def append(self, more: "EdgeLists") -> "EdgeLists":
-        """Return the edges with those of further nodes behind them."""
-        starts = np.concatenate([self.starts, more.starts[1:] + self.starts[-1]])
-        return EdgeLists(starts, np.concatenate([self.targets, more.targets]))
-
-
-def find_coded_edges(
-    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
-) -> tuple[EdgeLists, NDArray[np.bool_] | None]:
-    """Return all edges with targets as ``2 * row + (whether the target becomes a seed)``.
-
-    With late promotion these are only the edges that do make a seed. Then there is a second result:
-    which neighbours a point merely claims, shape ``(N, K)``; these are most edges, and lists of
-    them would take more time and memory. ``limit`` is that of the curvature, a scalar.
-    """
-    shared = _shared_neighbors(cloud, config)
-    indices = cloud.neighbors.indices
-    claims = scratch.empty(indices.shape, np.bool_) if promotes_late(config) else None
-
-    def find(rows: slice) -> list[_Edges]:
-        joins, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
-        becomes_seed = _become_seeds(cloud, config, rows, limit, connected)
-        if claims is not None:
-            claims[rows] = (joins & ~becomes_seed).cpu().numpy()
-            joins &= becomes_seed
-        return [_pick((indices[rows].to(torch.int32) * 2).add_(becomes_seed), joins)]
-
-    whole = slice(0, len(cloud.points))
-    return _pack(find, cloud, whole, None, chunk_size)[0], claims
-
-
 def mark_edges(
     cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
 ) -> tuple[Tensor, Tensor | None]:
@@ -136,44 +92,8 @@ def mark_edges(
 
 def _write_bits(into: NDArray[np.uint8], flags: Tensor) -> None:
     """Write flags ``(n, K)`` to the bits of bytes, the first to the lowest."""
-    packed = np.packbits(flags.numpy(), axis=1, bitorder="little")
+    packed = np.packbits(flags.cpu().numpy(), axis=1, bitorder="little")
     into[:, : packed.shape[1]] = packed
-
-
-def find_edges(
-    cloud: GrowingCloud,
-    config: GrowingConfig,
-    limit: Tensor,
-    *,
-    chunk_size: int,
-    more: EdgeLists | None = None,
-    block: slice | None = None,
-) -> tuple[EdgeLists, EdgeLists]:
-    """Return the edges of points of at most the curvature limit, and those of all others.
-
-    The first have the edges of ``more`` nodes behind them, the second are coded as
-    :func:`find_coded_edges` does. With ``block`` they are those of these points alone.
-    """
-    shared = _shared_neighbors(cloud, config)
-    is_seed = cloud.curvature <= limit
-
-    def find(rows: slice) -> list[_Edges]:
-        joins, _ = accept_edges(cloud, config, rows, _connect(shared, rows))
-        targets, seeds = cloud.neighbors.indices[rows], is_seed[rows, None]
-        coded = targets.to(torch.int32) * 2
-        return [_pick(targets, joins & seeds), _pick(coded, joins & ~seeds)]
-
-    block = slice(0, len(cloud.points)) if block is None else block
-    edges, others = _pack(find, cloud, block, more, chunk_size)
-    targets, counts = zip(*others, strict=True)
-    return edges, EdgeLists(np.concatenate([[0], *counts]).cumsum(), np.concatenate(targets))
-
-
-def join_edges(parts: Sequence[EdgeLists]) -> EdgeLists:
-    """Return the edges of successive blocks of points as those of all of them."""
-    counts = np.concatenate([np.diff(edges.starts) for edges in parts])
-    starts = np.concatenate([[0], counts]).cumsum()
-    return EdgeLists(starts, np.concatenate([edges.targets for edges in parts]))
 
 
 def _become_seeds(
@@ -268,58 +188,6 @@ def _shared_neighbors(cloud: GrowingCloud, config: GrowingConfig) -> SharedNeigh
         return None
     k = cloud.neighbors.indices.shape[1]
     return SharedNeighbors(cloud.neighbors, min_shared_neighbors(config.connectivity, k))
-
-
-class _Edges(NamedTuple):
-    """Accepted edges of some points, in the order of points and columns; how many each has."""
-
-    targets: NDArray[np.int32]
-    counts: NDArray[np.signedinteger]
-
-
-def _pick(targets: Tensor, accepted: Tensor) -> _Edges:
-    """Return the accepted ones of targets ``(n, K)``."""
-    chosen = targets.reshape(-1).index_select(0, places_of(accepted)).to(torch.int32)
-    return _Edges(chosen.cpu().numpy(), np.count_nonzero(accepted.cpu().numpy(), axis=1))
-
-
-def _pack(
-    find: Callable[[slice], list[_Edges]],
-    cloud: GrowingCloud,
-    block: slice,
-    more: EdgeLists | None,
-    chunk_size: int,
-) -> tuple[EdgeLists, list[_Edges]]:
-    """Join the first edges of a block's chunks, and those of more nodes; collect what is left.
-
-    The edges are found by as many threads as torch uses.
-    """
-    num_points = block.stop - block.start
-    chunks = [
-        slice(block.start + chunk.start, block.start + chunk.stop)
-        for chunk in chunks_of(num_points, chunk_size) or [slice(0, 0)]
-    ]
-    at_once = _CHUNKS_A_THREAD * allowed_threads()
-    spare = 0 if more is None else len(more.targets)
-    # As long as it can get: memory that is not used is not touched.
-    size = num_points * cloud.neighbors.indices.shape[1] + spare
-    targets = scratch.empty((size,), np.int32)
-    counts, remainder, used = [], [], 0
-
-    def append(edges: _Edges) -> None:
-        nonlocal used
-        targets[used : used + len(edges.targets)] = edges.targets
-        used += len(edges.targets)
-        counts.append(edges.counts)
-
-    for first in range(0, len(chunks), at_once):
-        for edges, *others in map_tasks(find, chunks[first : first + at_once], cloud.points.device):
-            append(edges)
-            remainder += others
-    if more is not None:
-        append(_Edges(more.targets, np.diff(more.starts)))
-    dtype = np.int32 if len(targets) < 2**31 else np.int64
-    return EdgeLists(np.concatenate([[0], *counts]).cumsum(dtype=dtype), targets[:used]), remainder
 
 
 def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
@@ -429,40 +297,3 @@ def patch_radii(patches: Tensor, mask: Tensor | None = None) -> Tensor:
     if mask is not None:
         sq_distances = torch.where(mask, sq_distances, 0.0)
     return sq_distances.amax(dim=-1).sqrt()
-
-
-def chain_of(seeds: NDArray[np.int32], num_points: int) -> EdgeLists:
-    """Return the edges of a chain of nodes behind those of a graph of so many points.
-
-    Each node leads to one of the seeds, then to the next node.
-    """
-    targets = np.empty(max(2 * len(seeds) - 1, 0), dtype=np.int32)
-    targets[::2] = seeds
-    targets[1::2] = np.arange(num_points + 1, num_points + len(seeds))
-    starts = np.minimum(2 * np.arange(len(seeds) + 1, dtype=np.int32), len(targets))
-    return EdgeLists(starts, targets)
-
-
-def first_to_reach(edges: EdgeLists, num_points: int) -> NDArray[np.int32]:
-    """Return for each point the first of the seeds that reaches it along edges, -1 for none.
-
-    This is what growing one region after the other, from each seed that is still free, comes to,
-    if it does not matter for what a point reaches who claimed it: the first seed that reaches a
-    point finds all of its way free. One depth-first search does it: behind the edges of the points
-    are those of the :func:`chain_of` the seeds, where it begins.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import depth_first_order
-
-    roots = np.full(num_points, -1, dtype=np.int32)
-    num_nodes = len(edges.starts) - 1
-    if num_nodes == num_points:
-        return roots
-    # The search reads no weights; an array of one repeated value takes no memory.
-    weights = np.broadcast_to(np.float64(1), len(edges.targets))
-    graph = csr_array((weights, edges.targets, edges.starts), shape=(num_nodes, num_nodes))
-    visited, parents = depth_first_order(graph, num_points, directed=True)
-    visited = visited[visited < num_points]
-    is_root = parents[visited] >= num_points
-    roots[visited] = visited[is_root][np.cumsum(is_root) - 1]
-    return roots

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_tasks
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_tasks
 from torchrg.config import GrowingConfig
 from torchrg.linalg import coordinate_resolution, eigh3_of_few
 from torchrg.linalg.moments import Segments
@@ -182,16 +182,17 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     """
     segments = Segments(labels, most=MOST_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
-    radii = [
-        neighborhood_radii(cloud.points, cloud.neighbors.at(rows))
-        for rows in torch.split(segments.rows, ROWS_AT_ONCE)
-    ]
+    radii = map_tasks(
+        lambda rows: neighborhood_radii(cloud.points, cloud.neighbors.at(rows)),
+        torch.split(segments.rows, ROWS_IN_CACHE),
+        labels.device,
+    )
     radius = segments.median(torch.cat(radii)).double()
     floor = config.coplanarity_floor * radius
     facets = _FACET_THICKNESS * float(config.facet_tolerance or 0.0)
     planes = planes._replace(
         thickness=torch.maximum(planes.thickness, floor).clamp(min=facets),
-        num_points=torch.bincount(labels + 1, minlength=1)[1:],
+        num_points=segments.sizes,
         floor=floor,
         radius=radius,
     )

@@ -1,7 +1,6 @@
 """Region growing: from points, normals and neighbours to labels."""
 
 import math
-from array import array
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,43 +9,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import kernels, scratch
+from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import (
     CHUNK_SIZE,
     ROWS_AT_ONCE,
     chunks_of,
-    return_freed_memory,
     sequential_operations,
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import blocks, canonical_order, measure_sampling
+from torchrg.neighbors import canonical_order, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
-from torchrg.regions.edges import (
-    EdgeLists,
-    GrowingCloud,
-    chain_of,
-    find_coded_edges,
-    find_edges,
-    first_to_reach,
-    is_order_free,
-    join_edges,
-    mark_edges,
-    neighborhood_radii,
-    promotes_late,
-)
+from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
-from torchrg.regions.reach import condense, join_condensed
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
-
-_LONG_QUEUE = 32
-"""From this many waiting seeds on, all of them go through NumPy at once; below, one at a time."""
-
-_CLAIMING_SEEDS = 2**13
-"""Seeds whose claims are gathered at a time; with 50 neighbours some 4 MB."""
 
 
 @of_clouds
@@ -283,75 +262,24 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
-    """Return the root of each point's region ``(N,)``, by whichever way the settings allow.
+    """Return the root of each point's region ``(N,)``: the point it began with, or -1.
 
-    The root of a region is the point it began with. Of a point that is not valid it is -1.
+    Points that are not valid have none, and some of those whose region is too small to count.
     """
-    growing = cloud.curvature[cloud.valid]
-    order = cloud.curvature.cpu().argsort(stable=True).to(torch.int32).numpy()
-    order = order[cloud.valid.cpu().numpy()[order]]
+    growing, indices = cloud.curvature[cloud.valid], cloud.neighbors.indices.cpu()
     limit = curvature_limit(growing, config.curvature_quantile)
-    seeds = order[: int(torch.count_nonzero(growing <= limit))]
-    indices, masked = cloud.neighbors
-    if kernels.serve(indices, masked, cloud.valid, cloud.curvature) and not scratch.is_active():
-        return _grow_by_bits(cloud, config, order, seeds, limit, chunk_size)
-    if is_order_free(config):
-        roots, others = reach_from_seeds(cloud, config, seeds, limit, chunk_size)
-        if int(config.min_size) <= cloud.neighbors.indices.shape[1]:
-            # Points that no seed reaches may make regions with free neighbours of their own.
-            free = roots < 0
-            left = grow_first_in_first_out(others, order[free[order]], free)
-            roots = np.where(free, left, roots)
-    else:
-        edges, claims = find_coded_edges(cloud, config, limit, chunk_size=chunk_size)
-        valid, lists = cloud.valid.cpu().numpy(), indices.cpu().numpy()
-        roots = grow_first_in_first_out(edges, order, valid, claims, lists)
-    return torch.from_numpy(roots).to(cloud.points.device)
-
-
-def _grow_by_bits(
-    cloud: GrowingCloud,
-    config: GrowingConfig,
-    order: NDArray[np.int32],
-    seeds: NDArray[np.int32],
-    limit: Tensor,
-    chunk_size: int,
-) -> Tensor:
-    """Do as :func:`grow` in a kernel: Algorithm 2 on a bit for each neighbour."""
-    indices, late = cloud.neighbors.indices, promotes_late(config)
+    is_seed, valid = (cloud.curvature <= limit).cpu(), cloud.valid.cpu()
+    order = cloud.curvature.cpu().argsort(stable=True)
+    order = order[valid[order]].int()
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
-    begins, is_seed = order, cloud.curvature <= limit
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
-        # What a point has around it that no seed reaches is too small a region.
-        begins = seeds
-    bits = indices, joins, makes_seed, is_seed, cloud.valid
-    return kernels.call("grow_regions", *bits, torch.from_numpy(begins), late)[0]
-
-
-def reach_from_seeds(
-    cloud: GrowingCloud,
-    config: GrowingConfig,
-    seeds: NDArray[np.int32],
-    limit: Tensor,
-    chunk_size: int,
-) -> tuple[NDArray[np.int32], EdgeLists]:
-    """Return the first of the seeds that reaches each point, and the edges of all other points.
-
-    The edges of seeds are one graph, or on a disk the graphs of blocks that :func:`condense`
-    shrinks.
-    """
-    num_points = len(cloud.points)
-    if not scratch.is_active():
-        chain = chain_of(seeds, num_points)
-        edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, more=chain)
-        return first_to_reach(edges, num_points), others
-    parts, more = [], []
-    for block in chunks_of(num_points, blocks.BLOCK_SIZE):
-        edges, others = find_edges(cloud, config, limit, chunk_size=chunk_size, block=block)
-        parts.append(condense(edges, block))
-        more.append(others)
-    return_freed_memory()
-    return join_condensed(parts, seeds), join_edges(more)
+        order = order[: int(torch.count_nonzero(growing <= limit))]
+    tables, late = (indices, joins, makes_seed, is_seed, valid, order), promotes_late(config)
+    if kernels.serve(indices, valid):
+        roots = kernels.call("grow_regions", *tables, late)[0]
+    else:
+        roots = grow_first_in_first_out(*tables, late=late)
+    return roots.to(cloud.points.device)
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
@@ -362,66 +290,61 @@ def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
 
 
 def grow_first_in_first_out(
-    edges: EdgeLists,
-    order: NDArray[np.int32],
-    valid: NDArray[np.bool_],
-    claims: NDArray[np.bool_] | None = None,
-    neighbors: NDArray[np.integer] | None = None,
-) -> NDArray[np.int32]:
+    neighbors: Tensor,
+    joins: Tensor,
+    makes_seed: Tensor | None,
+    is_seed: Tensor,
+    valid: Tensor,
+    order: Tensor,
+    *,
+    late: bool,
+) -> Tensor:
     """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
 
-    A point belongs to the first seed in the queue that has an edge to it. Whether it becomes a seed
-    itself is a property of that edge: targets are ``2 * row + (whether it does)``.
+    A point belongs to the first seed in the queue that it joins. Whether it becomes a seed itself
+    is a property of that edge, or its own where edges say nothing of it; :func:`mark_edges` returns
+    the bits of both. With ``late`` promotion any edge of its region may make a point a seed,
+    whichever claimed it: those that merely join do so when all seeds are known.
 
-    With late promotion any edge of its region may make a point a seed, whichever claimed it. Then
-    the order of the queue does not matter: all edges given make seeds, and those ``neighbors``
-    ``(N, K)`` that the seeds of a region merely ``claim`` join when the seeds are all known.
-
-    Of a long queue all waiting seeds are taken at a time, their edges in the order of the queue:
-    this claims exactly what one seed after the other does. Returns the root of each point's region,
-    -1 where not valid.
+    All waiting seeds are taken at a time, their edges in the order of the queue: this claims
+    exactly what one seed after the other does. Returns the root of each point's region.
     """
-    all_codes, starts = edges.targets, memoryview(edges.starts.data)
-    free = bytearray(valid.tobytes())
-    roots = array("i", bytes(4 * len(valid)))
-    free_view = np.frombuffer(free, dtype=np.bool_)
-    roots_view = np.frombuffer(roots, dtype=np.int32)
-    roots_view[:] = -1
-    slots = np.empty(len(valid), dtype=np.int32)
-    for root in _still_free(order, free_view):
+    lists, free, is_seed_itself = neighbors.numpy(), valid.numpy().copy(), is_seed.numpy()
+    roots, slots = np.full(len(free), UNLABELED, dtype=np.int32), np.empty(len(free), np.int32)
+
+    def claim(root: int, seeds: NDArray[np.integer], *, promoted: bool) -> NDArray[np.integer]:
+        """Give a region the free neighbours of its seeds, and return those that become seeds."""
+        near = lists[seeds]
+        claims = _flags(joins, seeds, near) & free[near]
+        by_edge = None if makes_seed is None else _flags(makes_seed, seeds, near)
+        if promoted:
+            claims &= by_edge
+        targets = near[claims]
+        # Of several writes to one place the last one stays: in reverse, the first edge to a point.
+        numbers = np.arange(len(targets), dtype=np.int32)
+        slots[targets[::-1]] = numbers[::-1]
+        free[targets], roots[targets] = False, root
+        becomes_seed = is_seed_itself[targets] if by_edge is None else by_edge[claims]
+        new: NDArray[np.integer] = targets[becomes_seed & (slots[targets] == numbers)]
+        return new
+
+    for root in _still_free(order.numpy(), free):
         if not free[root]:
             continue
-        free[root] = False
-        roots[root] = root
-        seeds = array("i", [root])
-        done = 0
-        while done < len(seeds):
-            if len(seeds) - done >= _LONG_QUEUE:
-                codes = _edges_of(edges, np.frombuffer(seeds[done:], dtype=np.int32))
-                codes = _first_of_each(codes[free_view[codes >> 1]], slots)
-                done = len(seeds)
-                targets = codes >> 1
-                free_view[targets] = False
-                roots_view[targets] = root
-                seeds.frombytes(targets[(codes & 1).astype(bool)].tobytes())
-                continue
-            seed = seeds[done]
-            done += 1
-            for code in all_codes[starts[seed] : starts[seed + 1]].tolist():
-                target = code >> 1
-                if free[target]:
-                    free[target] = False
-                    roots[target] = root
-                    if code & 1:
-                        seeds.append(target)
-        if claims is not None and neighbors is not None:
-            for first in range(0, len(seeds), _CLAIMING_SEEDS):
-                chunk = np.frombuffer(seeds[first : first + _CLAIMING_SEEDS], dtype=np.int32)
-                claimed = neighbors[chunk][claims[chunk]]
-                claimed = claimed[free_view[claimed]]
-                free_view[claimed] = False
-                roots_view[claimed] = root
-    return roots_view
+        free[root], roots[root] = False, root
+        waves: list[NDArray[np.integer]] = [np.array([root])]
+        while len(waves[-1]):
+            waves.append(claim(root, waves[-1], promoted=late))
+        for seeds in waves if late else ():
+            claim(root, seeds, promoted=False)
+    return torch.from_numpy(roots)
+
+
+def _flags(bits: Tensor, rows: NDArray[np.integer], near: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return the bits of some rows, one for each of the neighbours ``(n, K)``."""
+    of_rows = bits.numpy()[rows].view(np.uint8)
+    flags = np.unpackbits(of_rows, axis=1, count=near.shape[1], bitorder="little")
+    return flags.view(np.bool_)
 
 
 def _still_free(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
@@ -429,23 +352,3 @@ def _still_free(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[i
     for rows in chunks_of(len(order), ROWS_AT_ONCE):
         chunk = order[rows]
         yield from chunk[free[chunk]].tolist()
-
-
-def _edges_of(edges: EdgeLists, rows: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the targets of some points' edges, one point after the other."""
-    starts = edges.starts[rows]
-    counts = edges.starts[rows + 1] - starts
-    ends = np.cumsum(counts, dtype=starts.dtype)
-    places = np.repeat(starts - ends + counts, counts)
-    places += np.arange(len(places), dtype=places.dtype)
-    return edges.targets[places]
-
-
-def _first_of_each(codes: NDArray[np.int32], slots: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the first of the codes of each target; ``slots`` has room for every point."""
-    targets = codes >> 1
-    numbers = np.arange(len(targets), dtype=np.int32)
-    # Of several writes to one place the last one stays: in reverse, the first edge to a point.
-    slots[targets[::-1]] = numbers[::-1]
-    firsts: NDArray[np.int32] = codes[slots[targets] == numbers]
-    return firsts
