@@ -137,14 +137,21 @@ KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, 
                            Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
                            Doubles axes, double* coordinates) {
   if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
+  double u[BLOCK], v[BLOCK], w[BLOCK];
   for (int64_t m = 0, start = 0; m < num; start += counts[m++])
-    for (int64_t i = start; i < start + counts[m]; i++) {
-      if (rows[i] < 0 || rows[i] >= P) return NO_SUCH_ROW;
-      const double *center = centers + 3 * m, *axis = axes + 3 * num_axes * m;
-      const double u = x[rows[i]] - center[0], v = y[rows[i]] - center[1],
-                   w = z[rows[i]] - center[2];
-      for (int64_t a = 0; a < num_axes; a++, axis += 3)
-        coordinates[a * n + i] = u * axis[0] + v * axis[1] + w * axis[2];
+    for (int64_t from = start; from < start + counts[m]; from += BLOCK) {
+      const int count = int(smaller(start + counts[m] - from, int64_t(BLOCK)));
+      const double* center = centers + 3 * m;
+      for (int j = 0; j < count; j++) {
+        const int64_t row = rows[from + j];
+        if (row < 0 || row >= P) return NO_SUCH_ROW;
+        u[j] = x[row] - center[0], v[j] = y[row] - center[1], w[j] = z[row] - center[2];
+      }
+      for (int64_t a = 0; a < num_axes; a++) {
+        const double* axis = axes + 3 * (num_axes * m + a);
+        for (int j = 0; j < count; j++)
+          coordinates[a * n + from + j] = u[j] * axis[0] + v[j] * axis[1] + w[j] * axis[2];
+      }
     }
   return DONE;
 }
