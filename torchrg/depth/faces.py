@@ -133,8 +133,20 @@ def hidden_contacts(
     counts as on it, NaN for a curved region. The pairs are as
     :func:`torchrg.regions.repair.merge_coplanar` takes them.
     """
-    image, pairs = labels.view(seen.shape), _aligned_pairs(planes)
-    lines = count_lines(points, seen, image, pairs, planes, reach)
+    pairs, tables = _aligned_pairs(planes), (planes.normal, planes.center, reach)
+    if serves(points):
+        image = points.T, seen, labels.view(seen.shape)
+        (lines, *_) = kernels.call("count_lines", *image, *tables, pairs, _EVERY, _LEAST_NEARER)
+    else:
+        pixels = points.view(*seen.shape, 3), seen, labels.view(seen.shape)
+        rows = [values[::_EVERY] for values in pixels]
+        columns = [values[:, ::_EVERY].transpose(0, 1) for values in pixels]
+        lines = pairs.new_tensor(
+            [
+                sum(_count_lines(way, (a, b), *(t[a] for t in tables)) for way in (rows, columns))
+                for a, b in pairs.tolist()
+            ]
+        )
     lead = lines >= _LEAST_LINES
     return pairs[lead].sort(dim=1).values, lines[lead] * _EVERY
 
@@ -150,42 +162,13 @@ def _aligned_pairs(planes: RegionPlanes) -> Tensor:
     return (aligned & is_larger & both_flat).nonzero()
 
 
-def count_lines(
-    points: Tensor,
-    seen: Tensor,
-    labels: Tensor,
-    pairs: Tensor,
-    planes: RegionPlanes,
-    reach: Tensor,
-) -> Tensor:
-    """Return how many of the rows and columns looked at lead from one region to the other, by pair.
-
-    They do so past what is nearer. ``points`` are those of :func:`hidden_contacts`, ``seen`` and
-    ``labels`` images.
-    """
-    tables = planes.normal, planes.center, reach
-    if serves(points):
-        image, limits = (points.T, seen, labels), (_EVERY, _LEAST_NEARER)
-        return kernels.call("count_lines", *image, *tables, pairs, *limits)[0]
-    pixels = points.view(*seen.shape, 3), seen, labels
-    rows = [values[::_EVERY] for values in pixels]
-    columns = [values[:, ::_EVERY].transpose(0, 1) for values in pixels]
-    counts = [
-        sum(
-            _count_lines_of_pair(lines, (a, b), *(table[a] for table in tables))
-            for lines in (rows, columns)
-        )
-        for a, b in pairs.tolist()
-    ]
-    return pairs.new_tensor(counts)
-
-
-def _count_lines_of_pair(
+def _count_lines(
     lines: list[Tensor], pair: tuple[int, int], normal: Tensor, center: Tensor, reach: Tensor
 ) -> int:
-    """Do as :func:`count_lines` for lines of one direction, one pair and its larger plane.
+    """Return how many lines lead from one region to the other past what is nearer.
 
-    The lines are points ``(n, L, 3)``, which of them are seen, and labels ``(n, L)``.
+    That is than the plane of the larger one. The lines are points ``(n, L, 3)``, which of them are
+    seen, and labels ``(n, L)``.
     """
     points, seen, labels = lines
     first, second = ((labels == region) for region in pair)

@@ -164,7 +164,9 @@ def _refine(
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
-    joined = _join_strips(cloud, labels, planes)
+    width, (x, y, _) = cloud.seen.shape[1], cloud.points.unbind(dim=1)
+    tables = _planes_over_rays(planes), _normals_in_space(planes), planes.num_points
+    joined = join_strips(labels, (x[:width], y[::width]), cloud.noise, *tables)
     if joined is not labels:
         labels = number_by_size(joined, config.min_size)
         planes = fit_inverse_planes(cloud, labels)
@@ -187,13 +189,6 @@ def absorb_pixels(
     tables = planes.normal, planes.center, reach
     kernels.call("absorb_pixels", cloud.points.T, seen, image, *tables, *room)
     return image.flatten()
-
-
-def _join_strips(cloud: InverseCloud, labels: Tensor, fit: RegionPlanes) -> Tensor:
-    """Return what :func:`join_strips` does for the regions of an inverse cloud ``(H * W,)``."""
-    width, (x, y, _) = cloud.seen.shape[1], cloud.points.unbind(dim=1)
-    planes, normals, rays = _planes_over_rays(fit), _normals_in_space(fit), (x[:width], y[::width])
-    return join_strips(labels, rays, cloud.noise, planes, normals, fit.num_points)
 
 
 def _planes_over_rays(fit: RegionPlanes) -> Tensor:

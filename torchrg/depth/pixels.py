@@ -85,7 +85,7 @@ def describe_pixels(
     total = across + along * z * z
     variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
     normals = torch.stack([-column / length for column in away], dim=-1)
-    joins = _join(image, planes, normals, tolerance, limits)
+    joins = [_join(image, planes, normals, tolerance, limits, axis) for axis in (1, 0)]
     return Pixels(
         torch.where(valid[..., None], normals, 0.0),
         torch.where(valid, variation, 0.0),
@@ -101,43 +101,24 @@ def _join(
     normals: Tensor,
     tolerance: Tensor,
     limits: tuple[float, float, float],
-) -> list[Tensor]:
-    """Return which pixels are on one surface with the next to the right, and below, ``(H, W)``.
+    axis: int,
+) -> Tensor:
+    """Return which pixels are on one surface with the next along an axis, ``(H, W)``.
 
     The tolerance ``(H, W)`` is what their windows may deviate by; the limits are of step, angle and
     wider angle.
     """
-    flat, numbers = planes.choice.flat, planes.choice.window.flatten()
-    joins = []
-    for axis in (1, 0):
-        length, step = flat.shape[axis] - 1, (flat.shape[1], 1)[axis]
-        both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
-        here = places_of(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
-        there = here + step
-        on_one = _are_on_one_surface(image, planes, normals, tolerance, here, there, limits)
-        joined = torch.zeros_like(flat)
-        joined.view(-1)[here] = (numbers[here] == numbers[there]) | on_one
-        joins.append(joined)
-    return joins
-
-
-def _are_on_one_surface(
-    image: Image,
-    planes: PixelPlanes,
-    normals: Tensor,
-    tolerance: Tensor,
-    here: Tensor,
-    there: Tensor,
-    limits: tuple[float, float, float],
-) -> Tensor:
-    """Tell which pixels are on one surface with others; see :func:`_join`."""
     max_step, max_sq_chord, wider_sq_chord = limits
-    width = len(image.u)
+    flat, numbers, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
+    length, joined = flat.shape[axis] - 1, torch.zeros_like(flat)
+    both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
+    here = places_of(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
+    there = here + (width, 1)[axis]
     row, column = here // width, here % width
     ours, theirs = planes.take(here), planes.take(there)
     u_slope, v_slope = ours.u_slope - theirs.u_slope, ours.v_slope - theirs.v_slope
     step = u_slope * image.u[column] + v_slope * image.v[row] + ours.origin - theirs.origin
-    next_step = step + torch.where(there // width > row, v_slope, u_slope)
+    next_step = step + (v_slope, u_slope)[axis]
     tolerance, normals = tolerance.flatten(), normals.view(-1, 3)
     limit = max_step * torch.maximum(tolerance[here], tolerance[there])
     turned = sq_chords(*(normals[at][:, :, None].unbind(dim=1) for at in (here, there))).squeeze(1)
@@ -148,7 +129,9 @@ def _are_on_one_surface(
     alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
     both_hold = holds(sides, middles, there, width) & holds(their_sides, their_middles, here, width)
     accepted = (turned <= max_sq_chord) | ((alike | (turned <= wider_sq_chord)) & both_hold)
-    return accepted & (step.abs() <= limit) & (next_step.abs() <= limit)
+    accepted &= (step.abs() <= limit) & (next_step.abs() <= limit)
+    joined.view(-1)[here] = accepted | (numbers[here] == numbers[there])
+    return joined
 
 
 def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:

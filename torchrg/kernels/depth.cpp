@@ -36,7 +36,7 @@ INLINE void solve(const double (&s)[MOMENTS][N], int j, double least_count, doub
   const double rest = ww - u_slope * uw - v_slope * vw;
   const double variance = (rest < 0 ? 0 : rest) * count / larger(count - 3, 1.0);
   to[0][j] = u_slope, to[1][j] = v_slope, to[2][j] = w - u_slope * u - v_slope * v;
-  to[3][j] = (has_plane & (variance < NONE)) ? square_root(variance) : NONE, to[4][j] = w;
+  to[3][j] = has_plane & (variance < NONE) ? square_root(variance) : NONE, to[4][j] = w;
 }
 
 // What a pixel adds to the sums of its windows, in place j.
@@ -450,29 +450,23 @@ KERNEL connect_pixels(int64_t h, int64_t w, Flagged flat, Flagged right, Flagged
 
 namespace {
 
-// The eight pixels around one, those outside of the image replaced by the nearest inside.
-struct Around {
-  int64_t h, w;
+// Pixels whose label may change in a turn, each once.
+struct Front {
+  int64_t h, w, *rows, *marks, *chosen;  // (h * w) each; marks are the turns of coming in last
+  int64_t count = 0, turn = 0;
 
+  Front(int64_t h, int64_t w, int64_t* rows, int64_t* marks, int64_t* chosen)
+      : h(h), w(w), rows(rows), marks(marks), chosen(chosen) {
+    for (int64_t i = 0; i < h * w; i++) marks[i] = -1;
+  }
+  // The eight pixels around one, those outside of the image replaced by the nearest inside.
   template <class Visit>
-  INLINE_MEMBER void visit(int64_t pixel, const Visit& visit) const {
+  INLINE_MEMBER void visit_around(int64_t pixel, const Visit& visit) const {
     const int64_t row = pixel / w, column = pixel % w;
     for (int64_t r = row - 1; r <= row + 1; r++)
       for (int64_t c = column - 1; c <= column + 1; c++)
         if (r != row || c != column)
           visit(smaller(larger(r, int64_t(0)), h - 1) * w + smaller(larger(c, int64_t(0)), w - 1));
-  }
-};
-
-// Pixels whose label may change in a turn, each once.
-struct Front {
-  const Around& around;
-  int64_t *rows, *marks, *chosen;  // (h * w) each; marks are the turns in which pixels came in last
-  int64_t count, turn;
-
-  Front(const Around& around, int64_t* rows, int64_t* marks, int64_t* chosen)
-      : around(around), rows(rows), marks(marks), chosen(chosen), count(0), turn(0) {
-    for (int64_t i = 0; i < around.h * around.w; i++) marks[i] = -1;
   }
   INLINE_MEMBER void add(int64_t pixel) {
     if (marks[pixel] == turn) return;
@@ -483,13 +477,13 @@ struct Front {
   template <class Cost, class Follows>
   INLINE_MEMBER void spread(int64_t* labels, int64_t num_turns, const Cost& cost,
                             const Follows& follows) {
-    for (; turn < num_turns && count > 0;) {
+    while (turn < num_turns && count > 0) {
       int64_t moved = 0;
       for (int64_t f = 0; f < count; f++) {
         const int64_t pixel = rows[f];
         double least = NONE;
         int64_t best = -1;
-        around.visit(pixel, [&](int64_t other) {
+        visit_around(pixel, [&](int64_t other) {
           const double away = cost(pixel, other);
           if (away < least || (away == least && labels[other] < best))
             least = away, best = labels[other];
@@ -501,7 +495,7 @@ struct Front {
       const auto add_next = [&](int64_t pixel) {
         if (follows(pixel)) add(pixel);
       };
-      for (int64_t f = 0; f < moved; f++) add_next(chosen[f]), around.visit(chosen[f], add_next);
+      for (int64_t f = 0; f < moved; f++) add_next(chosen[f]), visit_around(chosen[f], add_next);
     }
   }
 };
@@ -520,8 +514,7 @@ KERNEL absorb_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points,
                      int64_t* rows, int64_t* marks, int64_t* chosen) {
   const int64_t n = h * w;
   if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
-  const Around around = {h, w};
-  Front front(around, rows, marks, chosen);
+  Front front(h, w, rows, marks, chosen);
   const auto may_join = [&](int64_t pixel) { return labels[pixel] < 0 && seen[pixel]; };
   for (int64_t i = 0; i < n; i++)
     if (may_join(i)) front.add(i);
@@ -543,8 +536,7 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
   const int64_t n = h * w;
   if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
   const double *x = points, *y = points + n, *z = points + 2 * n;
-  const Around around = {h, w};
-  Front front(around, rows, marks, chosen);
+  Front front(h, w, rows, marks, chosen);
   const auto compare = [&](int64_t i, int64_t other) {
     if (labels[i] != labels[other] && labels[i] >= 0 && labels[other] >= 0)
       front.add(i), front.add(other);
