@@ -38,7 +38,7 @@ SIGNATURES = {
     "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N] d[N3]",
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
-    "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n -> i[N] i[N]",
+    "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
     "meet_others": "i[N] i[n] i[nk] b[nk]? -> b[n]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
     "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",

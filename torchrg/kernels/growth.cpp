@@ -35,12 +35,12 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
 // growth.grow_first_in_first_out, with a bit for each neighbour that joins, in words of 64.
 //
 // A target becomes a seed by the bit of the edge, or where it is one itself. With `late` promotion
-// those that merely join do so when all seeds of the region are known.
+// those that merely join do so when all seeds of the region are known. `roots` are -1 before the
+// first of `order`, and `queue` is for the kernel itself.
 KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t num_roots,
                     Ints indices, Longs joins, Longs makes_seed, Flagged is_seed, Flagged valid,
                     Ints order, int64_t late, int32_t* roots, int32_t* queue) {
   if (64 * num_words < k) return TOO_WIDE;
-  for (int64_t i = 0; i < num_points; i++) roots[i] = -1;
   for (int64_t r = 0; r < num_roots; r++) {
     const int32_t root = order[r];
     if (uint32_t(root) >= uint64_t(num_points)) return NO_SUCH_ROW;

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import (
     CHUNK_SIZE,
@@ -26,6 +26,10 @@ from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, 
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
+
+_ROOTS_AT_ONCE = 1024
+"""Points that regions begin at between two releases of what is on a disk. Where each reads a list
+for itself, the system maps some 200 kB around it."""
 
 
 @of_clouds
@@ -274,11 +278,16 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
         order = order[: int(torch.count_nonzero(growing <= limit))]
-    tables, late = (indices, joins, makes_seed, is_seed, valid, order), promotes_late(config)
+    tables, late = (indices, joins, makes_seed, is_seed, valid), promotes_late(config)
     if kernels.serve(indices, valid):
-        roots = kernels.call("grow_regions", *tables, late)[0]
+        roots = torch.full(valid.shape, UNLABELED, dtype=torch.int32, device="cpu")
+        queue = torch.empty_like(roots)
+        at_once = _ROOTS_AT_ONCE if scratch.is_active() else max(len(order), 1)
+        for some in torch.split(order, at_once):
+            kernels.call("grow_regions", *tables, some, late, roots, queue)
+            scratch.release()
     else:
-        roots = grow_first_in_first_out(*tables, late=late)
+        roots = grow_first_in_first_out(*tables, order, late=late)
     return roots.to(cloud.points.device)
 
 
