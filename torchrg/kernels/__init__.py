@@ -27,7 +27,6 @@ definitions."""
 
 SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
-    "are_coplanar": "f[3N] i[nk] b[nk]? f[n3] b[nk] b[nk]? x x -> b[nk]",
     "fit_normals_pca": "f[N3] i[nk] b[nk]? f[n] x x -> f[n3] f[n] f[n] b[n] b[n]",
     "survey": "f[N3] i[nk] b[nk]? f[n3] b[n] n n x x -> f[n] f[n] f[n] b[n] b[n] f[n] f[n]",
     "broken_planes": "f[N3] i[nk] b[nk]? f[n] f[n3] l[p2] f[c] -> f[n3] f[n] f[n3] f[n] f[n]",
@@ -44,7 +43,6 @@ SIGNATURES = {
     "gather_borders": "i[e] i[e] d[e]? d[e] L[r] L[r] -> l[e] i[e] i[e] d[e] d[e] l[1]",
     "merging_costs": "d[R] d[RF] d[Rc] d[Rc] i[E] i[E] d[E] d[E] x x -> d[E]",
     "cheapest_borders": "i[E] i[E] d[E] D[R] -> l[R]",
-    "neighbor_quantiles": "f[N] i[nk] b[nk]? x n -> f[n]",
     "fit_pixel_windows": "d[hw] b[hw] d[w] d[h] D[5hw] D[mpq] x x n n -> ",
     "fit_cell_windows": "d[mhw] D[5hw] D[mpq] x x n n -> ",
     "rate_windows": "D[9hw] d[pq] x x x x x x x x x n n n -> ",
@@ -54,12 +52,9 @@ SIGNATURES = {
     "describe_pixels": "d[hw] b[hw] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] D[hw] D[hw] "
     "B[hw] x x x x x x n n -> ",
     "join_pixels": "l[hw] b[hw] d[hw3] d[hw] d[N] d[M] l[n] d[w] d[h] B[hw] B[hw] x x x n n -> ",
-    "segment_rows": "l[n] n L[M] L[M] L[M] -> l[n]",
     "outer_places": "d[n] d[n] l[M] x -> b[n]",
-    "segment_coordinates": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
-    "number_by_size": "l[n] n -> l[n] l[n] l[n]",
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
     "absorb_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",

@@ -71,31 +71,6 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   return DONE;
 }
 
-// growth.number_by_size; `sizes` and `order` are for the kernel itself.
-KERNEL number_by_size(int64_t n, Longs regions, int64_t min_size, int64_t* numbers, int64_t* sizes,
-                      int64_t* order) {
-  for (int64_t i = 0; i < n; i++) sizes[i] = order[i] = 0;
-  for (int64_t i = 0; i < n; i++) {
-    if (regions[i] < -1 || regions[i] >= n) return NO_SUCH_ROW;
-    if (regions[i] >= 0) sizes[regions[i]]++;
-  }
-  const int64_t least = larger(min_size, int64_t(1));
-  for (int64_t r = 0; r < n; r++)
-    if (sizes[r] >= least) order[sizes[r] - 1]++;
-  // How many regions are larger than each size.
-  for (int64_t size = n, larger_ones = 0; size >= 1; size--) {
-    const int64_t number = order[size - 1];
-    order[size - 1] = larger_ones, larger_ones += number;
-  }
-  for (int64_t i = 0; i < n; i++) {
-    const int64_t r = regions[i];
-    // A size below zero is the region's number.
-    if (r >= 0 && sizes[r] >= least) sizes[r] = -1 - order[sizes[r] - 1]++;
-    numbers[i] = r >= 0 && sizes[r] < 0 ? -1 - sizes[r] : -1;
-  }
-  return DONE;
-}
-
 // shared_neighbors.SharedNeighbors.connected: whether ends of edges from rows `first` on share
 // `least` neighbours. Lists of a block of rows are bits over the points that occur in them, its
 // members; `numbers` need no values before, as a number counts where the member so numbered is it.

@@ -110,9 +110,6 @@ class Segments:
     """
 
     def __init__(self, labels: Tensor, *, most: int | None = None) -> None:
-        if labels.device.type == "cpu" and kernels.serve():
-            self._take_rows(labels, most)
-            return
         labels = labels.clamp(min=-1)
         num_unlabeled, *_ = counts = torch.bincount(labels + 1, minlength=1)
         self.rows = _ascending(labels)[num_unlabeled:]
@@ -126,14 +123,6 @@ class Segments:
             self.rows = self.rows[torch.cat(parts)] if parts else self.rows
             sizes = [len(block) for block in parts]
             self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
-        self.labels = torch.repeat_interleave(self.counts)
-
-    def _take_rows(self, labels: Tensor, most: int | None) -> None:
-        num_regions = int(labels.max()) + 1 if len(labels) else 0
-        self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
-        room, most = self.counts.new_empty(2, len(self.counts)), most or len(labels) + 1
-        (rows,) = kernels.call("segment_rows", labels.long(), most, self.counts, *room)
-        self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
 
     def split(self, most: int) -> "list[Segments]":
@@ -177,9 +166,6 @@ class Segments:
 
         Along the ``axes`` ``(M, A, 3)`` of their region, A columns ``(n,)`` of float64.
         """
-        if self.is_served(vectors) and centers.dtype == torch.float64:
-            tables = self.rows, self.counts, centers, axes
-            return list(kernels.call("segment_coordinates", *vectors.unbind(dim=1), *tables)[0])
         about, columns = self.take_about(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
@@ -191,9 +177,6 @@ class Segments:
 
     def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Return the columns of :meth:`take` about a center ``(M, 3)`` for each region."""
-        if self.is_served(vectors) and centers.dtype == torch.float64:
-            eye = torch.eye(3, dtype=torch.float64, device=centers.device)
-            return self.along(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
         return [self.take(column).double() - self.spread(center) for column, center in pairs]
 

@@ -223,10 +223,6 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
     rank, quantiles = max(math.ceil(quantile * indices.shape[1]), 1), torch.empty_like(values)
 
     def work(block: slice) -> None:
-        if kernels.serve(values, indices, counted, k=indices.shape[1]):
-            lists = neighbors.at(block)
-            (quantiles[block],) = kernels.call("neighbor_quantiles", values, *lists, quantile, rank)
-            return
         if counted is None and values.device.type == "cpu":
             near = np.take(values.numpy(), indices[block].numpy())
             near.partition(rank - 1, axis=1)
