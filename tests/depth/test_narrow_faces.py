@@ -81,7 +81,7 @@ def test_jitter_of_rays_is_found(jitter, rng):
     moved = [torch.randn(HEIGHT, WIDTH, generator=rng).double() * jitter for _ in range(2)]
     image = 0.5 + 0.001 * (u + moved[0]).abs() + 0.0005 * (v[:, None] + moved[1])
     seen = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    found = find_jitter(fit_windows(Image(image, seen, u, v))[2])
+    found = find_jitter(fit_windows(Image(image, seen, u, v))[2], 2)
     assert found == pytest.approx(min(jitter, 0.15), rel=0.1, abs=1e-4)
 
 
@@ -129,10 +129,10 @@ def test_planes_that_end_stay_apart():
 
 
 def roof(turn_deg, step=0.0):
-    """Return the arguments of ``join_strips`` for a face, and a strip of 6 columns beside it."""
-    ray = rays()
+    """Return labels and planes for ``join_strips``: a face, and 6 columns beside it."""
+    x = rays()[0, :, 0]
     slope = math.tan(math.radians(turn_deg))
-    crease = float(ray[0, 200, 0])
+    crease = float(x[200])
     # In space: z = 2, and z = 2 + step + slope (x - 2 crease).
     planes = torch.tensor([[0, 0, 0.5], [-slope, 0, 1.0]], dtype=torch.float64)
     planes[1] /= 2 + step - slope * 2 * crease
@@ -140,31 +140,39 @@ def roof(turn_deg, step=0.0):
     labels[:, 100:200], labels[:, 200:206] = 0, 1
     normals = torch.tensor([[0, 0, -1.0], [slope, 0, -1.0]]).double()
     normals /= normals.norm(dim=1, keepdim=True)
-    return labels, ray, torch.full((HEIGHT, WIDTH), 1e-6).double(), planes, normals
+    return labels, planes, normals
+
+
+def join(labels, planes, normals, axes=(0, 1)):
+    """Return what ``join_strips`` makes of an image, or of one turned over with its axes."""
+    places = [rays()[0, :, 0], rays()[:, 0, 1]]
+    noise = torch.full((labels.numel(),), 1e-6).double()
+    count = torch.bincount(labels[labels >= 0], minlength=len(planes))
+    axes = [*axes, 2]
+    x, y = (places[axis] for axis in axes[:2])
+    planes, normals = planes[:, axes], normals[:, axes]
+    return join_strips(labels.flatten(), (x, y), noise, planes, normals, count).view(labels.shape)
 
 
 @pytest.mark.parametrize(("turn", "step", "joins"), [(20, 0, 1), (50, 0, 0), (20, 0.05, 0)])
 def test_a_strip_joins_the_face_that_it_bends_away_from(turn, step, joins):
     labels, *others = roof(turn, step)
-    joined = join_strips(labels, *others)
+    joined = join(labels, *others)
     assert joined[:, 200:206].unique().tolist() == [1 - joins]
     assert torch.equal(joined[:, :200], labels[:, :200])
-    axes = [1, 0, 2]
-    ray, noise, planes, normals = others
-    turned = (ray.transpose(0, 1)[..., axes], noise.T, planes[:, axes], normals[:, axes])
-    assert torch.equal(join_strips(labels.T, *turned), joined.T)
+    assert torch.equal(join(labels.T, *others, axes=(1, 0)), joined.T)
 
 
 def test_wide_regions_and_strips_beside_narrow_ones_stay():
     labels, *others = roof(20)
     labels[:, 200:225] = 1
-    assert torch.equal(join_strips(labels, *others), labels)
+    assert torch.equal(join(labels, *others), labels)
     labels[:, 206:] = -1
     labels[:, :190] = -1
-    assert torch.equal(join_strips(labels, *others), labels)
+    assert torch.equal(join(labels, *others), labels)
 
 
 def test_one_region_or_none_stays():
-    labels, ray, noise, planes, normals = roof(20)
+    labels, planes, normals = roof(20)
     for kept in (labels.clamp(max=0), torch.full_like(labels, -1)):
-        assert torch.equal(join_strips(kept, ray, noise, planes[:1], normals[:1]), kept)
+        assert torch.equal(join(kept, planes[:1], normals[:1]), kept)

@@ -4,7 +4,7 @@ Strips along rounded edges go to the face beside them; regions of one plane that
 nearer parts count as touching.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torchrg._parallel import places_of
 from torchrg.depth.passes import serves
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
-from torchrg.structures import UNLABELED
+from torchrg.regions.repair import renumber
 
 _MOST_WIDTH = 10.0
 """Pixels; a wider strip is a face of its own."""
@@ -42,10 +42,30 @@ _LEAST_NEARER = 0.5
 or have no depth, as in the shadow of something nearer."""
 
 
+def borders(labels: Tensor, steps: Iterable[tuple[int, int]]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield for each step in rows and columns the pixels of an image that it takes to others.
+
+    That is to those of another label: row-major places of both, ``(n,)`` each.
+    """
+    # Narrow numbers are compared faster.
+    width, flat = labels.shape[1], labels.flatten().to(torch.int32)
+    for down, right in steps:
+        step = down * width + right
+        here = places_of(flat[: max(len(flat) - step, 0)] != flat[step:])
+        column = here % width + right
+        here = here[(column >= 0) & (column < width)]
+        yield here, here + step
+
+
 def join_strips(
-    labels: Tensor, rays: Tensor, noise: Tensor, planes: Tensor, normals: Tensor
+    labels: Tensor,
+    rays: tuple[Tensor, Tensor],
+    noise: Tensor,
+    planes: Tensor,
+    normals: Tensor,
+    count: Tensor,
 ) -> Tensor:
-    """Give narrow regions to the face that they bend away from, and return the labels ``(H, W)``.
+    """Give narrow regions to the face that they bend away from, and return the labels.
 
     A region is a strip of the face beside it if it is less than 10 pixels wide and at most 0.4 of
     the face, if its plane is turned by at most 35 degrees against the face's, and if along half of
@@ -54,31 +74,28 @@ def join_strips(
     equal ones to the larger. Strips of strips stay. The width of a region is twice its pixels over
     its circumference in sides of pixels.
 
-    ``labels`` ``(H, W)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; ``rays``
-    ``(H, W, 3)`` are ``(x, y, 1)``, so that those times ``planes`` ``(M, 3)`` are inverse depths,
-    of standard deviation ``noise`` ``(H, W)``; ``normals`` ``(M, 3)`` are in space.
+    ``labels`` ``(H * W,)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`, and are
+    returned themselves if nothing joins. The ``rays`` are x of the columns ``(W,)`` and y of the
+    rows ``(H,)``, so that ``(x, y, 1)`` times ``planes`` ``(M, 3)`` are inverse depths, of standard
+    deviation ``noise`` ``(H * W,)``; ``normals`` ``(M, 3)`` are in space, ``count`` ``(M,)`` tells
+    how many pixels regions have.
     """
-    num_regions = len(normals)
-    edges, meetings = labels.new_zeros(num_regions + 1), []
-    for image, turned_rays, deviation in (
-        (labels, rays, noise),
-        (labels.T, rays.transpose(0, 1), noise.T),
-    ):
-        places = places_of(image[:-1] != image[1:])
-        row, column = places // image.shape[1], places % image.shape[1]
-        first, second = image[row, column], image[row + 1, column]
-        for side in (first, second, image[0], image[-1]):
-            edges += torch.bincount(side + 1, minlength=num_regions + 1)
-        meets = (first >= 0) & (second >= 0)
-        row, column = row[meets], column[meets]
-        pairs = torch.stack([first[meets], second[meets]], dim=1)
-        apart = planes[pairs[:, 0]] - planes[pairs[:, 1]]
-        gap = (apart * turned_rays[row, column]).sum(dim=1).abs()
-        meetings.append((pairs, apart, gap - _MOST_NOISE * deviation[row, column]))
+    (x, y), num_regions, meetings = rays, len(normals), []
+    image = labels.view(len(y), len(x))
+    sides = [image[0], image[-1], image[:, 0], image[:, -1]]
+    for here, there in borders(image, [(1, 0), (0, 1)]):
+        pair = torch.stack([labels[here], labels[there]], dim=1)
+        sides.append(pair.flatten())
+        meets = (pair >= 0).all(dim=1)
+        here, pair = here[meets], pair[meets]
+        apart = planes[pair[:, 0]] - planes[pair[:, 1]]
+        a, b, c = apart.unbind(dim=1)
+        gap = (a * x[here % len(x)] + b * y[here // len(x)] + c).abs()
+        meetings.append((pair, apart, gap - _MOST_NOISE * noise[here]))
     pairs, apart, gap = (torch.cat(columns) for columns in zip(*meetings, strict=True))
-    count = torch.bincount(labels.flatten() + 1, minlength=num_regions + 1)[1:]
-    width = 2 * count / edges[1:]
-    pitch = (rays[-1, -1] - rays[0, 0])[:2] / (rays.new_tensor(labels.T.shape) - 1).clamp(min=1)
+    edges = torch.bincount(torch.cat(sides) + 1, minlength=num_regions + 1)[1:]
+    width = 2 * count / edges
+    pitch = torch.stack([(place[-1] - place[0]) / max(len(place) - 1, 1) for place in rays])
     slope = (apart[:, :2] * pitch).norm(dim=1)
     smooth = [
         pairs[gap <= slope * (width[pairs[:, 0]] / 2).clamp(min=_LEAST_REACH)],
@@ -92,20 +109,13 @@ def join_strips(
     joins &= sq_chords(ours, theirs).squeeze(1) <= deg_to_sq_chord(_MOST_TURN_DEG)
     joins &= contacts >= _LEAST_BESIDE * (count / width)[strip]
     joins &= ~torch.isin(face, strip[joins])
+    if not bool(joins.any()):
+        return labels
     most = contacts.new_zeros(num_regions).scatter_reduce(0, strip[joins], contacts[joins], "amax")
     joins &= contacts == most[strip]
     unchanged = torch.arange(num_regions, device=labels.device)
     target = torch.where(most > 0, num_regions, unchanged)
-    target = target.scatter_reduce(0, strip[joins], face[joins], "amin")
-    return torch.cat([target, target.new_tensor([UNLABELED])])[labels]
-
-
-class _Lines(NamedTuple):
-    """Pixels of rows or of columns, ``(n, L)``, and their coordinates ``(n, L, 3)``."""
-
-    points: Tensor
-    seen: Tensor
-    labels: Tensor
+    return renumber(labels, target.scatter_reduce(0, strip[joins], face[joins], "amin"))
 
 
 def hidden_contacts(
@@ -123,12 +133,8 @@ def hidden_contacts(
     counts as on it, NaN for a curved region. The pairs are as
     :func:`torchrg.regions.repair.merge_coplanar` takes them.
     """
-    pixels = _Lines(points.view(*seen.shape, 3), seen, labels.view(seen.shape))
-    rows = _Lines(*(values[::_EVERY] for values in pixels))
-    columns = _Lines(*(values[:, ::_EVERY].transpose(0, 1).contiguous() for values in pixels))
-    pairs = _aligned_pairs(planes)
-    across, along = (count_lines(direction, pairs, planes, reach) for direction in (rows, columns))
-    lines = across + along
+    image, pairs = labels.view(seen.shape), _aligned_pairs(planes)
+    lines = count_lines(points, seen, image, pairs, planes, reach)
     lead = lines >= _LEAST_LINES
     return pairs[lead].sort(dim=1).values, lines[lead] * _EVERY
 
@@ -144,28 +150,49 @@ def _aligned_pairs(planes: RegionPlanes) -> Tensor:
     return (aligned & is_larger & both_flat).nonzero()
 
 
-def count_lines(lines: _Lines, pairs: Tensor, planes: RegionPlanes, reach: Tensor) -> Tensor:
-    """Return how many lines lead from one region to the other past what is nearer, by pair."""
+def count_lines(
+    points: Tensor,
+    seen: Tensor,
+    labels: Tensor,
+    pairs: Tensor,
+    planes: RegionPlanes,
+    reach: Tensor,
+) -> Tensor:
+    """Return how many of the rows and columns looked at lead from one region to the other, by pair.
+
+    They do so past what is nearer. ``points`` are those of :func:`hidden_contacts`, ``seen`` and
+    ``labels`` images.
+    """
     tables = planes.normal, planes.center, reach
-    if serves(lines.points):
-        points = lines.points.movedim(-1, 0)
-        return kernels.call("count_lines", points, *lines[1:], *tables, pairs, _LEAST_NEARER)[0]
+    if serves(points):
+        image, limits = (points.T, seen, labels), (_EVERY, _LEAST_NEARER)
+        return kernels.call("count_lines", *image, *tables, pairs, *limits)[0]
+    pixels = points.view(*seen.shape, 3), seen, labels
+    rows = [values[::_EVERY] for values in pixels]
+    columns = [values[:, ::_EVERY].transpose(0, 1) for values in pixels]
     counts = [
-        _count_lines_of_pair(lines, (a, b), *(table[a] for table in tables))
+        sum(
+            _count_lines_of_pair(lines, (a, b), *(table[a] for table in tables))
+            for lines in (rows, columns)
+        )
         for a, b in pairs.tolist()
     ]
     return pairs.new_tensor(counts)
 
 
 def _count_lines_of_pair(
-    lines: _Lines, pair: tuple[int, int], normal: Tensor, center: Tensor, reach: Tensor
+    lines: list[Tensor], pair: tuple[int, int], normal: Tensor, center: Tensor, reach: Tensor
 ) -> int:
-    """Do as :func:`count_lines` for one pair and the plane of its larger region."""
-    first, second = ((lines.labels == region) for region in pair)
+    """Do as :func:`count_lines` for lines of one direction, one pair and its larger plane.
+
+    The lines are points ``(n, L, 3)``, which of them are seen, and labels ``(n, L)``.
+    """
+    points, seen, labels = lines
+    first, second = ((labels == region) for region in pair)
     both = first.any(dim=1) & second.any(dim=1)
     if not bool(both.any()):
         return 0
-    points, seen, first, second = lines.points[both], lines.seen[both], first[both], second[both]
+    points, seen, first, second = points[both], seen[both], first[both], second[both]
     height = ((points - center) * normal).sum(dim=2)
     in_front = seen & (height > reach)
     ends = first | second | (seen & (height < -reach))

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import map_tasks, places_of
 from torchrg.config import DepthConfig
-from torchrg.depth.faces import hidden_contacts, join_strips
+from torchrg.depth.faces import borders, hidden_contacts, join_strips
 from torchrg.depth.normals import PixelPlanes, Pixels
 from torchrg.depth.passes import pass_over_rows, serves
 from torchrg.depth.windows import Image
@@ -227,16 +227,10 @@ class PixelGrid:
 
     def borders(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of pixels of two regions side by side, each once."""
-        pairs = []
-        for down, right in _AHEAD:
-            step = down * self.width + right
-            here = places_of(labels[: max(len(labels) - step, 0)] != labels[step:])
-            column = here % self.width + right
-            has_next = (column >= 0) & (column < self.width)
-            here = here[has_next & (labels[here] >= 0) & (labels[here + step] >= 0)]
-            pairs.append((here, here + step))
+        pairs = borders(labels.view(self.height, self.width), _AHEAD)
         first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
-        return first, second
+        touch = (labels[first] >= 0) & (labels[second] >= 0)
+        return first[touch], second[touch]
 
 
 def _refine(
@@ -259,9 +253,10 @@ def _refine(
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
-    joined = number_by_size(_join_strips(cloud, labels, planes), config.min_size)
-    if not torch.equal(joined, labels):
-        labels, planes = joined, fit_inverse_planes(cloud, joined)
+    joined = _join_strips(cloud, labels, planes)
+    if joined is not labels:
+        labels = number_by_size(joined, config.min_size)
+        planes = fit_inverse_planes(cloud, labels)
     reach = planes.times_thickness(_ABSORB_REACH)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = number_by_size(moved, config.min_size)
@@ -285,10 +280,9 @@ def absorb_pixels(
 
 def _join_strips(cloud: InverseCloud, labels: Tensor, fit: RegionPlanes) -> Tensor:
     """Return what :func:`join_strips` does for the regions of an inverse cloud ``(H * W,)``."""
-    shape, (x, y, _) = cloud.seen.shape, cloud.points.unbind(dim=1)
-    rays = torch.stack([x, y, torch.ones_like(x)], dim=-1).view(*shape, 3)
-    planes, normals = _planes_over_rays(fit), _normals_in_space(fit)
-    return join_strips(labels.view(shape), rays, cloud.noise.view(shape), planes, normals).flatten()
+    width, (x, y, _) = cloud.seen.shape[1], cloud.points.unbind(dim=1)
+    planes, normals, rays = _planes_over_rays(fit), _normals_in_space(fit), (x[:width], y[::width])
+    return join_strips(labels, rays, cloud.noise, planes, normals, fit.num_points)
 
 
 def _planes_over_rays(fit: RegionPlanes) -> Tensor:
@@ -309,8 +303,7 @@ def fit_inverse_planes(
     """
     shares = Segments(labels, most=most).shares(len(labels) + 1)
     parts = map_tasks(lambda share: _fit_together(cloud, share), shares, labels.device)
-    planes = RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
-    return planes._replace(num_points=torch.bincount(labels + 1, minlength=1)[1:])
+    return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
@@ -337,7 +330,7 @@ def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
         covariance,
         torch.maximum(thickness / length.squeeze(1), noise),
         rms=squares.sqrt() / length.squeeze(1),
-        num_points=segments.counts,
+        num_points=segments.sizes,
         curved=thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
         floor=noise,
         reach=torch.full_like(noise, torch.inf),

@@ -150,7 +150,9 @@ def fit_pixels(
     numbers = torch.full_like(choice.window, -1)
     numbers.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
     narrow = fit_narrow_windows(image, numbers, pixels)
-    rate_windows({1: narrow}, 1, noises, focal, jitter=find_jitter(squares[_STEEP_SIZE]))
+    rate_windows(
+        {1: narrow}, 1, noises, focal, jitter=find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)
+    )
     chosen, beside = choose_narrow(image, numbers, pixels, narrow)
     taken = chosen >= 0
     pixel = pixels[taken]

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg._parallel import places_of
 from torchrg.depth.passes import pass_over_rows, serves
 from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
@@ -31,6 +32,8 @@ _NUM_MOMENTS = 10
 """Sums of a window's pixels that its plane needs."""
 _FLAT_QUANTILE = 0.35
 """Share of the windows of an image that deviate by noise alone: at least a third of it is flat."""
+_PIXELS_APART = 4
+"""Windows overlap: of the small ones those so many pixels apart tell as much of noise as all."""
 _NUM_BINS = 12
 """Classes of depth that noise is fitted to."""
 _MOST_GROWTH = 1.4
@@ -237,15 +240,11 @@ def noise_by_size(
     if noise is not None:
         constant, growth = noise
         return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
-    windows = {size: Windows(*table) for size, table in tables.items()}
-    # Windows stand a cell apart and overlap; of the smallest a quarter are as many as of the next.
-    windows[1] = Windows(*tables[1][:, ::REACH, ::REACH])
+    windows = {size: _windows_apart(tables[size], size) for size in sorted(tables)}
     middle = windows[sorted(windows)[len(windows) // 2 - 1]]
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0
-    for size in sorted(windows):
-        has_plane = windows[size].deviation.isfinite()
-        deviation, mean = windows[size].deviation[has_plane], windows[size].mean[has_plane]
+    for size, (*_, deviation, mean) in windows.items():
         ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
         usual = float(_low_quantile(ratios)) if len(ratios) else factor
         factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)
@@ -253,20 +252,28 @@ def noise_by_size(
     return noises
 
 
-def find_jitter(table: Tensor) -> float:
+def _windows_apart(table: Tensor, size: int) -> Tensor:
+    """Return the planes ``(5, n)`` of windows four pixels or a cell apart, of those that have one.
+
+    They are from a table ``(9, h, w)`` of those of a size.
+    """
+    step = max(_PIXELS_APART // size, 1)
+    planes = table[:NUM_PLANE, ::step, ::step].flatten(1)
+    return planes.index_select(1, places_of(planes[3].isfinite()))
+
+
+def find_jitter(table: Tensor, size: int) -> float:
     """Return by how many pixels the rays of an image are off the middles of their pixels.
 
     It is a standard deviation, from 0 for exact rays to 0.15. Jitter moves a value by as much of
     what it changes from one pixel to the next, so that it shows in windows that are steep: no flat
     window deviates by less. Of the steeper half of the classes of steepness the one counts where
-    flat windows deviate least.
+    flat windows deviate least. ``table`` ``(9, h, w)`` is that of windows of a size.
     """
-    # Windows stand a cell apart and overlap.
-    windows = Windows(*table[:, ::REACH, ::REACH])
-    slope = torch.hypot(windows.u_slope, windows.v_slope)
-    used = windows.deviation.isfinite() & (slope > 0)
-    slope, order = slope[used].sort()
-    ratio = windows.deviation[used][order] / slope
+    u_slope, v_slope, _, deviation, _ = _windows_apart(table, size)
+    slope, order = torch.hypot(u_slope, v_slope).sort()
+    is_steep = slope > 0
+    ratio = deviation[order][is_steep] / slope[is_steep]
     steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
     return min([_MOST_JITTER, *(float(_low_quantile(ratios)) for ratios in steep if len(ratios))])
 
@@ -276,11 +283,10 @@ def _low_quantile(values: Tensor) -> Tensor:
     return kth_smallest(values, int(_FLAT_QUANTILE * (len(values) - 1)))
 
 
-def _fit_noise(windows: Windows, rounding: float) -> tuple[float, float]:
+def _fit_noise(planes: Tensor, rounding: float) -> tuple[float, float]:
     """Fit ``b + a w^2``, both not negative, to the deviations of flat windows; return a and b."""
-    used = windows.deviation.isfinite()
-    mean, order = windows.mean[used].sort()
-    deviation = torch.maximum(windows.deviation[used][order], rounding * mean)
+    mean, order = planes[4].sort()
+    deviation = torch.maximum(planes[3][order], rounding * mean)
     bins = [rows for rows in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(rows)]
     if not bins:
         return 0.0, 0.0

@@ -52,13 +52,15 @@ SIGNATURES = {
     "describe_pixels": "d[hw] b[hw] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] D[hw] D[hw] "
     "B[hw] x x x x x x n n -> ",
     "join_pixels": "l[hw] b[hw] d[hw3] d[hw] d[N] d[M] l[n] d[w] d[h] B[hw] B[hw] x x x n n -> ",
+    "segment_rows": "l[n] n L[M] L[M] L[M] -> l[n]",
     "outer_places": "d[n] d[n] l[M] x -> b[n]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
+    "number_by_size": "l[n] n -> l[n] l[n] l[n]",
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
     "absorb_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",
-    "count_lines": "d[3nL] b[nL] l[nL] d[M3] d[M3] d[M] l[p2] x -> l[p] l[M] l[M]",
+    "count_lines": "d[3P] b[hw] l[hw] d[M3] d[M3] d[M] l[p2] n x -> l[p] l[M] l[M]",
 }
 """Arguments and results of each kernel.
 

@@ -520,15 +520,17 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
   const double *x = points, *y = points + n, *z = points + 2 * n;
   const Around around = {h, w};
   Front front = {around, rows, marks, 0, 0};
-  for (int64_t i = 0; i < n; i++) {
-    marks[i] = -1;
-    bool is_border = false;
-    if (labels[i] >= 0)
-      around.visit(i, [&](int64_t other) {
-        is_border |= labels[other] >= 0 && labels[other] != labels[i];
-      });
-    if (is_border) front.add(i);
-  }
+  for (int64_t i = 0; i < n; i++) marks[i] = -1;
+  const auto compare = [&](int64_t i, int64_t other) {
+    if (labels[i] != labels[other] && labels[i] >= 0 && labels[other] >= 0)
+      front.add(i), front.add(other);
+  };
+  for (int64_t r = 0; r < h; r++)
+    for (int64_t c = 0, i = r * w; c < w; c++, i++) {
+      if (c + 1 < w) compare(i, i + 1);
+      if (r + 1 < h) compare(i, i + w);
+      if (r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
+    }
   for (int64_t turn = 0; turn < num_turns && front.count > 0; turn++) {
     int64_t moved = 0;
     for (int64_t f = 0; f < front.count; f++) {
@@ -539,6 +541,8 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
         const int64_t other = labels[q];
         if (other < 0 || other == own) return;
         const double *one = planes + 3 * own, *two = planes + 3 * other;
+        const double away = size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
+        if (!(away <= reach[other])) return;
         const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
         const auto over = [&](double u, double v) { return a * u + b * v + c; };
         const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
@@ -546,11 +550,9 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
                      theirs = over(middles[2 * other], middles[2 * other + 1]);
         const double slope = square_root(a * a + b * b);
         const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
-        const double away =
-            size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
         const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
-                          here * mine < 0 && mine * theirs < 0 && away <= reach[other] &&
-                          size_of(mine) > reach[other] && size_of(theirs) > reach[own];
+                          here * mine < 0 && mine * theirs < 0 && size_of(mine) > reach[other] &&
+                          size_of(theirs) > reach[own];
         if (goes && (away < least || (away == least && other < best))) least = away, best = other;
       });
       if (best >= 0) rows[moved] = pixel, chosen[moved++] = best;
@@ -567,42 +569,51 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
   return DONE;
 }
 
-// faces._count_lines for pairs of regions; lines are points (3, n, L), and what is seen of them.
-KERNEL count_lines(int64_t n, int64_t L, int64_t M, int64_t p, Doubles points, Flagged seen,
-                   Longs labels, Doubles normals, Doubles centers, Doubles reach, Longs pairs,
-                   double least_nearer, int64_t* counts, int64_t* firsts, int64_t* lasts) {
-  if (!are_labels(labels, n * L, M)) return NO_SUCH_ROW;
-  for (int64_t m = 0; m < M; m++) firsts[m] = n, lasts[m] = -1;
-  for (int64_t i = 0; i < n * L; i++)
-    if (labels[i] >= 0)
-      firsts[labels[i]] = smaller(firsts[labels[i]], i / L), lasts[labels[i]] = i / L;
-  for (int64_t q = 0; q < p; q++) {
-    const int64_t first = pairs[2 * q], second = pairs[2 * q + 1];
-    if (first < 0 || first >= M || second < 0 || second >= M) return NO_SUCH_ROW;
-    counts[q] = 0;
-    for (int64_t line = larger(firsts[first], firsts[second]);
-         line <= smaller(lasts[first], lasts[second]); line++) {
-      int64_t previous = -1, passed = 0;
-      bool leads = false;
-      for (int64_t i = line * L; i < (line + 1) * L && !leads; i++) {
-        const int64_t label = labels[i];
-        const bool is_end = label == first || label == second;
-        // Before the first of either nothing counts.
-        if (!is_end && (previous < 0 || !seen[i])) continue;
-        double height = 0;
-        for (int axis = 0; axis < 3 && seen[i]; axis++)
-          height += (points[axis * n * L + i] - centers[3 * first + axis]) *
-                    normals[3 * first + axis];
-        if (is_end || (seen[i] && height < -reach[first])) {
-          const int64_t gap = i - previous - 1;
-          leads = is_end && previous >= 0 && gap > 0 && labels[previous] != label &&
-                  (labels[previous] == first || labels[previous] == second) &&
-                  double(passed) >= least_nearer * double(gap);
-          previous = i, passed = 0;
-        }
-        passed += seen[i] && height > reach[first] && !is_end;
+// faces.count_lines: along how many rows and columns, every so many, one of a pair of regions goes
+// on at the other past what is nearer; points are (3, h w).
+KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Doubles points,
+                   Flagged seen, Longs labels, Doubles normals, Doubles centers, Doubles reach,
+                   Longs pairs, int64_t every, double least_nearer, int64_t* counts,
+                   int64_t* firsts, int64_t* lasts) {
+  if (every < 1) return TOO_WIDE;
+  if (P != h * w || !are_labels(labels, P, M)) return NO_SUCH_ROW;
+  for (int64_t q = 0; q < 2 * p; q++)
+    if (pairs[q] < 0 || pairs[q] >= M) return NO_SUCH_ROW;
+  for (int64_t q = 0; q < p; q++) counts[q] = 0;
+  for (int direction = 0; direction < 2; direction++) {
+    const int64_t num_lines = direction ? w : h, length = direction ? h : w;
+    const int64_t between = direction ? 1 : w, along = direction ? w : 1;
+    for (int64_t m = 0; m < M; m++) firsts[m] = num_lines, lasts[m] = -1;
+    for (int64_t line = 0; line < num_lines; line += every)
+      for (int64_t i = 0; i < length; i++) {
+        const int64_t m = labels[line * between + i * along];
+        if (m >= 0 && lasts[m] < line) firsts[m] = smaller(firsts[m], line), lasts[m] = line;
       }
-      counts[q] += leads;
+    for (int64_t q = 0; q < p; q++) {
+      const int64_t first = pairs[2 * q], second = pairs[2 * q + 1];
+      const double *normal = normals + 3 * first, *center = centers + 3 * first;
+      for (int64_t line = larger(firsts[first], firsts[second]);
+           line <= smaller(lasts[first], lasts[second]); line += every) {
+        int64_t previous = -1, end = -1, passed = 0;
+        bool leads = false;
+        for (int64_t i = 0; i < length && !leads; i++) {
+          const int64_t pixel = line * between + i * along, label = labels[pixel];
+          const bool is_end = label == first || label == second;
+          // Before the first of either nothing counts.
+          if (!is_end && (previous < 0 || !seen[pixel])) continue;
+          double height = 0;
+          for (int axis = 0; axis < 3 && !is_end; axis++)
+            height += (points[axis * P + pixel] - center[axis]) * normal[axis];
+          if (is_end || height < -reach[first]) {
+            const int64_t gap = i - previous - 1;
+            leads = is_end && end >= 0 && end != label && gap > 0 &&
+                    double(passed) >= least_nearer * double(gap);
+            previous = i, end = is_end ? label : -1, passed = 0;
+          }
+          passed += height > reach[first];
+        }
+        counts[q] += leads;
+      }
     }
   }
   return DONE;

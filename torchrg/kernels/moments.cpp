@@ -88,6 +88,33 @@ int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) 
 
 }  // namespace
 
+// Segments.rows, counts and sizes: of regions of many points every so many, so that at most `most`
+// are taken.
+KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t* counts,
+                    int64_t* sizes, int64_t* places, int64_t* rows) {
+  if (most < 1) return TOO_WIDE;
+  int64_t end = 0;
+  for (int64_t i = 0; i < n; i++) end = larger(end, labels[i] + 1);
+  if (end > num) return NO_SUCH_ROW;
+  for (int64_t m = 0; m < num; m++) sizes[m] = counts[m] = 0;
+  visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
+    if (m >= 0) sizes[m] += to - from;
+  });
+  const auto step_of = [&](int64_t m) { return larger((sizes[m] + most - 1) / most, int64_t(1)); };
+  for (int64_t m = 0, start = 0; m < num; m++)
+    places[m] = start, start += (sizes[m] + step_of(m) - 1) / step_of(m);
+  // The count is of points up to the next one that is taken.
+  visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
+    if (m < 0) return;
+    const int64_t step = step_of(m);
+    int64_t next = from + counts[m];
+    for (; next < to; next += step) rows[places[m]++] = next;
+    counts[m] = next - to;
+  });
+  for (int64_t m = 0; m < num; m++) counts[m] = places[m] - (m ? places[m - 1] : 0);
+  return DONE;
+}
+
 // Segments.moments: means and covariances of weighted points, about zero if not centered.
 KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Doubles weights,
                        Longs counts, int64_t is_centered, double* means, double* covariances) {

@@ -87,6 +87,16 @@ INLINE bool are_rows(const int32_t* numbers, int64_t count, int64_t num_rows) {
   return inside;
 }
 
+// Calls `visit` with each run of equal labels, its first place and the one after its last: many are
+// long, and to count points one by one waits for every count to be written.
+template <class Visit>
+INLINE void visit_runs(Longs labels, int64_t n, const Visit& visit) {
+  for (int64_t from = 0, to = 0; from < n; from = to) {
+    while (to < n && labels[to] == labels[from]) to++;
+    visit(labels[from], from, to);
+  }
+}
+
 // Points (N, 3), lists of k of them each, and which of a list count: all where there is no mask.
 struct Lists {
   int64_t num_points, num_lists, k;

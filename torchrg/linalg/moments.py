@@ -99,7 +99,8 @@ class Segments:
 
     Sums run over one region after the other, never by atomic additions, so they do not depend on
     threads or device scheduling. ``labels`` ``(N,)`` are 0 to M-1, each at least once, or negative;
-    ``most`` points of a region are taken, evenly along their rows, by default all.
+    ``most`` points of a region are taken, evenly along their rows, by default all. Regions have
+    ``sizes`` ``(M,)`` points, of which ``counts`` are taken.
 
     Example:
         >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
@@ -110,10 +111,13 @@ class Segments:
     """
 
     def __init__(self, labels: Tensor, *, most: int | None = None) -> None:
+        if labels.device.type == "cpu" and kernels.serve():
+            self._take_rows(labels, most)
+            return
         labels = labels.clamp(min=-1)
         num_unlabeled, *_ = counts = torch.bincount(labels + 1, minlength=1)
         self.rows = _ascending(labels)[num_unlabeled:]
-        self.counts = counts[1:]
+        self.counts = self.sizes = counts[1:]
         if most is not None:
             ends = self.counts.cumsum(0).tolist()
             parts = [
@@ -123,6 +127,15 @@ class Segments:
             self.rows = self.rows[torch.cat(parts)] if parts else self.rows
             sizes = [len(block) for block in parts]
             self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
+        self.labels = torch.repeat_interleave(self.counts)
+
+    def _take_rows(self, labels: Tensor, most: int | None) -> None:
+        num_regions = int(labels.max()) + 1 if len(labels) else 0
+        self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
+        self.sizes, places = self.counts.new_empty(2, len(self.counts))
+        written = self.counts, self.sizes, places
+        (rows,) = kernels.call("segment_rows", labels.long(), most or len(labels) + 1, *written)
+        self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
 
     def split(self, most: int) -> "list[Segments]":
@@ -135,7 +148,7 @@ class Segments:
             segments = Segments.__new__(Segments)
             end = ends[last - 1] if last else 0
             segments.rows, segments.labels = self.rows[row:end], self.labels[row:end] - region
-            segments.counts = self.counts[region:last]
+            segments.counts, segments.sizes = self.counts[region:last], self.sizes[region:last]
             parts.append(segments)
             region, row = last, end
         return parts

@@ -191,7 +191,7 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     facets = _FACET_THICKNESS * float(config.facet_tolerance or 0.0)
     planes = planes._replace(
         thickness=torch.maximum(planes.thickness, floor).clamp(min=facets),
-        num_points=torch.bincount(labels + 1, minlength=1)[1:],
+        num_points=segments.sizes,
         floor=floor,
         radius=radius,
     )

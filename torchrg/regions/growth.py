@@ -242,6 +242,8 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
     ``min_size`` become :data:`torchrg.UNLABELED`.
     """
+    if regions.device.type == "cpu" and kernels.serve():
+        return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
     sizes = np.bincount(old + 1, minlength=len(old) + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))

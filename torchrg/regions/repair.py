@@ -3,6 +3,7 @@
 import heapq
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -117,8 +118,16 @@ def _drop_scattered(
 def _drop_small(labels: Tensor, min_size: int) -> Tensor:
     """Return labels without regions of fewer points, and without gaps in their numbers."""
     is_large = torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1)
-    numbers = torch.where(is_large, is_large.cumsum(0) - 1, UNLABELED)
-    return torch.cat([numbers, numbers.new_tensor([UNLABELED])])[labels]
+    return renumber(labels, torch.where(is_large, is_large.cumsum(0) - 1, UNLABELED))
+
+
+def renumber(labels: Tensor, numbers: Tensor) -> Tensor:
+    """Return labels with other numbers of regions ``(M,)``, those without a region as they are."""
+    table = torch.cat([numbers, numbers.new_tensor([UNLABELED])])
+    if table.device.type == "cpu":
+        # Three times faster than torch's.
+        return torch.from_numpy(np.take(table.numpy(), labels.numpy()))
+    return table[labels]
 
 
 def absorb_points(
@@ -318,7 +327,7 @@ def _merge(
         beside = [(min(a, c), max(a, c)) for c in touching[a]]
         offer(torch.tensor(beside, dtype=torch.int64).view(-1, 2))
     roots = [_root(owner, i) for i in range(len(owner))]
-    return torch.tensor([*roots, UNLABELED], device=labels.device)[labels]
+    return renumber(labels, torch.tensor(roots, dtype=torch.int64, device=labels.device))
 
 
 def _root(owner: list[int], i: int) -> int:
