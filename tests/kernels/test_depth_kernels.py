@@ -149,15 +149,23 @@ def test_moments_and_weights_of_regions_are_those_of_the_definition(size, rng):
         assert_same(found, stages())
 
 
-def test_outer_points_of_regions_are_those_of_the_definition(rng):
+@pytest.mark.parametrize("most", [None, 1, 7])
+def test_rows_and_outer_points_of_regions_are_those_of_the_definition(most, rng):
     places = torch.randn(900, 2, generator=rng).double()
     places[300:400, 1] = places[300:400, 0]
     places[400:410], places[500:600] = 1.0, places[500:600].round()
     labels = torch.arange(900).div(100, rounding_mode="floor") - 1
-    segments = Segments(labels[torch.randperm(900, generator=rng)])
-    columns = [segments.take(column) for column in places.T]
-    found = outer_places(segments, *columns)
+    labels = labels[torch.randperm(900, generator=rng)]
+
+    def stages():
+        segments = Segments(labels, most=most)
+        columns = [segments.take(column) for column in places.T]
+        return [
+            segments.rows,
+            segments.counts,
+            *map(torch.tensor, outer_places(segments, *columns)),
+        ]
+
+    found = stages()
     with definitions():
-        expected = outer_places(segments, *columns)
-    for one, other in zip(found, expected, strict=True):
-        assert (one == other).all()
+        assert_same(found, stages())
