@@ -75,6 +75,16 @@ double select(double* values, int64_t count, int64_t k) {
   return values[k];
 }
 
+// Calls `visit` with each run of equal labels, its first place and the one after its last: many are
+// long, and to count points one by one waits for every count to be written.
+template <class Visit>
+void visit_runs(Longs labels, int64_t n, const Visit& visit) {
+  for (int64_t from = 0, to = 0; from < n; from = to) {
+    while (to < n && labels[to] == labels[from]) to++;
+    visit(labels[from], from, to);
+  }
+}
+
 // Calls `visit` with each region and the places of its first point and of the one after its last.
 template <class Visit>
 int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) {

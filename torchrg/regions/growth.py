@@ -242,19 +242,20 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
     ``min_size`` become :data:`torchrg.UNLABELED`.
     """
-    if regions.device.type == "cpu" and kernels.serve():
-        return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
-    sizes = np.bincount(old + 1, minlength=len(old) + 1)[1:]
+    # Runs of equal numbers are counted at once: many are long.
+    starts = np.flatnonzero(np.diff(old, prepend=-2))
+    lengths, of_run = np.diff(starts, append=len(old)), old[starts]
+    sizes = np.bincount(of_run + 1, lengths, minlength=len(old) + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))
     firsts = np.empty(len(old) + 1, dtype=np.int32)
     # Of several writes to one place the last one stays: in reverse, the first.
-    firsts[old[::-1]] = np.arange(len(old), dtype=np.int32)[::-1]
+    firsts[of_run[::-1]] = starts[::-1]
     large = large[np.lexsort((firsts[large], -sizes[large]))]
     # The last entry is what -1 finds.
     numbers = np.full(len(old) + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
-    return torch.from_numpy(numbers[old]).to(regions.device)
+    return torch.from_numpy(np.repeat(numbers[of_run], lengths)).to(regions.device)
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
