@@ -1,7 +1,8 @@
 """Compiles torchrg/kernels/*.cpp while a wheel is built; without a compiler the wheel is pure.
 
 The variable TORCHRG_KERNELS asks for something else: 0 for a pure wheel, and a platform of WHEELS
-for the kernels of that one, compiled by ziglang, which the build then depends on.
+for the kernels of that one, compiled by ziglang, which the build then depends on. Where what it
+asks for cannot be had, the build fails.
 """
 
 import os
@@ -88,5 +89,7 @@ class KernelsHook(BuildHookInterface[Any]):
             return
         for library in libraries.values():
             library.unlink(missing_ok=True)
-        if ASKED != "0":
+        if ASKED not in ("", "0"):
+            self.app.abort(f"torchrg cannot be built with the kernels asked for: {error}")
+        if not ASKED:
             self.app.display_warning(f"torchrg is built without kernels and slower: {error}")

@@ -14,7 +14,7 @@ fi
 
 sources=(pyproject.toml scripts/constraints.txt scripts/build_kernels.py torchrg/kernels/*.{cpp,h})
 stamp=$venv/.torchrg-$(cat "${sources[@]}" | cksum | tr ' ' '-')${extras:+-$extras}
-if [ ! -e "$stamp" ]; then
+if [ ! -e "$stamp" ] || [ -n "$(find torchrg/kernels/*.{cpp,h} -newer "$stamp")" ]; then
   site=$("$python" -c 'import importlib.util as u; print("--system-site-packages" if u.find_spec("torch") else "")')
   [ -z "$kind" ] || site=
   [ -x "$venv/bin/python" ] || "$python" -m venv $site "$venv"
@@ -22,7 +22,7 @@ if [ ! -e "$stamp" ]; then
   # Whoever has no compiler gets one for the build alone, a package of 100 MB, or no kernels.
   target=$("$python" -c 'import platform; print(platform.machine() + {"Linux": "-linux-gnu.2.17"}.get(platform.system(), "-macos.11.0"))')
   install_torchrg() {
-    if [ -n "${TORCHRG_KERNELS+set}" ] || command -v "${CXX:-c++}" > /dev/null; then
+    if [ -n "${TORCHRG_KERNELS+set}" ] || ${CXX:-c++} --version > /dev/null 2>&1; then
       "${install[@]}" "$@"
     elif TORCHRG_KERNELS=${target/arm64/aarch64} "${install[@]}" "$@" 2> /dev/null; then
       echo "There is no C++ compiler: the kernels of torchrg were compiled by the package ziglang."

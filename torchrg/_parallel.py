@@ -147,12 +147,31 @@ def map_tasks(
     with sequential_operations():
         if num_threads < 2:
             return [work(task) for task in tasks]
+        results, waiting = {}, iter(list(enumerate(tasks)))
+
+        def take_tasks() -> None:
+            try:
+                for place, task in waiting:
+                    results[place] = work(task)
+            finally:
+                # After an error nobody begins another task.
+                for _ in waiting:
+                    pass
+
+        # This thread works too: until others run, and instead of them where no core is free.
+        settings = torch.is_grad_enabled(), copy_context()
         with ThreadPoolExecutor(
-            num_threads,
-            initializer=_begin_thread,
-            initargs=(torch.is_grad_enabled(), copy_context()),
+            num_threads - 1, initializer=_begin_thread, initargs=settings
         ) as pool:
-            return list(pool.map(work, tasks))
+            others = [pool.submit(take_tasks) for _ in range(num_threads - 1)]
+            token = _THREADS.set(1)
+            try:
+                take_tasks()
+            finally:
+                _THREADS.reset(token)
+            for other in others:
+                other.result()
+        return [results[place] for place in range(len(tasks))]
 
 
 @contextmanager

@@ -5,11 +5,13 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from torchrg import kernels
 from torchrg.cli import COMMANDS, main
 from torchrg.io import read_cloud, write_cloud
 from torchrg.structures import Cloud
@@ -249,6 +251,21 @@ def leica(room_file, tmp_path):
 
 
 NAMES = ("--columns", "x,y,z,intensity,r,g,b")
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_run_without_kernels_says_once_and_in_one_line_how_to_get_them(
+    room_file, tmp_path, run, monkeypatch
+):
+    monkeypatch.delenv("TORCHRG_NO_KERNELS", raising=False)
+    monkeypatch.setattr(kernels, "_kind", lambda: "of-no-processor")
+    for command in (("info",), ("segment", "--out", tmp_path / "seg.npz")):
+        monkeypatch.setattr(kernels, "_library", cache(kernels._library.__wrapped__))
+        code, _, err = run(command[0], room_file, *command[1:])
+        (line,) = (line for line in err.splitlines() if "kernels" in line)
+        assert line.startswith("torchrg: warning: torchrg runs without its kernels")
+        assert line.endswith("with TORCHRG_KERNELS set as the guide says.")
+        assert (code, "_library()" in err) == (0, False)
 
 
 def test_columns_are_named_by_a_rule_that_is_shown_or_by_a_flag(leica, tmp_path, run):

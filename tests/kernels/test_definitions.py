@@ -5,7 +5,7 @@ import torch
 
 from tests.kernels.clouds import clouds, definitions, lists, needs_library
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.normals.consensus.noise import _survey
+from torchrg.normals.consensus.noise import _neighbor_quantiles, _survey
 from torchrg.normals.pca import fit_points_pca
 from torchrg.robust.scale import _majority_difference
 
@@ -94,5 +94,16 @@ def test_survey_is_that_of_the_definition(points, masked):
         alike = (found[place] - expected[place]).abs() <= 1e-5 * radius
         alike |= found[place].isinf() & expected[place].isinf()
         assert alike.float().mean() > 0.95
+    # The deviations from two layers, and where places repeat.
+    assert torch.equal(found[3], expected[3])
     assert torch.equal(found[4], expected[4])
-    assert (found[3] == expected[3]).float().mean() > 0.999
+
+
+def test_quantiles_of_neighbors_are_those_of_the_definition_to_the_bit(points, masked):
+    near = lists(points, 50, masked)
+    values = torch.randn(len(points), 3, generator=torch.Generator().manual_seed(2))
+    values[::3, :2] = values[0, :2]
+    values[::7, 1:] = torch.inf
+    for quantile in (0.1, 0.35, 1.0):
+        found, expected = both(_neighbor_quantiles, values, near, quantile)
+        assert torch.equal(found, expected)

@@ -9,6 +9,7 @@ from tests.kernels.clouds import clouds, definitions, lists, needs_library
 from torchrg.config import GrowingConfig, load_config
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals.pca import fit_points_pca
+from torchrg.regions.adjacency import find_contacts
 from torchrg.regions.edges import GrowingCloud, accept_edges
 from torchrg.regions.growth import by_column, grow
 from torchrg.regions.shared_neighbors import SharedNeighbors
@@ -117,3 +118,15 @@ def test_regions_are_those_of_the_definition(name, preset, k):
         large = (expected >= 0) & (counts[expected] >= settings.min_size)
         assert torch.equal(found[large], expected[large])
         assert torch.equal(found.cpu() >= 0, expected >= 0)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_rows_at_a_border_are_those_of_the_definition(masked):
+    near = lists(ROOM, 20, masked)
+    labels = torch.arange(len(ROOM)) // 700 - 2
+    found = find_contacts(labels, near)
+    with definitions():
+        expected = find_contacts(labels, near)
+    assert len(found[0]) > 10
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one, other)

@@ -39,7 +39,7 @@ from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.result import PLANES_FILE, describe_planes, write_table
-from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints
+from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
 
 _LOOKED_AT = 10_000
 """Points, spread over a cloud, that tell where most of its points are."""
@@ -270,7 +270,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
             "stay in place, unlabelled"
         )
     finite = cloud.coordinates[cloud.finite] if num_bad else cloud.coordinates
-    low, high = (end.astype(np.float64) for end in (finite.min(axis=0), finite.max(axis=0)))
+    low, high = bounding_box(finite)
     size = float((high - low).max())
     low, high = np.quantile(finite[:: max(len(cloud) // _LOOKED_AT, 1)], _MIDDLE, axis=0)
     width = float((high - low).max())

@@ -15,6 +15,7 @@ from torchrg.cli.ending import (
     USAGE_ERROR,
     fail,
     raising_interrupts,
+    warn,
 )
 from torchrg.errors import OUT_OF_MEMORY, ConfigError, PrecisionWarning, TorchrgError
 
@@ -92,5 +93,6 @@ def _run(arguments: list[str]) -> int:
     with raising_interrupts(), warnings.catch_warnings():
         # Commands tell of the precision of each file as a line: see check_finite.
         warnings.simplefilter("ignore", PrecisionWarning)
+        warnings.showwarning = lambda message, *_, **__: warn(" ".join(str(message).split()))
         code: int = command.run(remaining)
     return code

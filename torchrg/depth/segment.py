@@ -1,7 +1,6 @@
 """From one depth image to planes."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,8 +13,9 @@ from torchrg.depth.camera import has_depth, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels, join_pixels
 from torchrg.depth.normals import Pixels, describe_pixels, fit_pixels
 from torchrg.depth.windows import Image
-from torchrg.linalg.moments import kth_smallest
-from torchrg.regions import summarize_planes
+from torchrg.linalg.moments import Segments, kth_smallest
+from torchrg.regions.fit import fit_planes
+from torchrg.regions.table import measure_planes
 from torchrg.structures import Segmentation
 
 
@@ -108,19 +108,21 @@ def _segment(
 
     if pose is not None:
         pose = pose.to(normals)
-        normals = normals @ pose[:3, :3].T
+        normals, plane_normals = normals @ pose[:3, :3].T, plane_normals @ pose[:3, :3].T
     z = torch.where(seen, depth.double(), 1.0)
     points = torch.stack([(x * z).flatten(), (y[:, None] * z).flatten(), z.flatten()]).T
     if pose is not None:
         points = (pose[:3, :3] @ points.T + pose[:3, 3:]).T
-    table = summarize_planes(points, normals, labels)
+    segments = Segments(labels)
+    fit = fit_planes(segments, points, plane_normals, shared=True)
+    table = measure_planes(segments, points, fit._replace(curved=curved))
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),
         pixels.curvature.to(depth.dtype),
         edge,
         valid,
-        replace(table, curved=curved),
+        table,
     )
 
 

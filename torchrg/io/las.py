@@ -28,7 +28,7 @@ from torchrg.io.files import (
     first_line,
     refusing,
 )
-from torchrg.structures import Cloud
+from torchrg.structures import Cloud, bounding_box
 
 _SPELLING = Spelling(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True
@@ -176,8 +176,7 @@ def _header(laspy: ModuleType, cloud: Cloud, *, colored: bool) -> Any:  # noqa: 
     stored = cloud.header.get("las")
     if stored is None:
         header = laspy.LasHeader(version="1.4", point_format=7 if colored else 6)
-        low, high = cloud.coordinates.min(axis=0), cloud.coordinates.max(axis=0)
-        low, high = low.astype(np.float64), high.astype(np.float64)
+        low, high = bounding_box(cloud.coordinates)
         middle = np.rint((low + high) / 2)
         reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
         header.offsets = middle

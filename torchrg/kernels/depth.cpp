@@ -36,7 +36,7 @@ INLINE void solve(const double (&s)[MOMENTS][N], int j, double least_count, doub
   const double rest = ww - u_slope * uw - v_slope * vw;
   const double variance = (rest < 0 ? 0 : rest) * count / larger(count - 3, 1.0);
   to[0][j] = u_slope, to[1][j] = v_slope, to[2][j] = w - u_slope * u - v_slope * v;
-  to[3][j] = has_plane & (variance < NONE) ? square_root(variance) : NONE, to[4][j] = w;
+  to[3][j] = (has_plane & (variance < NONE)) ? square_root(variance) : NONE, to[4][j] = w;
 }
 
 // What a pixel adds to the sums of its windows, in place j.

@@ -71,6 +71,20 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   return DONE;
 }
 
+// torchrg.regions.adjacency._Border._meets_others: which rows have a neighbour of another region.
+KERNEL meet_others(int64_t num_points, int64_t num_rows, int64_t k, Ints labels, Ints own,
+                   Ints indices, Flagged mask, bool* meets) {
+  for (int64_t i = 0; i < num_rows; i++) {
+    meets[i] = false;
+    if (!are_rows(indices + i * k, k, num_points)) return NO_SUCH_ROW;
+    for (int64_t e = i * k; own[i] >= 0 && e < (i + 1) * k; e++) {
+      const int32_t other = labels[indices[e]];
+      meets[i] |= other != own[i] && other >= 0 && (!mask || mask[e]);
+    }
+  }
+  return DONE;
+}
+
 // shared_neighbors.SharedNeighbors.connected: whether ends of edges from rows `first` on share
 // `least` neighbours. Lists of a block of rows are bits over the points that occur in them, its
 // members; `numbers` need no values before, as a number counts where the member so numbered is it.

@@ -125,6 +125,30 @@ KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t*
   return DONE;
 }
 
+// Segments.along: coordinates (A, n) of rows along the axes of their regions, about centers.
+KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Doubles x,
+                           Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
+                           Doubles axes, double* coordinates) {
+  for (int64_t i = 0; i < n; i++)
+    if (rows[i] < 0 || rows[i] >= P) return NO_SUCH_ROW;
+  double u[BLOCK], v[BLOCK], w[BLOCK];
+  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
+    const double *center = centers + 3 * m, *axis = axes + 3 * num_axes * m;
+    for (int64_t from = start; from < end; from += BLOCK) {
+      const int count = int(smaller(end - from, int64_t(BLOCK)));
+      for (int j = 0; j < count; j++) {
+        const int64_t row = rows[from + j];
+        u[j] = x[row] - center[0], v[j] = y[row] - center[1], w[j] = z[row] - center[2];
+      }
+      for (int64_t a = 0; a < num_axes; a++) {
+        const double p = axis[3 * a], q = axis[3 * a + 1], r = axis[3 * a + 2];
+        for (int j = 0; j < count; j++)
+          coordinates[a * n + from + j] = u[j] * p + v[j] * q + w[j] * r;
+      }
+    }
+  });
+}
+
 // Segments.moments: means and covariances of weighted points, about zero if not centered.
 KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Doubles weights,
                        Longs counts, int64_t is_centered, double* means, double* covariances) {

@@ -21,8 +21,54 @@ constexpr int LANES = 8;
 constexpr int MOST = 512;  // values of a row: neighbours of a point, points of a patch
 constexpr float INFINITE = __builtin_inff();
 
+#ifdef __AVX__
 typedef float Lanes __attribute__((vector_size(32)));
 typedef int32_t Flags __attribute__((vector_size(32)));  // -1 for true
+#else
+// Two registers of four lanes each: of wider ones than there are, GCC compares lane by lane.
+typedef float FourFloats __attribute__((vector_size(16)));
+typedef int32_t FourFlags __attribute__((vector_size(16)));
+
+template <class T, class Four>
+struct Pair {
+  Four low, high;
+
+  INLINE_MEMBER Pair() : low{}, high{} {}
+  INLINE_MEMBER Pair(T value) : low(Four{} + value), high(Four{} + value) {}
+  INLINE_MEMBER Pair(Four a, Four b) : low(a), high(b) {}
+  INLINE_MEMBER T operator[](int lane) const { return lane < 4 ? low[lane] : high[lane - 4]; }
+};
+typedef Pair<float, FourFloats> Lanes;
+typedef Pair<int32_t, FourFlags> Flags;
+
+#define ON_BOTH(Result, operation, Operand)                                              \
+  INLINE Result operator operation(Operand a, Operand b) {                               \
+    return Result(a.low operation b.low, a.high operation b.high);                       \
+  }
+#define ON_BOTH_IN_PLACE(operation, Operand)                                             \
+  ON_BOTH(Operand, operation, Operand)                                                   \
+  INLINE Operand& operator operation##=(Operand& a, Operand b) { return a = a operation b; }
+ON_BOTH_IN_PLACE(+, Lanes)
+ON_BOTH_IN_PLACE(-, Lanes)
+ON_BOTH_IN_PLACE(*, Lanes)
+ON_BOTH_IN_PLACE(/, Lanes)
+ON_BOTH_IN_PLACE(+, Flags)
+ON_BOTH_IN_PLACE(-, Flags)
+ON_BOTH(Flags, &, Flags)
+ON_BOTH(Flags, ^, Flags)
+ON_BOTH(Flags, >>, Flags)
+ON_BOTH(Flags, <, Lanes)
+ON_BOTH(Flags, <=, Lanes)
+ON_BOTH(Flags, >, Lanes)
+ON_BOTH(Flags, >=, Lanes)
+ON_BOTH(Flags, <, Flags)
+ON_BOTH(Flags, <=, Flags)
+ON_BOTH(Flags, >, Flags)
+ON_BOTH(Flags, >=, Flags)
+ON_BOTH(Flags, ==, Flags)
+INLINE Lanes operator-(Lanes a) { return Lanes(-a.low, -a.high); }
+INLINE Flags operator~(Flags a) { return Flags(~a.low, ~a.high); }
+#endif
 
 INLINE float square_root(float value) { return __builtin_sqrtf(value); }
 INLINE double square_root(double value) { return __builtin_sqrt(value); }
@@ -44,13 +90,30 @@ INLINE Lanes load(const float* values) {
   __builtin_memcpy(&lanes, values, sizeof lanes);
   return lanes;
 }
+INLINE Flags load(const int32_t* values) {
+  Flags lanes;
+  __builtin_memcpy(&lanes, values, sizeof lanes);
+  return lanes;
+}
 INLINE void store(float* values, Lanes lanes) { __builtin_memcpy(values, &lanes, sizeof lanes); }
 INLINE Lanes all(float value) { return Lanes{} + value; }
+#ifdef __AVX__
 INLINE Lanes where(Flags flags, Lanes a, Lanes b) { return flags ? a : b; }
+INLINE Flags where(Flags flags, Flags a, Flags b) { return flags ? a : b; }
+#else
+INLINE Lanes where(Flags flags, Lanes a, Lanes b) {
+  return Lanes(flags.low ? a.low : b.low, flags.high ? a.high : b.high);
+}
+INLINE Flags where(Flags flags, Flags a, Flags b) {
+  return Flags(flags.low ? a.low : b.low, flags.high ? a.high : b.high);
+}
+#endif
 INLINE Lanes magnitude(Lanes a) { return where(a < 0, -a, a); }
 INLINE Lanes positive(Lanes a) { return where(a > 0, a, all(0)); }
 INLINE Lanes larger(Lanes a, Lanes b) { return where(a < b, b, a); }
 INLINE Lanes smaller(Lanes a, Lanes b) { return where(b < a, b, a); }
+INLINE Flags larger(Flags a, Flags b) { return where(a < b, b, a); }
+INLINE Flags smaller(Flags a, Flags b) { return where(b < a, b, a); }
 
 INLINE float total(Lanes a) {
   return ((a[0] + a[4]) + (a[2] + a[6])) + ((a[1] + a[5]) + (a[3] + a[7]));

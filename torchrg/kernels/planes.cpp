@@ -41,15 +41,41 @@ INLINE float of_few(const Patch& patch, int count, float breadth) {
   return square_root(total(squares) / float(count - 3));
 }
 
+// torchrg.normals.consensus.noise._layered_deviations: of the sides of a plane from two parallel
+// ones, without what is asked of the result.
+INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_refits, float least) {
+  alignas(32) float sides[2][MOST];
+  for (int turn = 0;; turn++) {
+    float numbers[2], means[2][3], covariances[2][6], pooled[6];
+    for (int j = 0; j < patch.width; j += LANES) {
+      const Lanes weight = load(patch.weight + j);
+      const Lanes upper = where(plane.residuals(patch, j) > 0, weight, all(0));
+      store(sides[0] + j, upper), store(sides[1] + j, weight - upper);
+    }
+    for (int side = 0; side < 2; side++)
+      numbers[side] = moments(patch, sides[side], patch.width, means[side], covariances[side]);
+    if (turn == num_refits)
+      return smaller(numbers[0], numbers[1]) < least ? INFINITE : float(plane.low);
+    for (int i = 0; i < 6; i++)
+      pooled[i] = numbers[0] / count * covariances[0][i] + numbers[1] / count * covariances[1][i];
+    decompose(pooled, plane);
+    float ends[2];
+    for (int side = 0; side < 2; side++)
+      ends[side] = means[side][0] * plane.a + means[side][1] * plane.b + means[side][2] * plane.c;
+    plane.offset = (ends[0] + ends[1]) / 2;
+  }
+}
+
 }  // namespace
 
-// What torchrg.normals.consensus.noise.survey_noise takes from each neighbourhood: _deviations, and
-// the deviations of the `few` and the `more` nearest ones.
+// torchrg.normals.consensus.noise._survey: deviations of all neighbours and of the `few` and the
+// `more` nearest ones, from a plane, and where these look `layered` from two.
 KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
               Flagged mask, Floats normals, Flagged valid, int64_t few, int64_t more,
-              double kurtosis, double breadth, float* offsets, float* radius, float* whole,
-              bool* layered, bool* again, float* of_fewer, float* of_more) {
-  if (few < 4 || more < 4) return TOO_WIDE;
+              double breadth, double kurtosis, double share, int64_t num_refits, int64_t least,
+              float* offsets, float* radius, float* whole, float* layered, bool* again,
+              float* of_fewer, float* of_more) {
+  if (few < 4 || more < 4 || uint64_t(num_refits) > MOST) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
     again[i] = false;
@@ -73,8 +99,84 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
     const float s2 = total(second), s4 = total(fourth);
     radius[i] = square_root(farthest(patch, patch.weight));
     whole[i] = valid[i] && count > 3 ? square_root(s2 / larger(count - 3, 1.0f)) : INFINITE;
-    layered[i] = s4 * count < float(kurtosis) * s2 * s2 && is_finite(whole[i]);
+    layered[i] = INFINITE;
+    if (s4 * count < float(kurtosis) * s2 * s2 && is_finite(whole[i])) {
+      const float square =
+          of_layers(patch, {a, b, c, offsets[i], 0, 0, 0}, count, int(num_refits), float(least));
+      const float deviation = square_root(square * count / larger(count - 4, 1.0f));
+      if (deviation <= float(share) * whole[i]) layered[i] = deviation;
+    }
     of_fewer[i] = few <= k ? of_few(patch, int(few), float(breadth)) : INFINITE;
     of_more[i] = more <= k ? of_few(patch, int(more), float(breadth)) : INFINITE;
   });
+}
+
+namespace {
+
+// Whole numbers in the order of values, and back: those of negative ones descend otherwise.
+INLINE int32_t as_key(float value) {
+  int32_t key;
+  __builtin_memcpy(&key, &value, sizeof key);
+  return key < 0 ? key ^ INT32_MAX : key;
+}
+INLINE float of_key(int32_t key) {
+  if (key < 0) key ^= INT32_MAX;
+  float value;
+  __builtin_memcpy(&value, &key, sizeof value);
+  return value;
+}
+
+// The key of some rank, from 1, among the k of each lane.
+INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
+  Flags low = load(keys), high = low;
+  for (int j = 1; j < k; j++) {
+    const Flags key = load(keys + LANES * j);
+    low = smaller(key, low), high = larger(key, high);
+  }
+  while (total(low < high)) {
+    const Flags middle = (low & high) + ((low ^ high) >> 1);
+    Flags count{}, below = low, above = high;
+    for (int j = 0; j < k; j++) {
+      const Flags key = load(keys + LANES * j), within = key <= middle;
+      count -= within;
+      below = where(within, larger(key, below), below);
+      above = where(within, above, smaller(key, above));
+    }
+    const Flags is_high = count >= ranks;
+    low = where(is_high, where(count == ranks, below, low), above);
+    high = where(is_high, below, where(count == ranks - 1, above, high));
+  }
+  return low;
+}
+
+}  // namespace
+
+// torchrg.normals.consensus.noise._neighbor_quantiles of columns of values, a lane for each result.
+KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_rows, int64_t k,
+                          Floats values, Ints indices, Flagged mask, double quantile,
+                          int64_t rank_of_all, float* found) {
+  if (k < 1 || k > MOST || !(quantile >= 0 && quantile <= 1)) return TOO_WIDE;
+  alignas(32) int32_t keys[MOST * LANES], ranks[LANES];
+  const int64_t num_found = num_rows * num_columns;
+  for (int64_t start = 0; start < num_found; start += LANES) {
+    for (int lane = 0; lane < LANES; lane++) {
+      const int64_t place = smaller(start + lane, num_found - 1), i = place / num_columns;
+      const int32_t* row = indices + i * k;
+      const bool* counted = mask ? mask + i * k : nullptr;
+      const float* column = values + place % num_columns;
+      if (!are_rows(row, k, num_points)) return NO_SUCH_ROW;
+      int count = 0;
+      for (int j = 0; j < k; j++) {
+        const bool counts = !counted || counted[j];
+        count += counts;
+        keys[LANES * j + lane] = as_key(counts ? column[num_columns * row[j]] : INFINITE);
+      }
+      ranks[lane] = int(rank_of_all);
+      if (mask) ranks[lane] = larger(int(__builtin_ceilf(float(quantile) * float(count))), 1);
+    }
+    const Flags selected = select(keys, int(k), load(ranks));
+    for (int lane = 0; lane < LANES && start + lane < num_found; lane++)
+      found[start + lane] = of_key(selected[lane]);
+  }
+  return DONE;
 }

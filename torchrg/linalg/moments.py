@@ -179,6 +179,9 @@ class Segments:
 
         Along the ``axes`` ``(M, A, 3)`` of their region, A columns ``(n,)`` of float64.
         """
+        if self.is_served(vectors) and centers.dtype == torch.float64:
+            tables = self.rows, self.counts, centers, axes
+            return list(kernels.call("segment_coordinates", *vectors.unbind(dim=1), *tables)[0])
         about, columns = self.take_about(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
@@ -190,6 +193,9 @@ class Segments:
 
     def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Return the columns of :meth:`take` about a center ``(M, 3)`` for each region."""
+        if self.is_served(vectors) and centers.dtype == torch.float64:
+            eye = torch.eye(3, dtype=torch.float64, device=centers.device)
+            return self.along(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
         return [self.take(column).double() - self.spread(center) for column, center in pairs]
 
@@ -199,7 +205,7 @@ class Segments:
 
     def sum(self, values: Tensor) -> Tensor:
         """Return the sum of each region's values, given in the order of :meth:`take`."""
-        return self._reduce(values, "sum", np.add)
+        return reduce_runs(values, self.counts, "sum")
 
     def mean(self, values: Tensor) -> Tensor:
         """Return the mean of each region's values."""
@@ -260,7 +266,8 @@ class Segments:
 
     def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the smallest and the largest value of each region."""
-        return self._reduce(values, "min", np.minimum), self._reduce(values, "max", np.maximum)
+        low, high = (reduce_runs(values, self.counts, how) for how in ("min", "max"))
+        return low, high
 
     def median(self, values: Tensor) -> Tensor:
         """Return the median of each region's values, the lower one of an even number."""
@@ -268,12 +275,20 @@ class Segments:
         medians = [kth_smallest(region, (len(region) - 1) // 2) for region in parts]
         return torch.stack(medians) if parts else values
 
-    def _reduce(self, values: Tensor, name: str, reduction: np.ufunc) -> Tensor:
-        if values.device.type != "cpu" or not bool(self.counts.all()):
-            return torch.segment_reduce(values.contiguous(), name, lengths=self.counts)
-        # Five times faster than torch's, and sums are of halves of halves: more accurate.
-        starts = self.counts.cumsum(0) - self.counts
-        return torch.from_numpy(reduction.reduceat(values.numpy(), starts.numpy()))
+
+def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
+    """Return the "sum", "min" or "max" ``(M,)`` of runs of so many values each.
+
+    Example:
+        >>> reduce_runs(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([2, 1]), "min")
+        tensor([1., 2.])
+    """
+    if values.device.type != "cpu" or not bool(counts.all()):
+        return torch.segment_reduce(values.contiguous(), how, lengths=counts)
+    # Five times faster than torch's, and sums are of halves of halves: more accurate.
+    reduction = {"sum": np.add, "min": np.minimum, "max": np.maximum}[how]
+    starts = counts.cumsum(0) - counts
+    return torch.from_numpy(reduction.reduceat(values.numpy(), starts.numpy()))
 
 
 def _ascending(labels: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from torchrg import kernels
 from torchrg._parallel import ROWS_IN_CACHE, map_tasks
+from torchrg.structures import bounding_box
 
 MIN_FOR_CELLS = 2000
 """Points below which a tree is as fast as cells."""
@@ -50,7 +51,8 @@ def search_cells(
     Returns:
         The rows that are left, ascending. What is in ``found`` for them means nothing.
     """
-    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    low, high = bounding_box(points)
+    extent = high - low
     places = torch.from_numpy(np.ascontiguousarray(points))
     into, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
     certain = torch.zeros(len(points), dtype=torch.bool, device="cpu")

@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg._parallel import ROWS_AT_ONCE, chunks_of, places_of
+from torchrg.structures import bounding_box
 
 MORTON_BITS = 21
 """Bits of a number in a Morton code: three of them fit an int64."""
@@ -70,7 +71,11 @@ def finite_rows(points: Tensor) -> Tensor:
         >>> finite_rows(torch.tensor([[3.0, 0, 0], [torch.nan, 0, 0], [2, 0, 0]])).tolist()
         [2, 0]
     """
-    rows = points.isfinite().all(dim=-1).nonzero().squeeze(-1)
+    x, y, z = points.isfinite().unbind(dim=-1)
+    is_finite = x & y & z
+    if bool(is_finite.all()):
+        return canonical_order(points)
+    rows = places_of(is_finite)
     return rows[canonical_order(points[rows])]
 
 
@@ -83,18 +88,6 @@ def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0
     """
     result = values.new_full((num_points, *values.shape[1:]), fill)
     return result.index_copy_(0, rows, values)
-
-
-def bounding_box(
-    coordinates: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the least and the largest coordinates of points ``(N, 3)``, each ``(3,)``.
-
-    Column by column: along the rows NumPy takes twenty times as long.
-    """
-    columns = coordinates.T
-    low, high = [column.min() for column in columns], [column.max() for column in columns]
-    return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
 
 
 def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -3,14 +3,15 @@
 import math
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_IN_CACHE, chunks_of, places_of
+from torchrg import kernels
+from torchrg._parallel import ROWS_IN_CACHE, Result, chunks_of, map_chunks, map_tasks, places_of
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
@@ -22,6 +23,9 @@ LEAST_CONTACTS = 3
 
 PARALLEL_DEG = 15.0
 """At a smaller angle the line in which two planes cross may be far from where the faces end."""
+
+_CHUNKS_AT_ONCE = 16
+"""Chunks whose edges threads share, so few that what is kept of them is little."""
 
 _REACH = 4.0
 """An edge that leads across the planes by at most this many of their thicknesses is within their
@@ -62,11 +66,10 @@ def find_adjacency(
     angle = unsigned_angle_deg(first, second)
     crossing = (angle > PARALLEL_DEG) & ~curved[pairs].any(dim=1)
     reach = _REACH * thickness[pairs].amax(dim=1)
-    lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
-    for contacts in border.contacts():
+
+    def measure(contacts: _Contacts) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         is_crossing = crossing[contacts.pair]
         on_lines = _select(contacts, is_crossing)
-        lines.add(on_lines.pair, _edges(points, on_lines).norm(dim=1))
         on_curves = _select(contacts, ~is_crossing & (contacts.column <= NUM_CONTACTS))
         edge, pair = _edges(points, on_curves), on_curves.pair
         across = torch.stack([(edge * side[pair]).sum(dim=1) for side in (first, second)])
@@ -76,7 +79,12 @@ def find_adjacency(
         share = math.pi**2 * spacing * spacing / (2 * num_nearest * num_nearest * size)
         share = torch.where(size > 0, share, 0.0)
         flat = across.abs().amax(dim=0) <= farthest
-        curves.add(pair[flat], share[flat])
+        return on_lines.pair, _edges(points, on_lines).norm(dim=1), pair[flat], share[flat]
+
+    lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
+    for on_line, size, on_curve, share in border.map_contacts(measure):
+        lines.add(on_line, size)
+        curves.add(on_curve, share)
     (sizes, on_line), (shares, on_curve) = (kind.on(points.device) for kind in (lines, curves))
     along = torch.linalg.cross(first, second)
     along = along / along.norm(dim=1, keepdim=True)
@@ -170,15 +178,18 @@ class _Border:
         # Narrow numbers are gathered three times as fast.
         self._labels, self._neighbors = labels.to(torch.int32), neighbors
         self._num_regions = int(labels.max()) + 1 if len(labels) else 0
-        touches = torch.zeros_like(labels, dtype=torch.bool)
+        meets = torch.empty_like(labels, dtype=torch.bool)
+
+        def mark(chunk: slice) -> None:
+            meets[chunk] = self._meets_others(chunk)
+
+        map_chunks(mark, len(labels), ROWS_IN_CACHE, labels.device)
+        self._rows = places_of(meets).to(torch.int32)
         # Small tensors kept from each chunk would split the room that glibc has for the next.
         counts: Counter[int] = Counter()
-        for chunk in chunks_of(len(labels), ROWS_IN_CACHE):
-            places, _, keys = self._edges_of(chunk)
-            touches[chunk.start + places // self._width] = True
-            values_of_chunk = torch.unique(keys, return_counts=True)
-            counts.update(dict(zip(*(values.tolist() for values in values_of_chunk), strict=True)))
-        self._rows = places_of(touches).to(torch.int32)
+        for rows in torch.split(self._rows, ROWS_IN_CACHE):
+            values = torch.unique(self._edges_of(rows)[2], return_counts=True)
+            counts.update(dict(zip(*(of_chunk.tolist() for of_chunk in values), strict=True)))
         self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
         self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
         num_regions = max(self._num_regions, 1)
@@ -188,27 +199,42 @@ class _Border:
     def _width(self) -> int:
         return max(self._neighbors.indices.shape[1], 1)
 
-    def _edges_of(self, rows: slice | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _meets_others(self, rows: slice) -> Tensor:
+        """Return which of some points have a neighbour of another region, shape ``(n,)``."""
+        own, near = self._labels[rows], self._neighbors.at(rows)
+        if kernels.serve(own, *near):
+            return kernels.call("meet_others", self._labels, own, *near)[0]
+        return self._touches(own, near)[0].any(dim=1)
+
+    def _touches(self, own: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
+        """Return which neighbours of points of some regions are of another one, and of which."""
+        other = near.of(self._labels)
+        touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
+        return touches if near.valid is None else touches & near.valid, other
+
+    def _edges_of(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return where in the lists of some points other regions are, the lists, and the pairs."""
         label, near = self._labels[rows], self._neighbors.at(rows)
-        other = near.of(self._labels)
-        touches = (other != label[:, None]) & (other >= 0) & (label >= 0)[:, None]
-        if near.valid is not None:
-            touches &= near.valid
+        touches, other = self._touches(label, near)
         places = places_of(touches)
         first = label.index_select(0, places // self._width)
         second = other.reshape(-1).index_select(0, places)
         lower, higher = torch.minimum(first, second), torch.maximum(first, second)
         return places, near.indices, lower.long() * self._num_regions + higher
 
-    def contacts(self) -> Iterator[_Contacts]:
-        """Yield all edges, those of some points at a time, in the order of their rows."""
-        for rows in torch.split(self._rows, ROWS_IN_CACHE):
+    def map_contacts(self, work: Callable[[_Contacts], Result]) -> Iterator[Result]:
+        """Yield what work makes of all edges, those of some points at a time, in their order."""
+
+        def find(rows: Tensor) -> Result:
             places, targets, keys = self._edges_of(rows)
             source, column = places // self._width, places % self._width
             targets = targets.reshape(-1).index_select(0, places)
             pair = torch.searchsorted(self._keys, keys)
-            yield _Contacts(pair, rows.index_select(0, source), targets, column)
+            return work(_Contacts(pair, rows.index_select(0, source), targets, column))
+
+        chunks = torch.split(self._rows, ROWS_IN_CACHE)
+        for some in chunks_of(len(chunks), _CHUNKS_AT_ONCE):
+            yield from map_tasks(find, chunks[some], self._rows.device)
 
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
@@ -227,13 +253,17 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
     """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
     origin = points[:1].double()
     cells = array("q"), array("q")
-    for contacts in border.contacts():
+
+    def find_cells(contacts: _Contacts) -> tuple[Tensor, Tensor]:
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
         place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
         cell = torch.where(place.isfinite(), place, 0.0).floor().long()
-        for numbers, values in zip(cells, _each_once(contacts.pair, cell), strict=True):
+        return _each_once(contacts.pair, cell)
+
+    for found in border.map_contacts(find_cells):
+        for numbers, values in zip(cells, found, strict=True):
             numbers.frombytes(values.cpu().numpy().tobytes())
     pair, cell = _each_once(
         *(torch.from_numpy(np.array(numbers)).to(points.device) for numbers in cells)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_tasks
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_tasks
 from torchrg.config import GrowingConfig
 from torchrg.linalg import coordinate_resolution, eigh3_of_few
 from torchrg.linalg.moments import Segments
@@ -117,34 +117,51 @@ class RegionPlanes(NamedTuple):
         return (away * self.normal[regions]).sum(dim=2)
 
 
-def fit_planes(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
+def fit_planes(
+    segments: Segments, points: Tensor, normals: Tensor, *, shared: bool = False
+) -> RegionPlanes:
     """Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
 
     The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
     (1.4826 times their median), so that points of another surface do not tilt the plane.
     ``normals`` of any sign decide where points do not, in regions of one or two points or along a
     line; the sign is that of :func:`with_table_sign`. Nothing is known of the noise: the floor is
-    0.
+    0. Where points of a region have ``shared`` normals these are ``(M, 3)``, and no region is
+    curved.
 
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
     shares = segments.shares(POINTS_AT_ONCE)
-    parts = map_tasks(lambda share: _fit_together(share, points, normals), shares, points.device)
+    sizes = [len(share.counts) for share in shares]
+    own = torch.split(normals, sizes) if shared else [None] * len(shares)
+    parts = map_tasks(
+        lambda task: _fit_together(task[0], points, normals, task[1]),
+        list(zip(shares, own, strict=True)),
+        points.device,
+    )
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _fit_together(segments: Segments, points: Tensor, normals: Tensor) -> RegionPlanes:
-    """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
+def _shared_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal that points share, signs aside, and the spread of theirs, in degrees."""
     columns = segments.take_about(normals, normals.new_zeros(len(segments.counts), 3).double())
-    weights = torch.ones_like(columns[0])
-    _, spread_of_normals = segments.moments(columns, weights, centered=False)
-    shares, directions = eigh3_of_few(spread_of_normals)
-    # The direction that the normals of a region share, signs aside, and their angle to it.
-    usual = directions[:, :, 2]
-    spread = (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
+    _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
+    shares, directions = eigh3_of_few(squares)
+    return directions[:, :, 2], (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
+
+
+def _fit_together(
+    segments: Segments, points: Tensor, normals: Tensor, shared: Tensor | None
+) -> RegionPlanes:
+    """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
+    if shared is None:
+        usual, spread = _shared_normals(segments, normals)
+    else:
+        usual, spread = shared.double(), torch.zeros_like(shared[:, 0])
     origin = segments.first(points).double()
     local = segments.take_about(points, origin)
+    weights = torch.ones_like(local[0])
     resolution = coordinate_resolution(segments.first(points)).double()
     for _ in range(_NUM_FITS):
         mean, covariance = segments.moments(local, weights)
@@ -182,10 +199,11 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     """
     segments = Segments(labels, most=MOST_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
-    radii = [
-        neighborhood_radii(cloud.points, cloud.neighbors.at(rows))
-        for rows in torch.split(segments.rows, ROWS_AT_ONCE)
-    ]
+    radii = map_tasks(
+        lambda rows: neighborhood_radii(cloud.points, cloud.neighbors.at(rows)),
+        torch.split(segments.rows, ROWS_IN_CACHE),
+        labels.device,
+    )
     radius = segments.median(torch.cat(radii)).double()
     floor = config.coplanarity_floor * radius
     facets = _FACET_THICKNESS * float(config.facet_tolerance or 0.0)

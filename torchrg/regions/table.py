@@ -16,7 +16,7 @@ from torchrg._optional import require
 from torchrg._parallel import map_tasks, places_of
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few
-from torchrg.linalg.moments import Segments
+from torchrg.linalg.moments import Segments, reduce_runs
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
@@ -117,11 +117,28 @@ def summarize_planes(
     check_floating("summarize_planes", points=points, normals=normals)
     segments = Segments(labels)
     fit = fit_planes(segments, points, normals)
-    first, second = _plane_axes(fit)
+    planes = measure_planes(segments, points, fit, outline=outline)
+    if up is not None:
+        planes = replace(planes, kind=classify_planes(planes, _direction(up, points)))
+    if neighbors is not None:
+        meeting = find_adjacency(
+            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
+        )
+        lengths, angles = meeting.boundary_length, meeting.dihedral_deg
+        lengths, angles = lengths.to(points.dtype), angles.to(points.dtype)
+        planes = replace(planes, adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
+    return planes
 
+
+def measure_planes(
+    segments: Segments, points: Tensor, fit: RegionPlanes, *, outline: bool = False
+) -> Planes:
+    """Measure regions on the planes that were fitted to them; see :func:`summarize_planes`."""
+    first, second = _plane_axes(fit)
     shares = segments.shares(POINTS_AT_ONCE)
     sizes = [len(share.counts) for share in shares]
-    frames = zip(*(torch.split(part, sizes) for part in (fit.center, first, second)), strict=True)
+    frame = fit.center, torch.stack([first, second, fit.normal], dim=1)
+    frames = zip(*(torch.split(part, sizes) for part in frame), strict=True)
     measures = map_tasks(
         lambda part: _measure(points, *part, outline=outline),
         list(zip(shares, frames, strict=True)),
@@ -134,7 +151,7 @@ def summarize_planes(
     def as_given(values: Tensor) -> Tensor:
         return values.to(points.dtype)
 
-    planes = Planes(
+    return Planes(
         normal=as_given(fit.normal),
         offset=as_given((fit.center * fit.normal).sum(dim=1)),
         centroid=as_given(fit.center + mean),
@@ -145,30 +162,21 @@ def summarize_planes(
         axes=as_given(axes),
         center=as_given(fit.center + (middle[:, None] @ axes).squeeze(1)),
         curved=fit.curved,
+        outline=sum(outlines, ()) if outline else None,
     )
-    if up is not None:
-        planes = replace(planes, kind=classify_planes(planes, _direction(up, points)))
-    if outline:
-        planes = replace(planes, outline=sum(outlines, ()))
-    if neighbors is not None:
-        meeting = find_adjacency(
-            points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
-        )
-        lengths, angles = as_given(meeting.boundary_length), as_given(meeting.dihedral_deg)
-        planes = replace(planes, adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
-    return planes
 
 
 def _measure(
-    points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor, Tensor], *, outline: bool
+    points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor], *, outline: bool
 ) -> tuple[list[Tensor], _Outlines]:
-    """Return mean, area, rectangle and outlines of regions, by centers and two axes ``(M, 3)``."""
-    center, first, second = frame
-    eye = torch.eye(3, dtype=first.dtype, device=first.device).expand(len(first), 3, 3)
-    axes = torch.cat([eye, torch.stack([first, second], dim=1)], dim=1)
-    *centered, u, v = segments.along(points, center, axes)
-    mean = torch.stack([segments.mean(column) for column in centered], dim=1)
-    del centered
+    """Return mean, area, rectangle and outlines of regions, by centers ``(M, 3)`` and axes.
+
+    The axes ``(M, 3, 3)`` are two in the plane and its normal; the mean is in space.
+    """
+    u, v, height = segments.along(points, *frame)
+    mean = torch.stack([segments.mean(column) for column in (u, v, height)], dim=1)
+    mean = (mean[:, None] @ frame[1]).squeeze(1)
+    del height
     boxes = fit_rectangles(segments, u, v)
     area, width = covered_areas(segments, u, v, boxes)
     rings = _outlines(segments, u, v, width, frame, points.dtype) if outline else ()
@@ -249,19 +257,19 @@ def _outlines(
     u: Tensor,
     v: Tensor,
     width: Tensor,
-    frame: tuple[Tensor, Tensor, Tensor],
+    frame: tuple[Tensor, Tensor],
     dtype: torch.dtype,
 ) -> _Outlines:
     """Trace the outline of each region, and lift it into space."""
     outlines = []
     counts = segments.counts.tolist()
     parts = torch.split(torch.stack([u, v], dim=1), counts)
-    for places, size, center, first, second in zip(parts, width.tolist(), *frame, strict=True):
+    for places, size, center, axes in zip(parts, width.tolist(), *frame, strict=True):
         rings = (
             torch.from_numpy(ring).to(u.device)
             for ring in trace_outline(places.cpu().numpy(), size)
         )
-        lifted = (center + ring[:, :1] * first + ring[:, 1:] * second for ring in rings)
+        lifted = (center + ring[:, :1] * axes[0] + ring[:, 1:] * axes[1] for ring in rings)
         outlines.append(tuple(ring.to(dtype) for ring in lifted))
     return tuple(outlines)
 
@@ -447,11 +455,11 @@ def covered_areas(
     s = segments.spread(sine * math.cos(_CELL_ANGLE) + cosine * math.sin(_CELL_ANGLE))
     row = _numbered(segments, u * c + v * s, size)
     column = _numbered(segments, v * c - u * s, size)
-    cells = _occupied(segments.labels, row, column, len(size))
+    cells = _occupied(segments.labels, row, column, segments.counts)
     area, width = _corrected(cells, segments.counts, size), size
     wide_enough = torch.zeros_like(size, dtype=torch.bool)
     for _ in range(_NUM_DOUBLINGS):
-        cells = _occupied(cells.owner, cells.row // 2, cells.column // 2, len(size))
+        cells = _occupied(cells.owner, cells.row // 2, cells.column // 2, cells.num_cells)
         size = size * 2
         wider = _corrected(cells, segments.counts, size)
         wide_enough |= wider <= _WIDE_ENOUGH * area
@@ -461,26 +469,20 @@ def covered_areas(
 
 def _numbered(segments: Segments, x: Tensor, size: Tensor) -> Tensor:
     """Return the number of each point's cell along one axis, from 0 on in each region."""
-    low = segments.spread(segments.bounds(x)[0])
+    low = segments.spread(reduce_runs(x, segments.counts, "min"))
     return ((x - low) / segments.spread(torch.where(size > 0, size, 1.0))).long()
 
 
-def _occupied(owner: Tensor, row: Tensor, column: Tensor, num_regions: int) -> _Cells:
-    """Return the cells with points, each once."""
+def _occupied(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Cells:
+    """Return the cells with points, each once, of regions of so many points one after the other."""
     # One empty row and column on each side, so that no cell has a neighbour of another region.
-    heights, widths = (
-        torch.zeros(num_regions, dtype=torch.int64, device=owner.device).scatter_reduce_(
-            0, owner, place, "amax"
-        )
-        + 3
-        for place in (row, column)
-    )
-    ends = (heights * widths).cumsum(0)
+    heights, widths = (reduce_runs(place, counts, "max") + 3 for place in (row, column))
+    num_regions, ends = len(counts), (heights * widths).cumsum(0)
     starts = ends - heights * widths
-    keys = starts[owner] + (row + 1) * widths[owner] + column + 1
+    keys = (starts + widths + 1).index_select(0, owner) + row * widths.index_select(0, owner)
     grid = torch.zeros(int(ends[-1]) if num_regions else 0, dtype=torch.bool, device=owner.device)
-    grid[keys] = True
-    keys = grid.nonzero().squeeze(1)
+    grid[keys + column] = True
+    keys = places_of(grid)
     owner = torch.searchsorted(ends, keys, right=True)
     width = widths[owner]
     sides = torch.stack([keys - 1, keys + 1, keys - width, keys + width])

@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,35 +62,26 @@ def survey_noise(
     of all neighbours; noise is at least the rounding of the coordinates.
     """
     points = points.contiguous()
-    offsets, radius, whole, layered = (torch.empty_like(points[:, 0]) for _ in range(4))
-    small = [torch.empty_like(whole) for _ in constants.NOISE_COUNTS]
+    offsets, radius = torch.empty_like(points[:, 0]), torch.empty_like(points[:, 0])
+    deviations = points.new_empty(len(points), 2 + len(constants.NOISE_COUNTS))
 
     def work(block: slice) -> None:
-        indices, mask = neighbors.at(block)
-        offsets[block], radius[block], whole[block], low, again, *nearest = _survey(
-            points, Neighbors(indices, mask), fit.normals[block], fit.valid[block]
+        near = neighbors.at(block)
+        offsets[block], radius[block], whole, layered, again, *nearest = _survey(
+            points, near, fit.normals[block], fit.valid[block]
         )
-        layered[block] = torch.inf
-        if len(rows := places_of(low)):
-            near, numbers = Neighbors(indices, mask).at(rows), rows + block.start
-            layered[numbers] = _layered_deviations(
-                points, near, fit.normals[numbers], whole[numbers]
-            )
-        for values, deviations in zip(small, nearest, strict=True):
-            values[block] = deviations
         if len(rows := places_of(again)):
-            patches, counted = _each_place_once(points, Neighbors(indices, mask).at(rows))
-            for values, size in zip(small, constants.NOISE_COUNTS, strict=True):
-                values[rows + block.start] = _small_deviations(patches, counted, size)
+            patches, counted = _each_place_once(points, near.at(rows))
+            for values, size in zip(nearest, constants.NOISE_COUNTS, strict=True):
+                values[rows] = _small_deviations(patches, counted, size)
+        torch.stack([whole, layered, *nearest], dim=1, out=deviations[block])
 
     map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
-    quantile = constants.NOISE_QUANTILE
-    noise = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(whole, neighbors, quantile)
-    layered_noise = constants.NOISE_FACTOR_OF_ALL * _neighbor_quantiles(
-        layered, neighbors, quantile
-    )
-    noise = torch.minimum(noise, layered_noise)
+    whole, layered, *small = _neighbor_quantiles(
+        deviations, neighbors, constants.NOISE_QUANTILE
+    ).unbind(dim=1)
+    noise = constants.NOISE_FACTOR_OF_ALL * torch.minimum(whole, layered)
     count: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
         count = neighbors.valid.sum(dim=1)
@@ -99,7 +89,7 @@ def survey_noise(
     for size, factor, limit, values in zip(
         constants.NOISE_COUNTS, factors, limits, small, strict=True
     ):
-        noise_of_size = factor * _neighbor_quantiles(values, neighbors, quantile)
+        noise_of_size = factor * values
         near = (
             radius
             * (size / torch.as_tensor(count, dtype=radius.dtype, device=radius.device)).sqrt()
@@ -108,9 +98,9 @@ def survey_noise(
         below = (1 - share * share).clamp_(min=0)
         scaled = noise_of_size / torch.where(below > 0, below, 1.0).sqrt_()
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
-    common = _neighbor_quantiles(noise, neighbors, constants.COMMON_QUANTILE)
+    common = _neighbor_quantiles(noise[:, None], neighbors, constants.COMMON_QUANTILE)[:, 0]
     noise = torch.minimum(noise, constants.MAX_ABOVE_COMMON * common)
-    return Survey(offsets, whole, torch.maximum(noise, floor), radius)
+    return Survey(offsets, deviations[:, 0].contiguous(), torch.maximum(noise, floor), radius)
 
 
 def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
@@ -132,18 +122,36 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
         tensor([1., 1., 1., 1., 1., 1., 1., 1.])
     """
     for _ in range(constants.REGIONAL_STEPS):
-        noise = _neighbor_quantiles(noise, neighbors, constants.REGIONAL_QUANTILE)
+        noise = _neighbor_quantiles(noise[:, None], neighbors, constants.REGIONAL_QUANTILE)[:, 0]
     return noise
 
 
 def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
-    """Return what :func:`_deviations` does, and :func:`_of_nearest` for both of the counts."""
+    """Return parts of a survey, deviations from two layers, where places repeat, and deviations.
+
+    These are of the nearest neighbours, for each of the counts.
+    """
     counts = constants.NOISE_COUNTS
     if kernels.serve(points, *near, normals, valid, k=near.indices.shape[1]):
-        limits = constants.MAX_LAYERED_KURTOSIS, constants.MIN_BREADTH
-        return kernels.call("survey", points, *near, normals, valid, *counts, *limits)
+        return kernels.call(
+            "survey",
+            points,
+            *near,
+            normals,
+            valid,
+            *counts,
+            constants.MIN_BREADTH,
+            constants.MAX_LAYERED_KURTOSIS,
+            constants.MAX_LAYERED_SHARE,
+            constants.NUM_REFITS,
+            constants.MIN_PLANE_POINTS,
+        )
+    offsets, radius, whole, looks_layered, again = _deviations(points, *near, normals, valid)
+    layered = torch.full_like(whole, torch.inf)
+    if len(rows := places_of(looks_layered)):
+        layered[rows] = _layered_deviations(points, near.at(rows), normals[rows], whole[rows])
     of_nearest = [_of_nearest(points, near, count) for count in counts]
-    return *_deviations(points, *near, normals, valid), *of_nearest
+    return offsets, radius, whole, layered, again, *of_nearest
 
 
 def _deviations(
@@ -179,7 +187,7 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole:
         normals, two, squares = fit_parallel_planes(columns, (upper, counted - upper))
         upper = above(along(columns, normals), two.mean(dim=0)[:, None]) * counted
     num_upper = upper.sum(dim=1)
-    deviations = (squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1)).sqrt_()
+    deviations = square_root(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
     layered &= deviations <= constants.MAX_LAYERED_SHARE * whole
     return torch.where(layered, deviations, torch.inf)
@@ -218,23 +226,28 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
 
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
-    """Return a quantile of values over the neighbours of each point."""
-    indices, counted = neighbors
-    rank, quantiles = max(math.ceil(quantile * indices.shape[1]), 1), torch.empty_like(values)
+    """Return quantiles over the neighbours of each point, of each column of values ``(N, C)``."""
+    k, quantiles = neighbors.indices.shape[1], torch.empty_like(values)
+    rank = max(math.ceil(quantile * k), 1)
 
     def work(block: slice) -> None:
-        if counted is None and values.device.type == "cpu":
-            near = np.take(values.numpy(), indices[block].numpy())
-            near.partition(rank - 1, axis=1)
-            quantiles.numpy()[block] = near[:, rank - 1]
+        near = neighbors.at(block)
+        if kernels.serve(values, *near, k=k):
+            (quantiles[block],) = kernels.call("neighbor_quantiles", values, *near, quantile, rank)
             return
-        of_neighbors = values[indices[block].long()]
-        if counted is None:
-            quantiles[block] = of_neighbors.kthvalue(rank, dim=1).values
-            return
-        ranks = (quantile * counted[block].sum(dim=1, keepdim=True)).ceil().clamp(min=1)
-        ascending = torch.where(counted[block], of_neighbors, torch.inf).sort(dim=1).values
-        quantiles[block] = ascending.gather(1, ranks.long() - 1).squeeze(1)
+        for column, into in zip(values.unbind(dim=1), quantiles[block].unbind(dim=1), strict=True):
+            of_neighbors = near.of(column)
+            if near.valid is None and values.device.type == "cpu":
+                # A tenth of the time of torch's.
+                of_neighbors.numpy().partition(rank - 1, axis=1)
+                into[:] = of_neighbors[:, rank - 1]
+                continue
+            if near.valid is None:
+                into[:] = of_neighbors.kthvalue(rank, dim=1).values
+                continue
+            ranks = (quantile * near.valid.sum(dim=1, keepdim=True)).ceil().clamp(min=1)
+            ascending = torch.where(near.valid, of_neighbors, torch.inf).sort(dim=1).values
+            into[:] = ascending.gather(1, ranks.long() - 1).squeeze(1)
 
     map_chunks(work, len(values), ROWS_IN_CACHE, values.device)
     return quantiles
