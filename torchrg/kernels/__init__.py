@@ -51,9 +51,8 @@ SIGNATURES = {
     "offer_windows": "d[hw] b[hw] d[w] d[h] d[9pq] L[hw] B[hw] B[hw] n n n n -> ",
     "fit_narrow_windows": "d[hw] d[w] d[h] l[hw] l[n] x x D[52n] n n -> ",
     "choose_narrow": "d[hw] d[w] d[h] l[hw] l[n] d[92n] L[n] B[n] n n -> ",
-    "describe_pixels": "d[hw] b[hw] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] D[hw] D[hw] "
-    "B[hw] x x x x x x n n -> ",
-    "join_pixels": "l[hw] b[hw] d[hw3] d[hw] d[N] d[M] l[n] d[w] d[h] B[hw] B[hw] x x x n n -> ",
+    "describe_pixels": "d[hw] b[hw] d[w] d[h] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] "
+    "D[hw] B[hw] B[hw] B[hw] x x x x x x x x x n n -> ",
     "segment_rows": "l[n] n L[M] L[M] L[M] -> l[n]",
     "outer_places": "d[n] d[n] l[M] x -> b[n]",
     "segment_coordinates": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
