@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from torchrg.depth.growth import holds
 from torchrg.depth.normals import fit_pixels, least_in_windows
+from torchrg.depth.pixels import holds
 from torchrg.depth.windows import CELL_SIZES, Image, Windows, fit_windows, noise_by_size
 
 FOCAL = (525.0, 525.0)

@@ -13,10 +13,10 @@ from torchrg.depth.growth import (
     absorb_pixels,
     connect_pixels,
     fit_inverse_planes,
-    join_pixels,
     move_to_creases,
 )
-from torchrg.depth.normals import describe_pixels, fit_pixels
+from torchrg.depth.normals import fit_pixels
+from torchrg.depth.pixels import describe_pixels
 from torchrg.depth.segment import _inverse_cloud
 from torchrg.depth.windows import Image
 from torchrg.linalg.moments import Segments
@@ -76,12 +76,11 @@ def stages_of(depth):
     image, config = image_of(depth), DepthConfig()
     x, y = image.u / FOCAL[0], image.v / FOCAL[1]
     planes = fit_pixels(image, focal=FOCAL, noise=None, dtype=depth.dtype)
-    pixels = describe_pixels(image, planes, x, y, FOCAL)
-    joins = join_pixels(image, planes, pixels, config)
-    labels = number_by_size(connect_pixels(planes.choice.flat, *joins), 20)
+    pixels = describe_pixels(image, planes, FOCAL, config)
+    labels = number_by_size(connect_pixels(planes.choice.flat, pixels.right, pixels.down), 20)
     cloud = _inverse_cloud(image, pixels, x, y)
     found = [*planes.squares.values(), planes.narrow, planes.pixels, *planes.choice, *pixels]
-    found += [*joins, labels]
+    found += [labels]
     if bool((labels >= 0).any()):
         fit = fit_inverse_planes(cloud, labels, most=500)
         reach = fit.times_thickness(3.0)

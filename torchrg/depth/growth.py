@@ -7,13 +7,10 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import map_tasks, places_of
+from torchrg._parallel import map_tasks
 from torchrg.config import DepthConfig
 from torchrg.depth.faces import borders, hidden_contacts, join_strips
-from torchrg.depth.normals import PixelPlanes, Pixels
-from torchrg.depth.passes import pass_over_rows, serves
-from torchrg.depth.windows import Image
-from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.depth.passes import serves
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MOST_FITTED, RegionPlanes
 from torchrg.regions.growth import number_by_size
@@ -47,14 +44,6 @@ _NUM_FITS = 2
 """Fits of a region's plane, a plain one and a reweighted one: its pixels are near the plane
 already."""
 
-_ALIKE = 1.75
-"""Factor of the largest angle between normals of two windows that both hold both pixels. On a
-column, large windows turn by more than the angle from one cell to the next."""
-
-_SLOPE_NOISE = 1.0
-"""Standard deviations by which the slopes of two windows that both hold both pixels may differ,
-whatever the angle is. The small windows of a narrow face turn by noise alone."""
-
 _MOST_MOVES = 16
 """Pixels by which a border may move: windows hardly reach farther from their middle."""
 
@@ -80,7 +69,8 @@ def grow_pixels(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Grow regions over a depth image, and give border pixels and parts of one face to them.
 
-    Regions are the connected components of the flat pixels that :func:`join_pixels` joins.
+    Regions are the connected components of the flat pixels, by the ``joins`` to the right and down
+    of :class:`torchrg.depth.pixels.Pixels`.
 
     Returns:
         Labels ``(H * W,)``, 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; unit normals
@@ -100,85 +90,6 @@ def _normals_in_space(fit: RegionPlanes) -> Tensor:
     away = torch.stack([-fit.normal[:, 0], -fit.normal[:, 1], distance], dim=1)
     normals: Tensor = -away / away.norm(dim=1, keepdim=True)
     return normals
-
-
-def join_pixels(
-    image: Image, planes: PixelPlanes, pixels: Pixels, config: DepthConfig
-) -> tuple[Tensor, Tensor]:
-    """Return whether pixels are on one surface with the next to the right, and below, ``(H, W)``.
-
-    They are if both have a flat window, their normals in space are within the angle, and at both
-    pixels their two planes differ by at most ``max_step`` times what a flat window may deviate by:
-    no region crosses a step. Where both windows hold both pixels the angle may be larger: a crease
-    between the pixels would lie within two flat windows.
-    """
-    wider = min(_ALIKE * config.max_angle_deg, 90.0)
-    limits = config.max_step, deg_to_sq_chord(config.max_angle_deg), deg_to_sq_chord(wider)
-    window, flat, _ = planes.choice
-    joins = torch.zeros_like(flat), torch.zeros_like(flat)
-    if serves(image.values):
-        fixed = window, flat, pixels.normals, pixels.tolerance, *planes.tables, image.u, image.v
-        pass_over_rows("join_pixels", len(image.v), *fixed, *joins, *limits)
-        return joins
-    for axis, joined in ((1, joins[0]), (0, joins[1])):
-        length, step = flat.shape[axis] - 1, (flat.shape[1], 1)[axis]
-        both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
-        here = places_of(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
-        there, numbers = here + step, window.flatten()
-        on_one_surface = _are_on_one_surface(image, planes, pixels, here, there, limits)
-        joined.view(-1)[here] = (numbers[here] == numbers[there]) | on_one_surface
-    return joins
-
-
-def _are_on_one_surface(
-    image: Image,
-    planes: PixelPlanes,
-    pixels: Pixels,
-    here: Tensor,
-    there: Tensor,
-    limits: tuple[float, float, float],
-) -> Tensor:
-    """Tell which pixels are on one surface with others; limits of step, angle and wider angle."""
-    max_step, max_sq_chord, wider_sq_chord = limits
-    width = len(image.u)
-    row, column = here // width, here % width
-    ours, theirs = planes.take(here), planes.take(there)
-    u_slope, v_slope = ours.u_slope - theirs.u_slope, ours.v_slope - theirs.v_slope
-    step = u_slope * image.u[column] + v_slope * image.v[row] + ours.origin - theirs.origin
-    next_step = step + torch.where(there // width > row, v_slope, u_slope)
-    tolerance = pixels.tolerance.flatten()
-    limit = max_step * torch.maximum(tolerance[here], tolerance[there])
-    normals = pixels.normals.view(-1, 3)
-    turned = sq_chords(*(normals[at][:, :, None].unbind(dim=1) for at in (here, there))).squeeze(1)
-    sides, middles = planes.sides_and_middles(here)
-    their_sides, their_middles = planes.sides_and_middles(there)
-    sq_noise = _sq_slope_noise(sides, tolerance[here])
-    sq_noise = sq_noise + _sq_slope_noise(their_sides, tolerance[there])
-    alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
-    both_hold = holds(sides, middles, there, width) & holds(their_sides, their_middles, here, width)
-    accepted = (turned <= max_sq_chord) | ((alike | (turned <= wider_sq_chord)) & both_hold)
-    return accepted & (step.abs() <= limit) & (next_step.abs() <= limit)
-
-
-def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
-    """Return the variance of the slopes of windows of so many rows and columns, ``(2, n)``.
-
-    That of least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, the mean of both
-    axes.
-    """
-    rows, columns = sides.unbind()
-    count = rows * columns
-    return 6 * tolerance.square() * (1 / (rows * rows) + 1 / (columns * columns)) / count
-
-
-def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
-    """Tell whether windows hold pixels, by row-major place in an image of so many columns.
-
-    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` row and column of their middles.
-    """
-    (rows, columns), (row, column) = sides.unbind(), middles.unbind()
-    down, right = (pixels // width - row).abs(), (pixels % width - column).abs()
-    return (down <= rows / 2) & (right <= columns / 2)
 
 
 def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from torchrg.depth.windows import (
     noise_by_size,
 )
 
-_FLAT = 1.35
+FLAT = 1.35
 """A flat window deviates from its plane by at most this many times the tolerance."""
 _OWN_REACH = 3.5
 """A pixel is on the plane of a window within this many times the noise."""
@@ -193,7 +193,7 @@ def rate_windows(
     bend = torch.where(mean > 0, bend, 0.0)
     tolerance = torch.maximum(by_noise, _BEND * bend)
     relative = deviation / tolerance
-    is_flat = relative <= _FLAT
+    is_flat = relative <= FLAT
     if quarters is not None:
         usual = _deviation_of_quarters(tables[quarters][3], relative.shape)
         # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
@@ -304,67 +304,3 @@ def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         best, chosen = torch.nn.functional.max_pool2d(best, size, 1, pad, return_indices=True)
         place = place[chosen.flatten()]
     return -best[0, 0], place.view(image.shape)
-
-
-class Pixels(NamedTuple):
-    """What the windows of pixels say, ``(H, W)``; normals are unit ones ``(H, W, 3)``.
-
-    ``curvature`` is the share of a window's variance across its plane. ``tolerance`` is what a flat
-    window may deviate by, ``noise`` that of inverse depth as large windows see it. ``valid`` tells
-    which pixels have a plane; all but the noise is 0 at others.
-    """
-
-    normals: Tensor
-    curvature: Tensor
-    tolerance: Tensor
-    noise: Tensor
-    valid: Tensor
-
-
-def describe_pixels(
-    image: Image, pixels: PixelPlanes, x: Tensor, y: Tensor, focal: tuple[float, float]
-) -> Pixels:
-    """Return normals towards the camera, curvature and limits of deviation of pixels.
-
-    ``x`` ``(W,)`` and ``y`` ``(H,)`` are slopes of the rays. A deviation e of inverse depth is one
-    of ``distance * z * e`` from the plane; a step of a column is one of
-    ``(x_step - x_slope * z * ray) z`` along it.
-    """
-    values, seen, choice = image.values, image.seen, pixels.choice
-    if serves(values):
-        curvature, tolerance, noise = (torch.empty_like(values) for _ in range(3))
-        normals = values.new_empty(*values.shape, 3)
-        described = Pixels(normals, curvature, tolerance, noise, torch.empty_like(seen))
-        fixed = values, seen, x, y, choice.window, choice.flat, *pixels.tables
-        numbers = *focal, *pixels.noise
-        pass_over_rows("describe_pixels", len(y), *fixed, *described, *numbers)
-        return described
-    places = torch.arange(values.numel(), device=values.device)
-    windows = Windows(*(column.view(values.shape) for column in pixels.take(places)))
-    sides = pixels.sides_and_middles(places)[0].view(2, *values.shape)
-    noise = pixels.noise.at(values)
-    valid = choice.flat | (seen & windows.deviation.isfinite())
-    is_smooth = windows.deviation > _FLAT * windows.tolerance
-    limit = torch.maximum(windows.tolerance, noise)
-    tolerance = torch.where(is_smooth, windows.deviation, limit)
-    away = windows.u_slope * focal[0], windows.v_slope * focal[1], windows.origin
-    length = (away[0].square() + away[1].square() + away[2].square()).sqrt()
-    length = torch.where(length > 0, length, 1.0)
-    z = 1 / torch.where(values > 0, values, 1.0)
-    across = (z * torch.where(valid, windows.deviation, 0.0) / length).square()
-    rays, y = x * x + (y * y)[:, None] + 1, y[:, None]
-    along = torch.zeros_like(z)
-    slopes = (windows.u_slope, windows.v_slope)
-    for side, slope, f, place in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
-        step, spread = slope * z, (side * side - 1) / 12
-        along = along + spread * (step * step * rays - 2 / f * step * place + 1 / (f * f))
-    total = across + along * z * z
-    variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
-    normals = torch.stack([-column / length for column in away], dim=-1)
-    return Pixels(
-        torch.where(valid[..., None], normals, 0.0),
-        torch.where(valid, variation, 0.0),
-        torch.where(valid, tolerance, 0.0),
-        noise,
-        valid,
-    )

@@ -10,8 +10,9 @@ from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import places_of, sequential_operations
 from torchrg.config import DepthConfig, settings_of
 from torchrg.depth.camera import has_depth, read_intrinsics
-from torchrg.depth.growth import InverseCloud, grow_pixels, join_pixels
-from torchrg.depth.normals import Pixels, describe_pixels, fit_pixels
+from torchrg.depth.growth import InverseCloud, grow_pixels
+from torchrg.depth.normals import fit_pixels
+from torchrg.depth.pixels import Pixels, describe_pixels
 from torchrg.depth.windows import Image
 from torchrg.linalg.moments import Segments, kth_smallest
 from torchrg.regions.fit import fit_planes
@@ -94,8 +95,8 @@ def _segment(
     v = torch.arange(depth.shape[0], device=depth.device).double() - cy
     image, x, y = Image(inverse, seen, u, v), u / fx, v / fy
     planes = fit_pixels(image, focal=focal, noise=config.noise, dtype=depth.dtype)
-    pixels = describe_pixels(image, planes, x, y, focal)
-    joins, flat, edge = join_pixels(image, planes, pixels, config), *planes.choice[1:]
+    pixels = describe_pixels(image, planes, focal, config)
+    joins, flat, edge = (pixels.right, pixels.down), *planes.choice[1:]
     del planes
     cloud = _inverse_cloud(image, pixels, x, y)
     labels, plane_normals, curved = grow_pixels(cloud, flat, joins, config)

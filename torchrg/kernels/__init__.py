@@ -27,7 +27,6 @@ definitions."""
 
 SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
-    "are_coplanar": "f[3N] i[nk] b[nk]? f[n3] b[nk] b[nk]? x x -> b[nk]",
     "fit_normals_pca": "f[N3] i[nk] b[nk]? f[n] x x -> f[n3] f[n] f[n] b[n] b[n]",
     "survey": "f[N3] i[nk] b[nk]? f[n3] b[n] n n x x x n n -> f[n] f[n] f[n] f[n] b[n] f[n] f[n]",
     "broken_planes": "f[N3] i[nk] b[nk]? f[n] f[n3] l[p2] f[c] -> f[n3] f[n] f[n3] f[n] f[n]",
@@ -52,15 +51,13 @@ SIGNATURES = {
     "offer_windows": "d[hw] b[hw] d[w] d[h] d[9pq] L[hw] B[hw] B[hw] n n n n -> ",
     "fit_narrow_windows": "d[hw] d[w] d[h] l[hw] l[n] x x D[52n] n n -> ",
     "choose_narrow": "d[hw] d[w] d[h] l[hw] l[n] d[92n] L[n] B[n] n n -> ",
-    "describe_pixels": "d[hw] b[hw] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] D[hw] D[hw] "
-    "B[hw] x x x x x x n n -> ",
-    "join_pixels": "l[hw] b[hw] d[hw3] d[hw] d[N] d[M] l[n] d[w] d[h] B[hw] B[hw] x x x n n -> ",
+    "describe_pixels": "d[hw] b[hw] d[w] d[h] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] "
+    "D[hw] B[hw] B[hw] B[hw] x x x x x x x x x n n -> ",
     "segment_rows": "l[n] n L[M] L[M] L[M] -> l[n]",
     "outer_places": "d[n] d[n] l[M] x -> b[n]",
     "segment_coordinates": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
-    "number_by_size": "l[n] n -> l[n] l[n] l[n]",
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
     "absorb_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",

@@ -100,10 +100,13 @@ enum Column { U_SLOPE, V_SLOPE, ORIGIN, DEVIATION, MEAN, NOISE, TOLERANCE, STRON
 struct Window {
   const double* numbers;  // one in each column, `step` apart
   int64_t step;
-  double rows, columns, row, column;  // sides, and the place of the middle
+  double rows, columns;
+  int64_t cell, across, wide;  // its middle is that of a cell, of so many pixels and cells a row
 
   INLINE_MEMBER double operator[](Column column) const { return numbers[column * step]; }
   INLINE_MEMBER bool holds(int64_t r, int64_t c) const {
+    const double row = double(cell / across * wide) + double(wide - 1) / 2,
+                 column = double(cell % across * wide) + double(wide - 1) / 2;
     return size_of(double(r) - row) <= rows / 2 && size_of(double(c) - column) <= columns / 2;
   }
 };
@@ -125,15 +128,12 @@ struct Windows {
     while (size < NUM_SIZES && k >= first[size + 1]) size++;
     const int64_t cell = k - first[size];
     if (size == NUM_SIZES) {
-      const int64_t pixel = pixels[cell % n];
       const double tall = cell < n ? SHORT : LONG, wide = cell < n ? LONG : SHORT;
-      return {narrow + cell, 2 * n, tall, wide, double(pixel / width), double(pixel % width)};
+      return {narrow + cell, 2 * n, tall, wide, pixels[cell % n], width, 1};
     }
     const int64_t cells = first[size + 1] - first[size], wide = int64_t(1) << size;
-    const double side = double(SIDE * wide), middle = double(wide - 1) / 2;
-    return {squares + COLUMNS * first[size] + cell, cells, side, side,
-            double(cell / columns[size] * wide) + middle,
-            double(cell % columns[size] * wide) + middle};
+    const double side = double(SIDE * wide);
+    return {squares + COLUMNS * first[size] + cell, cells, side, side, cell, columns[size], wide};
   }
   INLINE_MEMBER bool has(int64_t k) const { return k >= 0 && k < first[NUM_SIZES] + 2 * n; }
 };
@@ -260,6 +260,20 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
   return DONE;
 }
 
+namespace {
+
+// Calls `visit` with the rows and columns of the pixels of a narrow window, lying (0) or upright.
+template <class Visit>
+INLINE void visit_narrow(int64_t h, int64_t w, int64_t pixel, int shape, const Visit& visit) {
+  const int64_t row = pixel / w, tall = (shape ? LONG : SHORT) / 2;
+  const int64_t column = pixel % w, wide = (shape ? SHORT : LONG) / 2;
+  for (int64_t r = larger(row - tall, int64_t(0)); r <= smaller(row + tall, h - 1); r++)
+    for (int64_t c = larger(column - wide, int64_t(0)); c <= smaller(column + wide, w - 1); c++)
+      visit(r, c);
+}
+
+}  // namespace
+
 // windows.fit_narrow_windows, lying (0) and upright (1), of pixels that `numbers` numbers.
 KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u, Doubles v,
                           Longs numbers, Longs pixels, double least_count, double least_spread,
@@ -267,16 +281,13 @@ KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubl
   if (!are_rows_of(from, to, n)) return TOO_WIDE;
   for (int64_t number = from; number < to; number++) {
     if (pixels[number] < 0 || pixels[number] >= h * w) return NO_SUCH_ROW;
-    const int64_t row = pixels[number] / w, column = pixels[number] % w;
     double sums[MOMENTS][2] = {}, terms[MOMENTS][1], solved[5][2];
     for (int shape = 0; shape < 2; shape++) {
-      const int64_t tall = (shape ? LONG : SHORT) / 2, wide = (shape ? SHORT : LONG) / 2;
-      for (int64_t r = larger(row - tall, int64_t(0)); r <= smaller(row + tall, h - 1); r++)
-        for (int64_t c = larger(column - wide, int64_t(0)); c <= smaller(column + wide, w - 1); c++) {
-          if (numbers[r * w + c] < 0) continue;
-          write_moments(1, u[c], v[r], values[r * w + c], terms, 0);
-          for (int m = 0; m < MOMENTS; m++) sums[m][shape] += terms[m][0];
-        }
+      visit_narrow(h, w, pixels[number], shape, [&](int64_t r, int64_t c) {
+        if (numbers[r * w + c] < 0) return;
+        write_moments(1, u[c], v[r], values[r * w + c], terms, 0);
+        for (int m = 0; m < MOMENTS; m++) sums[m][shape] += terms[m][0];
+      });
       solve(sums, shape, least_count, least_spread, solved);
       for (int part = 0; part < 5; part++)
         planes[(2 * part + shape) * n + number] = solved[part][shape];
@@ -308,105 +319,108 @@ KERNEL choose_narrow(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u,
     }
     double least = NONE;
     int64_t flattest = 2 * n;
-    for (int64_t shape = 0; shape < 2; shape++) {
-      const int64_t tall = (shape ? LONG : SHORT) / 2, wide = (shape ? SHORT : LONG) / 2;
-      for (int64_t r = larger(row - tall, int64_t(0)); r <= smaller(row + tall, h - 1); r++)
-        for (int64_t c = larger(column - wide, int64_t(0)); c <= smaller(column + wide, w - 1); c++) {
-          if (numbers[r * w + c] < 0) continue;
-          if (numbers[r * w + c] >= n) return NO_SUCH_ROW;
-          const int64_t k = shape * n + numbers[r * w + c];
-          if (at(RELATIVE, k) < least && is_near(k)) least = at(RELATIVE, k), flattest = k;
-        }
-    }
+    bool inside = true;
+    for (int shape = 0; shape < 2; shape++)
+      visit_narrow(h, w, pixel, shape, [&](int64_t r, int64_t c) {
+        const int64_t other = numbers[r * w + c], k = shape * n + other;
+        inside &= other < n;
+        if (other >= 0 && other < n && at(RELATIVE, k) < least && is_near(k))
+          least = at(RELATIVE, k), flattest = k;
+      });
+    if (!inside) return NO_SUCH_ROW;
     beside[number] = flattest < 2 * n, chosen[number] = beside[number] ? flattest : -1;
   }
   return DONE;
 }
 
-// normals.describe_pixels: normals, curvature, tolerance, noise and validity by pixels' windows.
+namespace {
+
+// What a window tells of all its pixels.
+struct Described {
+  int64_t number = -1;
+  Window window;
+  double slopes[2], origin, deviation, limit, length, normal[3];
+
+  INLINE_MEMBER void look_at(const Windows& all, int64_t window_number, const double* focal) {
+    if (number == window_number) return;
+    number = window_number, window = all[number], origin = window[ORIGIN];
+    deviation = window[DEVIATION], limit = window[TOLERANCE];
+    slopes[0] = window[U_SLOPE], slopes[1] = window[V_SLOPE];
+    const double a = slopes[0] * focal[0], b = slopes[1] * focal[1];
+    length = square_root(a * a + b * b + origin * origin), length = length > 0 ? length : 1;
+    normal[0] = -a / length, normal[1] = -b / length, normal[2] = -origin / length;
+  }
+  INLINE_MEMBER double tolerance(double noise) const {
+    return deviation > FLAT * limit ? deviation : larger(limit, noise);
+  }
+};
+
+}  // namespace
+
+// pixels.describe_pixels: noise, normals, curvature and validity by pixels' windows, and whether
+// pixels are on one surface with the next, to the right and below.
 KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Doubles values,
-                       Flagged seen, Doubles x, Doubles y, Longs windows, Flagged flat,
-                       Doubles squares, Doubles narrow, Longs pixels, double* normals,
-                       double* curvature, double* tolerance, double* noise, bool* valid, double fx,
-                       double fy, double factor, double constant, double growth, double rounding,
-                       int64_t from, int64_t to) {
+                       Flagged seen, Doubles u, Doubles v, Doubles x, Doubles y, Longs windows,
+                       Flagged flat, Doubles squares, Doubles narrow, Longs pixels, double* normals,
+                       double* curvature, double* noise, bool* valid, bool* right, bool* down,
+                       double fx, double fy, double factor, double constant, double growth,
+                       double rounding, double max_step, double max_sq_chord,
+                       double wider_sq_chord, int64_t from, int64_t to) {
   const Windows all(h, w, n, squares, narrow, pixels);
   if (N != COLUMNS * all.first[NUM_SIZES] || M != COLUMNS * 2 * n || !are_rows_of(from, to, h))
     return TOO_WIDE;
+  for (int64_t pixel = from * w; pixel < smaller(to + 1, h) * w; pixel++)
+    if (!all.has(windows[pixel])) return NO_SUCH_ROW;
   const Noise usual = {factor, constant, growth, rounding};
+  const double focal[2] = {fx, fy};
+  Described own, beside, below;  // neighbouring pixels mostly have the same window
+  const auto are_joined = [&](int64_t r, int64_t c, Described& other, bool is_down) {
+    const int64_t there = r * w + c + (is_down ? w : 1);
+    if (windows[there] == own.number) return true;
+    other.look_at(all, windows[there], focal);
+    const double u_slope = own.slopes[0] - other.slopes[0],
+                 v_slope = own.slopes[1] - other.slopes[1];
+    const double step = u_slope * u[c] + v_slope * v[r] + own.origin - other.origin;
+    const double ours = own.tolerance(noise[r * w + c]),
+                 theirs = other.tolerance(usual.at(values[there]));
+    const double limit = max_step * larger(ours, theirs);
+    if (!(size_of(step) <= limit && size_of(step + (is_down ? v_slope : u_slope)) <= limit))
+      return false;
+    const double *a = own.normal, *b = other.normal;
+    const double sign = __builtin_copysign(1.0, a[0] * b[0] + a[1] * b[1] + a[2] * b[2]);
+    const double turned =
+        square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
+    if (turned <= max_sq_chord) return true;
+    const bool alike = u_slope * u_slope + v_slope * v_slope <=
+                       sq_slope_noise(own.window, ours) + sq_slope_noise(other.window, theirs);
+    return (alike || turned <= wider_sq_chord) && own.window.holds(r + is_down, c + !is_down) &&
+           other.window.holds(r, c);
+  };
   for (int64_t r = from; r < to; r++)
     for (int64_t c = 0; c < w; c++) {
       const int64_t pixel = r * w + c;
+      if (windows[pixel] == beside.number) own = beside;
+      own.look_at(all, windows[pixel], focal);
       noise[pixel] = usual.at(values[pixel]);
-      if (!all.has(windows[pixel])) return NO_SUCH_ROW;
-      const Window window = all[windows[pixel]];
-      const double deviation = window[DEVIATION];
-      valid[pixel] = flat[pixel] || (seen[pixel] && deviation < NONE);
-      tolerance[pixel] = curvature[pixel] = 0;
-      double* normal = normals + 3 * pixel;
-      normal[0] = normal[1] = normal[2] = 0;
+      right[pixel] = flat[pixel] && c + 1 < w && flat[pixel + 1] && are_joined(r, c, beside, false);
+      down[pixel] = flat[pixel] && r + 1 < h && flat[pixel + w] && are_joined(r, c, below, true);
+      valid[pixel] = flat[pixel] || (seen[pixel] && own.deviation < NONE);
+      for (int axis = 0; axis < 3; axis++)
+        normals[3 * pixel + axis] = valid[pixel] ? own.normal[axis] : 0;
+      curvature[pixel] = 0;
       if (!valid[pixel]) continue;
-      tolerance[pixel] = deviation > FLAT * window[TOLERANCE]
-                             ? deviation
-                             : larger(window[TOLERANCE], noise[pixel]);
-      const double away[3] = {window[U_SLOPE] * fx, window[V_SLOPE] * fy, window[ORIGIN]};
-      double length = square_root(square(away[0]) + square(away[1]) + square(away[2]));
-      length = length > 0 ? length : 1;
-      for (int axis = 0; axis < 3; axis++) normal[axis] = -away[axis] / length;
       const double z = 1 / (values[pixel] > 0 ? values[pixel] : 1);
-      const double ray = x[c] * x[c] + y[r] * y[r] + 1, across = square(z * deviation / length);
-      const double sides[2] = {window.columns, window.rows}, places[2] = {x[c], y[r]};
-      const double slopes[2] = {window[U_SLOPE], window[V_SLOPE]}, focal[2] = {fx, fy};
+      const double ray = x[c] * x[c] + y[r] * y[r] + 1;
+      const double across = square(z * own.deviation / own.length);
+      const double sides[2] = {own.window.columns, own.window.rows}, places[2] = {x[c], y[r]};
       double along = 0;
       for (int axis = 0; axis < 2; axis++) {
-        const double step = slopes[axis] * z, f = focal[axis];
+        const double step = own.slopes[axis] * z, f = focal[axis];
         along += (sides[axis] * sides[axis] - 1) / 12 *
                  (step * step * ray - 2 / f * step * places[axis] + 1 / (f * f));
       }
       const double total = across + along * z * z;
       curvature[pixel] = smaller(across / (total > 0 ? total : 1), 1.0 / 3);
-    }
-  return DONE;
-}
-
-// growth.join_pixels: which pixels are on one surface with the next, to the right and below.
-KERNEL join_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Longs windows,
-                   Flagged flat, Doubles normals, Doubles tolerance, Doubles squares,
-                   Doubles narrow, Longs pixels, Doubles u, Doubles v, bool* right, bool* down,
-                   double max_step, double max_sq_chord, double wider_sq_chord, int64_t from,
-                   int64_t to) {
-  const Windows all(h, w, n, squares, narrow, pixels);
-  if (N != COLUMNS * all.first[NUM_SIZES] || M != COLUMNS * 2 * n || !are_rows_of(from, to, h))
-    return TOO_WIDE;
-  const auto are_joined = [&](int64_t r, int64_t c, int64_t here, int64_t there, bool is_down) {
-    if (windows[here] == windows[there]) return true;
-    const Window own = all[windows[here]], other = all[windows[there]];
-    const double u_slope = own[U_SLOPE] - other[U_SLOPE], v_slope = own[V_SLOPE] - other[V_SLOPE];
-    const double step = u_slope * u[c] + v_slope * v[r] + own[ORIGIN] - other[ORIGIN];
-    const double limit = max_step * larger(tolerance[here], tolerance[there]);
-    if (!(size_of(step) <= limit && size_of(step + (is_down ? v_slope : u_slope)) <= limit))
-      return false;
-    const double *a = normals + 3 * here, *b = normals + 3 * there;
-    const double sign = __builtin_copysign(1.0, a[0] * b[0] + a[1] * b[1] + a[2] * b[2]);
-    const double turned =
-        square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
-    if (turned <= max_sq_chord) return true;
-    const bool alike =
-        u_slope * u_slope + v_slope * v_slope <=
-        sq_slope_noise(own, tolerance[here]) + sq_slope_noise(other, tolerance[there]);
-    return (alike || turned <= wider_sq_chord) && own.holds(r + is_down, c + !is_down) &&
-           other.holds(r, c);
-  };
-  for (int64_t r = from; r < to; r++)
-    for (int64_t c = 0; c < w; c++) {
-      const int64_t here = r * w + c;
-      const bool has_right = flat[here] && c + 1 < w && flat[here + 1],
-                 has_below = flat[here] && r + 1 < h && flat[here + w];
-      if ((has_right || has_below) && !all.has(windows[here])) return NO_SUCH_ROW;
-      if ((has_right && !all.has(windows[here + 1])) || (has_below && !all.has(windows[here + w])))
-        return NO_SUCH_ROW;
-      right[here] = has_right && are_joined(r, c, here, here + 1, false);
-      down[here] = has_below && are_joined(r, c, here, here + w, true);
     }
   return DONE;
 }
@@ -453,13 +467,42 @@ struct Around {
 // Pixels whose label may change in a turn, each once.
 struct Front {
   const Around& around;
-  int64_t* rows;   // (h * w)
-  int64_t* marks;  // (h * w), the turn in which a pixel came in last
+  int64_t *rows, *marks, *chosen;  // (h * w) each; marks are the turns in which pixels came in last
   int64_t count, turn;
 
+  Front(const Around& around, int64_t* rows, int64_t* marks, int64_t* chosen)
+      : around(around), rows(rows), marks(marks), chosen(chosen), count(0), turn(0) {
+    for (int64_t i = 0; i < around.h * around.w; i++) marks[i] = -1;
+  }
   INLINE_MEMBER void add(int64_t pixel) {
     if (marks[pixel] == turn) return;
     marks[pixel] = turn, rows[count++] = pixel;
+  }
+  // In each turn pixels take the label of the pixel around them at the least cost, of equal ones the
+  // smallest; those around them that may follow are next.
+  template <class Cost, class Follows>
+  INLINE_MEMBER void spread(int64_t* labels, int64_t num_turns, const Cost& cost,
+                            const Follows& follows) {
+    for (; turn < num_turns && count > 0;) {
+      int64_t moved = 0;
+      for (int64_t f = 0; f < count; f++) {
+        const int64_t pixel = rows[f];
+        double least = NONE;
+        int64_t best = -1;
+        around.visit(pixel, [&](int64_t other) {
+          const double away = cost(pixel, other);
+          if (away < least || (away == least && labels[other] < best))
+            least = away, best = labels[other];
+        });
+        if (best >= 0) rows[moved] = pixel, chosen[moved++] = best;
+      }
+      for (int64_t f = 0; f < moved; f++) labels[rows[f]] = chosen[f], chosen[f] = rows[f];
+      count = 0, turn++;
+      const auto add_next = [&](int64_t pixel) {
+        if (follows(pixel)) add(pixel);
+      };
+      for (int64_t f = 0; f < moved; f++) add_next(chosen[f]), around.visit(chosen[f], add_next);
+    }
   }
 };
 
@@ -478,36 +521,18 @@ KERNEL absorb_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points,
   const int64_t n = h * w;
   if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
   const Around around = {h, w};
-  Front front = {around, rows, marks, 0, 0};
-  for (int64_t i = 0; i < n; i++) {
-    marks[i] = -1;
-    if (labels[i] < 0 && seen[i]) front.add(i);
-  }
-  while (front.count > 0) {
-    int64_t joined = 0;
-    for (int64_t f = 0; f < front.count; f++) {
-      const int64_t pixel = rows[f];
-      double least = NONE;
-      int64_t best = -1;
-      around.visit(pixel, [&](int64_t other) {
-        const int64_t m = labels[other];
-        if (m < 0 || m == best) return;
-        double away = 0;
-        for (int axis = 0; axis < 3; axis++)
-          away += (points[axis * n + pixel] - centers[3 * m + axis]) * normals[3 * m + axis];
-        away = size_of(away);
-        if (away <= reach[m] && (away < least || (away == least && m < best)))
-          least = away, best = m;
-      });
-      if (best >= 0) rows[joined] = pixel, chosen[joined++] = best;
-    }
-    for (int64_t f = 0; f < joined; f++) labels[rows[f]] = chosen[f], chosen[f] = rows[f];
-    front.count = 0, front.turn++;
-    for (int64_t f = 0; f < joined; f++)
-      around.visit(chosen[f], [&](int64_t other) {
-        if (labels[other] < 0 && seen[other]) front.add(other);
-      });
-  }
+  Front front(around, rows, marks, chosen);
+  const auto may_join = [&](int64_t pixel) { return labels[pixel] < 0 && seen[pixel]; };
+  for (int64_t i = 0; i < n; i++)
+    if (may_join(i)) front.add(i);
+  front.spread(labels, n, [&](int64_t pixel, int64_t other) {
+    const int64_t m = labels[other];
+    if (m < 0) return NONE;
+    double away = 0;
+    for (int axis = 0; axis < 3; axis++)
+      away += (points[axis * n + pixel] - centers[3 * m + axis]) * normals[3 * m + axis];
+    return size_of(away) <= reach[m] ? size_of(away) : NONE;
+  }, may_join);
   return DONE;
 }
 
@@ -519,8 +544,7 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
   if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
   const double *x = points, *y = points + n, *z = points + 2 * n;
   const Around around = {h, w};
-  Front front = {around, rows, marks, 0, 0};
-  for (int64_t i = 0; i < n; i++) marks[i] = -1;
+  Front front(around, rows, marks, chosen);
   const auto compare = [&](int64_t i, int64_t other) {
     if (labels[i] != labels[other] && labels[i] >= 0 && labels[other] >= 0)
       front.add(i), front.add(other);
@@ -531,41 +555,24 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
       if (r + 1 < h) compare(i, i + w);
       if (r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
     }
-  for (int64_t turn = 0; turn < num_turns && front.count > 0; turn++) {
-    int64_t moved = 0;
-    for (int64_t f = 0; f < front.count; f++) {
-      const int64_t pixel = rows[f], own = labels[pixel];
-      double least = NONE;
-      int64_t best = -1;
-      around.visit(pixel, [&](int64_t q) {
-        const int64_t other = labels[q];
-        if (other < 0 || other == own) return;
-        const double *one = planes + 3 * own, *two = planes + 3 * other;
-        const double away = size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
-        if (!(away <= reach[other])) return;
-        const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
-        const auto over = [&](double u, double v) { return a * u + b * v + c; };
-        const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
-        const double mine = over(middles[2 * own], middles[2 * own + 1]),
-                     theirs = over(middles[2 * other], middles[2 * other + 1]);
-        const double slope = square_root(a * a + b * b);
-        const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
-        const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
-                          here * mine < 0 && mine * theirs < 0 && size_of(mine) > reach[other] &&
-                          size_of(theirs) > reach[own];
-        if (goes && (away < least || (away == least && other < best))) least = away, best = other;
-      });
-      if (best >= 0) rows[moved] = pixel, chosen[moved++] = best;
-    }
-    for (int64_t f = 0; f < moved; f++) labels[rows[f]] = chosen[f], chosen[f] = rows[f];
-    front.count = 0, front.turn++;
-    for (int64_t f = 0; f < moved; f++) {
-      front.add(chosen[f]);
-      around.visit(chosen[f], [&](int64_t other) {
-        if (labels[other] >= 0) front.add(other);
-      });
-    }
-  }
+  front.spread(labels, num_turns, [&](int64_t pixel, int64_t q) {
+    const int64_t own = labels[pixel], other = labels[q];
+    if (other < 0 || other == own) return NONE;
+    const double *one = planes + 3 * own, *two = planes + 3 * other;
+    const double away = size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
+    if (!(away <= reach[other])) return NONE;
+    const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
+    const auto over = [&](double u, double v) { return a * u + b * v + c; };
+    const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
+    const double mine = over(middles[2 * own], middles[2 * own + 1]),
+                 theirs = over(middles[2 * other], middles[2 * other + 1]);
+    const double slope = square_root(a * a + b * b);
+    const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
+    const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
+                      here * mine < 0 && mine * theirs < 0 && size_of(mine) > reach[other] &&
+                      size_of(theirs) > reach[own];
+    return goes ? away : NONE;
+  }, [&](int64_t pixel) { return labels[pixel] >= 0; });
   return DONE;
 }
 

@@ -85,34 +85,6 @@ KERNEL meet_others(int64_t num_points, int64_t num_rows, int64_t k, Ints labels,
   return DONE;
 }
 
-// growth.number_by_size; `sizes` and `order` are for the kernel itself.
-KERNEL number_by_size(int64_t n, Longs regions, int64_t min_size, int64_t* numbers, int64_t* sizes,
-                      int64_t* order) {
-  int64_t least_number = -1, num = 0, largest = 0;
-  for (int64_t i = 0; i < n; i++)
-    least_number = smaller(least_number, regions[i]), num = larger(num, regions[i] + 1);
-  if (least_number < -1 || num > n) return NO_SUCH_ROW;
-  for (int64_t r = 0; r < num; r++) sizes[r] = 0;
-  visit_runs(regions, n, [&](int64_t r, int64_t from, int64_t to) {
-    if (r >= 0) largest = larger(largest, sizes[r] += to - from);
-  });
-  for (int64_t size = 0; size < largest; size++) order[size] = 0;
-  const int64_t least = larger(min_size, int64_t(1));
-  for (int64_t r = 0; r < num; r++)
-    if (sizes[r] >= least) order[sizes[r] - 1]++;
-  // How many regions are larger than each size.
-  for (int64_t size = largest, larger_ones = 0; size >= 1; size--) {
-    const int64_t number = order[size - 1];
-    order[size - 1] = larger_ones, larger_ones += number;
-  }
-  visit_runs(regions, n, [&](int64_t r, int64_t from, int64_t to) {
-    // A size below zero is the region's number.
-    if (r >= 0 && sizes[r] >= least) sizes[r] = -1 - order[sizes[r] - 1]++;
-    for (int64_t i = from; i < to; i++) numbers[i] = r >= 0 && sizes[r] < 0 ? -1 - sizes[r] : -1;
-  });
-  return DONE;
-}
-
 // shared_neighbors.SharedNeighbors.connected: whether ends of edges from rows `first` on share
 // `least` neighbours. Lists of a block of rows are bits over the points that occur in them, its
 // members; `numbers` need no values before, as a number counts where the member so numbered is it.

@@ -246,23 +246,20 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
     ``min_size`` become :data:`torchrg.UNLABELED`.
     """
-    if regions.device.type == "cpu" and kernels.serve():
-        return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
-    sizes = np.bincount(old[old >= 0], minlength=len(old))
+    # Runs of equal numbers are counted at once: many are long.
+    starts = np.flatnonzero(np.diff(old, prepend=-2))
+    lengths, of_run = np.diff(starts, append=len(old)), old[starts]
+    sizes = np.bincount(of_run + 1, lengths, minlength=len(old) + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))
-    sizes = sizes[large]
+    firsts = np.empty(len(old) + 1, dtype=np.int32)
+    # Of several writes to one place the last one stays: in reverse, the first.
+    firsts[of_run[::-1]] = starts[::-1]
+    large = large[np.lexsort((firsts[large], -sizes[large]))]
     # The last entry is what -1 finds.
-    numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
+    numbers = np.full(len(old) + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
-    numbered = numbers[old]
-    firsts = np.full(len(large) + 1, len(old))
-    for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
-        firsts[numbered[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
-    order = np.lexsort((firsts[:-1], -sizes))
-    ranks = np.full(len(large) + 1, UNLABELED, dtype=np.int64)
-    ranks[order] = np.arange(len(large))
-    return torch.from_numpy(ranks[numbered]).to(regions.device)
+    return torch.from_numpy(np.repeat(numbers[of_run], lengths)).to(regions.device)
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
