@@ -22,8 +22,8 @@ from torchrg.linalg.eigen import principal_frame
 from torchrg.linalg.moments import fit_planes_to_each, fit_weighted_planes, residuals, split_columns
 
 PACKAGE = Path(__file__).parents[1] / "torchrg"
-# The row of linalg itself, and the largest number that a file can hold.
-MAY_ASK_FOR_PRECISION = {"neighbors/cells.py", "datasets/s3dis.py"}
+# The largest number that a file can hold.
+MAY_ASK_FOR_PRECISION = {"datasets/s3dis.py"}
 EIGEN_TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-14}
 
 

@@ -109,7 +109,16 @@ def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
 def _release_until(is_done: threading.Event) -> None:
     """Let the system take back the pages of all maps again and again; it can read them again."""
     while not is_done.wait(_RELEASE_SECONDS):
-        with _lock:
-            maps = list(_maps)
-        for memory in maps:
-            memory.madvise(mmap.MADV_DONTNEED)
+        release()
+
+
+def release() -> None:
+    """Let the system take back the pages of all maps, which it can read again.
+
+    What reads rows here and there should ask for it now and then: with each of them a system maps
+    the pages around it too, more in a hundredth of a second than a limit may leave room for.
+    """
+    with _lock:
+        maps = list(_maps)
+    for memory in maps:
+        memory.madvise(mmap.MADV_DONTNEED)

@@ -7,7 +7,6 @@ from tests.kernels.clouds import clouds, definitions, lists, needs_library
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.normals.consensus.noise import _neighbor_quantiles, _survey
 from torchrg.normals.pca import fit_points_pca
-from torchrg.regions.edges import GrowingCloud, are_coplanar
 from torchrg.robust.scale import _majority_difference
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
@@ -108,17 +107,3 @@ def test_quantiles_of_neighbors_are_those_of_the_definition_to_the_bit(points, m
     for quantile in (0.1, 0.35, 1.0):
         found, expected = both(_neighbor_quantiles, values, near, quantile)
         assert torch.equal(found, expected)
-
-
-@pytest.mark.parametrize("compares", [False, True])
-def test_coplanar_neighbors_are_those_of_the_definition_to_the_bit(points, masked, compares):
-    near = lists(points, 50, masked)
-    fit = fit_points_pca(points, near)
-    cloud = GrowingCloud(points.T.contiguous().T, fit.normals, fit.curvature, near, fit.valid)
-    generator = torch.Generator().manual_seed(3)
-    asked = (torch.rand(near.indices.shape, generator=generator) < 0.5) & near.counted()
-    asked[::5] = False
-    compared = torch.rand(near.indices.shape, generator=generator) < 0.5 if compares else None
-    rows = slice(0, len(points))
-    found, expected = both(are_coplanar, cloud, rows, asked, compared, 0.01)
-    assert torch.equal(found & asked, expected & asked)

@@ -27,7 +27,6 @@ definitions."""
 
 SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
-    "are_coplanar": "f[3N] i[nk] b[nk]? f[n3] b[nk] b[nk]? x x -> b[nk]",
     "fit_normals_pca": "f[N3] i[nk] b[nk]? f[n] x x -> f[n3] f[n] f[n] b[n] b[n]",
     "survey": "f[N3] i[nk] b[nk]? f[n3] b[n] n n x x x n n -> f[n] f[n] f[n] f[n] b[n] f[n] f[n]",
     "broken_planes": "f[N3] i[nk] b[nk]? f[n] f[n3] l[p2] f[c] -> f[n3] f[n] f[n3] f[n] f[n]",
@@ -38,7 +37,7 @@ SIGNATURES = {
     "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N] d[N3]",
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
-    "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n -> i[N] i[N]",
+    "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
     "meet_others": "i[N] i[n] i[nk] b[nk]? -> b[n]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
     "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",
@@ -59,7 +58,6 @@ SIGNATURES = {
     "segment_coordinates": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
-    "number_by_size": "l[n] n -> l[n] l[n] l[n]",
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
     "absorb_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",

@@ -35,12 +35,12 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
 // growth.grow_first_in_first_out, with a bit for each neighbour that joins, in words of 64.
 //
 // A target becomes a seed by the bit of the edge, or where it is one itself. With `late` promotion
-// those that merely join do so when all seeds of the region are known.
+// those that merely join do so when all seeds of the region are known. `roots` are -1 before the
+// first of `order`, and `queue` is for the kernel itself.
 KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t num_roots,
                     Ints indices, Longs joins, Longs makes_seed, Flagged is_seed, Flagged valid,
                     Ints order, int64_t late, int32_t* roots, int32_t* queue) {
   if (64 * num_words < k) return TOO_WIDE;
-  for (int64_t i = 0; i < num_points; i++) roots[i] = -1;
   for (int64_t r = 0; r < num_roots; r++) {
     const int32_t root = order[r];
     if (uint32_t(root) >= uint64_t(num_points)) return NO_SUCH_ROW;
@@ -82,34 +82,6 @@ KERNEL meet_others(int64_t num_points, int64_t num_rows, int64_t k, Ints labels,
       meets[i] |= other != own[i] && other >= 0 && (!mask || mask[e]);
     }
   }
-  return DONE;
-}
-
-// growth.number_by_size; `sizes` and `order` are for the kernel itself.
-KERNEL number_by_size(int64_t n, Longs regions, int64_t min_size, int64_t* numbers, int64_t* sizes,
-                      int64_t* order) {
-  int64_t least_number = -1, num = 0, largest = 0;
-  for (int64_t i = 0; i < n; i++)
-    least_number = smaller(least_number, regions[i]), num = larger(num, regions[i] + 1);
-  if (least_number < -1 || num > n) return NO_SUCH_ROW;
-  for (int64_t r = 0; r < num; r++) sizes[r] = 0;
-  visit_runs(regions, n, [&](int64_t r, int64_t from, int64_t to) {
-    if (r >= 0) largest = larger(largest, sizes[r] += to - from);
-  });
-  for (int64_t size = 0; size < largest; size++) order[size] = 0;
-  const int64_t least = larger(min_size, int64_t(1));
-  for (int64_t r = 0; r < num; r++)
-    if (sizes[r] >= least) order[sizes[r] - 1]++;
-  // How many regions are larger than each size.
-  for (int64_t size = largest, larger_ones = 0; size >= 1; size--) {
-    const int64_t number = order[size - 1];
-    order[size - 1] = larger_ones, larger_ones += number;
-  }
-  visit_runs(regions, n, [&](int64_t r, int64_t from, int64_t to) {
-    // A size below zero is the region's number.
-    if (r >= 0 && sizes[r] >= least) sizes[r] = -1 - order[sizes[r] - 1]++;
-    for (int64_t i = from; i < to; i++) numbers[i] = r >= 0 && sizes[r] < 0 ? -1 - sizes[r] : -1;
-  });
   return DONE;
 }
 

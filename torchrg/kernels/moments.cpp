@@ -8,21 +8,23 @@ namespace {
 typedef const double* Doubles;
 
 constexpr int BLOCK = 128;
-constexpr int SAMPLE = 256, NEAR = 32;  // of a sample's values, those around the one asked for
 
-// Adds up T terms of places `from` to `from + count`, which `fill` writes.
-template <int T, class Fill>
-void add_pairwise(int64_t from, int64_t count, const Fill& fill, double (&sums)[T]) {
+// Adds up the T terms of `count` points from one on; `term` writes those of a point.
+template <int T, class Term>
+void add_pairwise(int64_t from, int64_t count, const Term& term, double (&sums)[T]) {
   if (count > BLOCK) {
     const int64_t half = count / 2 - count / 2 % LANES;
     double others[T];
-    add_pairwise<T>(from, half, fill, sums);
-    add_pairwise<T>(from + half, count - half, fill, others);
+    add_pairwise(from, half, term, sums);
+    add_pairwise(from + half, count - half, term, others);
     for (int t = 0; t < T; t++) sums[t] += others[t];
     return;
   }
-  alignas(32) double terms[T][BLOCK];
-  fill(from, int(count), terms);
+  alignas(32) double terms[T][BLOCK], values[T];
+  for (int j = 0; j < count; j++) {
+    term(from + j, values);
+    for (int t = 0; t < T; t++) terms[t][j] = values[t];
+  }
   const int whole = int(count) - int(count) % LANES;
   for (int t = 0; t < T; t++) {
     double lanes[LANES] = {}, sum = 0;
@@ -38,69 +40,60 @@ void add_pairwise(int64_t from, int64_t count, const Fill& fill, double (&sums)[
 }
 
 // As NumPy's reduceat: the first term, and the sum of all others.
-template <int T, class Fill>
-void add_up(int64_t from, int64_t count, const Fill& fill, double (&sums)[T]) {
-  double first[T][BLOCK];
-  fill(from, 1, first);
-  add_pairwise<T>(from + 1, count - 1, fill, sums);
-  for (int t = 0; t < T; t++) sums[t] = first[t][0] + sums[t];
+template <int T, class Term>
+void add_up(int64_t from, int64_t count, const Term& term, double (&sums)[T]) {
+  double first[T];
+  term(from, first);
+  add_pairwise(from + 1, count - 1, term, sums);
+  for (int t = 0; t < T; t++) sums[t] = first[t] + sums[t];
 }
 
-// The value that k others precede; values move.
+// The value that k others precede; values move, without a branch for each.
 double select(double* values, int64_t count, int64_t k) {
   int64_t low = 0, high = count - 1;
+  const auto move_down = [&](auto belongs) {
+    int64_t place = low;
+    for (int64_t i = low; i <= high; i++) {
+      const double value = values[i];
+      values[i] = values[place], values[place] = value;
+      place += belongs(value);
+    }
+    return place;
+  };
   while (low < high) {
     const double a = values[low], b = values[low + (high - low) / 2], c = values[high];
     const double pivot = larger(smaller(a, b), smaller(larger(a, b), c));
-    int64_t below = low, equal = low;
-    for (int64_t i = low; i <= high; i++) {
-      const double value = values[i];
-      values[i] = values[below], values[below] = value;
-      below += value < pivot;
-    }
-    if (k < below) {
-      high = below - 1;
+    int64_t end = move_down([&](double value) { return value < pivot; });
+    if (k < end) {
+      high = end - 1;
       continue;
     }
-    for (int64_t i = low; below == low && i <= high; i++) {
-      const double value = values[i];
-      values[i] = values[equal], values[equal] = value;
-      equal += value == pivot;
-    }
-    if (k < equal) return pivot;
-    low = larger(below, equal);
+    if (end == low) end = move_down([&](double value) { return value == pivot; });
+    if (k < end) return pivot;
+    low = end;
   }
   return values[k];
 }
 
-// The same of many values: those that a sample shows to be near the one are moved to the front. If
-// it is none of them `fill` writes all again.
-template <class Fill>
-double select_filled(double* values, int64_t count, int64_t k, const Fill& fill) {
-  if (count < 4 * SAMPLE) return select(values, count, k);
-  double sample[SAMPLE];
-  for (int64_t i = 0; i < SAMPLE; i++) sample[i] = values[i * count / SAMPLE];
-  const int64_t rank = k * SAMPLE / count, low_rank = larger(rank - NEAR, int64_t(0)),
-                high_rank = smaller(rank + NEAR, int64_t(SAMPLE - 1));
-  const double low = select(sample, SAMPLE, low_rank), high = select(sample, SAMPLE, high_rank);
-  int64_t below = 0, between = 0;
-  for (int64_t i = 0; i < count; i++) {
-    const double value = values[i];
-    values[between] = value;
-    below += value < low, between += (value >= low) & (value <= high);
+// Calls `visit` with each run of equal labels, its first place and the one after its last: many are
+// long, and to count points one by one waits for every count to be written.
+template <class Visit>
+void visit_runs(Longs labels, int64_t n, const Visit& visit) {
+  for (int64_t from = 0, to = 0; from < n; from = to) {
+    while (to < n && labels[to] == labels[from]) to++;
+    visit(labels[from], from, to);
   }
-  if (k >= below && k < below + between) return select(values, between, k - below);
-  fill();
-  return select(values, count, k);
 }
 
-INLINE int64_t sum_of(Longs counts, int64_t num, int64_t n) {
-  int64_t total = 0;
-  for (int64_t m = 0; m < num; m++) {
-    if (counts[m] < 1 || counts[m] > n - total) return -1;
-    total += counts[m];
+// Calls `visit` with each region and the places of its first point and of the one after its last.
+template <class Visit>
+int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) {
+  int64_t start = 0;
+  for (int64_t m = 0; m < num; start += counts[m++]) {
+    if (counts[m] < 1 || counts[m] > n - start) return NO_SUCH_ROW;
+    visit(m, start, start + counts[m]);
   }
-  return total;
+  return DONE;
 }
 
 }  // namespace
@@ -136,56 +129,49 @@ KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t*
 KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Doubles x,
                            Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
                            Doubles axes, double* coordinates) {
-  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
+  for (int64_t i = 0; i < n; i++)
+    if (rows[i] < 0 || rows[i] >= P) return NO_SUCH_ROW;
   double u[BLOCK], v[BLOCK], w[BLOCK];
-  for (int64_t m = 0, start = 0; m < num; start += counts[m++])
-    for (int64_t from = start; from < start + counts[m]; from += BLOCK) {
-      const int count = int(smaller(start + counts[m] - from, int64_t(BLOCK)));
-      const double* center = centers + 3 * m;
+  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
+    const double *center = centers + 3 * m, *axis = axes + 3 * num_axes * m;
+    for (int64_t from = start; from < end; from += BLOCK) {
+      const int count = int(smaller(end - from, int64_t(BLOCK)));
       for (int j = 0; j < count; j++) {
         const int64_t row = rows[from + j];
-        if (row < 0 || row >= P) return NO_SUCH_ROW;
         u[j] = x[row] - center[0], v[j] = y[row] - center[1], w[j] = z[row] - center[2];
       }
       for (int64_t a = 0; a < num_axes; a++) {
-        const double* axis = axes + 3 * (num_axes * m + a);
+        const double p = axis[3 * a], q = axis[3 * a + 1], r = axis[3 * a + 2];
         for (int j = 0; j < count; j++)
-          coordinates[a * n + from + j] = u[j] * axis[0] + v[j] * axis[1] + w[j] * axis[2];
+          coordinates[a * n + from + j] = u[j] * p + v[j] * q + w[j] * r;
       }
     }
-  return DONE;
+  });
 }
 
 // Segments.moments: means and covariances of weighted points, about zero if not centered.
 KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Doubles weights,
                        Longs counts, int64_t is_centered, double* means, double* covariances) {
-  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
-  int64_t start = 0;
-  for (int64_t m = 0; m < num; start += counts[m++]) {
-    double sums[4], *mean = means + 3 * m, squares[6];
-    add_up<4>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
-      for (int j = 0; j < count; j++) {
-        const double weight = weights[from + j];
-        terms[0][j] = x[from + j] * weight, terms[1][j] = y[from + j] * weight;
-        terms[2][j] = z[from + j] * weight, terms[3][j] = weight;
-      }
+  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
+    double sums[4], squares[6], *mean = means + 3 * m;
+    add_up(start, end - start, [&](int64_t i, double* terms) {
+      const double weight = weights[i];
+      terms[0] = x[i] * weight, terms[1] = y[i] * weight, terms[2] = z[i] * weight;
+      terms[3] = weight;
     }, sums);
     const double total = sums[3];
     for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total : 0;
     const double a = mean[0], b = mean[1], c = mean[2];
-    add_up<6>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
-      for (int j = 0; j < count; j++) {
-        const double u = x[from + j] - a, v = y[from + j] - b, w = z[from + j] - c;
-        const double weight = weights[from + j], wu = weight * u, wv = weight * v;
-        terms[0][j] = wu * u, terms[1][j] = wu * v, terms[2][j] = wu * w;
-        terms[3][j] = wv * v, terms[4][j] = wv * w, terms[5][j] = weight * w * w;
-      }
+    add_up(start, end - start, [&](int64_t i, double* terms) {
+      const double u = x[i] - a, v = y[i] - b, w = z[i] - c;
+      const double wu = weights[i] * u, wv = weights[i] * v, ww = weights[i] * w;
+      terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
+      terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
     }, squares);
     const int place[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
     for (int entry = 0; entry < 9; entry++)
       covariances[9 * m + entry] = squares[place[entry]] / total;
-  }
-  return DONE;
+  });
 }
 
 // Segments.reweigh: medians and mean squares of the distances of points from planes, and Tukey's
@@ -193,42 +179,33 @@ KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, 
 KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Longs counts,
                         Doubles means, Doubles axes, Doubles least, double mad, double cut,
                         double* weights, double* medians, double* squares) {
-  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
-  int64_t start = 0;
-  for (int64_t m = 0; m < num; start += counts[m++]) {
-    const double a = means[3 * m], b = means[3 * m + 1], c = means[3 * m + 2];
-    const double p = axes[3 * m], q = axes[3 * m + 1], r = axes[3 * m + 2];
+  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
+    const double *mean = means + 3 * m, *axis = axes + 3 * m, a = mean[0], b = mean[1], c = mean[2];
+    const double p = axis[0], q = axis[1], r = axis[2];
     const auto residual = [&](int64_t i) { return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r; };
+    for (int64_t i = start; i < end; i++) {
+      const double away = size_of(residual(i));
+      weights[i] = away < double(INFINITE) ? away : double(INFINITE);
+    }
+    const int64_t count = end - start;
     double sum[1];
-    const auto fill = [&]() {
-      for (int64_t i = start; i < start + counts[m]; i++) {
-        const double away = size_of(residual(i));
-        weights[i] = away < double(INFINITE) ? away : double(INFINITE);
-      }
-    };
-    fill();
-    add_up<1>(start, counts[m], [&](int64_t from, int count, double (*terms)[BLOCK]) {
-      for (int j = 0; j < count; j++) terms[0][j] = weights[from + j] * weights[from + j];
-    }, sum);
-    medians[m] = select_filled(weights + start, counts[m], (counts[m] - 1) / 2, fill);
-    squares[m] = sum[0] / double(counts[m]);
-    double unit = cut * larger(mad * medians[m], least[m]);
-    unit = unit > 0 ? unit : 1;
-    for (int64_t i = start; i < start + counts[m]; i++) {
+    add_up(start, count, [&](int64_t i, double* term) { *term = weights[i] * weights[i]; }, sum);
+    squares[m] = sum[0] / double(count);
+    medians[m] = select(weights + start, count, (count - 1) / 2);
+    const double least_unit = cut * larger(mad * medians[m], least[m]);
+    const double unit = least_unit > 0 ? least_unit : 1;
+    for (int64_t i = start; i < end; i++) {
       const double ratio = residual(i) / unit, weight = larger(1 - ratio * ratio, 0.0);
       weights[i] = weight * weight;
     }
-  }
-  return DONE;
+  });
 }
 
 // table._outer_places of each region: whether its points (x, y) are outside of the octagon of the
 // farthest ones.
 KERNEL outer_places(int64_t n, int64_t num, Doubles x, Doubles y, Longs counts, double rounding,
                     bool* outer) {
-  if (sum_of(counts, num, n) < 0) return NO_SUCH_ROW;
-  for (int64_t m = 0, start = 0; m < num; start += counts[m++]) {
-    const int64_t end = start + counts[m];
+  return visit_regions(n, num, counts, [&](int64_t, int64_t start, int64_t end) {
     int64_t farthest[8];
     double most[8], largest = 0;
     for (int e = 0; e < 8; e++) farthest[e] = start, most[e] = -double(INFINITE);
@@ -256,6 +233,5 @@ KERNEL outer_places(int64_t n, int64_t num, Doubles x, Doubles y, Longs counts, 
       for (int e = 0; e < corners; e++) inside &= u[e] * x[i] + v[e] * y[i] > offset[e];
       outer[i] = !inside;
     }
-  }
-  return DONE;
+  });
 }

@@ -108,7 +108,6 @@ INLINE Flags where(Flags flags, Flags a, Flags b) {
   return Flags(flags.low ? a.low : b.low, flags.high ? a.high : b.high);
 }
 #endif
-INLINE Lanes ones_where(Flags flags) { return where(flags, all(1), all(0)); }
 INLINE Lanes magnitude(Lanes a) { return where(a < 0, -a, a); }
 INLINE Lanes positive(Lanes a) { return where(a > 0, a, all(0)); }
 INLINE Lanes larger(Lanes a, Lanes b) { return where(a < b, b, a); }
@@ -148,16 +147,6 @@ INLINE bool are_rows(const int32_t* numbers, int64_t count, int64_t num_rows) {
   bool inside = true;
   for (int64_t j = 0; j < count; j++) inside &= uint32_t(numbers[j]) < uint64_t(num_rows);
   return inside;
-}
-
-// Calls `visit` with each run of equal labels, its first place and the one after its last: many are
-// long, and to count points one by one waits for every count to be written.
-template <class Visit>
-INLINE void visit_runs(Longs labels, int64_t n, const Visit& visit) {
-  for (int64_t from = 0, to = 0; from < n; from = to) {
-    while (to < n && labels[to] == labels[from]) to++;
-    visit(labels[from], from, to);
-  }
 }
 
 // Points (N, 3), lists of k of them each, and which of a list count: all where there is no mask.

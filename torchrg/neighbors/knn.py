@@ -21,7 +21,7 @@ from torchrg._parallel import (
 )
 from torchrg.errors import ShapeError
 from torchrg.neighbors.blocks import search_blocks
-from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells, search_grid, sort_ties
+from torchrg.neighbors.cells import MIN_FOR_CELLS, search_cells
 from torchrg.neighbors.order import canonical_order
 from torchrg.structures import Neighbors
 
@@ -226,20 +226,22 @@ def _search_cloud(
     tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
     first, last = np.searchsorted(starts, (asked.start, asked.stop - 1), side="right") - 1
     left = np.arange(first, last + 1)
-    if len(places) >= MIN_FOR_CELLS:
+    if len(places) >= MIN_FOR_CELLS and kernels.serve(k=k):
         sample = places[left[:: -(-len(left) // _SAMPLE_SIZE)]]
         reach = tree.query(sample, [k])[0][:, 0]
-        if outside is not None or not kernels.serve(k=k):
-            left = search_cells(places, k, left, reach, store)
-        elif len(places) == len(points):
-            left = search_grid(places, left, reach, indices, order, first_row)
+        if len(places) == len(points) and outside is None:
+            left = search_cells(places, left, reach, indices, order, first_row)
         else:
-            near, wanted = np.empty((len(places), k), dtype=np.int32), left
-            left = search_grid(places, wanted, reach, near)
+            found, wanted = np.empty((len(places), k), dtype=np.int32), left
+            left = search_cells(places, wanted, reach, found)
             answered = np.setdiff1d(wanted, left, assume_unique=True)
             for chunk in chunks_of(len(answered), ROWS_IN_CACHE):
-                numbers = answered[chunk]
-                store(numbers, np.broadcast_to(0.0, (len(numbers), k)), near[numbers])
+                rows = answered[chunk]
+                near = found[rows]
+                distances = np.broadcast_to(0.0, near.shape)
+                if outside is not None:
+                    distances = np.linalg.norm(places[near] - places[rows, None], axis=2)
+                store(rows, distances, near)
     for chunk in chunks_of(len(left), ROWS_AT_ONCE):
         store(left[chunk], *_query(tree, places[left[chunk]], width))
 
@@ -256,7 +258,9 @@ def _query(
     while len(left):
         ranks = np.arange(1, min(width, tree.n) + 1)
         near, rows_near = tree.query(queries[left], ranks, workers=allowed_threads())
-        sort_ties(near, rows_near, near[:, 1:] == near[:, :-1])
+        tied = np.flatnonzero((near[:, 1:] == near[:, :-1]).any(axis=1))
+        by_both = np.lexsort((rows_near[tied], near[tied]))
+        rows_near[tied] = np.take_along_axis(rows_near[tied], by_both, axis=1)
         distances[left], rows[left] = near[:, :k], rows_near[:, :k]
         is_open = (near[:, k - 1] == near[:, -1]) & (width < tree.n)
         left, width = left[is_open], 2 * width

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._parallel import ROWS_IN_CACHE, Result, chunks_of, map_chunks, map_tasks, places_of
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
@@ -215,6 +215,7 @@ class _Border:
     def _edges_of(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return where in the lists of some points other regions are, the lists, and the pairs."""
         label, near = self._labels[rows], self._neighbors.at(rows)
+        scratch.release()
         touches, other = self._touches(label, near)
         places = places_of(touches)
         first = label.index_select(0, places // self._width)

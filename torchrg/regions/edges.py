@@ -22,7 +22,6 @@ from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.neighbors import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
-from torchrg.robust.scale import QN_FACTOR
 from torchrg.structures import Neighbors, Rows
 
 
@@ -242,10 +241,6 @@ def are_coplanar(
     The limit is taken over the neighbours ``compared``, shape ``(n, K)``, default all; its floor is
     a fraction of the distance to the farthest neighbour.
     """
-    near, columns = cloud.neighbors.at(rows), cloud.points.T
-    if kernels.serve(columns, *near, cloud.normals, asked, compared, k=asked.shape[1]):
-        lists = columns, *near, cloud.normals[rows], asked, compared
-        return kernels.call("are_coplanar", *lists, QN_FACTOR, floor_fraction)[0]
     needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
     indices, counted = cloud.neighbors.at(rows).at(needed)
     patches = gather_patches(cloud.points, indices)

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import (
     CHUNK_SIZE,
@@ -26,6 +26,10 @@ from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, 
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
+
+_ROOTS_AT_ONCE = 1024
+"""Points that regions begin at between two releases of what is on a disk. Where each reads a list
+for itself, the system maps some 200 kB around it."""
 
 
 @of_clouds
@@ -242,23 +246,20 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
     ``min_size`` become :data:`torchrg.UNLABELED`.
     """
-    if regions.device.type == "cpu" and kernels.serve():
-        return kernels.call("number_by_size", regions.long(), min_size)[0]
     old = regions.cpu().numpy()
-    sizes = np.bincount(old[old >= 0], minlength=len(old))
+    # Runs of equal numbers are counted at once: many are long.
+    starts = np.flatnonzero(np.diff(old, prepend=-2))
+    lengths, of_run = np.diff(starts, append=len(old)), old[starts]
+    sizes = np.bincount(of_run + 1, lengths, minlength=len(old) + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))
-    sizes = sizes[large]
+    firsts = np.empty(len(old) + 1, dtype=np.int32)
+    # Of several writes to one place the last one stays: in reverse, the first.
+    firsts[of_run[::-1]] = starts[::-1]
+    large = large[np.lexsort((firsts[large], -sizes[large]))]
     # The last entry is what -1 finds.
-    numbers = np.full(len(old) + 1, UNLABELED, dtype=np.int32)
+    numbers = np.full(len(old) + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
-    numbered = numbers[old]
-    firsts = np.full(len(large) + 1, len(old))
-    for rows in reversed(chunks_of(len(old), ROWS_AT_ONCE)):
-        firsts[numbered[rows][::-1]] = np.arange(rows.start, rows.stop)[::-1]
-    order = np.lexsort((firsts[:-1], -sizes))
-    ranks = np.full(len(large) + 1, UNLABELED, dtype=np.int64)
-    ranks[order] = np.arange(len(large))
-    return torch.from_numpy(ranks[numbered]).to(regions.device)
+    return torch.from_numpy(np.repeat(numbers[of_run], lengths)).to(regions.device)
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
@@ -274,11 +275,16 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
         order = order[: int(torch.count_nonzero(growing <= limit))]
-    tables, late = (indices, joins, makes_seed, is_seed, valid, order), promotes_late(config)
+    tables, late = (indices, joins, makes_seed, is_seed, valid), promotes_late(config)
     if kernels.serve(indices, valid):
-        roots = kernels.call("grow_regions", *tables, late)[0]
+        roots = torch.full(valid.shape, UNLABELED, dtype=torch.int32, device="cpu")
+        queue = torch.empty_like(roots)
+        at_once = _ROOTS_AT_ONCE if scratch.is_active() else max(len(order), 1)
+        for some in torch.split(order, at_once):
+            kernels.call("grow_regions", *tables, some, late, roots, queue)
+            scratch.release()
     else:
-        roots = grow_first_in_first_out(*tables, late=late)
+        roots = grow_first_in_first_out(*tables, order, late=late)
     return roots.to(cloud.points.device)
 
 
