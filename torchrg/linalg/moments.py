@@ -264,11 +264,6 @@ class Segments:
         is_plain = values.device.type == "cpu" and values.dtype == torch.float64
         return is_plain and kernels.serve() and bool(self.counts.all())
 
-    def bounds(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the smallest and the largest value of each region."""
-        low, high = (reduce_runs(values, self.counts, how) for how in ("min", "max"))
-        return low, high
-
     def median(self, values: Tensor) -> Tensor:
         """Return the median of each region's values, the lower one of an even number."""
         parts = torch.split(values, self.counts.tolist())

@@ -248,16 +248,17 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     """
     old = regions.cpu().numpy()
     # Runs of equal numbers are counted at once: many are long.
-    starts = np.flatnonzero(np.diff(old, prepend=-2))
+    starts = np.append(0, np.flatnonzero(old[1:] != old[:-1]) + 1)[: len(old)]
     lengths, of_run = np.diff(starts, append=len(old)), old[starts]
-    sizes = np.bincount(of_run + 1, lengths, minlength=len(old) + 1)[1:]
+    num = int(of_run.max(initial=UNLABELED)) + 1
+    sizes = np.bincount(of_run + 1, lengths, minlength=num + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))
-    firsts = np.empty(len(old) + 1, dtype=np.int32)
+    firsts = np.empty(num + 1, dtype=np.int32)
     # Of several writes to one place the last one stays: in reverse, the first.
     firsts[of_run[::-1]] = starts[::-1]
     large = large[np.lexsort((firsts[large], -sizes[large]))]
     # The last entry is what -1 finds.
-    numbers = np.full(len(old) + 1, UNLABELED)
+    numbers = np.full(num + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
     return torch.from_numpy(np.repeat(numbers[of_run], lengths)).to(regions.device)
 

@@ -345,12 +345,9 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
         closed curve. Communications of the ACM 18(7), 1975.
     """
-    angles = [_least_area_angle(places) for places in outer_places(segments, u, v)]
-    cosine = u.new_tensor([math.cos(angle) for angle in angles])
-    sine = u.new_tensor([math.sin(angle) for angle in angles])
-    c, s = segments.spread(cosine), segments.spread(sine)
-    one, other = segments.bounds(u * c + v * s), segments.bounds(v * c - u * s)
-    low, high = (torch.stack(pair, dim=1) for pair in zip(one, other, strict=True))
+    rectangles = [_least_rectangle(places) for places in outer_places(segments, u, v)]
+    cosine, sine, *ends = u.new_tensor(rectangles).view(-1, 6).unbind(dim=1)
+    low, high = torch.stack(ends[:2], dim=1), torch.stack(ends[2:], dim=1)
     directions = torch.stack([cosine, sine, -sine, cosine], dim=1).view(-1, 2, 2)
     sides, centers = high - low, (high + low) / 2
     swap = sides[:, 0] < sides[:, 1]
@@ -359,6 +356,18 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
         torch.where(swap[:, None, None], directions.flip(1), directions),
         torch.where(swap[:, None], centers.flip(1), centers),
     )
+
+
+def _least_rectangle(places: NDArray[np.float64]) -> list[float]:
+    """Return cosine and sine of the smallest rectangle about points ``(n, 2)``, and its ends.
+
+    These are the least coordinates along its two directions, then the largest ones.
+    """
+    angle = _least_area_angle(places)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    u, v = places.T
+    along = np.stack([u * cosine + v * sine, v * cosine - u * sine])
+    return [cosine, sine, *along.min(axis=1).tolist(), *along.max(axis=1).tolist()]
 
 
 def _least_area_angle(places: NDArray[np.float64]) -> float:
