@@ -19,7 +19,7 @@ from torchrg._parallel import (
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import canonical_order, measure_sampling
+from torchrg.neighbors import ascending_rows, canonical_order, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
@@ -271,7 +271,7 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     growing, indices = cloud.curvature[cloud.valid], cloud.neighbors.indices.cpu()
     limit = curvature_limit(growing, config.curvature_quantile)
     is_seed, valid = (cloud.curvature <= limit).cpu(), cloud.valid.cpu()
-    order = cloud.curvature.cpu().argsort(stable=True)
+    order = ascending_rows(cloud.curvature.cpu())
     order = order[valid[order]].int()
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
