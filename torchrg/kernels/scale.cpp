@@ -34,7 +34,8 @@ INLINE Around look_around(const float* row, int n, float pivot) {
 // A pivot moves between differences that are too small (low) and those that are not (high).
 float majority_difference(const float* row, int n) {
   const int lags = n / 2, rank = lags * (lags + 1) / 2;
-  float low = 0, high = row[n - 1] - row[0], num_low = 0, num_high = lags * n - rank;
+  const float num_all = lags * n - rank;
+  float low = 0, high = row[n - 1] - row[0], num_low = 0, num_high = num_all;
   if (high == 0) return 0;
   float pivot = (row[3 * n / 4] - row[n / 4]) * QUARTERS;
   if (!(pivot > 0 && pivot < high)) pivot = high * 0.5f;
@@ -56,6 +57,8 @@ float majority_difference(const float* row, int n) {
     }
     const float middle = low + (high - low) * 0.5f;
     pivot = low + (high - low) * (rank - 0.5f - num_low) / larger(num_high - num_low, 1.0f);
+    // Small differences are evenly spread, the largest ones far apart.
+    if (num_high == num_all && num_low > 0) pivot = low * (rank - 0.5f) / num_low;
     const bool in_turn = turn > 2 * QUICK_PASSES && turn % 2;
     if (in_turn || !(pivot > low && pivot < high)) pivot = middle;
     if (!(pivot > low && pivot < high)) pivot = low;
