@@ -8,7 +8,7 @@ import torch
 
 from tests.kernels.clouds import needs_library
 from torchrg.neighbors import search_knn
-from torchrg.neighbors.cells import search_cells
+from torchrg.neighbors.knn import search_cells
 from torchrg.scenes import make_room
 
 SIZE = 1600

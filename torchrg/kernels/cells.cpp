@@ -1,4 +1,4 @@
-// Nearest neighbours by cells: torchrg/neighbors/cells.py.
+// Nearest neighbours by cells: torchrg/neighbors/knn.py.
 #include "plain.h"
 
 namespace {
