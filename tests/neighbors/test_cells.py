@@ -33,8 +33,7 @@ def _far_apart(rng):
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Cells are used for clouds as small as these, and a tree for what they leave."""
-    for module in ("cells", "knn"):
-        monkeypatch.setattr(f"torchrg.neighbors.{module}.MIN_FOR_CELLS", 400)
+    monkeypatch.setattr("torchrg.neighbors.knn._MIN_FOR_CELLS", 400)
 
 
 CLOUDS = {
