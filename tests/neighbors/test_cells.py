@@ -72,7 +72,7 @@ def all_distances(points, k):
 @pytest.mark.parametrize("k", [2, 17, 50])
 @pytest.mark.parametrize("kind", CLOUDS)
 def test_what_cells_answer_is_what_all_distances_say(kind, k, monkeypatch):
-    monkeypatch.setitem(search_cells.__globals__, "MIN_FOR_CELLS", 1)
+    monkeypatch.setattr("torchrg.neighbors.knn._MIN_FOR_CELLS", 1)
     points, near, rows = cloud_of(kind)
     found = np.empty((len(points), k), dtype=np.int32)
     left = search_cells(points, np.arange(len(points)), near[::5, k - 1], found)
