@@ -83,7 +83,7 @@ def _apply(call: str, tensors: list[Tensor]) -> list[Tensor]:
     if torch.compiler.is_compiling() and not tensors[0].requires_grad:
         outputs: list[Tensor] = _forward(tensors, call)
         return outputs
-    return list(_Differentiable.apply(call, *tensors))  # type: ignore[no-untyped-call]
+    return list(_operation().apply(call, *tensors))  # type: ignore[no-untyped-call]
 
 
 def _parse(call: str, tensors: list[Tensor]) -> tuple[_Function, dict[str, Any]]:
@@ -186,12 +186,20 @@ class _Differentiable(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
         first = _with_batch_first(info.batch_size, places[1:], list(tensors))
-        outputs = _Differentiable.apply(call, *first)  # type: ignore[no-untyped-call]
+        outputs = _operation().apply(call, *first)  # type: ignore[no-untyped-call]
         return outputs, (0,) * len(outputs)
+
+
+class _Refusing(_Differentiable):
+    """The same outside of compilers, which take no operation with a rule for forward mode."""
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
         refuse_forward_mode(ctx.call.split("|")[0])
+
+
+def _operation() -> type[_Differentiable]:
+    return _Differentiable if torch.compiler.is_compiling() else _Refusing
 
 
 class _Once(torch.autograd.Function):
