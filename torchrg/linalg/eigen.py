@@ -96,7 +96,8 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     check_floating("eigh3", matrices=matrices)
     if not matrices.requires_grad and has_values(matrices):
         return _jacobi(matrices)
-    values, vectors = _Eigh3.apply(matrices)  # type: ignore[no-untyped-call]
+    operation = _Eigh3 if torch.compiler.is_compiling() else _Refusing
+    values, vectors = operation.apply(matrices)  # type: ignore[no-untyped-call]
     return values, vectors
 
 
@@ -131,6 +132,10 @@ class _Eigh3(torch.autograd.Function):
         whole: Tensor = vectors @ inner @ vectors.mT
         # Only the upper triangle is read, but both stand for one number, as in torch.linalg.eigh.
         return (whole + whole.mT) / 2
+
+
+class _Refusing(_Eigh3):
+    """The same outside of compilers, which take no operation with a rule for forward mode."""
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
