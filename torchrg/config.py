@@ -144,8 +144,12 @@ class GrowingConfig:
     """After growth, regions that touch become one when they lie within this root mean square
     distance of one plane, in the unit of the cloud. It is for points drawn from a mesh, which lie
     exactly on its facets, of which a flat face has several, and for reconstructions that bend flat
-    faces. By default 1/240 of the height of the cloud, 11 mm in a room, where deviations grow with
-    scale, and none where noise is white. None: they stay apart."""
+    faces. auto: 1/240 of the height of the cloud, 11 mm in a room, where deviations grow with
+    scale, and less than half of that, 5 mm, where noise is white. None: they stay apart."""
+    faceted: bool | Auto = field(default="auto", metadata=NO_FLAG)
+    """Whether flat faces deviate from their planes by form, as facets of a mesh and the bends of a
+    fused reconstruction do, and not by noise. Then points decide whether a region is flat, not
+    their normals; it needs facet_tolerance. auto: measured."""
     max_plane_residual: float | None = None
     """After growth, a point loses its label when it is farther from the plane of its region than
     this many times the thickness of the region. None: it keeps the label."""
@@ -190,6 +194,12 @@ class GrowingConfig:
         _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
+    @property
+    def needs_sampling(self) -> bool:
+        """Whether a setting is ``auto``."""
+        faceted = self.faceted if self.facet_tolerance is not None else False
+        return "auto" in (self.min_size, self.facet_tolerance, faceted)
+
     def at_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Return the settings with numbers; see :meth:`PipelineConfig.at_sampling`."""
         least, tolerance = self.min_size, self.facet_tolerance
@@ -203,8 +213,12 @@ class GrowingConfig:
         if tolerance == "auto":
             reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
             most = min(_FACETS_BY_HEIGHT * sampling.height, _FACETS_BY_REACH * reach)
-            tolerance = float(f"{_facets(sampling) * most:.3g}") or None
-        return dataclasses.replace(self, min_size=least, facet_tolerance=tolerance)
+            fraction = max(_facets(sampling), _WHITE_FRACTION)
+            tolerance = float(f"{fraction * most:.3g}") or None
+        faceted = _facets(sampling) > 0.5 if self.faceted == "auto" else self.faceted
+        return dataclasses.replace(
+            self, min_size=least, facet_tolerance=tolerance, faceted=faceted
+        )
 
 
 WHITENESS = 0.4, 0.6
@@ -214,6 +228,9 @@ _VARIATION = 0.38
 _FACETS_BY_HEIGHT, _FACETS_BY_REACH = 1 / 240, 0.3
 """Tolerance of facets by the height of the cloud, and at most by the reach of 50 neighbours, that
 scans of many storeys do not have a larger one."""
+_WHITE_FRACTION = 0.45
+"""Fraction of the tolerance of facets that is left where noise is white, 5 mm in a room: cushions
+and other bent faces come in pieces there, too."""
 _SIDE_OF_REGION = 1 / 27
 """Side of the least region by the height of the cloud: 10 cm in a room of 2.7 m."""
 _LEAST_SIZES = 20, 50

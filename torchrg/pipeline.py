@@ -238,7 +238,7 @@ def _segment(
 def _has_auto(config: PipelineConfig) -> bool:
     """Return whether a setting that counts is measured."""
     scope = config.normals.method == "consensus" and config.normals.noise_scope
-    return "auto" in (scope, config.growing.min_size, config.growing.facet_tolerance)
+    return scope == "auto" or config.growing.needs_sampling
 
 
 def _numbered_by_points(labels: Tensor, num_planes: int) -> tuple[Tensor, Tensor]:

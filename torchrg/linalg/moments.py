@@ -266,9 +266,13 @@ class Segments:
 
     def median(self, values: Tensor) -> Tensor:
         """Return the median of each region's values, the lower one of an even number."""
+        return self.quantile(values, 0.5)
+
+    def quantile(self, values: Tensor, fraction: float) -> Tensor:
+        """Return the lower quantile of each region's values, one of them."""
         parts = torch.split(values, self.counts.tolist())
-        medians = [kth_smallest(region, (len(region) - 1) // 2) for region in parts]
-        return torch.stack(medians) if parts else values
+        found = [kth_smallest(region, int(fraction * (len(region) - 1))) for region in parts]
+        return torch.stack(found) if parts else values
 
 
 def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:

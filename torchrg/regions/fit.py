@@ -48,6 +48,10 @@ _FACET_THICKNESS = 2 / 3
 """Least thickness of the faces of a mesh, in facet tolerances: points beside a face are on facets
 no closer to its plane than those in it."""
 
+_MAX_FACET_RMS = 1.5
+"""Facet tolerances, root mean square, within which the points of a faceted region are on one plane,
+however much their normals are spread."""
+
 _LEAST_HEIGHT = 0.2
 """An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. What is
 thinner than 0.2 a w is a plane with noisy normals."""
@@ -213,6 +217,9 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
         floor=floor,
         radius=radius,
     )
+    if config.faceted is True and facets:
+        on_plane = planes.rms <= _MAX_FACET_RMS * float(config.facet_tolerance or 0.0)
+        planes = planes._replace(curved=planes.curved & ~on_plane)
     if cloud.reach is None:
         return planes
     reach = segments.median(segments.take(cloud.reach)).double()

@@ -24,8 +24,12 @@ from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
+from torchrg.regions.levels import split_levels
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
+
+_MAX_LEVELS = 2
+"""Levels that a region is split off at most: a step on a step of a wall."""
 
 _ROOTS_AT_ONCE = 1024
 """Points that regions begin at between two releases of what is on a disk. Where each reads a list
@@ -120,7 +124,7 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    if "auto" in (settings.min_size, settings.facet_tolerance):
+    if settings.needs_sampling:
         settings = settings.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
     labels = label_regions(cloud, grow(cloud, settings, chunk_size), settings, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
@@ -148,6 +152,12 @@ def label_regions(
         tolerance = float(config.facet_tolerance)
         labels = merge_facets(labels, contacts, fits.of(labels), tolerance=tolerance)
         labels = number_by_size(labels, least)
+    if config.cut_bridges and bool((labels >= 0).any()):
+        for _ in range(_MAX_LEVELS):
+            split = split_levels(cloud, labels, fits.of(labels), config)
+            if split is labels:
+                break
+            labels = number_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = number_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
     return labels

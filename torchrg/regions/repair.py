@@ -33,6 +33,12 @@ their ends."""
 _ROUNDING = 0.01
 """Distances of less than this many thicknesses decide nothing."""
 
+_MIN_STEP = 1.5
+"""Parallel planes this many thicknesses apart are two levels, not pieces of one face."""
+
+_LEVEL_REACH = 3.0
+"""Thicknesses of the nearer plane beyond which a point is on neither level."""
+
 _ONE_SIDED = 0.5
 """A face ends at another plane if the mean distance of its points from that, with signs, is this
 share of the mean without; of a face that goes on behind the plane it is near 0."""
@@ -83,7 +89,8 @@ def refine_regions(
             planes.times_thickness(config.absorb_reach),
             valid=cloud.valid,
             normals=cloud.normals,
-            max_angle_deg=config.absorb_angle_deg,
+            # The normals of facets say little of the face; the distance decides.
+            max_angle_deg=90.0 if config.faceted is True else config.absorb_angle_deg,
         )
         labels = _drop_small(labels, int(config.min_size))
     if config.merge_coplanar:
@@ -97,6 +104,13 @@ def refine_regions(
         vague = planes.bent | (planes.num_points < LEAST_FITTED)
         reach = torch.where(vague, torch.nan, planes.times_thickness(config.absorb_reach))
         labels = refine_borders(cloud, labels, planes, reach)
+        labels = assign_levels(cloud, labels, planes)
+        if config.facet_tolerance is not None:
+            # Something narrower than a neighborhood may part a face in facets.
+            near = cloud.neighbors if config.faceted is True else beside.neighbors
+            tolerance = float(config.facet_tolerance)
+            contacts = find_contacts(labels, near)
+            labels = merge_facets(labels, contacts, planes, tolerance=tolerance)
     return labels
 
 
@@ -415,6 +429,51 @@ def refine_borders(
         rows = rows[moved]
         labels[rows] = chosen[moved]
         rows = torch.unique(torch.cat([rows, around[moved].flatten()]))
+    return labels
+
+
+def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> Tensor:
+    """Give points where parallel regions touch to the nearer plane.
+
+    The planes must be 1.5 thicknesses apart at the point, so that pieces of one face stay as they
+    are. The point moves if it is nearer to the other plane, and so are the points of both regions
+    among its 8 nearest on average: a single residual is noise. Points that moved and their
+    neighbors are decided again in the next pass.
+    """
+    beside = NearestPoints(cloud.neighbors)
+    flat = ~planes.curved & (planes.num_points >= LEAST_FITTED)
+    flat = torch.cat([flat, flat.new_zeros(1)])
+    labels = labels.clone()
+    rows = _touching(labels, beside)
+    for _ in range(_MAX_PASSES):
+        rows = rows[flat[labels[rows]]]
+        near, label = beside.around(rows).long(), labels[rows]
+        options = labels[near]
+        turn = unsigned_angle_deg(planes.normal[options], planes.normal[label][:, None])
+        usable = flat[options] & (options != label[:, None]) & (turn <= PARALLEL_DEG)
+        place = cloud.points[rows].double()
+        distance = planes.signed_distances(place, options).abs()
+        other, least = _least(torch.where(usable, distance, torch.inf), options)
+        both = least.isfinite()
+        rows, near, pair = rows[both], near[both], torch.stack([label, other], dim=1)[both]
+        if not len(rows):
+            break
+        group = torch.cat([rows[:, None], near], dim=1)
+        members = (labels[group][:, :, None] == pair[:, None]).any(dim=2, keepdim=True)
+        normal, center = planes.normal[pair], planes.center[pair]
+        normal = torch.where((normal[:, :1] * normal).sum(dim=2, keepdim=True) < 0, -normal, normal)
+        away = cloud.points[group].double()[:, :, None] - center[:, None]
+        away = (away * normal[:, None]).sum(dim=3)
+        thickness = planes.thickness[pair].amax(dim=1)
+        apart = (away[:, 0, 0] - away[:, 0, 1]).abs() >= _MIN_STEP * thickness
+        mean, first = (away * members).sum(dim=1).abs(), away[:, 0].abs()
+        moved = apart & (mean[:, 1] < mean[:, 0]) & (first[:, 1] < first[:, 0])
+        moved &= first[:, 1] <= _LEVEL_REACH * planes.thickness[pair[:, 1]]
+        if not bool(moved.any()):
+            break
+        rows = rows[moved]
+        labels[rows] = pair[moved, 1]
+        rows = torch.unique(group[moved])
     return labels
 
 
