@@ -195,25 +195,30 @@ RAYS = Sampling(whiteness=0.9, variation=0.6, density=7000.0, height=2.7)
 
 
 @pytest.mark.parametrize(
-    ("sampling", "scope", "tolerance", "least"),
+    ("sampling", "scope", "tolerance", "faceted", "least"),
     [
         # A square of a 13th of 2.7 m has 173 of 4,000 points, of a 27th 7 of 700 and 70 of 7,000.
-        (FACETS, "local", 0.0113, 173),
-        (FACETS._replace(exactness=0.0), "local", 0.0113, 40),
-        (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0189, 50),
-        (VERTICES, "regional", None, 20),
-        (VERTICES._replace(whiteness=0.5), "local", 0.00563, 20),
-        (RAYS, "local", None, 50),
-        (Sampling(), "local", None, 20),
+        (FACETS, "local", 0.0113, True, 173),
+        (FACETS._replace(exactness=0.0), "local", 0.0113, True, 40),
+        (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0189, True, 50),
+        (VERTICES, "regional", 0.00506, False, 20),
+        (VERTICES._replace(whiteness=0.55), "regional", 0.00506, False, 20),
+        (VERTICES._replace(whiteness=0.48), "local", 0.00675, True, 20),
+        (RAYS, "local", 0.00506, False, 50),
+        (Sampling(), "local", None, False, 20),
     ],
 )
-def test_settings_follow_from_how_a_cloud_samples_surfaces(sampling, scope, tolerance, least):
+def test_settings_follow_from_how_a_cloud_samples_surfaces(
+    sampling, scope, tolerance, faceted, least
+):
     config = load_config().at_sampling(sampling)
     assert config.normals.noise_scope == scope
     assert config.growing.facet_tolerance == tolerance
     assert config.growing.min_size == least
-    told = load_config().measured(sampling)["settings"]
-    assert [*told.values()] == [scope, tolerance, least]
+    assert config.growing.faceted in (faceted, "auto")
+    chosen = load_config().measured(sampling)["settings"]
+    expected = [scope, tolerance, *([] if tolerance is None else [faceted]), least]
+    assert [*chosen.values()] == expected
 
 
 def test_settings_that_are_numbers_stay():

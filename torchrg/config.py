@@ -215,10 +215,10 @@ class GrowingConfig:
             most = min(_FACETS_BY_HEIGHT * sampling.height, _FACETS_BY_REACH * reach)
             fraction = max(_facets(sampling), _WHITE_FRACTION)
             tolerance = float(f"{fraction * most:.3g}") or None
-        faceted = _facets(sampling) > 0.5 if self.faceted == "auto" else self.faceted
-        return dataclasses.replace(
-            self, min_size=least, facet_tolerance=tolerance, faceted=faceted
-        )
+        faceted = self.faceted
+        if faceted == "auto" and tolerance is not None:
+            faceted = _facets(sampling) > 0.5
+        return dataclasses.replace(self, min_size=least, facet_tolerance=tolerance, faceted=faceted)
 
 
 WHITENESS = 0.4, 0.6
@@ -310,9 +310,9 @@ class PipelineConfig:
 
         Where whiteness is below 0.4, faces are bent or in facets, and ``facet_tolerance`` is 1/240
         of the height of the cloud, but at most 0.3 of the reach of 50 neighbours; from 0.6 on noise
-        is white, and there is none; between, it falls evenly. The noise of a region counts where it
-        is white and distances to the nearest point vary by less than 0.38, as only those of
-        vertices and grids do. The least region is a square of a 27th of the height, of a 13th where
+        is white, and it is 0.45 of that; between, it falls evenly. Below 0.5 faces are ``faceted``.
+        The noise of a region counts where it is white and distances to the nearest point vary by
+        less than 0.38, as only those of vertices and grids do. The least region is a square of a 27th of the height, of a 13th where
         points are drawn from a mesh, whose facets on curved things are no planes.
 
         Example:
@@ -340,8 +340,9 @@ class PipelineConfig:
         settings = {
             f"{section}.{name}": getattr(getattr(chosen, section), name)
             for section in ("normals", "growing")
-            for name in ("noise_scope", "facet_tolerance", "min_size")
+            for name in ("noise_scope", "facet_tolerance", "faceted", "min_size")
             if getattr(getattr(self, section), name, None) == "auto"
+            and getattr(getattr(chosen, section), name) != "auto"
         }
         return {"sampling": sampling._asdict(), "settings": settings}
 
