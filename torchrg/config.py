@@ -312,8 +312,9 @@ class PipelineConfig:
         of the height of the cloud, but at most 0.3 of the reach of 50 neighbours; from 0.6 on noise
         is white, and it is 0.45 of that; between, it falls evenly. Below 0.5 faces are ``faceted``.
         The noise of a region counts where it is white and distances to the nearest point vary by
-        less than 0.38, as only those of vertices and grids do. The least region is a square of a 27th of the height, of a 13th where
-        points are drawn from a mesh, whose facets on curved things are no planes.
+        less than 0.38, as only those of vertices and grids do. The least region is a square of a
+        27th of the height, of a 13th where points are drawn from a mesh, whose facets on curved
+        things are no planes.
 
         Example:
             >>> mesh = Sampling(0.06, variation=0.5, exactness=0.6, density=4e3, height=2.7)

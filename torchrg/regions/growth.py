@@ -28,9 +28,6 @@ from torchrg.regions.levels import split_levels
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
-_MAX_LEVELS = 2
-"""Levels that a region is split off at most: a step on a step of a wall."""
-
 _ROOTS_AT_ONCE = 1024
 """Points that regions begin at between two releases of what is on a disk. Where each reads a list
 for itself, the system maps some 200 kB around it."""
@@ -153,11 +150,8 @@ def label_regions(
         labels = merge_facets(labels, contacts, fits.of(labels), tolerance=tolerance)
         labels = number_by_size(labels, least)
     if config.cut_bridges and bool((labels >= 0).any()):
-        for _ in range(_MAX_LEVELS):
-            split = split_levels(cloud, labels, fits.of(labels), config)
-            if split is labels:
-                break
-            labels = number_by_size(split, 1)
+        split = split_levels(cloud, labels, fits.of(labels), config)
+        labels = labels if split is labels else number_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = number_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
     return labels

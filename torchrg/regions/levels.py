@@ -9,10 +9,10 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, NearestPoints
 from torchrg.regions.edges import GrowingCloud
-from torchrg.regions.fit import RegionPlanes, fit_planes
+from torchrg.regions.fit import RegionPlanes, fit_planes, fit_regions
 from torchrg.regions.repair import renumber
 from torchrg.robust.scale import MAD_FACTOR
-from torchrg.structures import UNLABELED
+from torchrg.structures import UNLABELED, Neighbors
 
 _NUM_AVERAGED = 16
 """Nearest neighbors whose residuals are averaged: a quarter of white noise remains."""
@@ -43,6 +43,9 @@ _VALLEY_WIDTH = 1 / 6
 _NUM_RINGS = 4
 """Rings of nearest neighbors around a level that are counted with it: they cross the step."""
 
+_MAX_LEVELS = 2
+"""Times that a region is searched: a board may hold a further level."""
+
 _BINS, _WINDOW, _PEAK_WIDTH = 64, (1, 2, 3, 2, 1), 1.5
 """Bins of half a standard deviation among which the main level is sought, the weights by which
 their counts are smoothed, and the standard deviations around the peak that are averaged."""
@@ -72,33 +75,46 @@ def split_levels(
         Labels, shape ``(N,)``; second levels are numbered from M on. ``labels`` itself if there are
         none.
     """
-    min_size, num_regions = int(config.min_size), len(planes.normal)
-    large = (planes.num_points >= _MIN_POINTS * min_size) & ~planes.curved
-    region = renumber(labels, _numbers(large))
-    if not bool(large.any()):
-        return labels
-    planes, beside = RegionPlanes(*(v[large] for v in planes)), NearestPoints(cloud.neighbors)
+    searched = labels
+    for _ in range(_MAX_LEVELS):
+        large = (planes.num_points >= _MIN_POINTS * int(config.min_size)) & ~planes.curved
+        if not bool(large.any()):
+            break
+        region = renumber(searched, _numbers(large))
+        level, owner = _find_levels(
+            cloud, region, RegionPlanes(*(v[large] for v in planes)), config
+        )
+        if not len(owner):
+            break
+        labels = torch.where(level >= 0, level + int(labels.max()) + 1, labels)
+        # Only regions that were split are searched again.
+        rows = places_of(torch.isin(region, owner))
+        searched = torch.full_like(labels, UNLABELED)
+        searched[rows] = torch.unique(labels[rows], return_inverse=True)[1]
+        planes = fit_regions(cloud, searched, config)
+    return labels
+
+
+def _find_levels(
+    cloud: GrowingCloud, region: Tensor, planes: RegionPlanes, config: GrowingConfig
+) -> tuple[Tensor, Tensor]:
+    """Return the second level of each point ``(N,)``, -1 for none, and the region of each level."""
     residual, average, noise = _measure_residuals(cloud, region, planes)
-    side = 2 * region + (average > 0)
+    beside = NearestPoints(cloud.neighbors)
     limit = _SEED_NOISES * torch.cat([noise, noise.new_tensor([torch.inf])])
-    level = _components(average.abs() > limit[region], side, beside)
+    level = _components(average.abs() > limit[region], 2 * region + (average > 0), beside)
     step = _steps(level, residual)
     level = _components(average.abs() > step[level] / 2, level, beside)
     step, owner = _steps(level, residual)[:-1], Segments(level).first(region)
     min_step = (_STEP_NOISES * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
     num_points = torch.bincount(level + 1, minlength=1)[1:]
-    level = renumber(level, _numbers(kept := (num_points >= min_size) & (step >= min_step)))
-    if not bool(kept.any()):
-        return labels
-    step, owner = step[kept], owner[kept]
+    kept = (num_points >= int(config.min_size)) & (step >= min_step)
+    level, step, owner = renumber(level, _numbers(kept)), step[kept], owner[kept]
     fits = fit_planes(Segments(level), cloud.points, cloud.normals)
     turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
     kept = (turn <= PARALLEL_DEG) & (fits.thickness <= _MAX_THICKNESS * step)
     kept &= _have_valleys(level, step, average, region, beside)
-    if not bool(kept.any()):
-        return labels
-    split = renumber(level, torch.where(kept, kept.cumsum(0) - 1 + num_regions, UNLABELED))
-    return torch.where(split >= 0, split, labels)
+    return renumber(level, _numbers(kept)), owner[kept]
 
 
 def _numbers(kept: Tensor) -> Tensor:
@@ -120,9 +136,9 @@ def _measure_residuals(
 
     def work(block: slice) -> None:
         rows = segments.rows[block]
-        near = cloud.neighbors.at(rows).indices[:, :_NUM_AVERAGED]
-        same = narrow[near] == narrow[rows, None]
-        average[rows] = sum_neighbors(residual[near] * same) / same.sum(dim=1)
+        near = Neighbors(cloud.neighbors.at(rows).indices[:, :_NUM_AVERAGED])
+        same = near.of(narrow) == narrow[rows, None]
+        average[rows] = sum_neighbors(near.of(residual) * same) / same.sum(dim=1)
 
     map_chunks(work, len(segments.rows), ROWS_IN_CACHE, region.device)
     floor = planes.floor.float()
