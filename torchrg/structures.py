@@ -449,10 +449,12 @@ class Segmentation(NamedTuple):
         valid: Points that are finite and have a normal, shape ``(N,)``, bool.
         planes: The plane table, M rows.
         points: What was segmented, shape ``(N, 3)``, to show it; None where it is not known.
-        neighbors: Neighbours of the finite points in canonical order, as
-            :func:`torchrg.search_knn` finds them there; None where they were not kept.
+        neighbors: Neighbors of the distinct finite points in canonical order, as
+            :func:`torchrg.search_knn` finds them there; None where they were not kept. See
+            :func:`torchrg.neighbors.distinct_points`.
         sampling: What was measured of the cloud, by which settings were chosen; None where it was
             not.
+        num_copies: Number of points that repeat the coordinates of another point.
     """
 
     labels: Tensor
@@ -464,6 +466,7 @@ class Segmentation(NamedTuple):
     points: Tensor | None = None
     neighbors: Neighbors | None = None
     sampling: Sampling | None = None
+    num_copies: int = 0
 
     def to(self, device: torch.device | str) -> "Segmentation":
         """Return the segmentation on a device."""
