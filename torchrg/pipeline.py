@@ -68,8 +68,14 @@ def segment_planes(
 
     Convention:
         The result does not depend on the order of the points, on chunk size, on the number of
-        threads or on where arrays are; only exact duplicates may swap. Lengths are in the unit of
-        the cloud.
+        threads or on where arrays are. Lengths are in the unit of the cloud. A unit that is a power
+        of two times another changes nothing. Other units, another origin, and float64 in place of
+        float32 change results where rounding decides, as between equal distances.
+
+        Points with equal coordinates are copies. Neighbors are searched among distinct points, and
+        copies of a point have its result, so the normals and planes are those of the distinct
+        points. ``min_size`` and the table count copies once, except the table's ``count``. Labels
+        are numbered by ``count``.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64. Clouds far from the origin should be
@@ -81,8 +87,8 @@ def segment_planes(
             are described from all points and numbered by their number, and which of them meet is
             found on the voxels. Default: all points are segmented.
         within: Object of each point, shape ``(N,)``, integers, to keep planes within objects: no
-            plane has points of two of them, and the table names that of each. Points of voxels of
-            another object have no label. Default: planes go across.
+            plane has points of two of them, and the table names that of each. Where objects share
+            a position or a voxel, its size counts once for each. Default: planes go across.
         keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
             that :func:`make_superpoints` need not search them again.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
@@ -276,8 +282,10 @@ def make_superpoints(
     :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
 
     Convention:
-        The result does not depend on the order of the points or on the number of threads. Exact
-        duplicates are in one superpoint. Sizes are counted in distinct points, of any density.
+        The result does not depend on the order of the points or on the number of threads. Copies of
+        a point are in one superpoint. Sizes are counted in distinct points, of any density, and
+        superpoints are numbered by all their points. A few points may lie on another plane than
+        the rest of their superpoint.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64.
@@ -285,7 +293,8 @@ def make_superpoints(
             ``consensus``.
         config: Settings, or a dictionary of them.
         colors: Colours, shape ``(N, 3)``, integers up to the largest of their type, or floating in
-            [0, 1]. Default: they play no part.
+            [0, 1]. Copies of a point have one color, halfway between the least and the largest of
+            each channel. Default: they play no part.
         voxel: Side of voxels, in the unit of the cloud: the points that stand for voxels are
             partitioned, and every point is in the superpoint of its voxel. Sizes are counted in
             voxels then, and superpoints numbered by their number. Default: all points are.

@@ -325,7 +325,7 @@ class Planes:
 
     Its planes are gone through as those of a list; its columns are tensors of all of them. Lengths
     are in the unit of the cloud. Values are computed in float64 and given in the dtype of the
-    points.
+    points. Copies of a point count once in all columns except ``count``.
 
     Attributes:
         normal: Unit normals, shape ``(M, 3)``; the sign makes the first of z, y, x that is not
@@ -334,7 +334,7 @@ class Planes:
             has ``normal . x = offset``.
         centroid: Mean of the region's points, shape ``(M, 3)``.
         area: Area that the points cover on the plane, shape ``(M,)``.
-        count: Number of points, shape ``(M,)``, int64.
+        count: Number of points, copies included, shape ``(M,)``, int64.
         rms: Root mean square distance of the points to the plane, shape ``(M,)``.
         extent: Long and short side of the smallest rectangle in the plane that holds the points'
             projections, shape ``(M, 2)``.

@@ -17,7 +17,8 @@ from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_chunks, places_of
 from torchrg.config import SuperpointsConfig
 from torchrg.linalg import sq_chords
-from torchrg.neighbors import DistinctPoints, distinct_points, search_knn
+from torchrg.linalg.moments import reduce_runs
+from torchrg.neighbors import DistinctPoints, distinct_points, finite_rows, search_knn
 from torchrg.regions.adjacency import NUM_CONTACTS, NearestPoints
 from torchrg.regions.growth import number_by_count
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
@@ -142,13 +143,11 @@ def merge_copies(
     shades = _unit_colors(colors)
     if not distinct.num_copies:
         return distinct, shades[distinct.rows]
-    rows = places_of(distinct.inverse >= 0)
-    place, shades = distinct.inverse[rows, None].expand(-1, 3), shades[rows]
+    rows = finite_rows(points)
+    counts, columns = torch.bincount(distinct.inverse[rows]), shades[rows].unbind(dim=1)
     low, high = (
-        shades.new_empty(len(distinct.rows), 3).scatter_reduce(
-            0, place, shades, side, include_self=False
-        )
-        for side in ("amin", "amax")
+        torch.stack([reduce_runs(column, counts, side) for column in columns], dim=1)
+        for side in ("min", "max")
     )
     return distinct, (low + high) / 2
 
