@@ -134,9 +134,10 @@ class GrowingConfig:
     """A neighbour farther than this does not join, in the unit of the cloud. Where points are few,
     the k nearest neighbours reach across gaps, and this keeps them apart. None: not tested."""
     min_size: int | Auto = "auto"
-    """Regions of fewer points are not labelled. With absorb, points at the borders of a region
-    count as well. By default the points on a square whose side is a 27th of the height of the
-    cloud, 10 cm in a room, but 20 to 50; more where points are drawn from a mesh."""
+    """Regions of fewer points are not labelled. Copies of a point count once. With absorb, points
+    at the borders of a region count as well. By default the points on a square whose side is a 27th
+    of the height of the cloud, 10 cm in a room, but 20 to 50; more where points are drawn from a
+    mesh."""
     cut_bridges: bool = True
     """Whether a region of several faces that only a few points join is split, as faces 12 degrees
     apart and floors with furniture on them are. It takes consensus about a twentieth more time."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,11 +22,11 @@ from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ShapeError
 from torchrg.neighbors import (
+    DistinctPoints,
     canonical_order,
-    finite_rows,
+    distinct_points,
     measure_sampling,
     restore_points,
-    restore_rows,
     sample_voxels,
     search_knn,
 )
@@ -34,13 +34,9 @@ from torchrg.neighbors.knn import keep_within
 from torchrg.normals import ESTIMATORS
 from torchrg.precision import warn_of_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
-from torchrg.structures import (
-    UNLABELED,
-    Neighbors,
-    PlaneAdjacency,
-    Segmentation,
-    Superpoints,
-)
+from torchrg.regions.growth import number_by_count
+from torchrg.regions.superpoints import merge_copies
+from torchrg.structures import UNLABELED, Neighbors, Rows, Segmentation, Superpoints
 
 BYTES_PER_POINT = 1_100
 """Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
@@ -72,8 +68,14 @@ def segment_planes(
 
     Convention:
         The result does not depend on the order of the points, on chunk size, on the number of
-        threads or on where arrays are; only exact duplicates may swap. Lengths are in the unit of
-        the cloud.
+        threads or on where arrays are. Lengths are in the unit of the cloud. A unit that is a power
+        of two times another changes nothing. Other units, another origin, and float64 in place of
+        float32 change results where rounding decides, as between equal distances.
+
+        Points with equal coordinates are copies. Neighbors are searched among distinct points, and
+        copies of a point have its result, so the normals and planes are those of the distinct
+        points. ``min_size`` and the table count copies once, except the table's ``count``. Labels
+        are numbered by ``count``.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64. Clouds far from the origin should be
@@ -85,8 +87,8 @@ def segment_planes(
             are described from all points and numbered by their number, and which of them meet is
             found on the voxels. Default: all points are segmented.
         within: Object of each point, shape ``(N,)``, integers, to keep planes within objects: no
-            plane has points of two of them, and the table names that of each. Points of voxels of
-            another object have no label. Default: planes go across.
+            plane has points of two of them, and the table names that of each. Where objects share
+            a position or a voxel, its size counts once for each. Default: planes go across.
         keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
             that :func:`make_superpoints` need not search them again.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.
@@ -141,32 +143,6 @@ def segment_planes(
     return seg if keep_neighbors else seg._replace(neighbors=None)
 
 
-class _CanonicalCloud(NamedTuple):
-    """Points in canonical order, their rows in the cloud; with voxels, that of each or -1."""
-
-    points: Tensor
-    rows: Tensor
-    inverse: Tensor | None
-
-    @classmethod
-    def of(cls, points: Tensor, voxel: float | None) -> "_CanonicalCloud":
-        """Sort the points of a cloud, or of its voxels."""
-        if voxel is None:
-            rows = finite_rows(points)
-            return cls(points[rows], rows, None)
-        voxels = sample_voxels(points, voxel)
-        order = canonical_order(points[voxels.rows])
-        rows = voxels.rows[order]
-        places = torch.cat([order.argsort(), order.new_tensor([UNLABELED])])
-        return cls(points[rows], rows, places[voxels.inverse])
-
-    def restore(self, values: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
-        """Return values of the points in the order of the cloud."""
-        if self.inverse is None:
-            return restore_rows(values, self.rows, num_points, fill=fill)
-        return restore_points(values, self.inverse, fill=fill)
-
-
 def _segment(
     points: Tensor,
     config: PipelineConfig,
@@ -174,87 +150,116 @@ def _segment(
     objects: Tensor | None,
     begin: Callable[[str], None],
 ) -> Segmentation:
-    """Do what :func:`segment_planes` says: the steps, in their order."""
+    """Do what :func:`segment_planes` says: the steps, in their order.
+
+    Places are distinct points, or one point of each voxel, and ``inverse`` is the place of each
+    point. Regions grow on parts: the points of one object at a place are one part.
+    """
     begin("neighbors")
-    cloud = _CanonicalCloud.of(points, voxel)
+    distinct = distinct_points(points)
+    places, inverse = distinct.points, distinct.inverse
+    if voxel is not None:
+        places, inverse = _sample_places(distinct, voxel)
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
-    if len(cloud.points):
-        k = min(config.normals.k, len(cloud.points))
-        neighbors = search_knn(cloud.points, k, canonical=True)
+    if len(places):
+        k = min(config.normals.k, len(places))
+        neighbors = search_knn(places, k, canonical=True)
     sampling = None
     if _has_auto(config):
-        sampling = measure_sampling(cloud.points, neighbors)
+        sampling = measure_sampling(places, neighbors)
         config = config.at_sampling(sampling)
 
     begin("normals")
     estimate = ESTIMATORS[config.normals.method]
-    fit = estimate(cloud.points, neighbors, config.normals, config.chunk_size)
+    fit = estimate(places, neighbors, config.normals, config.chunk_size)
 
     begin("regions")
-    beside = neighbors
+    parts: Rows = slice(None)
+    beside, around, part_of = neighbors, neighbors, inverse
     if objects is not None:
+        parts, groups, part_of = _split_places(inverse, objects, len(places))
         # Growth, and all steps after it, join neighbours alone.
-        beside = keep_within(neighbors, objects[cloud.rows], config.chunk_size)
+        beside = keep_within(neighbors, groups, config.chunk_size, parts)
+        if len(groups) > len(places):
+            around = search_knn(places[parts], neighbors.indices.shape[1], canonical=True)
+    normals, curvature, valid, residual_rms = (values[parts] for values in fit[:4])
     labels = grow_regions(
-        cloud.points,
-        fit.normals,
-        fit.curvature,
+        places[parts],
+        normals,
+        curvature,
         beside,
         config.growing,
-        valid=fit.valid,
-        residual_rms=fit.residual_rms,
+        valid=valid,
+        residual_rms=residual_rms,
         canonical=True,
         chunk_size=config.chunk_size,
     )
 
     begin("planes")
+    of_points = restore_points(labels, part_of, fill=UNLABELED)
+    numbers = number_by_count(of_points)
+    labels, of_points = numbers[labels], numbers[of_points]
     describe = partial(summarize_planes, up=config.planes.up, outline=config.planes.outline)
-    planes = describe(cloud.points, fit.normals, labels, neighbors=neighbors)
+    planes = describe(places[parts], normals, labels, neighbors=around, canonical=True)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    labels = cloud.restore(labels, len(points), fill=UNLABELED)
     normals, curvature, sharp, valid = (
-        cloud.restore(values, len(points))
-        for values in (fit.normals, fit.curvature, sharp, fit.valid)
+        restore_points(values, inverse) for values in (fit.normals, fit.curvature, sharp, fit.valid)
     )
-    if objects is not None and cloud.inverse is not None:
-        labels = labels.where(objects == objects[cloud.rows][cloud.inverse], UNLABELED)
     if voxel is not None:
-        labels, place = _numbered_by_points(labels, len(planes))
-        rows = finite_rows(points)
-        adjacency = _renumbered(planes.adjacency, place)
-        planes = describe(points[rows], normals[rows], labels[rows])
-        planes = replace(planes, adjacency=adjacency)
+        rows: Rows = distinct.rows if objects is None else slice(None)
+        cloud = points[rows], normals[rows], of_points[rows]
+        whole = describe(*cloud, canonical=objects is None)
+        planes = replace(whole, adjacency=planes.adjacency)
+    planes = replace(planes, count=torch.bincount(of_points + 1, minlength=1)[1:])
     if objects is not None:
         of_plane = objects.new_zeros(len(planes))
-        of_plane[labels[labels >= 0]] = objects[labels >= 0]
+        of_plane[of_points[of_points >= 0]] = objects[of_points >= 0]
         planes = replace(planes, object=of_plane)
     begin("done")
     searched = neighbors if voxel is None else None
     return Segmentation(
-        labels, normals, curvature, sharp, valid, planes, points, searched, sampling
+        of_points,
+        normals,
+        curvature,
+        sharp,
+        valid,
+        planes,
+        points,
+        searched,
+        sampling,
+        distinct.num_copies,
     )
+
+
+def _sample_places(distinct: DistinctPoints, voxel: float) -> tuple[Tensor, Tensor]:
+    """Return one point of each voxel, in canonical order, and the place of each point there."""
+    voxels = sample_voxels(distinct.points, voxel)
+    order = canonical_order(distinct.points[voxels.rows])
+    place = order.argsort()[voxels.inverse]
+    return distinct.points[voxels.rows[order]], distinct.restore(place, fill=UNLABELED)
+
+
+def _split_places(inverse: Tensor, objects: Tensor, num_places: int) -> tuple[Rows, Tensor, Tensor]:
+    """Return the places and the objects of parts, ascending, and the part of each point.
+
+    Objects are numbered from 0 unless each place has one point.
+    """
+    has_place = inverse >= 0
+    if num_places == int(torch.count_nonzero(has_place)):
+        of_place = objects.new_empty(num_places)
+        of_place[inverse[has_place]] = objects[has_place]
+        return slice(None), of_place, inverse
+    values, groups = torch.unique(objects, return_inverse=True)
+    keys, part = torch.unique(inverse * len(values) + groups, return_inverse=True)
+    num_bad = int(torch.count_nonzero(keys < 0))
+    keys, part = keys[num_bad:], (part - num_bad).clamp(min=UNLABELED)
+    return keys // len(values), keys % len(values), part
 
 
 def _has_auto(config: PipelineConfig) -> bool:
     """Return whether a setting that counts is measured."""
     scope = config.normals.method == "consensus" and config.normals.noise_scope
     return scope == "auto" or config.growing.needs_sampling
-
-
-def _numbered_by_points(labels: Tensor, num_planes: int) -> tuple[Tensor, Tensor]:
-    """Number the planes of voxels by their numbers of points; return the new number of each too."""
-    counts = torch.bincount(labels + 1, minlength=num_planes + 1)[1:]
-    place = counts.argsort(descending=True, stable=True).argsort()
-    return torch.cat([place, place.new_tensor([UNLABELED])])[labels], place
-
-
-def _renumbered(adjacency: PlaneAdjacency | None, place: Tensor) -> PlaneAdjacency | None:
-    """Return which planes meet after the planes were given other numbers."""
-    if adjacency is None:
-        return None
-    pairs = place[adjacency.pairs].sort(dim=-1).values
-    order = (pairs[:, 0] * len(place) + pairs[:, 1]).argsort()
-    return PlaneAdjacency(*(column[order] for column in (pairs, *adjacency[1:])))
 
 
 @of_clouds
@@ -277,8 +282,10 @@ def make_superpoints(
     :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
 
     Convention:
-        The result does not depend on the order of the points or on the number of threads. Exact
-        duplicates are in one superpoint. Sizes are counted in distinct points, of any density.
+        The result does not depend on the order of the points or on the number of threads. Copies of
+        a point are in one superpoint. Sizes are counted in distinct points, of any density, and
+        superpoints are numbered by all their points. A few points may lie on another plane than
+        the rest of their superpoint.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64.
@@ -286,7 +293,8 @@ def make_superpoints(
             ``consensus``.
         config: Settings, or a dictionary of them.
         colors: Colours, shape ``(N, 3)``, integers up to the largest of their type, or floating in
-            [0, 1]. Default: they play no part.
+            [0, 1]. Copies of a point have one color, halfway between the least and the largest of
+            each channel. Default: they play no part.
         voxel: Side of voxels, in the unit of the cloud: the points that stand for voxels are
             partitioned, and every point is in the superpoint of its voxel. Sizes are counted in
             voxels then, and superpoints numbered by their number. Default: all points are.
@@ -324,8 +332,10 @@ def make_superpoints(
         return partition_points(
             tensor, seg.normals, seg.labels, settings, shades, neighbors=neighbors
         )
-    rows, inverse = sample_voxels(tensor, voxel)
+    distinct, shades = merge_copies(tensor, seg.normals, seg.labels, shades)
+    rows, inverse = sample_voxels(distinct.points, voxel)
     shades = None if shades is None else shades[rows]
+    rows, inverse = distinct.rows[rows], distinct.restore(inverse, fill=UNLABELED)
     partition = partition_points(
         tensor[rows], seg.normals[rows], seg.labels[rows], settings, shades
     )

@@ -22,7 +22,7 @@ from torchrg.io.fields import are_whole, put_results
 from torchrg.io.files import DAMAGES
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_beside
 from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import finite_rows, search_knn
+from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.plane_table import (
     Arrays,
     Json,
@@ -194,8 +194,11 @@ class Result:
         table = self.table
         if "labels" not in self.fields or (table is not None and table.adjacency is not None):
             return table
-        rows = finite_rows(self.cloud.points)
+        whole = self.cloud.points, self._normals, self.labels
+        rows = distinct_rows(self.cloud.points, self.labels)
         sampled, neighbors = rows, self.neighbors
+        if neighbors is not None and len(neighbors.indices) != len(rows):
+            neighbors = None
         if neighbors is None and bool((self.labels[rows] >= 0).any()):
             places = np.random.default_rng(0).permutation(len(rows))[:_MOST_SEARCHED]
             sampled = rows[torch.from_numpy(places).sort().values]
@@ -204,10 +207,12 @@ class Result:
         points, (present, labels) = self.cloud.points[sampled], number_labels(self.labels[sampled])
         if table is None:
             has_normals = "normals" in self.fields
-            cloud = (self.cloud.points, self._normals, self.labels)
-            whole = neighbors if has_normals and len(sampled) == len(rows) else None
-            table = summarize_planes(*(values[rows] for values in cloud), neighbors=whole)
-            table = replace(table, curved=table.curved & has_normals)
+            beside = neighbors if has_normals and len(sampled) == len(rows) else None
+            table = summarize_planes(
+                *(values[rows] for values in whole), neighbors=beside, canonical=True
+            )
+            count = torch.bincount(self.labels + 1, minlength=1)[1:]
+            table = replace(table, count=count, curved=table.curved & has_normals)
         if neighbors is None or not len(present) or table.adjacency is not None:
             return table
         normal, rms = (column[present].double() for column in (table.normal, table.rms))

@@ -325,7 +325,7 @@ class Planes:
 
     Its planes are gone through as those of a list; its columns are tensors of all of them. Lengths
     are in the unit of the cloud. Values are computed in float64 and given in the dtype of the
-    points.
+    points. Copies of a point count once in all columns except ``count``.
 
     Attributes:
         normal: Unit normals, shape ``(M, 3)``; the sign makes the first of z, y, x that is not
@@ -334,7 +334,7 @@ class Planes:
             has ``normal . x = offset``.
         centroid: Mean of the region's points, shape ``(M, 3)``.
         area: Area that the points cover on the plane, shape ``(M,)``.
-        count: Number of points, shape ``(M,)``, int64.
+        count: Number of points, copies included, shape ``(M,)``, int64.
         rms: Root mean square distance of the points to the plane, shape ``(M,)``.
         extent: Long and short side of the smallest rectangle in the plane that holds the points'
             projections, shape ``(M, 2)``.
@@ -449,10 +449,12 @@ class Segmentation(NamedTuple):
         valid: Points that are finite and have a normal, shape ``(N,)``, bool.
         planes: The plane table, M rows.
         points: What was segmented, shape ``(N, 3)``, to show it; None where it is not known.
-        neighbors: Neighbours of the finite points in canonical order, as
-            :func:`torchrg.search_knn` finds them there; None where they were not kept.
+        neighbors: Neighbors of the distinct finite points in canonical order, as
+            :func:`torchrg.search_knn` finds them there; None where they were not kept. See
+            :func:`torchrg.neighbors.distinct_points`.
         sampling: What was measured of the cloud, by which settings were chosen; None where it was
             not.
+        num_copies: Number of points that repeat the coordinates of another point.
     """
 
     labels: Tensor
@@ -464,6 +466,7 @@ class Segmentation(NamedTuple):
     points: Tensor | None = None
     neighbors: Neighbors | None = None
     sampling: Sampling | None = None
+    num_copies: int = 0
 
     def to(self, device: torch.device | str) -> "Segmentation":
         """Return the segmentation on a device."""

@@ -284,6 +284,21 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
     return tuple(notes)
 
 
+def note_on_copies(num_copies: int, num_points: int) -> tuple[str, ...]:
+    """Return a warning if points of a cloud repeat the coordinates of others.
+
+    Example:
+        >>> note_on_copies(2, 3)
+        ('2 of 3 points are copies of others; copies count once and get one result',)
+    """
+    if not num_copies:
+        return ()
+    return (
+        f"{num_copies:,} of {num_points:,} points are copies of others; copies count once and get "
+        "one result",
+    )
+
+
 def segment_cloud(
     cloud: Cloud,
     settings: PipelineConfig,

@@ -23,6 +23,7 @@ from torchrg.batch.scans import (
     check_finite,
     check_stems,
     find_objects,
+    note_on_copies,
     note_on_origin,
     segment_cloud,
     write_results,
@@ -112,6 +113,7 @@ class CloudSource(Source):
             within=objects,
             begin=begin,
         )
+        notes += note_on_copies(seg.num_copies, len(cloud))
         begin("write")
         what, place = (reading, seg, superpoints), _place_of(scan)
         files = write_scan(self.layout, scan.name, folder, *what, level=self.level, place=place)

@@ -36,7 +36,7 @@ from torchrg.structures import Cloud
 _COLORED_FROM = 200
 """Pixels along the longer side, evenly apart, that tell which planes are next to each other and
 must differ in colour. Choosing colours from all pixels would take as long as finding the planes."""
-_NO_IMAGES = ("planes", "points", "neighbors", "sampling")
+_NO_IMAGES = ("planes", "points", "neighbors", "sampling", "num_copies")
 """Parts of a segmentation of an image that are no images."""
 _LEAST_BYTES_A_PIXEL = 300
 """Memory that labelling takes at least for each pixel."""

@@ -13,7 +13,7 @@ from torchrg.cli.ending import say
 from torchrg.cli.flags import ColumnsFlag, check_columns, choice_of, columns_of
 from torchrg.config import load_config
 from torchrg.io import read_cloud
-from torchrg.neighbors import canonical_order, measure_sampling, search_knn
+from torchrg.neighbors import distinct_points, measure_sampling, search_knn
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
@@ -64,12 +64,9 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         digits = _DIGITS[cloud.coordinates.dtype.itemsize]
         for name, values in (("lowest", low), ("highest", high), ("extent", high - low)):
             facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
-        ordered = finite - cloud.origin
-        ordered = ordered[canonical_order(ordered).numpy()]
-        is_first = np.ones(len(ordered), dtype=bool)
-        is_first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-        places = ordered[is_first]
-        facts["duplicates"] = f"{len(finite) - len(places):,}"
+        distinct = distinct_points(torch.from_numpy(finite - cloud.origin))
+        facts["duplicates"] = f"{distinct.num_copies:,}"
+        places = distinct.points.numpy()
         facts["spacing"] = "none"
         if len(places) > 1:
             near = search_knn(places, min(_NUM_NEIGHBORS, len(places)), canonical=True)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchrg.batch.records import describe_run
-from torchrg.batch.scans import check_finite
+from torchrg.batch.scans import check_finite, note_on_copies
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn
@@ -27,6 +27,7 @@ from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.fields import put_results
 from torchrg.io.npy import KEPT_FIELDS
+from torchrg.neighbors import distinct_points, search_knn
 from torchrg.normals import estimate_normals
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 
@@ -96,12 +97,16 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     check_output(target, cloud)
     with stage_bar(source.name, ("normals", "orientation")) as advance:
         advance("normals")
+        distinct, settings = distinct_points(cloud.points), arguments.normals
+        near = search_knn(distinct.points, min(settings.k, len(distinct.points)), canonical=True)
         fit = estimate_normals(
-            cloud.points, config=arguments.normals, chunk_size=arguments.chunk_size
-        )
+            distinct.points, settings, neighbors=near, chunk_size=arguments.chunk_size
+        ).each(distinct.restore)
         advance("orientation")
         scanner = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
         turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=scanner)
+    for note in note_on_copies(distinct.num_copies, len(cloud)):
+        warn(f"{source}: {note}.")
     provenance = describe_run(source, arguments.normals)
     names = ("orient", "viewpoint", *["columns"] * (arguments.columns is not None))
     provenance |= {name: getattr(arguments, name) for name in names}

@@ -21,6 +21,7 @@ from torchrg.batch.scans import (
     check_stems,
     find_objects,
     mark_of,
+    note_on_copies,
     note_on_origin,
     segment_cloud,
     write_scan,
@@ -226,6 +227,8 @@ def _segment(
             within=objects,
             begin=advance,
         )
+    for note in note_on_copies(seg.num_copies, len(cloud)):
+        warn(f"{source}: {note}.")
     if arguments.layout is None:
         provenance = _describe(arguments, sources, seg)
         write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)

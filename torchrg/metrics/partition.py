@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import check_labels, contingency_table, share
-from torchrg.neighbors import search_knn
+from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.structures import UNLABELED
 
 _NUM_NEIGHBORS = 8
@@ -61,7 +61,7 @@ def score_partition(
         Points whose true label is :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not scored. A
         point whose superpoint is -1 belongs to none, and is wrong. Of equally frequent parts a
         superpoint takes that of the lowest label. A point is at a border when one of its 8 nearest
-        scored points has another label.
+        scored points has another label. Copies of a point with the same labels count once there.
 
     Args:
         superpoints: Superpoint of each point, shape ``(N,)``, integers.
@@ -146,9 +146,13 @@ def _score_borders(
     """Return recall and precision of the borders of superpoints, and the distance they are at."""
     from scipy.spatial import cKDTree
 
+    # Copies of a point with the same labels count once.
+    rows = distinct_rows(points, superpoints, truth)
+    superpoints, truth, points = superpoints[rows], truth[rows], points[rows]
     if len(points) < 2:
         return 0.0, 0.0, distance or 0.0
-    indices = search_knn(points, min(_NUM_NEIGHBORS + 1, len(points))).indices[:, 1:].long()
+    k = min(_NUM_NEIGHBORS + 1, len(points))
+    indices = search_knn(points, k, canonical=True).indices[:, 1:].long()
     if distance is None:
         reach = (points[indices[:, -1]].double() - points.double()).norm(dim=1)
         distance = float(reach.median())

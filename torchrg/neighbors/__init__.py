@@ -1,17 +1,38 @@
 """Neighbourhoods: exact search, canonical order, patches, voxels."""
 
-from torchrg.neighbors.knn import gather_columns, gather_patches, search_knn, search_nearest
-from torchrg.neighbors.order import ascending_rows, canonical_order, finite_rows, restore_rows
+from torchrg.neighbors.knn import (
+    check_neighbors,
+    gather_columns,
+    gather_patches,
+    search_knn,
+    search_nearest,
+)
+from torchrg.neighbors.order import (
+    DistinctPoints,
+    ascending_rows,
+    canonical_order,
+    distinct_points,
+    distinct_rows,
+    finite_rows,
+    mark_first,
+    restore_points,
+    restore_rows,
+)
 from torchrg.neighbors.sampling import measure_sampling
-from torchrg.neighbors.voxels import Voxels, restore_points, sample_voxels
+from torchrg.neighbors.voxels import Voxels, sample_voxels
 
 __all__ = [
+    "DistinctPoints",
     "Voxels",
     "ascending_rows",
     "canonical_order",
+    "check_neighbors",
+    "distinct_points",
+    "distinct_rows",
     "finite_rows",
     "gather_columns",
     "gather_patches",
+    "mark_first",
     "measure_sampling",
     "restore_points",
     "restore_rows",

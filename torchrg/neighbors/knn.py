@@ -22,8 +22,8 @@ from torchrg._parallel import (
 )
 from torchrg.errors import ShapeError
 from torchrg.neighbors.blocks import search_blocks
-from torchrg.neighbors.order import canonical_order
-from torchrg.structures import Neighbors, bounding_box
+from torchrg.neighbors.order import canonical_order, distinct_rows, mark_first
+from torchrg.structures import Neighbors, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Points that tell how far the k-th neighbour is."""
@@ -118,22 +118,86 @@ def search_knn(
     return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
 
 
-def keep_within(neighbors: Neighbors, groups: Tensor, chunk_size: int) -> Neighbors:
-    """Return those neighbours of each point that are of its group ``(N,)``, the nearest first.
+def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
+    """Check the lists that a user passes: one for each point, itself first, of rows of the points.
+
+    Raises:
+        ShapeError: If they are not as :class:`torchrg.structures.Neighbors` says.
+    """
+    indices, num_points = neighbors.indices, len(points)
+    check_shapes(
+        caller,
+        points=(points, "N 3"),
+        neighbors=(indices, "N K"),
+        neighbors_valid=(neighbors.valid, "N K"),
+    )
+    if indices.dtype not in (torch.int32, torch.int64):
+        raise ShapeError(
+            f"{caller}: expected neighbors of int32 or int64, got {indices.dtype}; convert them."
+        )
+    if indices.device != points.device:
+        raise ShapeError(
+            f"{caller}: expected points and neighbors on one device, got {points.device} and "
+            f"{indices.device}."
+        )
+    if num_points == 0:
+        return
+    if indices.shape[1] == 0:
+        raise ShapeError(f"{caller}: expected neighbors of each point, got none; pass k of them.")
+    low, high = (int(end) for end in torch.aminmax(indices))
+    if not 0 <= low <= high < num_points:
+        raise ShapeError(
+            f"{caller}: expected neighbors to be rows of {num_points:,} points, got {low:,} to "
+            f"{high:,}; search them among these points."
+        )
+    is_own = indices[:, 0] == torch.arange(num_points, device=points.device)
+    if not bool(is_own.all()):
+        raise ShapeError(
+            f"{caller}: expected each point to be the first of its own neighbors, got others for "
+            f"{num_points - int(torch.count_nonzero(is_own)):,} of {num_points:,} points; put the "
+            "row of the point before its neighbors, as search_knn does."
+        )
+
+
+def keep_within(
+    neighbors: Neighbors, groups: Tensor, chunk_size: int, places: Rows = slice(None)
+) -> Neighbors:
+    """Return those neighbors of each point that are of its group, the nearest first.
+
+    Points of several groups may share a place. They are ascending by place, then by group.
+
+    Args:
+        neighbors: Neighbors of each place.
+        groups: Group of each point, shape ``(N,)``, from 0 where places are passed.
+        chunk_size: Points handled at a time.
+        places: Place of each point, shape ``(N,)``. Default: each has one point.
 
     Example:
         >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
         >>> kept = keep_within(near, torch.tensor([4, 7, 4]), 3)
         >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
         ([[0, 2, 0], [1, 1, 1], [2, 0, 2]], [2, 1, 2])
+        >>> kept = keep_within(near, torch.tensor([0, 0, 1, 1]), 4, torch.tensor([0, 1, 1, 2]))
+        >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
+        ([[0, 1, 0], [1, 0, 1], [2, 3, 2], [3, 2, 3]], [2, 2, 2, 2])
     """
-    shape, device = neighbors.indices.shape, groups.device
+    shape, device = (len(groups), neighbors.indices.shape[1]), groups.device
     indices, valid = (scratch.empty(shape, kind) for kind in (np.int32, np.bool_))
+    width = int(groups.max()) + 1 if len(groups) else 0
+    keys = None if isinstance(places, slice) else places * width + groups
 
     def work(rows: slice) -> None:
-        same = (neighbors.of(groups, rows) == groups[rows, None]) & neighbors.counted(rows)
+        if isinstance(places, slice) or keys is None:
+            near = neighbors.indices[rows]
+            same = neighbors.of(groups, rows) == groups[rows, None]
+            same &= neighbors.counted(rows)
+        else:
+            at = places[rows]
+            wanted = neighbors.indices[at].long() * width + groups[rows, None]
+            near = torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)
+            same = (keys[near] == wanted) & neighbors.counted(at)
         order = same.byte().argsort(dim=1, descending=True, stable=True)
-        near, same = neighbors.indices[rows].gather(1, order), same.gather(1, order)
+        near, same = near.gather(1, order), same.gather(1, order)
         indices[rows] = torch.where(same, near, near[:, :1]).numpy(force=True)
         valid[rows] = same.numpy(force=True)
 
@@ -160,10 +224,7 @@ def search_nearest(
     nearest = np.full(len(queries), -1)
     if len(points) == 0 or len(queries) == 0:
         return nearest
-    order = canonical_order(points).numpy()
-    is_first = np.ones(len(points), dtype=bool)
-    is_first[1:] = (points[order[1:]] != points[order[:-1]]).any(axis=1)
-    first = order[is_first]
+    first = distinct_rows(as_tensor("search_nearest", "points", points)).numpy()
     tree = cKDTree(points[first], balanced_tree=False, compact_nodes=False)
     # Those close to each other find the same parts of the tree in the cache.
     asked = canonical_order(queries).numpy()
@@ -212,9 +273,8 @@ def _search_cloud(
     from scipy.spatial import cKDTree
 
     k = indices.shape[1]
-    is_first = np.ones(len(points), dtype=bool)
-    is_first[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in points.T])
-    starts = np.flatnonzero(is_first)
+    columns = as_tensor("search_knn", "points", points).unbind(dim=1)
+    starts = np.flatnonzero(mark_first(*columns).numpy())
     counts = np.diff(starts, append=len(points))
     places = points[starts].astype(np.float64)
 

@@ -104,21 +104,3 @@ def cell_keys(cells: Sequence[Tensor]) -> Tensor:
         keys = keys.mul(count).add_(number)
         num_keys *= count
     return keys
-
-
-def restore_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
-    """Give each point the value of its voxel, shape ``(N, ...)``.
-
-    ``values`` has a row for each voxel, ``inverse`` ``(N,)`` the voxel of each point. Points of a
-    negative one, which have no voxel, get ``fill``; for labels :data:`torchrg.UNLABELED`.
-
-    Example:
-        >>> restore_points(torch.tensor([7, 8]), torch.tensor([1, -1, 0, 1]), fill=-1).tolist()
-        [8, -1, 7, 8]
-    """
-    has_voxel = inverse >= 0
-    if bool(has_voxel.all()):
-        return values.index_select(0, inverse)
-    result = values.new_full((len(inverse), *values.shape[1:]), fill)
-    result[has_voxel] = values[inverse[has_voxel]]
-    return result

@@ -32,7 +32,7 @@ from torchrg._checks import as_tensor, check_points, of_clouds
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows, restore_rows, search_knn
+from torchrg.neighbors import check_neighbors, distinct_points, search_knn
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
@@ -101,12 +101,14 @@ def estimate_normals(
         ``irls`` assumes. With the covariance ``C`` of the points of the fit, its eigenvalues ``l``
         and eigenvectors ``v``, ``dn = sum_j v_j (v_j . dC n) / (l_0 - l_j)``. ``jet`` adds the
         gradient of its least squares, ``irls`` that of each of its steps; ``consensus`` has none.
+        They flow to one of several copies of a point, the first.
 
     Args:
         points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
         config: Settings, a dictionary of them, a whole configuration, or the name of a preset.
             Default: that of :func:`torchrg.load_config`.
-        neighbors: Neighbours found before, for finite points. Default: searched.
+        neighbors: Neighbours found before, for finite points, the point itself first. Default:
+            searched among distinct points, and copies of a point have its result.
         max_distance: As of :func:`torchrg.search_knn`.
         chunk_size: Points handled at a time; bounds memory, changes no result.
         **changes: Single settings, as in ``method="pca", k=20``: see
@@ -141,13 +143,12 @@ def estimate_normals(
             f"them, got {settings.method!r}; choose one, or pass points.detach()."
         )
     if neighbors is not None:
+        check_neighbors("estimate_normals", neighbors, tensor)
         return estimate(tensor, neighbors, settings, chunk_size)
-    rows = finite_rows(tensor)
-    cloud = tensor[rows]
-    if len(cloud) == 0:
+    distinct = distinct_points(tensor)
+    size = min(settings.k, len(distinct.points))
+    if size == 0:
         neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=tensor.device))
     else:
-        size = min(settings.k, len(cloud))
-        neighbors = search_knn(cloud, size, max_distance=max_distance, canonical=True)
-    fit = estimate(cloud, neighbors, settings, chunk_size)
-    return fit.each(lambda values: restore_rows(values, rows, len(tensor)))
+        neighbors = search_knn(distinct.points, size, max_distance=max_distance, canonical=True)
+    return estimate(distinct.points, neighbors, settings, chunk_size).each(distinct.restore)

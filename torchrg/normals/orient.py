@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
-from torchrg._parallel import CHUNK_SIZE, map_chunks, sequential_operations
+from torchrg._parallel import CHUNK_SIZE, map_chunks, places_of, sequential_operations
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows, gather_patches, search_knn
+from torchrg.neighbors import check_neighbors, distinct_points, gather_patches, search_knn
 from torchrg.structures import Neighbors
 
 Orientation = Literal["viewpoint", "+x", "-x", "+y", "-y", "+z", "-z", "consistent", "interior"]
@@ -107,9 +107,10 @@ def orient_normals(
       from outside is turned inwards, as a room would be: use ``"consistent"`` for it.
 
     Convention:
-        The result does not depend on the signs that came in, nor on the order of the points. A
-        normal for which neither sign is right (at right angles to the axis, say) gets the one that
-        makes the first of z, y, x that is not zero positive.
+        The result does not depend on the signs that came in, nor on the order of the points. Copies
+        of a point count once, and look to one side. A normal for which neither sign is right (at
+        right angles to the axis, say) gets the one that makes the first of z, y, x that is not zero
+        positive.
 
     Args:
         points: Points, shape ``(N, 3)``.
@@ -158,22 +159,26 @@ def orient_normals(
     upright = _upright(vectors)
     turn = _turn_outwards if towards == "consistent" else _turn_inside
     if neighbors is not None:
+        check_neighbors("orient_normals", neighbors, cloud)
         signs = turn(cloud, upright.detach().to(cloud.dtype), neighbors)
         return upright * signs[:, None].to(vectors.dtype)
-    rows = finite_rows(cloud)
-    rows = rows[(upright[rows] != 0).any(dim=-1)]
-    if len(rows) == 0:
+    usable = places_of((upright != 0).any(dim=-1) & cloud.isfinite().all(dim=-1))
+    if len(usable) == 0:
         return upright
-    spreads = _evenly_spread(len(rows)).to(rows.device)
-    spreading, following = rows[spreads], rows[~spreads]
-    places, units = cloud[spreading], upright[spreading].detach().to(cloud.dtype)
-    near = search_knn(places, min(NUM_NEIGHBORS, len(places)), canonical=True)
-    oriented = units * turn(places, units, near)[:, None]
-    turned = upright.index_copy(0, spreading, oriented.to(vectors.dtype))
-    if len(following) == 0:
-        return turned
-    signs = _follow(cloud, upright, following, places, oriented)
-    return turned.index_copy(0, following, upright[following] * signs[:, None].to(vectors.dtype))
+    distinct = distinct_points(cloud[usable], upright[usable].detach().unbind(dim=-1))
+    places, units = distinct.points, upright[usable][distinct.rows].detach().to(cloud.dtype)
+    spreads = _evenly_spread(len(places)).to(places.device)
+    sources = places[spreads]
+    near = search_knn(sources, min(NUM_NEIGHBORS, len(sources)), canonical=True)
+    oriented = units[spreads] * turn(sources, units[spreads], near)[:, None]
+    sides = units.index_copy(0, places_of(spreads), oriented)
+    following = places_of(~spreads)
+    if len(following):
+        signs = _follow(places, units, following, sources, oriented)
+        sides = sides.index_copy(0, following, units[following] * signs[:, None])
+    # Copies of a point look to the side of the one that stands for them.
+    directions = upright.detach().index_copy(0, usable, distinct.restore(sides).to(vectors.dtype))
+    return turn_towards(vectors, directions)
 
 
 def _evenly_spread(num_points: int) -> Tensor:

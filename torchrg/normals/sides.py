@@ -7,8 +7,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._parallel import places_of
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows
+from torchrg.neighbors import distinct_rows
 from torchrg.normals.orient import Orientation, orient_normals, turn_towards
 from torchrg.structures import Cloud
 
@@ -82,19 +83,21 @@ def _to_front(cloud: Cloud, normals: Tensor) -> Tensor:
     from scipy.spatial import cKDTree
 
     points, front = cloud.points, torch.from_numpy(cloud.front).to(normals)
-    rows = finite_rows(points)
-    rows = rows[(normals[rows] != 0).any(dim=-1)]
-    is_known = (front[rows] != 0).any(dim=-1)
-    seeing, lost = rows[is_known], rows[~is_known]
-    turned = turn_towards(normals, front)
-    if len(lost) > _FEW * len(rows):
+    turned, is_known = turn_towards(normals, front), (front != 0).any(dim=-1)
+    has_normal = (normals != 0).any(dim=-1)
+    lost = places_of(has_normal & ~is_known & points.isfinite().all(dim=-1))
+    if len(lost) == 0:
+        return turned
+    # Copies with one normal and one front count once.
+    rows = distinct_rows(points, *turned.unbind(dim=-1), *front.unbind(dim=-1))
+    rows = rows[has_normal[rows]]
+    seeing = rows[is_known[rows]]
+    if len(rows) - len(seeing) > _FEW * len(rows):
         inside = orient_normals(points, normals, towards="interior")
         return turned.index_copy(0, lost, inside[lost])
-    if len(lost):
-        tree, places = cKDTree(points[seeing].numpy()), points[lost].numpy()
-        distance, _ = tree.query(places)
-        # All that are as near, so that their order does not matter.
-        near = tree.query_ball_point(places, distance * _AS_NEAR)
-        looks = torch.stack([turned[seeing[rows]].sum(dim=0) for rows in near])
-        turned = turned.index_copy(0, lost, turn_towards(normals[lost], looks))
-    return turned
+    tree, places = cKDTree(points[seeing].numpy()), points[lost].numpy()
+    distance, _ = tree.query(places)
+    # All that are as near, so that their order does not matter.
+    near = tree.query_ball_point(places, distance * _AS_NEAR)
+    looks = torch.stack([turned[seeing[rows]].sum(dim=0) for rows in near])
+    return turned.index_copy(0, lost, turn_towards(normals[lost], looks))

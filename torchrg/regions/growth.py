@@ -19,7 +19,7 @@ from torchrg._parallel import (
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import ascending_rows, canonical_order, measure_sampling
+from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
@@ -70,7 +70,9 @@ def grow_regions(
         points: Finite points, shape ``(N, 3)``.
         normals: Unit normals, shape ``(N, 3)``; their sign only matters with ``signed_normals``.
         curvature: Surface variation, shape ``(N,)``.
-        neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them.
+        neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them: the point
+            itself first. Copies of points are neighbors there, so leave them out before the search
+            (:func:`torchrg.neighbors.distinct_points`), as :func:`torchrg.segment_planes` does.
         config: Settings, a dictionary of them, a whole configuration, or the name of a preset.
             Default: that of :func:`torchrg.load_config`, which needs ``residual_rms``.
         valid: Points that have a normal, shape ``(N,)``, bool; no region passes through others, nor
@@ -99,9 +101,10 @@ def grow_regions(
         smoothness constraint. ISPRS Commission V Symposium, 2006.
 
     Example:
+        >>> from torchrg import search_knn
         >>> points = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
         >>> normals, curvature = torch.eye(3)[[2] * 16], torch.zeros(16)
-        >>> neighbors = Neighbors(torch.arange(16).expand(16, 16))
+        >>> neighbors = search_knn(points, 16)
         >>> labels = grow_regions(
         ...     points, normals, curvature, neighbors, GrowingConfig(min_size=9),
         ...     residual_rms=torch.zeros(16),
@@ -177,18 +180,12 @@ def checked_cloud(
         points=(points, "N 3"),
         normals=(normals, "N 3"),
         curvature=(curvature, "N"),
-        neighbors=(neighbors.indices, "N K"),
-        neighbors_valid=(neighbors.valid, "N K"),
         valid=(valid, "N"),
     )
     check_floating(caller, points=points, normals=normals, curvature=curvature)
+    check_neighbors(caller, neighbors, points)
     if valid is not None and valid.dtype != torch.bool:
         raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
-    if neighbors.indices.device != points.device:
-        raise ShapeError(
-            f"{caller}: expected points and neighbors on one device, got {points.device} and "
-            f"{neighbors.indices.device}."
-        )
     reach = None
     if config.plane_reach is not None:
         if residual_rms is None:
@@ -265,6 +262,21 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     numbers = np.full(num + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
     return torch.from_numpy(np.repeat(numbers[of_run], lengths)).to(regions.device)
+
+
+def number_by_count(labels: Tensor) -> Tensor:
+    """Return new numbers of regions, by their points: descending, equal counts in their order.
+
+    ``labels`` ``(N,)`` are those of points, -1 for none. The last of the numbers ``(M + 1,)`` is
+    that of -1, so that they can be indexed by labels.
+
+    Example:
+        >>> number_by_count(torch.tensor([0, 1, 1, -1])).tolist()
+        [1, 0, -1]
+    """
+    counts = torch.bincount(labels + 1, minlength=1)[1:]
+    numbers = counts.argsort(descending=True, stable=True).argsort()
+    return torch.cat([numbers, numbers.new_tensor([UNLABELED])])
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:

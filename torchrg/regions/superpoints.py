@@ -17,8 +17,10 @@ from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_chunks, places_of
 from torchrg.config import SuperpointsConfig
 from torchrg.linalg import sq_chords
-from torchrg.neighbors import finite_rows, restore_rows, search_knn
+from torchrg.linalg.moments import reduce_runs
+from torchrg.neighbors import DistinctPoints, distinct_points, finite_rows, search_knn
 from torchrg.regions.adjacency import NUM_CONTACTS, NearestPoints
+from torchrg.regions.growth import number_by_count
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
 _NUM_NEIGHBORS = 1 + NUM_CONTACTS
@@ -88,8 +90,8 @@ def partition_points(
     larger one that is theirs: this needs no order of visits.
 
     ``labels`` ``(N,)`` are those of planes, negative for none. Of a mesh with ``faces`` ``(F, 3)``
-    contacts are its edges, else those of a point to the 8 nearest: ``neighbors`` of the finite
-    points in canonical order are searched unless they are given, and no two points are equal.
+    contacts are its edges, else those of a point to the 8 nearest: ``neighbors`` of the distinct
+    finite points in canonical order, searched by default.
 
     References:
         [1] H. Knutsson. Representing local structure using tensors. SCIA, 1989.
@@ -105,31 +107,49 @@ def partition_points(
         [7] J. Walczak et al. Normal grouping density separation (NGDS): a novel object-driven
         indoor point cloud partition method. ICCS, 2020.
     """
-    rows = finite_rows(points)
-    ordered = points[rows].detach()
-    is_first = torch.ones(len(rows), dtype=torch.bool, device=points.device)
-    is_first[1:] = (ordered[1:] != ordered[:-1]).any(dim=1)
-    place = is_first.cumsum(0) - 1
-    distinct = rows[is_first]
+    distinct, shades = merge_copies(points, normals, labels, colors)
     edges = None
     if faces is not None:
-        edges = _mesh_edges(faces.cpu(), restore_rows(place, rows, len(points), fill=-1).cpu())
-    if neighbors is not None and not bool(is_first.all()):
-        neighbors = None
+        edges = _mesh_edges(faces.cpu(), distinct.inverse.cpu())
     partitions = _partition_places(
-        ordered[is_first].cpu(),
-        normals[distinct].detach().cpu(),
-        labels[distinct].cpu(),
+        distinct.points.detach().cpu(),
+        normals[distinct.rows].detach().cpu(),
+        labels[distinct.rows].cpu(),
         config,
-        None if colors is None else _unit_colors(colors[distinct]).cpu(),
+        None if shades is None else shades.cpu(),
         edges,
         neighbors,
     )
-    levels = tuple(
-        restore_rows(level.to(place.device)[place], rows, len(points), fill=UNLABELED)
-        for level in (_by_size(level, place.cpu()) for level in partitions)
+    levels = []
+    for level in partitions:
+        of_points = distinct.restore(level.to(points.device), fill=UNLABELED)
+        levels.append(number_by_count(of_points)[of_points])
+    return Superpoints(levels[0], main_planes(levels[0], labels), tuple(levels[1:]))
+
+
+def merge_copies(
+    points: Tensor, normals: Tensor, labels: Tensor, colors: Tensor | None
+) -> tuple[DistinctPoints, Tensor | None]:
+    """Return the distinct points of a cloud, and their colors in [0, 1], float64.
+
+    Of copies with other values the one on the largest plane stands for all. Their color is halfway
+    between the least and the largest of each channel, in whatever order they come.
+    """
+    last = torch.iinfo(labels.dtype).max
+    ties = labels.where(labels >= 0, last), *normals.detach().unbind(dim=1)
+    distinct = distinct_points(points, ties)
+    if colors is None:
+        return distinct, None
+    shades = _unit_colors(colors)
+    if not distinct.num_copies:
+        return distinct, shades[distinct.rows]
+    rows = finite_rows(points)
+    counts, columns = torch.bincount(distinct.inverse[rows]), shades[rows].unbind(dim=1)
+    low, high = (
+        torch.stack([reduce_runs(column, counts, side) for column in columns], dim=1)
+        for side in ("min", "max")
     )
-    return Superpoints(levels[0], main_planes(levels[0], labels), levels[1:])
+    return distinct, (low + high) / 2
 
 
 def _partition_places(
@@ -535,14 +555,6 @@ def _unit_colors(colors: Tensor) -> Tensor:
     """Return colours in [0, 1], float64, those that are not finite black."""
     largest = 1.0 if colors.is_floating_point() else float(torch.iinfo(colors.dtype).max)
     return (colors.detach().double() / largest).nan_to_num(0.0, 0.0, 0.0)
-
-
-def _by_size(regions: Tensor, place: Tensor) -> Tensor:
-    """Number regions of places by descending number of points, ties by their first points."""
-    if len(regions) == 0:
-        return regions
-    counts = torch.bincount(regions[place])
-    return counts.argsort(descending=True, stable=True).argsort()[regions]
 
 
 def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:

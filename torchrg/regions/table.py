@@ -14,12 +14,13 @@ from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._optional import require
 from torchrg._parallel import map_tasks, places_of
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments, reduce_runs
+from torchrg.neighbors import distinct_rows, mark_first
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
-from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes
+from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes, Rows
 
 _TIE = 1e-9
 """Rectangles whose areas differ by less than this share are equal but for rounding."""
@@ -83,8 +84,12 @@ def summarize_planes(
     neighbors: Neighbors | None = None,
     up: Sequence[float] | str | None = None,
     outline: bool = False,
+    canonical: bool = False,
 ) -> Planes:
     """Fit a plane to each region and measure it.
+
+    Copies of a point in one region count once, except in ``count``. The table does not depend on
+    the order of the points, but for which planes meet, which the neighbors say.
 
     Args:
         points: Points, shape ``(N, 3)``; those without a label may hold anything.
@@ -95,9 +100,11 @@ def summarize_planes(
         up: The upward direction, to tell floors, ceilings and walls: three numbers, or an axis such
             as ``"z"`` or ``"-y"``.
         outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
+        canonical: Whether the points already are finite and in canonical order, copies of one
+            region side by side; saves a sort.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is not as above, or a labeled point is not finite.
         ConfigError: If ``up`` is not a direction.
         MissingDependencyError: If outlines are asked for and shapely is not installed.
 
@@ -115,9 +122,11 @@ def summarize_planes(
         "summarize_planes", points=(points, "N 3"), normals=(normals, "N 3"), labels=(labels, "N")
     )
     check_floating("summarize_planes", points=points, normals=normals)
-    segments = Segments(labels)
-    fit = fit_planes(segments, points, normals)
-    planes = measure_planes(segments, points, fit, outline=outline)
+    rows = _distinct_members(points, labels, canonical=canonical)
+    segments, places = Segments(labels[rows]), points[rows]
+    fit = fit_planes(segments, places, normals[rows])
+    planes = measure_planes(segments, places, fit, outline=outline)
+    planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
         planes = replace(planes, kind=classify_planes(planes, _direction(up, points)))
     if neighbors is not None:
@@ -128,6 +137,21 @@ def summarize_planes(
         lengths, angles = lengths.to(points.dtype), angles.to(points.dtype)
         planes = replace(planes, adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
     return planes
+
+
+def _distinct_members(points: Tensor, labels: Tensor, *, canonical: bool) -> Rows:
+    """Return the rows of the distinct points of each region, in canonical order."""
+    if canonical:
+        is_first = mark_first(*points.unbind(dim=1), labels)
+        return slice(None) if bool(is_first.all()) else places_of(is_first)
+    members = places_of(labels >= 0)
+    num_bad = int(torch.count_nonzero(~points[members].isfinite().all(dim=1)))
+    if num_bad:
+        raise ShapeError(
+            f"summarize_planes: expected finite points in regions, got {num_bad:,} that are not; "
+            "label them -1."
+        )
+    return members[distinct_rows(points[members], labels[members])]
 
 
 def measure_planes(

@@ -21,11 +21,12 @@ from torchrg.config import (
     settings_of,
 )
 from torchrg.errors import ConfigError
-from torchrg.neighbors import finite_rows, restore_rows
+from torchrg.neighbors import distinct_points
 from torchrg.normals import estimate_normals, orient_normals
-from torchrg.normals.orient import NUM_NEIGHBORS, Orientation
+from torchrg.normals.orient import NUM_NEIGHBORS, Orientation, turn_towards
 from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
+from torchrg.regions.growth import number_by_count
 from torchrg.structures import UNLABELED
 from torchrg.transforms.rows import Sample, rows_of_clouds
 from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
@@ -65,12 +66,11 @@ class EstimateNormals(CloudTransform):
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return normals and curvature of a cloud."""
-        rows = finite_rows(cloud["coord"])
-        points = cloud["coord"][rows]
-        neighbors = search(points, self.config.k)
+        distinct = distinct_points(cloud["coord"])
+        neighbors = search(distinct.points, self.config.k)
         fit = estimate_normals(
-            points, self.config, neighbors=neighbors, chunk_size=self.chunk_size
-        ).each(lambda values: restore_rows(values, rows, len(cloud["coord"])))
+            distinct.points, self.config, neighbors=neighbors, chunk_size=self.chunk_size
+        ).each(distinct.restore)
         added = {"normal": fit.normals, "curvature": fit.curvature}
         return {**added, "residual": fit.residual_rms} if self.residual else added
 
@@ -140,12 +140,12 @@ class OrientNormals(CloudTransform):
             viewpoint = points.new_tensor(self.viewpoint)
         is_all = bool((normals != 0).any(dim=1).all() & points.isfinite().all())
         if search.known and is_all and self.towards in ("interior", "consistent"):
-            rows = finite_rows(points)
-            near = search(points[rows], NUM_NEIGHBORS)
+            distinct = distinct_points(points, normals.unbind(dim=1))
+            near = search(distinct.points, NUM_NEIGHBORS)
             turned = orient_normals(
-                points[rows], normals[rows], towards=self.towards, neighbors=near
+                distinct.points, normals[distinct.rows], towards=self.towards, neighbors=near
             )
-            return {"normal": restore_rows(turned, rows, len(points))}
+            return {"normal": turn_towards(normals, distinct.restore(turned))}
         turned = orient_normals(points, normals, towards=self.towards, viewpoint=viewpoint)
         return {"normal": turned}
 
@@ -191,23 +191,23 @@ class GrowRegions(CloudTransform):
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the plane labels of a cloud."""
-        points = cloud["coord"]
-        rows = finite_rows(points)
-        finite = points[rows]
-        if len(finite) == 0:
-            return {"plane": torch.full((len(points),), UNLABELED, device=points.device)}
-        read = {name: values[rows].to(points.dtype) for name, values in cloud.items()}
+        distinct = distinct_points(cloud["coord"], cloud["normal"].unbind(dim=1))
+        points = distinct.points
+        if len(points) == 0:
+            return {"plane": torch.full_like(distinct.inverse, UNLABELED)}
+        read = {name: values[distinct.rows].to(points.dtype) for name, values in cloud.items()}
         grown = grow_regions(
-            finite,
+            points,
             read["normal"],
             read["curvature"],
-            search(finite, self.k),
+            search(points, self.k),
             self.config,
             valid=(read["normal"] != 0).any(dim=-1),
             residual_rms=read.get("residual"),
             canonical=True,
         )
-        return {"plane": restore_rows(grown, rows, len(points), fill=UNLABELED)}
+        plane = distinct.restore(grown, fill=UNLABELED)
+        return {"plane": number_by_count(plane)[plane]}
 
     def extra_repr(self) -> str:
         """Return the settings."""
@@ -241,7 +241,7 @@ class SegmentPlanes(CloudTransform):
         """Return plane labels, normals and curvature of a cloud."""
         seg = segment_planes(cloud["coord"], self.config, keep_neighbors=self.keep_neighbors)
         if seg.neighbors is not None:
-            search.remember(cloud["coord"][finite_rows(cloud["coord"])], seg.neighbors)
+            search.remember(distinct_points(cloud["coord"]).points, seg.neighbors)
         return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
 
 
@@ -283,7 +283,7 @@ class MakeSuperpoints(CloudTransform):
         """Return the superpoints of a cloud."""
         colors = None if self.white is None else cloud["color"].double() / self.white
         points, plane = cloud["coord"], cloud["plane"].reshape(-1)
-        near = search.recall(points[finite_rows(points)]) if search.known else None
+        near = search.recall(distinct_points(points).points) if search.known else None
         partition = partition_points(
             points, cloud["normal"], plane, self.config, colors, neighbors=near
         )

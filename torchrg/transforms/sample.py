@@ -180,7 +180,7 @@ class NeighborSearch:
     :func:`torchrg.datasets.collate_offset` leaves it out, torch's refuses it.
 
     Args:
-        known: Finite points of clouds in canonical order, and their neighbours.
+        known: Distinct finite points of clouds in canonical order, and their neighbours.
     """
 
     def __init__(self, known: Sequence[tuple[Tensor, Neighbors]] = ()) -> None:
@@ -188,7 +188,7 @@ class NeighborSearch:
         self.used: list[tuple[Tensor, Neighbors]] = []
 
     def __call__(self, points: Tensor, k: int) -> Neighbors:
-        """Return the ``k`` nearest neighbours of finite points in canonical order."""
+        """Return the ``k`` nearest neighbours of distinct points in canonical order."""
         k = min(k, len(points))
         neighbors = self.recall(points, k)
         if neighbors is None:
@@ -198,7 +198,7 @@ class NeighborSearch:
         return Neighbors(neighbors.indices[:, : max(k, 1)])
 
     def recall(self, points: Tensor, k: int = 1) -> Neighbors | None:
-        """Return what is known of finite points in canonical order; None of fewer than ``k``."""
+        """Return what is known of distinct points in canonical order; None of fewer than ``k``."""
         for others, neighbors in self.known:
             is_same = others.dtype == points.dtype and others.device == points.device
             if is_same and neighbors.indices.shape[1] >= k and torch.equal(others, points):
@@ -207,7 +207,7 @@ class NeighborSearch:
         return None
 
     def remember(self, points: Tensor, neighbors: Neighbors) -> None:
-        """Keep the neighbours of finite points in canonical order."""
+        """Keep the neighbours of distinct points in canonical order."""
         self.used.append((points.detach(), neighbors))
 
 
