@@ -199,7 +199,13 @@ def _segment(
     of_points = restore_points(labels, part_of, fill=UNLABELED)
     numbers = number_by_count(of_points)
     labels, of_points = numbers[labels], numbers[of_points]
-    describe = partial(summarize_planes, up=config.planes.up, outline=config.planes.outline)
+    growing = config.growing
+    describe = partial(
+        summarize_planes,
+        up=config.planes.up,
+        outline=config.planes.outline,
+        facet_tolerance=growing.facet_tolerance if growing.faceted is True else None,
+    )
     planes = describe(places[parts], normals, labels, neighbors=around, canonical=True)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     normals, curvature, sharp, valid = (

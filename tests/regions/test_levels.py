@@ -8,6 +8,7 @@ import torch
 
 from tests.regions.test_refine import flat_cloud, scattered, with_settings
 from torchrg import load_config, segment_planes
+from torchrg.regions import summarize_planes
 from torchrg.regions.fit import fit_regions
 from torchrg.regions.levels import split_levels
 from torchrg.regions.repair import assign_levels, refine_regions
@@ -139,6 +140,15 @@ def test_points_decide_whether_a_faceted_region_is_flat(radius, curved):
     for faceted, expected in ((True, curved), (False, True), ("auto", True)):
         config = dataclasses.replace(CONFIG, faceted=faceted)
         assert fit_regions(cloud, labels, config).curved.tolist() == [expected]
+
+
+@pytest.mark.parametrize(("tolerance", "curved"), [(None, True), (0.005, False)])
+def test_the_table_calls_a_faceted_face_a_plane(tolerance, curved):
+    points, normals = (torch.from_numpy(each) for each in bumpy(np.random.default_rng(8), 1e9))
+    labels = torch.zeros(len(points), dtype=torch.int64)
+    table = summarize_planes(points, normals, labels, up="z", facet_tolerance=tolerance)
+    assert table.curved.tolist() == [curved]
+    assert table.rms.item() == pytest.approx(0.006, rel=0.1)
 
 
 def test_distance_decides_what_a_faceted_face_absorbs():

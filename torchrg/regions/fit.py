@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_tasks
-from torchrg.config import GrowingConfig
+from torchrg.config import Auto, GrowingConfig
 from torchrg.linalg import coordinate_resolution, eigh3_of_few
 from torchrg.linalg.moments import Segments
 from torchrg.regions.edges import GrowingCloud, neighborhood_radii
@@ -104,6 +104,13 @@ class RegionPlanes(NamedTuple):
     def times_thickness(self, factor: float) -> Tensor:
         """Return a distance from each plane ``(M,)``: NaN, no distance at all, if it is curved."""
         return torch.where(self.curved, torch.nan, factor * self.thickness)
+
+    def flattened(self, facet_tolerance: float | Auto | None) -> "RegionPlanes":
+        """Return the planes with no region curved whose points lie within 1.5 facet tolerances."""
+        if facet_tolerance is None:
+            return self
+        limit = _MAX_FACET_RMS * float(facet_tolerance)
+        return self._replace(curved=self.curved & (self.rms > limit))
 
     def distances(self, points: Tensor, regions: Tensor) -> Tensor:
         """Return the distance of each point ``(n, 3)`` from the plane of a region ``(n,)``."""
@@ -217,9 +224,8 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
         floor=floor,
         radius=radius,
     )
-    if config.faceted is True and facets:
-        on_plane = planes.rms <= _MAX_FACET_RMS * float(config.facet_tolerance or 0.0)
-        planes = planes._replace(curved=planes.curved & ~on_plane)
+    if config.faceted is True:
+        planes = planes.flattened(config.facet_tolerance)
     if cloud.reach is None:
         return planes
     reach = segments.median(segments.take(cloud.reach)).double()

@@ -14,6 +14,7 @@ from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._optional import require
 from torchrg._parallel import map_tasks, places_of
+from torchrg.config import Auto
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import eigh3_of_few
 from torchrg.linalg.moments import Segments, reduce_runs
@@ -85,6 +86,7 @@ def summarize_planes(
     up: Sequence[float] | str | None = None,
     outline: bool = False,
     canonical: bool = False,
+    facet_tolerance: float | Auto | None = None,
 ) -> Planes:
     """Fit a plane to each region and measure it.
 
@@ -102,6 +104,8 @@ def summarize_planes(
         outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
         canonical: Whether the points already are finite and in canonical order, copies of one
             region side by side; saves a sort.
+        facet_tolerance: Of faces in facets, whose normals are spread, in the unit of the points:
+            regions within 1.5 of it, root mean square, are planes. Default: normals decide alone.
 
     Raises:
         ShapeError: If a shape or dtype is not as above, or a labeled point is not finite.
@@ -124,7 +128,7 @@ def summarize_planes(
     check_floating("summarize_planes", points=points, normals=normals)
     rows = _distinct_members(points, labels, canonical=canonical)
     segments, places = Segments(labels[rows]), points[rows]
-    fit = fit_planes(segments, places, normals[rows])
+    fit = fit_planes(segments, places, normals[rows]).flattened(facet_tolerance)
     planes = measure_planes(segments, places, fit, outline=outline)
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
