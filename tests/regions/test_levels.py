@@ -9,9 +9,10 @@ import torch
 from tests.regions.test_refine import flat_cloud, scattered, with_settings
 from torchrg import load_config, segment_planes
 from torchrg.regions import summarize_planes
+from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.fit import fit_regions
 from torchrg.regions.levels import split_levels
-from torchrg.regions.repair import assign_levels, refine_regions
+from torchrg.regions.repair import assign_levels, merge_coplanar, refine_regions
 
 CONFIG = with_settings(min_size=50, facet_tolerance=0.005)
 NOISE = 0.003
@@ -123,6 +124,19 @@ def test_pieces_of_one_face_keep_their_points():
     cloud, _ = flat_cloud(points)
     labels = (cloud.points[:, 0] > 1).long()
     assert torch.equal(assign_levels(cloud, labels, fit_regions(cloud, labels, CONFIG)), labels)
+
+
+def test_a_thick_region_across_a_step_does_not_join_its_sides():
+    points, on_board = wall_with_board(np.random.default_rng(11), 0.024)
+    cloud, order = flat_cloud(points)
+    labels = torch.from_numpy(on_board)[order].long()
+    x, y = (cloud.points[:, 0] - 1).abs(), (cloud.points[:, 1] - 0.5).abs()
+    labels[(y > 0.2) & (y < 0.3) & (x < 0.3)] = 2
+    planes = fit_regions(cloud, labels, CONFIG)
+    assert planes.rms[2] > 3 * planes.rms[:2].max()
+    contacts = NearestPoints(cloud.neighbors).contacts(labels)
+    found = merge_coplanar(labels, contacts, planes, tolerance=1.2)
+    assert len(torch.unique(found[labels < 2])) == 2
 
 
 def bumpy(rng, radius, count=4000):

@@ -225,8 +225,10 @@ def merge_coplanar(
 
     Two regions are merged when one plane explains both: the root mean square distance of either to
     the plane through both is at most ``tolerance`` times what it is to its own, or the floor of the
-    planes. Of the smaller one the larger one's noise counts if that is more: what noise breaks off
-    a face is thinner than the face, or curved. Otherwise curved regions have no plane.
+    planes. Merged regions count with the mean square of the distances in their parts, so that a
+    thick region across a step does not join its two sides. Of the smaller one the larger one's
+    noise counts if that is more: what noise breaks off a face is thinner than the face, or curved.
+    Otherwise curved regions have no plane.
 
     ``contacts`` are pairs of regions that touch ``(E, 2)``, and how many contacts each has, as
     :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. What is merged is one
@@ -363,7 +365,8 @@ def _joined(a: _Moments, b: _Moments) -> _Moments:
         spread = side.covariance + shift[:, :, None] * shift[:, None, :]
         covariance = covariance + share[:, :, None] * spread
     noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
-    return _Moments(weight, mean, covariance, torch.maximum(a.scale, b.scale), noise)
+    scale = (share_a[:, 0] * a.scale.square() + share_b[:, 0] * b.scale.square()).sqrt()
+    return _Moments(weight, mean, covariance, scale, noise)
 
 
 def _misfit(a: _Moments, b: _Moments) -> Tensor:
