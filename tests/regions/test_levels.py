@@ -9,8 +9,7 @@ import torch
 from tests.regions.test_refine import flat_cloud, scattered, with_settings
 from torchrg import load_config, segment_planes
 from torchrg.regions import summarize_planes
-from torchrg.regions.adjacency import NearestPoints
-from torchrg.regions.fit import fit_regions
+from torchrg.regions.fit import RegionPlanes, fit_regions
 from torchrg.regions.levels import split_levels
 from torchrg.regions.repair import assign_levels, merge_coplanar, refine_regions
 
@@ -126,17 +125,28 @@ def test_pieces_of_one_face_keep_their_points():
     assert torch.equal(assign_levels(cloud, labels, fit_regions(cloud, labels, CONFIG)), labels)
 
 
-def test_a_thick_region_across_a_step_does_not_join_its_sides():
-    points, on_board = wall_with_board(np.random.default_rng(11), 0.024)
-    cloud, order = flat_cloud(points)
-    labels = torch.from_numpy(on_board)[order].long()
-    x, y = (cloud.points[:, 0] - 1).abs(), (cloud.points[:, 1] - 0.5).abs()
-    labels[(y > 0.2) & (y < 0.3) & (x < 0.3)] = 2
-    planes = fit_regions(cloud, labels, CONFIG)
-    assert planes.rms[2] > 3 * planes.rms[:2].max()
-    contacts = NearestPoints(cloud.neighbors).contacts(labels)
-    found = merge_coplanar(labels, contacts, planes, tolerance=1.2)
-    assert len(torch.unique(found[labels < 2])) == 2
+def test_thick_regions_across_a_step_do_not_join_its_sides():
+    # A wall and a board 24 mm in front of it, each with a thick region of 200 points between them.
+    height = torch.tensor([0.0, 0.024, 0.006, 0.018], dtype=torch.float64)
+    rms = torch.tensor([0.003, 0.003, 0.011, 0.011], dtype=torch.float64)
+    count = torch.tensor([10_000, 10_000, 200, 200])
+    no, zero = torch.zeros(4, dtype=torch.bool), torch.zeros(4, dtype=torch.float64)
+    planes = RegionPlanes(
+        normal=torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(4, 3),
+        center=torch.stack([zero, zero, height], dim=1),
+        covariance=torch.diag_embed(torch.stack([zero + 0.1, zero + 0.1, rms**2], dim=1)),
+        thickness=rms,
+        rms=rms,
+        num_points=count,
+        curved=no,
+        floor=zero,
+        reach=zero + torch.inf,
+        bent=no,
+        radius=zero,
+    )
+    contacts = torch.tensor([[0, 1], [0, 2], [1, 3]]), torch.tensor([50, 50, 50])
+    found = merge_coplanar(torch.arange(4), contacts, planes, tolerance=1.2)
+    assert found.tolist() == [0, 1, 0, 1]
 
 
 def bumpy(rng, radius, count=4000):
