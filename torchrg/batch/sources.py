@@ -50,6 +50,8 @@ from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
+from torchrg.io.colors import narrow_colors, read_colors
+from torchrg.io.fields import Values
 from torchrg.io.npy import map_folder
 from torchrg.normals.sides import CloudOrientation, orient_cloud
 from torchrg.structures import Cloud, Segmentation
@@ -221,16 +223,17 @@ class FolderSource(CloudSource):
         cloud = read_cloud(first, columns=self.columns if takes_columns(first) else None)
         others = [name for name in cloud.fields if name != "color"]
         notes = (f"left out: {', '.join(others)}",) if others else ()
-        arrays = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
+        arrays = {n: narrow_colors(cloud.fields[n]) for n in cloud.fields.keys() & {"color"}}
         return Reading(cloud, arrays, notes=notes)
 
     def _read_scene(self, folder: Path) -> Reading:
         """Read a folder in Pointcept's layout."""
         sample, arrays = read_pointcept_scene(folder), map_folder(folder, _COPIED)
-        # Pointcept's colours are 0 to 255 in any type.
-        colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
-        cloud = Cloud(sample["coord"].numpy(), colors, source=str(folder))
-        return Reading(cloud, arrays, _dataset(arrays.keys()))
+        colors, notes = dict[str, Values](), tuple[str, ...]()
+        if "color" in arrays:
+            colors["color"], notes = read_colors(folder / "color.npy", arrays["color"])
+        cloud = Cloud(sample["coord"].numpy(), colors, source=str(folder), notes=notes)
+        return Reading(cloud, {**arrays, **colors}, _dataset(arrays.keys()))
 
 
 def _dataset(names: Collection[str]) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
+from torchrg.io.colors import BYTE, WORD, read_colors
 from torchrg.structures import UNLABELED, Cloud
 
 Values = NDArray[Any]
@@ -65,8 +66,6 @@ _UNIT_TOLERANCE = 2e-3
 """Most that the square of a unit vector's length differs from 1: 1e-3 of the length."""
 LARGEST_WHOLE = 2**53
 """float64, and so text, tells whole numbers below from all others; this may have been another."""
-WIDEN = 257
-"""65535 / 255: what eight bits become in sixteen, and back without loss."""
 
 
 def assemble_cloud(
@@ -77,10 +76,12 @@ def assemble_cloud(
     grid_shape: tuple[int, int] | None = None,
     header: Mapping[str, Any] | None = None,
     notes: tuple[str, ...] = (),
+    integers: Collection[str] = (),
 ) -> Cloud:
     """Build a cloud from columns by the file's own names.
 
     ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, where these are no columns.
+    ``integers`` are the columns that the file writes as integers, whatever their type is here.
     """
     remaining = dict(columns)
     if coordinates is None:
@@ -102,20 +103,35 @@ def assemble_cloud(
     else:
         places = remaining.pop(coordinates)
     points = checked_coordinates(path, places)
+    sources = _sources_of(remaining)
     fields = {
         name: _stacked(path, [remaining[column] for column in parts])
-        for name, parts in _sources_of(remaining).items()
+        for name, parts in sources.items()
     }
-    for name, check in (("labels", _labels), ("normals", _normals), ("color", _color)):
+    for name, check in (("labels", _labels), ("normals", _normals)):
         if name in fields:
             fields[name] = check(path, fields[name])
+    if "color" in fields:
+        color = fields["color"]
+        _check_triples(path, "color", color)
+        if set(integers).issuperset(sources["color"]) and are_whole(color):
+            color = color.astype(np.int64)
+        fields["color"], more = read_colors(path, color)
+        notes += more
     return Cloud(points, fields, grid_shape, str(path), header or {}, notes)
 
 
 def assemble_table(
-    path: Path, table: Values, names: Sequence[str] | None, notes: tuple[str, ...] = ()
+    path: Path,
+    table: Values,
+    names: Sequence[str] | None,
+    notes: tuple[str, ...] = (),
+    integers: Collection[int] = (),
 ) -> Cloud:
-    """Build a cloud from a table, shape ``(N, C)``, with names of its columns or by the rule."""
+    """Build a cloud from a table, shape ``(N, C)``, with names of its columns or by the rule.
+
+    ``integers`` are the columns that the file writes without a decimal point or an exponent.
+    """
     if names is None:
         _check_table(path, table)
         is_pts = path.suffix.lower() == ".pts"
@@ -126,7 +142,7 @@ def assemble_table(
                 "others, name them with --columns",
             )
     columns = {name: table[:, i] for i, name in enumerate(names) if name != LEFT_OUT}
-    return assemble_cloud(path, columns, notes=notes)
+    return assemble_cloud(path, columns, notes=notes, integers=[names[i] for i in integers])
 
 
 def checked_coordinates(path: Path, coordinates: Values) -> NDArray[np.floating]:
@@ -217,7 +233,11 @@ def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
     if num_columns not in _GUESSED_WIDTHS:
         return names
     starts = range(num_columns - 3 if color_last else 3, num_columns - 2)
-    triples = {i: triple for i in starts if (triple := _triple_by_values(rows[:, i : i + 3]))}
+    triples: dict[int, tuple[str, str, str]] = {}
+    for white in (BYTE, WORD):
+        for start in starts if not triples else ():
+            if triple := _triple_by_values(rows[:, start : start + 3], white):
+                triples[start] = triple
     if len(triples) == 1:
         ((start, triple),) = triples.items()
         names[start : start + 3] = triple
@@ -226,14 +246,16 @@ def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
     return names
 
 
-def _triple_by_values(three: Values) -> tuple[str, str, str] | None:
-    """Return the names of three columns, shape ``(n, 3)``, that can be a normal or a colour."""
+def _triple_by_values(three: Values, white: int) -> tuple[str, str, str] | None:
+    """Return the names of three columns, shape ``(n, 3)``, that can be a normal or a color."""
     squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
     # Unit vectors may be zero or not numbers where there is none.
     lengths = squares[np.isfinite(squares) & (squares != 0)]
     if len(lengths) and (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
         return ("nx", "ny", "nz")
-    if three.size == 0 or (three.min() >= 0 and three.max() <= 255 and are_whole(three)):
+    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= white and are_whole(three))
+    # Counts and numbers of objects are integers, too; colors of 16 bits use most of their range.
+    if is_color and (white == BYTE or three.max(axis=0).min() > BYTE):
         return ("red", "green", "blue")
     return None
 
@@ -371,32 +393,6 @@ def _normals(path: Path, normals: Values) -> NDArray[np.floating]:
     """Return normals as float32 or float64, shape ``(N, 3)``."""
     _check_triples(path, "normals", normals)
     return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
-
-
-def _color(path: Path, color: Values) -> Values:
-    """Return colours as uint8 0..255, shape ``(N, 3)``; uint16 where 8 bits do not hold them.
-
-    Floating-point colours are 0..1 if none is larger, otherwise 0..255.
-    """
-    _check_triples(path, "color", color)
-    if color.dtype == np.uint8 or color.size == 0:
-        return color.astype(np.uint8, copy=False)
-    is_float = color.dtype.kind == "f"
-    color = np.nan_to_num(color) if is_float else color
-    low, high = color.min(), color.max()
-    if low < 0 or high > (255 if is_float else 65535):
-        raise FormatError(
-            f"{path}: expected color in 0..255, got {low} to {high}; rename or remove that field."
-        )
-    if is_float:
-        rounded: Values = np.rint(color * 255 if high <= 1 else color).astype(np.uint8)
-        return rounded
-    if high <= 255:
-        return color.astype(np.uint8)
-    if (color % WIDEN).any():
-        return color.astype(np.uint16)
-    narrow: Values = (color // WIDEN).astype(np.uint8)
-    return narrow
 
 
 def _check_triples(path: Path, name: str, values: Values) -> None:

@@ -87,7 +87,8 @@ def partition_points(
     left. Regions that are each other's cheapest partner merge at a time, and small ones with a much
     larger one that is theirs: this needs no order of visits.
 
-    ``labels`` ``(N,)`` are those of planes, negative for none. Of a mesh with ``faces`` ``(F, 3)``
+    ``labels`` ``(N,)`` are those of planes, negative for none, ``colors`` ``(N, 3)`` are in [0, 1],
+    floating point and finite. Of a mesh with ``faces`` ``(F, 3)``
     contacts are its edges, else those of a point to the 8 nearest: ``neighbors`` of the finite
     points in canonical order are searched unless they are given, and no two points are equal.
 
@@ -121,7 +122,7 @@ def partition_points(
         normals[distinct].detach().cpu(),
         labels[distinct].cpu(),
         config,
-        None if colors is None else _unit_colors(colors[distinct]).cpu(),
+        None if colors is None else colors[distinct].detach().cpu(),
         edges,
         neighbors,
     )
@@ -529,12 +530,6 @@ def _merge(
         borders.difference,
     )
     return _joined(regions, new), merged, new
-
-
-def _unit_colors(colors: Tensor) -> Tensor:
-    """Return colours in [0, 1], float64, those that are not finite black."""
-    largest = 1.0 if colors.is_floating_point() else float(torch.iinfo(colors.dtype).max)
-    return (colors.detach().double() / largest).nan_to_num(0.0, 0.0, 0.0)
 
 
 def _by_size(regions: Tensor, place: Tensor) -> Tensor:

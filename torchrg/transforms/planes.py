@@ -281,7 +281,9 @@ class MakeSuperpoints(CloudTransform):
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the superpoints of a cloud."""
-        colors = None if self.white is None else cloud["color"].double() / self.white
+        colors = None
+        if self.white is not None:
+            colors = (cloud["color"].double() / self.white).nan_to_num(0, 0, 0)
         points, plane = cloud["coord"], cloud["plane"].reshape(-1)
         near = search.recall(points[finite_rows(points)]) if search.known else None
         partition = partition_points(
