@@ -357,8 +357,6 @@ def _unit_colors(
         return None
     shades = as_tensor(caller, "colors", colors).detach()
     check_shapes(caller, points=(points, "N 3"), colors=(shades, "N 3"))
-    if shades.dtype == torch.bool or shades.is_complex():
-        raise ShapeError(f"{caller}: expected colors of real numbers, got {shades.dtype}.")
     shades = shades.float() if shades.dtype == torch.bfloat16 else shades
     found, notes = read_colors(caller, shades.cpu().numpy(), error=ConfigError)
     for note in notes:

@@ -350,7 +350,8 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
         fields[name] = fields[name].astype(np.int64)
     notes: tuple[str, ...] = ()
     if "color" in fields:
-        fields["color"], notes = read_colors(folder / "color.npy", fields["color"])
+        color, notes = read_colors(folder / "color.npy", arrays["color"])
+        fields["color"] = color.reshape(-1, 3)
     coord = arrays["coord"]
     grid = coord.shape[:2] if coord.ndim == 3 else None
     cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder), notes=notes)

@@ -50,7 +50,7 @@ from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
-from torchrg.io.colors import narrow_colors, read_colors
+from torchrg.io.colors import read_colors
 from torchrg.io.fields import Values
 from torchrg.io.npy import map_folder
 from torchrg.normals.sides import CloudOrientation, orient_cloud
@@ -223,7 +223,7 @@ class FolderSource(CloudSource):
         cloud = read_cloud(first, columns=self.columns if takes_columns(first) else None)
         others = [name for name in cloud.fields if name != "color"]
         notes = (f"left out: {', '.join(others)}",) if others else ()
-        arrays = {n: narrow_colors(cloud.fields[n]) for n in cloud.fields.keys() & {"color"}}
+        arrays = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
         return Reading(cloud, arrays, notes=notes)
 
     def _read_scene(self, folder: Path) -> Reading:

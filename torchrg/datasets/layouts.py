@@ -27,7 +27,6 @@ from torchrg.datasets.pointcept import write_files
 from torchrg.datasets.s3dis import CLASS_ORDERS
 from torchrg.datasets.scannet import NYU_IDS
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.colors import narrow_colors
 from torchrg.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Planes, Superpoints
 
@@ -66,10 +65,9 @@ class LayoutScan:
         normal: Unit normals, shape ``(N, 3)``.
         superpoint: Superpoint of each point, shape ``(N,)``.
         plane: Plane of each point, -1 for none, shape ``(N,)``.
-        given: What else is known: ``color`` ``(N, 3)``, of 8 or 16 bits; ``segment20`` or
-            ``segment``, the class of each point, -1 for none, ``category``, its number in NYU40, 0
-            for none, and ``instance``, its object, -1 for none, each ``(N,)``;
-            ``axis_align_matrix`` ``(4, 4)``.
+        given: What else is known: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the
+            class of each point, -1 for none, ``category``, its number in NYU40, 0 for none, and
+            ``instance``, its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
         objects: What :func:`torchrg.datasets.scannet.read_objects` returns; None if unknown.
         coarser: Coarser levels of superpoints, each shape ``(N,)``.
     """
@@ -93,8 +91,8 @@ class LayoutScan:
 
     @property
     def color(self) -> NDArray[np.uint8]:
-        """Colors of 8 bits, black where there are none."""
-        return narrow_colors(self.given.get("color", np.zeros(self.coord.shape, np.uint8)))
+        """Colours, black where there are none."""
+        return self.given.get("color", np.zeros(self.coord.shape, np.uint8))
 
     @property
     def truth(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:

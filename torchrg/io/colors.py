@@ -73,6 +73,11 @@ def read_colors(
         ('color values beyond 0..1 are clipped: 1 of 6',)
     """
     notes, dtype, white = list[str](), color.dtype, None
+    if dtype.kind not in "fiu" or color.shape[-1:] != (3,):
+        raise error(
+            f"{owner}: expected color to be three real numbers a point, got shape {color.shape} of "
+            f"{dtype}; convert it, or rename or remove that field."
+        )
     if dtype.kind == "f":
         color = color.astype(np.float32) if dtype.itemsize < 4 else color
         if missing := _count(np.isnan(color)):

@@ -56,10 +56,10 @@ _GUESSED_ROWS = 1000
 """Rows from which the meaning of such columns is guessed."""
 COLUMNS_RULE = (
     "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
-    "a unit normal, or a colour of whole numbers from 0 to 255, where the first 1,000 rows fit. Of "
-    "seven, the same is asked of the last three and of the three before the last; if one of both "
-    "fits, it is taken, with intensity before a colour; in .pts, where colours come last, the last "
-    "three alone are asked. Any other column is column_4, column_5 and so on."
+    "a unit normal, or a color of integers from 0 to 255, else 65535, where the first 1,000 rows "
+    "fit. Of seven, the same is asked of the last three and of the three before the last; if one "
+    "of both fits, it is taken, with intensity before a color; in .pts, where colors come last, "
+    "the last three alone are asked. Any other column is column_4, column_5 and so on."
 )
 """How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3

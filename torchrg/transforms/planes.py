@@ -21,6 +21,7 @@ from torchrg.config import (
     settings_of,
 )
 from torchrg.errors import ConfigError
+from torchrg.io.colors import find_white
 from torchrg.neighbors import finite_rows, restore_rows
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import NUM_NEIGHBORS, Orientation
@@ -253,8 +254,8 @@ class MakeSuperpoints(CloudTransform):
 
     Args:
         config: Settings. Default: :class:`torchrg.config.SuperpointsConfig`.
-        white: Largest value of a colour, 255 or 1, to read ``color`` ``(N, 3)`` too. Default:
-            colours play no part.
+        white: Value of a full channel of colors, 255 or 1, to read ``color`` ``(N, 3)`` too.
+            Default: colors play no part.
         **changes: Single settings, as in ``strengths=2.0``.
 
     Example:
@@ -283,7 +284,14 @@ class MakeSuperpoints(CloudTransform):
         """Return the superpoints of a cloud."""
         colors = None
         if self.white is not None:
-            colors = (cloud["color"].double() / self.white).nan_to_num(0, 0, 0)
+            colors = cloud["color"].double().nan_to_num(0, 0, 0)
+            largest = find_white(colors.numpy(force=True))
+            if largest > self.white:
+                raise ConfigError(
+                    f"MakeSuperpoints: expected color in 0..{self.white:g}, got 0..{largest}; pass "
+                    f"white={largest}."
+                )
+            colors = colors / self.white
         points, plane = cloud["coord"], cloud["plane"].reshape(-1)
         near = search.recall(points[finite_rows(points)]) if search.known else None
         partition = partition_points(
