@@ -180,9 +180,10 @@ def test_colors_without_names_are_of_8_or_16_bits(tmp_path, suffix):
     for colors in (EIGHT, SIXTEEN):
         write_lines(path, colors, [], mark)
         assert read(path)[0] == colors.tolist()
-    # Numbers of objects, which are small in one column.
-    write_lines(path, SIXTEEN // [1, 1, 1000], [], mark)
-    assert "color" not in read_cloud(path).fields
+    # Numbers of objects, which are small in one column, or large in a later row.
+    for others in (SIXTEEN // [1, 1, 1000], changed(SIXTEEN, 65536)):
+        write_lines(path, others, [], mark)
+        assert "color" not in read_cloud(path).fields
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

@@ -26,10 +26,9 @@ def find_white(color: Array) -> int:
     """Return the value of a full channel by type and values: 1, 255 or 65535.
 
     Convention:
-        Integers are in 0..255, or in 0..65535 if more than a few are beyond 255. Floating-point
-        numbers are in 0..1 if most of them are and some are fractions, or if all but a few are 0
-        and 1; integers among them are as integers. Values that are black in every range do not
-        count.
+        Floating-point numbers are in 0..1 if most of them are and some are fractions, or if all
+        but a few are 0 or 1. Other numbers are in 0..255, or in 0..65535 if more than a few are
+        beyond 255. Values that are black in every range do not count.
 
     Args:
         color: Real numbers of any type and shape, without NaN.

@@ -48,6 +48,7 @@ _TRIPLES = {
     ("rf", "gf", "bf"): "color",
 }
 """torchrg's names by those of three columns, in lower case."""
+_COLOR = ("red", "green", "blue")
 _GUESSED_WIDTHS = (6, 7)
 """Columns of a table without names whose meaning the values tell."""
 LEFT_OUT = "_"
@@ -56,10 +57,11 @@ _GUESSED_ROWS = 1000
 """Rows from which the meaning of such columns is guessed."""
 COLUMNS_RULE = (
     "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
-    "a unit normal, or a color of integers from 0 to 255, else 65535, where the first 1,000 rows "
-    "fit. Of seven, the same is asked of the last three and of the three before the last; if one "
-    "of both fits, it is taken, with intensity before a color; in .pts, where colors come last, "
-    "the last three alone are asked. Any other column is column_4, column_5 and so on."
+    "a unit normal, or a color of integers from 0 to 255, where the first 1,000 rows fit; else a "
+    "color of integers from 0 to 65535, where all rows fit. Of seven, the same is asked of the "
+    "last three and of the three before the last; if one of both fits, it is taken, with intensity "
+    "before a color; in .pts, where colors come last, the last three alone are asked. Any other "
+    "column is column_4, column_5 and so on."
 )
 """How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3
@@ -135,7 +137,7 @@ def assemble_table(
     if names is None:
         _check_table(path, table)
         is_pts = path.suffix.lower() == ".pts"
-        names = names_by_rule(table[:_GUESSED_ROWS], color_last=is_pts)
+        names = names_by_rule(table, color_last=is_pts)
         if len(names) > 3:
             notes += (
                 f"its columns have no names and are taken as {' '.join(names)}; if they are "
@@ -216,8 +218,8 @@ def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[
     return notes
 
 
-def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
-    """Name the columns of a table by :data:`COLUMNS_RULE` from its first rows, shape ``(n, C)``.
+def names_by_rule(table: Values, *, color_last: bool = False) -> list[str]:
+    """Name the columns of a table by :data:`COLUMNS_RULE`, shape ``(N, C)``.
 
     Of seven columns of small whole numbers, programs mean ``intensity red green blue`` or ``red
     green blue label``; which of these is not told by values, so both keep their numbers.
@@ -226,18 +228,18 @@ def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
         >>> names_by_rule(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
         ['x', 'y', 'z', 'intensity', 'red', 'green', 'blue']
     """
-    num_columns = rows.shape[1]
+    num_columns = table.shape[1]
     names = ["x", "y", "z", *(f"column_{i}" for i in range(4, num_columns + 1))]
     if num_columns == 4:
         return [*names[:3], "intensity"]
     if num_columns not in _GUESSED_WIDTHS:
         return names
     starts = range(num_columns - 3 if color_last else 3, num_columns - 2)
-    triples: dict[int, tuple[str, str, str]] = {}
-    for white in (BYTE, WORD):
-        for start in starts if not triples else ():
-            if triple := _triple_by_values(rows[:, start : start + 3], white):
-                triples[start] = triple
+    threes = {i: table[:, i : i + 3] for i in starts}
+    first = {i: _triple_by_values(three[:_GUESSED_ROWS]) for i, three in threes.items()}
+    triples = {i: triple for i, triple in first.items() if triple}
+    if not triples:
+        triples = {i: _COLOR for i, three in threes.items() if _is_wide_color(three)}
     if len(triples) == 1:
         ((start, triple),) = triples.items()
         names[start : start + 3] = triple
@@ -246,18 +248,21 @@ def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
     return names
 
 
-def _triple_by_values(three: Values, white: int) -> tuple[str, str, str] | None:
+def _triple_by_values(three: Values) -> tuple[str, str, str] | None:
     """Return the names of three columns, shape ``(n, 3)``, that can be a normal or a color."""
     squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
     # Unit vectors may be zero or not numbers where there is none.
     lengths = squares[np.isfinite(squares) & (squares != 0)]
     if len(lengths) and (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
         return ("nx", "ny", "nz")
-    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= white and are_whole(three))
-    # Counts and numbers of objects are integers, too; colors of 16 bits use most of their range.
-    if is_color and (white == BYTE or three.max(axis=0).min() > BYTE):
-        return ("red", "green", "blue")
-    return None
+    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= BYTE and are_whole(three))
+    return _COLOR if is_color else None
+
+
+def _is_wide_color(three: Values) -> bool:
+    """Whether three columns can be a color of 16 bits, each of which is more than 8 hold."""
+    in_range = three.min() >= 0 and three.max() <= WORD and three.max(axis=0).min() > BYTE
+    return bool(in_range) and are_whole(three)
 
 
 def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
