@@ -61,11 +61,14 @@ def test_dip_is_that_of_a_compass(normal, dip, direction):
     points = grid @ torch.from_numpy(np.stack([x, y]))
     normals = torch.from_numpy(normal / np.linalg.norm(normal)).expand_as(points)
     planes = summarize_planes(points, normals, torch.zeros(len(points), dtype=torch.int64))
-    (row,) = describe_planes(planes)["planes"]
-    assert row["dip_deg"] == pytest.approx(dip, abs=1e-6)
-    if dip:
-        turn = (row["dip_direction_deg"] - direction + 180) % 360 - 180
-        assert turn == pytest.approx(0, abs=1e-6)
+    # Normals of depth images look at the camera, those of ceilings down.
+    turned = replace(planes, normal=-planes.normal, offset=-planes.offset)
+    for table in (planes, turned):
+        (row,) = describe_planes(table)["planes"]
+        assert row["dip_deg"] == pytest.approx(dip, abs=1e-6)
+        if dip:
+            turn = (row["dip_direction_deg"] - direction + 180) % 360 - 180
+            assert turn == pytest.approx(0, abs=1e-6)
 
 
 def test_the_outline_is_a_polygon_that_shapely_reads(square):

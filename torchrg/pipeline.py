@@ -1,5 +1,6 @@
 """From points to planes, and to superpoints: each in one function."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,8 @@ from torchrg._checks import (
 )
 from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
+from torchrg.io.colors import read_colors
 from torchrg.neighbors import (
     DistinctPoints,
     canonical_order,
@@ -298,9 +300,9 @@ def make_superpoints(
         seg: What :func:`segment_planes` said about them. Default: it is asked, with the preset
             ``consensus``.
         config: Settings, or a dictionary of them.
-        colors: Colours, shape ``(N, 3)``, integers up to the largest of their type, or floating in
-            [0, 1]. Copies of a point have one color, halfway between the least and the largest of
-            each channel. Default: they play no part.
+        colors: Colors, shape ``(N, 3)``, in 0..1, 0..255 or 0..65535, as
+            :func:`torchrg.io.colors.find_white` tells. Copies of a point have one color, halfway
+            between the least and the largest of each channel. Default: colors play no part.
         voxel: Side of voxels, in the unit of the cloud: the points that stand for voxels are
             partitioned, and every point is in the superpoint of its voxel. Sizes are counted in
             voxels then, and superpoints numbered by their number. Default: all points are.
@@ -312,7 +314,10 @@ def make_superpoints(
 
     Raises:
         ShapeError: If a shape or dtype is wrong, or ``seg`` is of another number of points.
-        ConfigError: If a setting is wrong.
+        ConfigError: If a setting is wrong, or if colors are in none of these ranges.
+
+    Warns:
+        UserWarning: If a range of colors is not the usual one of their type, or some are clipped.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -323,8 +328,7 @@ def make_superpoints(
     """
     tensor = as_tensor("make_superpoints", "points", points).detach()
     check_points("make_superpoints", tensor)
-    shades = None if colors is None else as_tensor("make_superpoints", "colors", colors)
-    check_shapes("make_superpoints", points=(tensor, "N 3"), colors=(shades, "N 3"))
+    shades = _unit_colors("make_superpoints", tensor, colors, num_decorators=2)
     seg = segment_planes(tensor, voxel=voxel, keep_neighbors=True) if seg is None else seg
     if len(seg.labels) != len(tensor):
         raise ShapeError(
@@ -350,6 +354,31 @@ def make_superpoints(
         for level in (partition.labels, *partition.levels)
     )
     return Superpoints(labels, partition.plane, tuple(levels))
+
+
+def _unit_colors(
+    caller: str,
+    points: Tensor,
+    colors: Tensor | NDArray[np.generic] | None,
+    *,
+    num_decorators: int,
+) -> Tensor | None:
+    """Return the colors of points in [0, 1], float64, for a function with so many decorators.
+
+    Warns:
+        UserWarning: The caller of that function, if the values decided their range, or some are
+            clipped.
+    """
+    if colors is None:
+        return None
+    shades = as_tensor(caller, "colors", colors).detach()
+    check_shapes(caller, points=(points, "N 3"), colors=(shades, "N 3"))
+    shades = shades.float() if shades.dtype == torch.bfloat16 else shades
+    found, notes = read_colors(caller, shades.cpu().numpy(), error=ConfigError)
+    for note in notes:
+        warnings.warn(f"{caller}: {note}.", stacklevel=3 + num_decorators)
+    unit = torch.from_numpy(found.astype(np.float64)) / np.iinfo(found.dtype).max
+    return unit.to(points.device)
 
 
 @of_clouds
@@ -404,8 +433,7 @@ def segment_mesh(
                 f"segment_mesh: expected faces of rows of {len(tensor):,} vertices, got {low:,} to "
                 f"{high:,}; number them from 0."
             )
-    shades = None if colors is None else as_tensor("segment_mesh", "colors", colors)
-    check_shapes("segment_mesh", vertices=(tensor, "V 3"), colors=(shades, "V 3"))
+    shades = _unit_colors("segment_mesh", tensor, colors, num_decorators=1)
     seg = segment_planes(tensor, config)
     parts = SuperpointsConfig(strengths=(_STRENGTH_OF_K * k_thresh,), min_size=seg_min_verts)
     return partition_points(tensor, seg.normals, seg.labels, parts, shades, corners).labels

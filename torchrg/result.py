@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchrg.errors import ShapeError
 from torchrg.io import atomic_path, read_cloud
+from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.fields import are_whole, put_results
 from torchrg.io.files import DAMAGES
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_beside
@@ -135,14 +136,17 @@ class Result:
 
         Those of a result, and ``color`` as uint8.
         """
-        return {
-            name: torch.from_numpy(np.ascontiguousarray(values))
+        fields = {
+            name: values
             for name, (kinds, shape) in _KINDS.items()
             if (values := self.cloud.fields.get(name)) is not None
             and values.dtype.kind in kinds
             and values.shape[1:] == shape
-            and (name != "color" or values.dtype == np.uint8)
+            and (name != "color" or values.dtype.itemsize <= 2)
         }
+        if "color" in fields:
+            fields["color"] = narrow_colors(fields["color"])
+        return {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in fields.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return what is known as a sample of loaders and transforms.
@@ -349,9 +353,13 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
     }
     for name in fields.keys() & {"labels", "superpoints"}:
         fields[name] = fields[name].astype(np.int64)
+    notes: tuple[str, ...] = ()
+    if "color" in fields:
+        color, notes = read_colors(folder / "color.npy", arrays["color"])
+        fields["color"] = color.reshape(-1, 3)
     coord = arrays["coord"]
     grid = coord.shape[:2] if coord.ndim == 3 else None
-    cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder))
+    cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder), notes=notes)
     beside: Arrays = {}
     if (folder / RECORD).is_file():
         beside["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))

@@ -37,7 +37,7 @@ class Cloud:
         coordinates: The input's own coordinates, shape ``(N, 3)``, float32 or float64. Non-finite
             rows are kept.
         fields: Further values of each point by name, each of shape ``(N, ...)``: for example
-            ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8).
+            ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8 or uint16).
         grid_shape: ``(height, width)`` of an organised cloud (row-major), otherwise None.
         source: The file it came from, for messages.
         header: What the file says about the cloud as a whole: ``viewpoint`` of a PCD file (seven

@@ -20,6 +20,7 @@ from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole
 from torchrg.io import Cloud, estimate_points, write_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.result import read_result
 
 CLASSIC = load_config("classic")
 
@@ -133,6 +134,34 @@ def test_far_clouds_keep_their_coordinates_and_planes_are_in_them(tmp_path):
     floor = json.loads((out / "planes.json").read_text())["planes"][0]
     assert floor["offset"] == pytest.approx(3.0, abs=1e-4)
     assert floor["centroid"][:2] == pytest.approx([500_000.475, 4_000_000.475], abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("form", "note"),
+    [
+        (lambda color: np.float32(color / 255 * (1 + 1e-6)), ""),
+        (lambda color: color.astype(np.float32), ""),
+        (lambda color: color * np.uint16(257), ""),
+        (lambda color: color.astype(np.uint16), "its colors are taken as 0..255, by their values"),
+    ],
+)
+def test_scenes_have_colors_of_8_bits_whatever_was_in_them(tmp_path, form, note):
+    points, scene = grid(), tmp_path / "in" / "scene"
+    color = np.random.default_rng(0).integers(0, 256, points.shape, dtype=np.uint8)
+    scene.mkdir(parents=True)
+    np.save(scene / "coord.npy", points)
+    np.save(scene / "color.npy", form(color))
+    source = FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out", superpoint=True)
+    (report,) = convert_all(source, tmp_path / "out").values()
+    assert report.warnings == ((note,) if note else ())
+    written, found = load(tmp_path / "out" / "scene", "color", "superpoint")
+    assert written.dtype == np.uint8
+    assert np.array_equal(written, color)
+    seg = segment_planes(points, CLASSIC)
+    assert np.array_equal(found, make_superpoints(points, seg, colors=color).labels)
+    result = read_result(scene)
+    assert result.fields["color"].tolist() == color.tolist()
+    assert result.cloud.notes == report.warnings
 
 
 def test_a_short_write_of_an_array_is_a_full_disk(tmp_path):

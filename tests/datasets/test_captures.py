@@ -1,6 +1,7 @@
 """Captures of phones and of data sets: read, they show the room that they were made in."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -180,6 +181,16 @@ def test_a_capture_of_one_frame_needs_no_camera(tmp_path, run):
         # In coordinates of the camera: x right, y down, z forwards.
         expected = (FRAMES[0].points - FRAMES[0].place) @ (FRAMES[0].turn * [1, -1, -1])
         np.testing.assert_allclose(result["points"], expected.reshape(-1, 3), atol=1e-3)
+
+
+def test_an_image_of_replica_beyond_its_poses_has_none(tmp_path):
+    root = WRITERS["replica"](tmp_path / "capture")
+    images = root / "room0" / "results"
+    shutil.copy(images / "depth000001.png", images / "depth000002.png")
+    data = RGBDFrames.from_folder(root)
+    assert [sample["name"] for sample in data] == [f"room0/{i:06d}" for i in range(3)]
+    assert ["pose" in sample for sample in data] == [True, True, False]
+    assert torch.equal(data[2]["depth"], data[1]["depth"])
 
 
 def test_the_unit_of_floating_point_is_not_guessed(tmp_path, run):

@@ -322,6 +322,23 @@ def test_the_command_knows_kind_and_layouts(root, room, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
+def test_colors_of_16_bits_are_those_of_8_in_layouts(room, tmp_path):
+    color = room.color * np.uint16(257) - np.uint16(9) * (room.color > 0)
+    write_cloud(tmp_path / "hall.npz", Cloud(room.coord, {"color": color}))
+    flags = ["--preset", "classic", "--superpoints", "50"]
+    for layout in ("mmdet3d", "spformer", "mask3d", "pointcept"):
+        out = str(tmp_path / layout)
+        scan = str(tmp_path / "hall.npz")
+        assert main(["segment", scan, "--out", out, "--layout", layout, *flags]) == 0
+    points = np.load(tmp_path / "mmdet3d" / "scannet_instance_data" / "hall_vert.npy")
+    assert np.array_equal(points[:, 3:], room.color)
+    content = load_pth(tmp_path / "spformer" / "test" / "hall_inst_nostuff.pth")
+    check_points(room, *content[:2])
+    table = np.load(tmp_path / "mask3d" / "test" / "hall.npy")
+    assert np.array_equal(table[:, 3:6], room.color)
+    assert np.array_equal(np.load(tmp_path / "pointcept" / "hall" / "color.npy"), room.color)
+
+
 def test_one_scan_of_any_format(room, tmp_path, capsys):
     """``segment`` writes the same superpoints as ``convert``."""
     scan = tmp_path / "hall.ply"

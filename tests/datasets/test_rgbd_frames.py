@@ -206,6 +206,13 @@ def test_depth_without_meaning_is_zero(tmp_path):
     assert read_depth(tmp_path / "a.npy", depth_scale=1).tolist() == [[0, 0, 0, 0, 2]]
 
 
+def test_color_images_of_16_bits_are_rounded_to_8(tmp_path):
+    eight = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    image = eight * np.uint16(257) + np.uint16(100) * (eight < 255)
+    kornia_rs.io.write_image_png_u16(str(tmp_path / "a.png"), image, "rgb")
+    assert torch.equal(read_color(tmp_path / "a.png"), torch.from_numpy(eight).permute(2, 0, 1))
+
+
 def test_wrong_files_are_refused(tmp_path, tum):
     (tmp_path / "empty.npy").touch()
     write_color(tmp_path / "color.png")

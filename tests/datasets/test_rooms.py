@@ -121,3 +121,17 @@ def test_rooms_without_objects_are_refused(room):
 def test_an_unknown_class_order_is_refused(room):
     with pytest.raises(ConfigError, match="expected class_order to be one of pointcept, spt"):
         read_room(room, class_order="kpconv")
+
+
+@pytest.mark.parametrize("scale", [1, 255])
+def test_all_objects_of_a_room_have_colors_of_one_range(room, scale):
+    rows = rows_of(0, 40)
+    pure = rows_of(1, 40)
+    pure[:, 3:] = pure[:, 3:] % 2 * scale
+    tables = {"wall_1.txt": rows, "wall_2.txt": pure}
+    scaled = {name: table / [1, 1, 1, scale, scale, scale] for name, table in tables.items()}
+    write_objects(room, {name: text_of(table, color="%.9f") for name, table in scaled.items()})
+    found = read_room(room)
+    assert np.array_equal(found.color, np.vstack([rows, pure])[:, 3:])
+    assert found.color.dtype == np.uint8
+    assert found.notes == ()

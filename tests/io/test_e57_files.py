@@ -10,6 +10,7 @@ from torchrg.io.e57 import ScanPose, to_cartesian
 pye57 = pytest.importorskip("pye57")
 
 AXES = ("cartesianX", "cartesianY", "cartesianZ")
+RGB = ("colorRed", "colorGreen", "colorBlue")
 QUARTER = np.array([0.5**0.5, 0.0, 0.0, 0.5**0.5])
 
 
@@ -75,37 +76,48 @@ def test_the_coordinate_system_is_kept_and_pictures_are_told(tmp_path, monkeypat
 
 
 def write_columns(path, columns, extensions=(), pose=None):
-    """Write a scan of any columns, whole numbers in 16 bits, the others in double precision."""
+    """Write a scan of any columns."""
     with pye57.E57(str(path), "w") as file:
-        libe57, image = pye57.libe57, file.image_file
         for prefix in extensions:
-            image.extensionsAdd(prefix, f"urn:{prefix}")
-        prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
-        for name, column in columns.items():
-            is_whole = column.dtype.kind == "i"
-            node = libe57.IntegerNode(image, 0, 0, 2**16) if is_whole else libe57.FloatNode(image)
-            prototype.set(name, node)
-            count = len(column)
-            buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
-        scan = libe57.StructureNode(image)
-        points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
-        scan.set("guid", libe57.StringNode(image, "{1}"))
-        if pose is not None:
-            rotation, translation = libe57.StructureNode(image), libe57.StructureNode(image)
-            for letter, value in zip("wxyz", pose, strict=True):
-                rotation.set(letter, libe57.FloatNode(image, float(value)))
-            for letter in "xyz":
-                translation.set(letter, libe57.FloatNode(image, 0.0))
-            place = libe57.StructureNode(image)
-            place.set("rotation", rotation)
-            place.set("translation", translation)
-            scan.set("pose", place)
-        scan.set("points", points)
-        file.data3d.append(scan)
-        writer = points.writer(buffers)
-        writer.write(count)
-        writer.close()
+            file.image_file.extensionsAdd(prefix, f"urn:{prefix}")
+        append_scan(file, columns, pose)
     return path
+
+
+def append_scan(file, columns, pose=None, limits=None):
+    """Write a scan, integers in 16 bits, the others in double precision, and limits of colors."""
+    libe57, image = pye57.libe57, file.image_file
+    prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+    for name, column in columns.items():
+        is_whole = column.dtype.kind == "i"
+        node = libe57.IntegerNode(image, 0, 0, 2**16) if is_whole else libe57.FloatNode(image)
+        prototype.set(name, node)
+        count = len(column)
+        buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
+    scan = libe57.StructureNode(image)
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    scan.set("guid", libe57.StringNode(image, "{1}"))
+    if pose is not None:
+        rotation, translation = libe57.StructureNode(image), libe57.StructureNode(image)
+        for letter, value in zip("wxyz", pose, strict=True):
+            rotation.set(letter, libe57.FloatNode(image, float(value)))
+        for letter in "xyz":
+            translation.set(letter, libe57.FloatNode(image, 0.0))
+        place = libe57.StructureNode(image)
+        place.set("rotation", rotation)
+        place.set("translation", translation)
+        scan.set("pose", place)
+    scan.set("points", points)
+    if limits is not None:
+        bounds = libe57.StructureNode(image)
+        for end, values in zip(("Minimum", "Maximum"), limits, strict=True):
+            for channel, value in zip(RGB, np.broadcast_to(values, 3), strict=True):
+                bounds.set(f"{channel}{end}", libe57.FloatNode(image, float(value)))
+        scan.set("colorLimits", bounds)
+    file.data3d.append(scan)
+    writer = points.writer(buffers)
+    writer.write(count)
+    writer.close()
 
 
 def test_normals_turn_with_the_points(tmp_path):
@@ -209,3 +221,37 @@ def test_poses_that_are_no_places_of_scanners_are_not_taken_for_such(tmp_path):
     # What is written where no pose is known, around the origin.
     columns = dict(zip(AXES, (points - inside).T.copy(), strict=True))
     assert read_cloud(write_columns(tmp_path / "c.e57", columns, pose=(1, 0, 0, 0))).front is None
+
+
+EIGHT = np.random.default_rng(1).integers(0, 256, (40, 3))
+
+
+@pytest.mark.parametrize(
+    ("scans", "expected", "note"),
+    [
+        ([(EIGHT / 255, (0, 1))], EIGHT, None),
+        ([(EIGHT * 257, (0, 65535))], EIGHT, None),
+        ([(EIGHT * 200, (0, 65535))], EIGHT * 200, None),
+        ([(EIGHT // 255, (0, 255))], EIGHT // 255, None),
+        ([(EIGHT, (0, 65535))], EIGHT // 129, "its colors are at most 255 of 65535, their limit"),
+        ([(EIGHT * 16, (0, 4080))], EIGHT, "its colors are scaled from 0..4080, their limits, to"),
+        ([(EIGHT * [1, 2, 3] + 7, (7, [262, 517, 772]))], EIGHT, "colors are scaled from 7..772"),
+        ([(EIGHT, (0, 1))], EIGHT, "the limits of its colors, 0..1, do not fit them and are not"),
+        ([(EIGHT, (0, 0))], EIGHT, "the limits of its colors, 0..0, do not fit them and are not"),
+        ([(EIGHT / 255, (0, 1)), (EIGHT, (0, 255)), (EIGHT, None)], np.tile(EIGHT, (3, 1)), None),
+        (
+            [(EIGHT * 200, (0, 65535)), (EIGHT, (0, 255))],
+            np.concatenate([EIGHT * 200, EIGHT * 257]),
+            None,
+        ),
+    ],
+)
+def test_limits_of_colors_decide_their_range(tmp_path, scans, expected, note):
+    axes = dict(zip(AXES, np.random.default_rng(0).random((3, len(EIGHT))), strict=True))
+    with pye57.E57(str(tmp_path / "a.e57"), "w") as file:
+        for colors, limits in scans:
+            columns = colors.T.astype("d" if colors.dtype.kind == "f" else "q", order="C")
+            append_scan(file, axes | dict(zip(RGB, columns, strict=True)), limits=limits)
+    cloud = read_cloud(tmp_path / "a.e57")
+    np.testing.assert_array_equal(cloud.fields["color"], expected)
+    assert [note in each for each in cloud.notes] == ([True] if note else [])

@@ -39,6 +39,9 @@ def test_planes_of_a_room_are_groups(tmp_path):
     starts = [lines.index(f"num_{name}: 3000\n") + 1 for name in ("colors", "normals")]
     colors, normals = (np.loadtxt(lines[start : start + 3000]) for start in starts)
     assert np.allclose(colors * 255, color, atol=1e-6)
+    for same in (color / 255, color.astype(np.int64)):
+        write_cloud(tmp_path / "same.vg", Cloud(cloud.coordinates, {"color": same}), seg)
+        assert (tmp_path / "same.vg").read_bytes() == (tmp_path / "room.vg").read_bytes()
     assert np.allclose(normals, seg.normals, atol=1e-6)
 
 

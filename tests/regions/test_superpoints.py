@@ -343,11 +343,17 @@ def test_colours_tell_flat_things_apart():
     config = SuperpointsConfig(strengths=(12.0,))
     plain = make_superpoints(floor, seg, config)
     colored = make_superpoints(floor, seg, config, colors=shade)
-    scaled = make_superpoints(floor, seg, config, colors=shade.double() / 255)
     assert len(plain.plane) == 1
     assert score_partition(colored.labels, (x < 17).long()).asa > 0.9
     assert 1 < len(colored.plane) < 8
-    assert torch.equal(colored.labels, scaled.labels)
+    for same in (shade.double() / 255 * (1 + 1e-9), shade.long(), shade.half(), shade.double()):
+        found = make_superpoints(floor, seg, config, colors=same)
+        assert torch.equal(colored.labels, found.labels)
+    with pytest.warns(UserWarning, match="^make_superpoints: its colors are taken as 0..65535, by"):
+        found = make_superpoints(floor, seg, config, colors=shade.long() * 257)
+    assert torch.equal(colored.labels, found.labels)
+    with pytest.raises(ConfigError, match=r"^make_superpoints: expected color in 0\.\.255, got -"):
+        make_superpoints(floor, seg, config, colors=shade / 127.5 - 1)
 
 
 def test_arguments_are_checked(room):
@@ -356,6 +362,8 @@ def test_arguments_are_checked(room):
         make_superpoints(points[:, :2])
     with pytest.raises(ShapeError, match="expected colors of shape"):
         make_superpoints(points, colors=points[:5])
+    with pytest.raises(ConfigError, match="expected color to be three real numbers a point, got"):
+        make_superpoints(points, colors=points > 0)
     seg = segment_planes(points[:100])
     with pytest.raises(ShapeError, match="expected seg of 6,000 points, got 100"):
         make_superpoints(points, seg)

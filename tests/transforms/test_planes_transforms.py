@@ -178,6 +178,8 @@ def test_superpoints_read_colours_where_they_are_asked_to(coord):
     sample = {**SegmentPlanes("classic")({"coord": coord}), "color": color}
     plain, colored = MakeSuperpoints()(sample), MakeSuperpoints(white=255)(sample)
     assert len(plain["superpoint"].unique()) < len(colored["superpoint"].unique())
+    with pytest.raises(ConfigError, match=r"color in 0\.\.1, got 0\.\.255; pass white=255\."):
+        MakeSuperpoints(white=1)(sample)
     with pytest.raises(ConfigError, match="white > 0"):
         MakeSuperpoints(white=0)
     with pytest.raises(ConfigError, match="expected a sample with 'plane'"):

@@ -33,6 +33,7 @@ from torchrg.datasets.folder import folded_name
 from torchrg.datasets.layouts import LayoutScan, split_name, stem_of, write_layout
 from torchrg.datasets.pointcept import write_arrays, write_pointcept_scene
 from torchrg.errors import FormatError
+from torchrg.io.colors import narrow_colors
 from torchrg.io.fields import are_whole
 from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_folder
 from torchrg.neighbors import restore_points, sample_voxels
@@ -415,10 +416,13 @@ def write_scan(
 ) -> list[str]:
     """Write a scan in a layout, into the folder of its name; return the files by their paths there.
 
-    Every layout but ``"pointcept"`` needs superpoints, of which it takes one ``level``. ``place``
+    Every layout but ``"pointcept"`` needs superpoints, of which it takes one ``level``. Colors of
+    16 bits are rounded to 8, which is what readers of layouts expect. ``place``
     is where the scan is in its data set, which some layouts keep; the default is its name.
     """
-    cloud, arrays = reading.cloud, reading.arrays
+    cloud, arrays = reading.cloud, {**reading.arrays}
+    if "color" in arrays:
+        arrays["color"] = narrow_colors(arrays["color"])
     levels = [] if superpoints is None else [*superpoints.by_level().values()][level:]
     superpoint = levels[0] if levels else None
     if layout == "pointcept" or superpoint is None:

@@ -51,6 +51,8 @@ from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
+from torchrg.io.colors import read_colors
+from torchrg.io.fields import Values
 from torchrg.io.npy import map_folder
 from torchrg.normals.sides import CloudOrientation, orient_cloud
 from torchrg.structures import Cloud, Segmentation
@@ -229,10 +231,11 @@ class FolderSource(CloudSource):
     def _read_scene(self, folder: Path) -> Reading:
         """Read a folder in Pointcept's layout."""
         sample, arrays = read_pointcept_scene(folder), map_folder(folder, _COPIED)
-        # Pointcept's colours are 0 to 255 in any type.
-        colors = {n: sample[n].clamp(0, 255).byte().numpy() for n in sample.keys() & {"color"}}
-        cloud = Cloud(sample["coord"].numpy(), colors, source=str(folder))
-        return Reading(cloud, arrays, _dataset(arrays.keys()))
+        colors, notes = dict[str, Values](), tuple[str, ...]()
+        if "color" in arrays:
+            colors["color"], notes = read_colors(folder / "color.npy", arrays["color"])
+        cloud = Cloud(sample["coord"].numpy(), colors, source=str(folder), notes=notes)
+        return Reading(cloud, {**arrays, **colors}, _dataset(arrays.keys()))
 
 
 def _dataset(names: Collection[str]) -> str:

@@ -1,6 +1,6 @@
 """``torchrg view``: a picture or a page of a cloud or of a result."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -14,7 +14,7 @@ from torchrg.cli.ending import say, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
 from torchrg.cli.loop import check_beside, is_page
 from torchrg.errors import ConfigError
-from torchrg.io.fields import WIDEN
+from torchrg.io.colors import narrow_colors
 from torchrg.render import (
     color_curvature,
     color_normals,
@@ -93,16 +93,11 @@ def run(argv: list[str]) -> int:
 
 
 def _read(path: Path, arguments: Arguments) -> Result:
-    """Read a cloud or a result with colours of 8 bits, which is what screens show."""
+    """Read a cloud or a result, and print its notes."""
     result = read_result(path, columns=columns_of(path, arguments.columns))
-    cloud = result.cloud
-    for note in cloud.notes:
+    for note in result.cloud.notes:
         warn(f"{path}: {note}.")
-    color = cloud.fields.get("color")
-    if color is None or color.dtype == np.uint8:
-        return result
-    narrow = np.rint(color.astype(np.float64) / WIDEN).astype(np.uint8)
-    return replace(result, cloud=replace(cloud, fields={**cloud.fields, "color": narrow}))
+    return result
 
 
 def _write_picture(arguments: Arguments, result: Result) -> str:
@@ -181,7 +176,9 @@ def _colors(
         return color_normals(values, up=up)
     if color == "curvature":
         return color_curvature(values)
-    return color_sharp(values) if color == "sharp" else values[:, :3]
+    if color == "sharp":
+        return color_sharp(values)
+    return torch.from_numpy(narrow_colors(cloud.fields["color"]))
 
 
 def _direction(axis: Axis) -> Direction:

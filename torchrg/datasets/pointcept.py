@@ -22,6 +22,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
+from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.files import DAMAGES, make_folder
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, describe_planes
@@ -183,7 +184,7 @@ def _arrays_of(
     entries |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
     if superpoint is not None:
         entries["superpoint"] = superpoint
-    dtypes = {"color": np.uint8, "plane": np.int32, "superpoint": np.int32}
+    dtypes = {"plane": np.int32, "superpoint": np.int32}
     arrays: dict[str, Array] = {}
     for name in (name for name in POINT_ARRAYS if name in entries):
         values = as_tensor("write_pointcept_scene", name, entries[name]).detach().cpu().numpy()
@@ -192,6 +193,8 @@ def _arrays_of(
             arrays[name] = values.astype(np.int64)
         elif name in ("segment", "instance"):
             arrays[name] = _short(values).reshape(len(values), -1)
+        elif name == "color":
+            arrays[name] = narrow_colors(read_colors(place / "color.npy", values)[0])
         elif name in _FEATURES:
             arrays[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), -1)
         else:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.colors import narrow_colors
 from torchrg.io.files import DAMAGES, check_file, check_promise, read_text, refusing
 from torchrg.structures import FARTHEST, Array
 
@@ -89,16 +90,18 @@ def refuse_recording(path: Path) -> None:
 
 
 def read_color(source: Path) -> Tensor:
-    """Read red, green and blue, shape ``(3, H, W)``, uint8, from a PNG or JPEG of 8 bits a channel.
+    """Read red, green and blue, shape ``(3, H, W)``, uint8, from a PNG or JPEG.
 
-    A gray image has three equal channels.
+    A gray image has three equal channels, and channels of 16 bits are rounded to 8.
     """
     image = _read_image(source, "PNG or JPEG")
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+    is_known = image.dtype in (np.uint8, np.uint16) and image.ndim == 3
+    if not is_known or image.shape[2] not in (1, 3, 4):
         raise FormatError(
-            f"{source}: expected a colour image of 8 bits a channel, got shape {image.shape} and "
-            f"{image.dtype}."
+            f"{source}: expected a color image of 8 or 16 bits a channel, got shape {image.shape} "
+            f"and {image.dtype}."
         )
+    image = narrow_colors(image)
     channels = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
     return torch.from_numpy(np.ascontiguousarray(channels.transpose(2, 0, 1)))
 

@@ -24,6 +24,7 @@ from torchrg._optional import require
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.arrow import parse_numbers
+from torchrg.io.colors import find_white, narrow_colors, read_colors
 from torchrg.io.files import check_file
 from torchrg.transforms.rows import SampleDict
 
@@ -67,7 +68,7 @@ class Room(NamedTuple):
         repairs: A line for each byte that was read as another one: file, line and column, counted
             from one, and the line before and after. The file itself is not changed.
         notes: A line for each entry of the folder that is no object, and for each file whose class
-            is not among the 13, ``stairs`` for example.
+            is not among the 13, ``stairs`` for example; and what reading colors took for granted.
     """
 
     coord: NDArray[np.float32]
@@ -181,15 +182,16 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
     coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
     numbers = [classes.index(name if name in classes else _OTHER_CLASS) for name, _ in objects]
     notes += [f"{file.name} taken as clutter" for name, file in objects if name not in classes]
+    color, more = read_colors(path, np.concatenate(colors))
     counts = [len(coord) for coord in coords]
     dtype = np.int16 if len(objects) <= np.iinfo(np.int16).max else np.int32
     return Room(
         np.concatenate(coords),
-        np.concatenate(colors),
+        narrow_colors(color),
         np.repeat(np.array(numbers, np.int16), counts),
         np.repeat(np.arange(len(objects), dtype=dtype), counts),
         tuple(itertools.chain.from_iterable(repairs)),
-        tuple(notes),
+        (*notes, *more),
     )
 
 
@@ -237,11 +239,14 @@ def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
     return objects, notes
 
 
-def read_annotation(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8], list[str]]:
-    """Read coordinates and colours of one object in the order of the file, and list the repairs.
+def read_annotation(
+    path: Path,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8] | NDArray[np.float64], list[str]]:
+    """Read coordinates and colors of one object in the order of the file, and list the repairs.
 
     Numbers stand between spaces or tabs, lines end in LF or CR LF, blank lines do not count.
-    Colours may be written as ``106.000000`` and are rounded.
+    Colors are 0 to 255, may be written as ``106.000000``, and are rounded to uint8. Colors in 0..1,
+    of which most are fractions, stay float64, as one range is that of the whole room.
     """
     check_file(path)
     original = path.read_bytes()
@@ -250,8 +255,9 @@ def read_annotation(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8],
     if table is None or not _are_points(table):
         table = _parse_lines(path, content, original)
     coord = np.stack([column.astype(np.float32) for column in table[:3]], axis=1)
-    color = np.stack([np.rint(column).astype(np.uint8) for column in table[3:]], axis=1)
-    return coord, color, repairs
+    color = np.stack(table[3:], axis=1)
+    is_fraction = bool((color % 1).any()) and find_white(color) == 1
+    return coord, color if is_fraction else np.rint(color).astype(np.uint8), repairs
 
 
 def _repair(path: Path, original: bytes) -> tuple[bytes, list[str]]:

@@ -91,10 +91,11 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
     Convention:
         Coordinates and fields stay as they are in the file, points that are not finite included.
         Fields have one name whatever the format calls them, see :mod:`torchrg.io.fields`:
-        ``labels`` int64, ``normals``, ``curvature``, ``intensity``, ``color`` uint8. What had to be
-        taken for granted, as the names of columns without any, and what was left out, as pictures,
-        is in :attr:`torchrg.Cloud.notes`. Of the faces of a mesh and the poses of scans it is kept
-        from which side points were seen, :attr:`torchrg.Cloud.front`.
+        ``labels`` int64, ``normals``, ``curvature``, ``intensity``, ``color`` uint8 or uint16, see
+        :mod:`torchrg.io.colors`. What had to be taken for granted, as the names of columns without
+        any, and what was left out, as pictures, is in :attr:`torchrg.Cloud.notes`. Of the faces of
+        a mesh and the poses of scans it is kept from which side points were seen,
+        :attr:`torchrg.Cloud.front`.
 
     Args:
         path: A file with a suffix of :data:`FORMATS`, in any case.

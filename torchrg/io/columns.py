@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from torchrg.errors import FormatError
-from torchrg.io.fields import LARGEST_WHOLE, LEFT_OUT, WIDEN, Columns, Values, name_aside
+from torchrg.io.colors import narrow_colors
+from torchrg.io.fields import LARGEST_WHOLE, LEFT_OUT, Columns, Values, name_aside
 from torchrg.io.files import atomic_path
 from torchrg.structures import Cloud
 
@@ -91,7 +92,7 @@ def _storable(path: Path, name: str, values: Values, spelling: Spelling) -> Valu
         raise FormatError(
             f"{path}: expected field color of uint8 or uint16, got {values.dtype}; convert it."
         )
-    return values if spelling.color_bits == 16 else np.rint(values / WIDEN).astype(np.uint8)
+    return values if spelling.color_bits == 16 else narrow_colors(values)
 
 
 def _spread(name: str, values: Values, spelling: Spelling) -> dict[str, Values]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
+from torchrg.io.colors import WIDEN, read_colors
 from torchrg.io.faces import Fronts
 from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import DAMAGES, check_promise, refusing
@@ -28,6 +29,7 @@ _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _STATES = ("cartesianInvalidState", "sphericalInvalidState")
 _CHANNELS = {"colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
+_LIMITS = "colorLimits"
 _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _SYSTEM_NODE, SYSTEM = "coordinateMetadata", "coordinate_metadata"
 """Where the coordinate reference system is in a file, and in the header of a cloud."""
@@ -106,15 +108,15 @@ def read_e57(path: Path, size: int) -> Cloud:
             _to_world(path, _read_points(pye57, file, header), scan)
             for header, scan in zip(headers, scans, strict=True)
         ]
+        notes = _unify_colors(path, blocks, [_limits_of(pye57, header) for header in headers])
         root = file.root
         system = root[_SYSTEM_NODE].value() if root.isDefined(_SYSTEM_NODE) else ""
         num_pictures = len(root["images2D"]) if root.isDefined("images2D") else 0
     names = dict.fromkeys(name for block in blocks for name in block)
     lacks = [names.keys() - block.keys() for block in blocks]
-    notes: tuple[str, ...] = ()
     if any(lacks):
         missing = ", ".join(name for name in names if any(name in each for each in lacks))
-        notes = (f"{sum(map(bool, lacks))} of {len(scans)} scans lack {missing}, zero there",)
+        notes += (f"{sum(map(bool, lacks))} of {len(scans)} scans lack {missing}, zero there",)
     if num_pictures:
         notes += (f"pictures left out: {num_pictures}",)
     columns = {name: _joined(blocks, name, counts) for name in names}
@@ -129,6 +131,40 @@ def read_e57(path: Path, size: int) -> Cloud:
 def count_e57(path: Path, size: int) -> int:
     """Return about the number of points by the size: opening a file checks all of its pages."""
     return size // _BYTES_PER_POINT
+
+
+def _limits_of(pye57: ModuleType, header: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
+    """Return the limits of the colors of a scan, shape ``(2, 3)``, if it states all of them."""
+    if _LIMITS not in header.scan_fields:
+        return None
+    names = [f"{channel}{end}" for end in ("Minimum", "Maximum") for channel in _CHANNELS]
+    if not all(map(header[_LIMITS].isDefined, names)):
+        return None
+    nodes = [header[_LIMITS][name] for name in names]
+    is_scaled = [isinstance(node, pye57.libe57.ScaledIntegerNode) for node in nodes]
+    values = [n.scaledValue() if s else n.value() for n, s in zip(nodes, is_scaled, strict=True)]
+    return np.array(values, np.float64).reshape(2, len(_CHANNELS))
+
+
+def _unify_colors(
+    path: Path, blocks: Sequence[_Block], limits: Sequence[NDArray[np.float64] | None]
+) -> tuple[str, ...]:
+    """Bring the colors of all scans into one range where some state theirs; return notes."""
+    if all(each is None for each in limits):
+        return ()
+    channels, notes = [*_CHANNELS.values()], dict[str, None]()
+    colors = dict[int, Values]()
+    for i, (block, stated) in enumerate(zip(blocks, limits, strict=True)):
+        if all(channel in block for channel in channels):
+            color = np.stack([block[channel] for channel in channels], axis=1)
+            colors[i], more = read_colors(path, color, stated)
+            notes |= dict.fromkeys(more)
+    is_wide = any(color.dtype == np.uint16 for color in colors.values())
+    for i, color in colors.items():
+        factor = WIDEN if is_wide and color.dtype == np.uint8 else 1
+        columns = (color.astype(np.uint16) * factor if is_wide else color).T
+        blocks[i].update(zip(channels, columns, strict=True))
+    return tuple(notes)
 
 
 def _joined(blocks: Sequence[_Block], name: str, counts: Sequence[int]) -> Values:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
+from torchrg.io.colors import BYTE, WORD, read_colors
 from torchrg.structures import UNLABELED, Cloud
 
 Values = NDArray[Any]
@@ -47,6 +48,7 @@ _TRIPLES = {
     ("rf", "gf", "bf"): "color",
 }
 """torchrg's names by those of three columns, in lower case."""
+_COLOR = ("red", "green", "blue")
 _GUESSED_WIDTHS = (6, 7)
 """Columns of a table without names whose meaning the values tell."""
 LEFT_OUT = "_"
@@ -55,18 +57,17 @@ _GUESSED_ROWS = 1000
 """Rows from which the meaning of such columns is guessed."""
 COLUMNS_RULE = (
     "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
-    "a unit normal, or a colour of whole numbers from 0 to 255, where the first 1,000 rows fit. Of "
-    "seven, the same is asked of the last three and of the three before the last; if one of both "
-    "fits, it is taken, with intensity before a colour; in .pts, where colours come last, the last "
-    "three alone are asked. Any other column is column_4, column_5 and so on."
+    "a unit normal, or a color of integers from 0 to 255, where the first 1,000 rows fit; else a "
+    "color of integers from 0 to 65535, where all rows fit. Of seven, the same is asked of the "
+    "last three and of the three before the last; if one of both fits, it is taken, with intensity "
+    "before a color; in .pts, where colors come last, the last three alone are asked. Any other "
+    "column is column_4, column_5 and so on."
 )
 """How the columns of text and of bare arrays are named where nothing names them, for people."""
 _UNIT_TOLERANCE = 2e-3
 """Most that the square of a unit vector's length differs from 1: 1e-3 of the length."""
 LARGEST_WHOLE = 2**53
 """float64, and so text, tells whole numbers below from all others; this may have been another."""
-WIDEN = 257
-"""65535 / 255: what eight bits become in sixteen, and back without loss."""
 
 
 def assemble_cloud(
@@ -77,10 +78,12 @@ def assemble_cloud(
     grid_shape: tuple[int, int] | None = None,
     header: Mapping[str, Any] | None = None,
     notes: tuple[str, ...] = (),
+    integers: Collection[str] = (),
 ) -> Cloud:
     """Build a cloud from columns by the file's own names.
 
     ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, where these are no columns.
+    ``integers`` are the columns that the file writes as integers, whatever their type is here.
     """
     remaining = dict(columns)
     if coordinates is None:
@@ -102,31 +105,46 @@ def assemble_cloud(
     else:
         places = remaining.pop(coordinates)
     points = checked_coordinates(path, places)
+    sources = _sources_of(remaining)
     fields = {
         name: _stacked(path, [remaining[column] for column in parts])
-        for name, parts in _sources_of(remaining).items()
+        for name, parts in sources.items()
     }
-    for name, check in (("labels", _labels), ("normals", _normals), ("color", _color)):
+    for name, check in (("labels", _labels), ("normals", _normals)):
         if name in fields:
             fields[name] = check(path, fields[name])
+    if "color" in fields:
+        color = fields["color"]
+        _check_triples(path, "color", color)
+        if set(integers).issuperset(sources["color"]) and are_whole(color):
+            color = color.astype(np.int64)
+        fields["color"], more = read_colors(path, color)
+        notes += more
     return Cloud(points, fields, grid_shape, str(path), header or {}, notes)
 
 
 def assemble_table(
-    path: Path, table: Values, names: Sequence[str] | None, notes: tuple[str, ...] = ()
+    path: Path,
+    table: Values,
+    names: Sequence[str] | None,
+    notes: tuple[str, ...] = (),
+    integers: Collection[int] = (),
 ) -> Cloud:
-    """Build a cloud from a table, shape ``(N, C)``, with names of its columns or by the rule."""
+    """Build a cloud from a table, shape ``(N, C)``, with names of its columns or by the rule.
+
+    ``integers`` are the columns that the file writes without a decimal point or an exponent.
+    """
     if names is None:
         _check_table(path, table)
         is_pts = path.suffix.lower() == ".pts"
-        names = names_by_rule(table[:_GUESSED_ROWS], color_last=is_pts)
+        names = names_by_rule(table, color_last=is_pts)
         if len(names) > 3:
             notes += (
                 f"its columns have no names and are taken as {' '.join(names)}; if they are "
                 "others, name them with --columns",
             )
     columns = {name: table[:, i] for i, name in enumerate(names) if name != LEFT_OUT}
-    return assemble_cloud(path, columns, notes=notes)
+    return assemble_cloud(path, columns, notes=notes, integers=[names[i] for i in integers])
 
 
 def checked_coordinates(path: Path, coordinates: Values) -> NDArray[np.floating]:
@@ -200,8 +218,8 @@ def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[
     return notes
 
 
-def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
-    """Name the columns of a table by :data:`COLUMNS_RULE` from its first rows, shape ``(n, C)``.
+def names_by_rule(table: Values, *, color_last: bool = False) -> list[str]:
+    """Name the columns of a table by :data:`COLUMNS_RULE`, shape ``(N, C)``.
 
     Of seven columns of small whole numbers, programs mean ``intensity red green blue`` or ``red
     green blue label``; which of these is not told by values, so both keep their numbers.
@@ -210,14 +228,18 @@ def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
         >>> names_by_rule(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
         ['x', 'y', 'z', 'intensity', 'red', 'green', 'blue']
     """
-    num_columns = rows.shape[1]
+    num_columns = table.shape[1]
     names = ["x", "y", "z", *(f"column_{i}" for i in range(4, num_columns + 1))]
     if num_columns == 4:
         return [*names[:3], "intensity"]
     if num_columns not in _GUESSED_WIDTHS:
         return names
     starts = range(num_columns - 3 if color_last else 3, num_columns - 2)
-    triples = {i: triple for i in starts if (triple := _triple_by_values(rows[:, i : i + 3]))}
+    threes = {i: table[:, i : i + 3] for i in starts}
+    first = {i: _triple_by_values(three[:_GUESSED_ROWS]) for i, three in threes.items()}
+    triples = {i: triple for i, triple in first.items() if triple}
+    if not triples:
+        triples = {i: _COLOR for i, three in threes.items() if _is_wide_color(three)}
     if len(triples) == 1:
         ((start, triple),) = triples.items()
         names[start : start + 3] = triple
@@ -227,15 +249,20 @@ def names_by_rule(rows: Values, *, color_last: bool = False) -> list[str]:
 
 
 def _triple_by_values(three: Values) -> tuple[str, str, str] | None:
-    """Return the names of three columns, shape ``(n, 3)``, that can be a normal or a colour."""
+    """Return the names of three columns, shape ``(n, 3)``, that can be a normal or a color."""
     squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
     # Unit vectors may be zero or not numbers where there is none.
     lengths = squares[np.isfinite(squares) & (squares != 0)]
     if len(lengths) and (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
         return ("nx", "ny", "nz")
-    if three.size == 0 or (three.min() >= 0 and three.max() <= 255 and are_whole(three)):
-        return ("red", "green", "blue")
-    return None
+    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= BYTE and are_whole(three))
+    return _COLOR if is_color else None
+
+
+def _is_wide_color(three: Values) -> bool:
+    """Whether three columns can be a color of 16 bits, each of which is more than 8 hold."""
+    in_range = three.min() >= 0 and three.max() <= WORD and three.max(axis=0).min() > BYTE
+    return bool(in_range) and are_whole(three)
 
 
 def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
@@ -371,32 +398,6 @@ def _normals(path: Path, normals: Values) -> NDArray[np.floating]:
     """Return normals as float32 or float64, shape ``(N, 3)``."""
     _check_triples(path, "normals", normals)
     return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
-
-
-def _color(path: Path, color: Values) -> Values:
-    """Return colours as uint8 0..255, shape ``(N, 3)``; uint16 where 8 bits do not hold them.
-
-    Floating-point colours are 0..1 if none is larger, otherwise 0..255.
-    """
-    _check_triples(path, "color", color)
-    if color.dtype == np.uint8 or color.size == 0:
-        return color.astype(np.uint8, copy=False)
-    is_float = color.dtype.kind == "f"
-    color = np.nan_to_num(color) if is_float else color
-    low, high = color.min(), color.max()
-    if low < 0 or high > (255 if is_float else 65535):
-        raise FormatError(
-            f"{path}: expected color in 0..255, got {low} to {high}; rename or remove that field."
-        )
-    if is_float:
-        rounded: Values = np.rint(color * 255 if high <= 1 else color).astype(np.uint8)
-        return rounded
-    if high <= 255:
-        return color.astype(np.uint8)
-    if (color % WIDEN).any():
-        return color.astype(np.uint16)
-    narrow: Values = (color // WIDEN).astype(np.uint8)
-    return narrow
 
 
 def _check_triples(path: Path, name: str, values: Values) -> None:

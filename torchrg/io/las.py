@@ -18,8 +18,9 @@ import numpy as np
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
+from torchrg.io.colors import WIDEN
 from torchrg.io.columns import Spelling, flatten_cloud, slices
-from torchrg.io.fields import WIDEN, Columns, Values, are_whole, assemble_cloud
+from torchrg.io.fields import Columns, Values, are_whole, assemble_cloud
 from torchrg.io.files import (
     DAMAGES,
     asking_system,

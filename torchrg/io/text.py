@@ -73,7 +73,7 @@ def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cl
         )
     is_comma = opening.form.decimal == ","
     notes = ("its commas are taken as decimal points",) if is_comma else ()
-    return assemble_table(path, table, opening.names, notes)
+    return assemble_table(path, table, opening.names, notes, opening.integers)
 
 
 def write_text(path: Path, cloud: Cloud) -> None:
@@ -259,6 +259,12 @@ class _Opening(NamedTuple):
     num_points: int
     line: str
     line_number: int
+
+    @property
+    def integers(self) -> list[int]:
+        """Columns that the first point has as integers."""
+        words = self.form.split(self.line.split(_COMMENTS[0])[0])
+        return [i for i, word in enumerate(words) if word.removeprefix("-").isdecimal()]
 
     @property
     def left_out(self) -> list[int]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg.io.colors import read_colors
 from torchrg.io.fields import Values
 from torchrg.io.files import atomic_path
 from torchrg.structures import UNLABELED, Cloud
@@ -22,6 +23,7 @@ def write_vg(path: Path, cloud: Cloud, planes: NDArray[np.floating] | None = Non
     """Write text; ``planes`` ``(M, 4)`` are those of the labels, else they are fitted."""
     number = "%.9g" if cloud.coordinates.dtype == np.float32 else "%.17g"
     colors: Values = cloud.fields.get("color", np.zeros((0, 3), np.uint8))
+    colors, _ = read_colors(path, colors)
     with atomic_path(path) as beside, beside.open("w", encoding="ascii", newline="\n") as file:
         for key, rows, form in (
             ("points", cloud.coordinates, number),

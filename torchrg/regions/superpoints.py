@@ -89,9 +89,10 @@ def partition_points(
     left. Regions that are each other's cheapest partner merge at a time, and small ones with a much
     larger one that is theirs: this needs no order of visits.
 
-    ``labels`` ``(N,)`` are those of planes, negative for none. Of a mesh with ``faces`` ``(F, 3)``
-    contacts are its edges, else those of a point to the 8 nearest: ``neighbors`` of the distinct
-    finite points in canonical order, searched by default.
+    ``labels`` ``(N,)`` are those of planes, negative for none, ``colors`` ``(N, 3)`` are in [0, 1],
+    floating point and finite. Of a mesh with ``faces`` ``(F, 3)`` contacts are its edges, else
+    those of a point to the 8 nearest: ``neighbors`` of the distinct finite points in canonical
+    order, searched by default.
 
     References:
         [1] H. Knutsson. Representing local structure using tensors. SCIA, 1989.
@@ -130,7 +131,7 @@ def partition_points(
 def merge_copies(
     points: Tensor, normals: Tensor, labels: Tensor, colors: Tensor | None
 ) -> tuple[DistinctPoints, Tensor | None]:
-    """Return the distinct points of a cloud, and their colors in [0, 1], float64.
+    """Return the distinct points of a cloud, and their colors.
 
     Of copies with other values the one on the largest plane stands for all. Their color is halfway
     between the least and the largest of each channel, in whatever order they come.
@@ -140,7 +141,7 @@ def merge_copies(
     distinct = distinct_points(points, ties)
     if colors is None:
         return distinct, None
-    shades = _unit_colors(colors)
+    shades = colors.detach()
     if not distinct.num_copies:
         return distinct, shades[distinct.rows]
     rows = finite_rows(points)
@@ -549,12 +550,6 @@ def _merge(
         borders.difference,
     )
     return _joined(regions, new), merged, new
-
-
-def _unit_colors(colors: Tensor) -> Tensor:
-    """Return colours in [0, 1], float64, those that are not finite black."""
-    largest = 1.0 if colors.is_floating_point() else float(torch.iinfo(colors.dtype).max)
-    return (colors.detach().double() / largest).nan_to_num(0.0, 0.0, 0.0)
 
 
 def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:

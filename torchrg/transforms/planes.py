@@ -21,6 +21,7 @@ from torchrg.config import (
     settings_of,
 )
 from torchrg.errors import ConfigError
+from torchrg.io.colors import find_white
 from torchrg.neighbors import distinct_points
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import NUM_NEIGHBORS, Orientation, turn_towards
@@ -253,8 +254,8 @@ class MakeSuperpoints(CloudTransform):
 
     Args:
         config: Settings. Default: :class:`torchrg.config.SuperpointsConfig`.
-        white: Largest value of a colour, 255 or 1, to read ``color`` ``(N, 3)`` too. Default:
-            colours play no part.
+        white: Value of a full channel of colors, 255 or 1, to read ``color`` ``(N, 3)`` too.
+            Default: colors play no part.
         **changes: Single settings, as in ``strengths=2.0``.
 
     Example:
@@ -281,7 +282,16 @@ class MakeSuperpoints(CloudTransform):
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the superpoints of a cloud."""
-        colors = None if self.white is None else cloud["color"].double() / self.white
+        colors = None
+        if self.white is not None:
+            colors = cloud["color"].double().nan_to_num(0, 0, 0)
+            largest = find_white(colors.numpy(force=True))
+            if largest > self.white:
+                raise ConfigError(
+                    f"MakeSuperpoints: expected color in 0..{self.white:g}, got 0..{largest}; pass "
+                    f"white={largest}."
+                )
+            colors = colors / self.white
         points, plane = cloud["coord"], cloud["plane"].reshape(-1)
         near = search.recall(distinct_points(points).points) if search.known else None
         partition = partition_points(
