@@ -73,7 +73,7 @@ class NormalsConfig:
     that looks like noise to the points on it. By default it is measured which of them these are."""
 
     def __post_init__(self) -> None:
-        _check_values(self)
+        check_values(self)
         _require(self, "k", ">= 3", self.k >= 3)
         most = self.adaptive_k
         _require(self, "adaptive_k", ">= k or none", most is None or most >= self.k)
@@ -171,7 +171,7 @@ class GrowingConfig:
     many times its thickness about its own plane."""
 
     def __post_init__(self) -> None:
-        _check_values(self)
+        check_values(self)
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
         _require(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
         within = self.connectivity is None or 0 <= self.connectivity <= 1
@@ -265,7 +265,7 @@ class PipelineConfig:
     """Contents of the table of planes."""
 
     def __post_init__(self) -> None:
-        _check_values(self)
+        check_values(self)
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
 
     def at_angle(self, angle_deg: float) -> "PipelineConfig":
@@ -361,7 +361,7 @@ class SuperpointsConfig:
     longer ones. None: no limit."""
 
     def __post_init__(self) -> None:
-        _check_values(self)
+        check_values(self)
         is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths)
         _require(self, "strengths", "one or more numbers > 0, ascending", is_list)
         counts = self.counts
@@ -401,7 +401,7 @@ class DepthConfig:
     """Regions of fewer pixels are not labelled."""
 
     def __post_init__(self) -> None:
-        _check_values(self)
+        check_values(self)
         parts: tuple[float, ...] = (1.0, 0.0) if self.noise is None else self.noise
         is_noise = len(parts) == 2 and min(parts) >= 0 and max(parts) > 0
         _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
@@ -630,10 +630,10 @@ def _check_angle(where: str, angle_deg: float) -> None:
         raise ConfigError(f"{where}: expected angle_deg in [0, 90], got {angle_deg!r}.")
 
 
-def _check_values(config: Any) -> None:  # noqa: ANN401
+def check_values(config: Any) -> None:  # noqa: ANN401
     """Raise unless words are among their choices, and numbers of their type and at most 1e12."""
     for name, hint in typing.get_type_hints(type(config)).items():
-        value, kinds = getattr(config, name), _kinds_in(hint)
+        value, kinds = getattr(config, name), _kinds_of(hint)
         if typing.get_origin(hint) is Literal:
             names = ", ".join(typing.get_args(hint))
             _require(config, name, f"to be one of {names}", value in typing.get_args(hint))
@@ -647,10 +647,10 @@ def _check_values(config: Any) -> None:  # noqa: ANN401
             _require(config, name, bounds, abs(number) <= FARTHEST)
 
 
-def _kinds_in(hint: Any) -> set[Any]:  # noqa: ANN401
+def _kinds_of(hint: Any) -> set[Any]:  # noqa: ANN401
     """Return the types that an annotation names."""
     parts = typing.get_args(hint)
-    return set().union(*map(_kinds_in, parts)) if parts else {hint}
+    return set().union(*map(_kinds_of, parts)) if parts else {hint}
 
 
 def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401

@@ -23,7 +23,7 @@ from torchrg._parallel import (
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.order import canonical_order
-from torchrg.structures import Neighbors, bounding_box
+from torchrg.structures import MAX_POINTS, Neighbors, bounding_box
 
 _SAMPLE_SIZE = 400
 """Points that tell how far the k-th neighbour is."""
@@ -39,9 +39,6 @@ _MIN_SHARE = 0.03
 
 _CELLS_A_POINT = 8
 """Cells of the box about a cloud, empty ones too, that are worth their memory, 4 bytes each."""
-
-_MAX_INT32 = 2**31 - 1
-"""Largest number of a point or a cell, as lists of neighbors hold int32."""
 
 
 @of_clouds
@@ -84,9 +81,9 @@ def search_knn(
     tensor = as_tensor("search_knn", "points", points)
     check_shapes("search_knn", points=(tensor, "N 3"))
     check_floating("search_knn", points=tensor)
-    if len(tensor) > _MAX_INT32:
+    if len(tensor) > MAX_POINTS:
         raise ShapeError(
-            f"search_knn: expected at most {_MAX_INT32:,} points, got {len(tensor):,}; cut the "
+            f"search_knn: expected at most {MAX_POINTS:,} points, got {len(tensor):,}; cut the "
             "cloud into parts."
         )
     if max_distance is not None and not max_distance >= 0:
@@ -99,7 +96,7 @@ def search_knn(
             "or Inf; leave them out first."
         )
     bounds = _cloud_bounds(offset, len(coordinates))
-    least = min((stop - start for start, stop in bounds), default=_MAX_INT32)
+    least = min((stop - start for start, stop in bounds), default=MAX_POINTS)
     if not 1 <= k <= least:
         raise ShapeError(
             f"search_knn: expected k from 1 to the number of points ({least:,}), got {k}; lower k "
@@ -304,7 +301,7 @@ def search_cells(
         if len(rows) < _MIN_FOR_CELLS:
             break
         counts = extent / size + 4
-        if counts.prod() > min(max(_CELLS_A_POINT * len(points), 2**20), _MAX_INT32 - 1):
+        if counts.prod() > min(max(_CELLS_A_POINT * len(points), 2**20), MAX_POINTS - 1):
             continue
         _, width, height = (int(count) for count in counts)
         starts = torch.empty(int(counts[0]) * width * height + 1, dtype=torch.int32, device="cpu")

@@ -119,7 +119,7 @@ def partition_points(
     partitions = _partition_places(
         ordered[is_first].cpu(),
         normals[distinct].detach().cpu(),
-        labels[distinct].cpu(),
+        labels[distinct].long().cpu(),
         config,
         None if colors is None else _unit_colors(colors[distinct]).cpu(),
         edges,
@@ -554,8 +554,9 @@ def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
     on_plane = has_one & (labels >= 0)
     if not bool(on_plane.any()):
         return main
-    width = int(labels.max()) + 1
-    keys = superpoints[on_plane] * width + labels[on_plane]
+    planes, rows = torch.unique(labels[on_plane].long(), return_inverse=True)
+    keys = superpoints[on_plane] * len(planes) + rows
     keys, shared = torch.unique(keys, return_counts=True)
-    mostly = 2 * shared > sizes[keys // width]
-    return main.index_copy(0, keys[mostly] // width, keys[mostly] % width)
+    mostly = 2 * shared > sizes[keys // len(planes)]
+    chosen = keys[mostly]
+    return main.index_copy(0, chosen // len(planes), planes[chosen % len(planes)])
