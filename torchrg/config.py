@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import itertools
 import math
+import numbers
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -15,7 +16,7 @@ import torch
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError
-from torchrg.structures import Sampling
+from torchrg.structures import FARTHEST, Sampling
 
 Settings = TypeVar("Settings")
 NormalMethod = Literal[
@@ -72,7 +73,7 @@ class NormalsConfig:
     that looks like noise to the points on it. By default it is measured which of them these are."""
 
     def __post_init__(self) -> None:
-        _check_choices(self)
+        check_values(self)
         _require(self, "k", ">= 3", self.k >= 3)
         most = self.adaptive_k
         _require(self, "adaptive_k", ">= k or none", most is None or most >= self.k)
@@ -175,7 +176,7 @@ class GrowingConfig:
     many times its thickness about its own plane."""
 
     def __post_init__(self) -> None:
-        _check_choices(self)
+        check_values(self)
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
         _require(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
         within = self.connectivity is None or 0 <= self.connectivity <= 1
@@ -282,6 +283,7 @@ class PipelineConfig:
     """Contents of the table of planes."""
 
     def __post_init__(self) -> None:
+        check_values(self)
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
 
     def at_angle(self, angle_deg: float) -> "PipelineConfig":
@@ -379,14 +381,15 @@ class SuperpointsConfig:
     longer ones. None: no limit."""
 
     def __post_init__(self) -> None:
-        is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths, math.inf)
+        check_values(self)
+        is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths)
         _require(self, "strengths", "one or more numbers > 0, ascending", is_list)
         counts = self.counts
         is_list = counts is None or (len(counts) > 0 and _ascends(0, *reversed(counts)))
         _require(self, "counts", "one or more whole numbers > 0, descending, or none", is_list)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
         extent = self.max_extent
-        _require(self, "max_extent", "> 0 or none", extent is None or 0 < extent < math.inf)
+        _require(self, "max_extent", "> 0 or none", extent is None or extent > 0)
 
     @property
     def num_levels(self) -> int:
@@ -418,8 +421,9 @@ class DepthConfig:
     """Regions of fewer pixels are not labelled."""
 
     def __post_init__(self) -> None:
-        parts = (1.0,) if self.noise is None else self.noise
-        is_noise = all(0 <= number < math.inf for number in parts) and sum(parts) > 0
+        check_values(self)
+        parts: tuple[float, ...] = (1.0, 0.0) if self.noise is None else self.noise
+        is_noise = len(parts) == 2 and min(parts) >= 0 and max(parts) > 0
         _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
         _require(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
@@ -620,7 +624,7 @@ def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
             if value in typing.get_args(choice):
                 return value
         elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
+            return float(value) if abs(value) <= FARTHEST else value  # It is refused by its range.
         elif typing.get_origin(choice) is tuple and not isinstance(value, str | Mapping | None):
             kind, *others = typing.get_args(choice)
             parts = tuple(value) if isinstance(value, Iterable) else (value,)
@@ -646,13 +650,27 @@ def _check_angle(where: str, angle_deg: float) -> None:
         raise ConfigError(f"{where}: expected angle_deg in [0, 90], got {angle_deg!r}.")
 
 
-def _check_choices(config: Any) -> None:  # noqa: ANN401
-    """Raise unless settings that are one of some words are one of them."""
+def check_values(config: Any) -> None:  # noqa: ANN401
+    """Raise unless words are among their choices, and numbers of their type and at most 1e12."""
     for name, hint in typing.get_type_hints(type(config)).items():
+        value, kinds = getattr(config, name), _kinds_of(hint)
         if typing.get_origin(hint) is Literal:
             names = ", ".join(typing.get_args(hint))
-            is_one = getattr(config, name) in typing.get_args(hint)
-            _require(config, name, f"to be one of {names}", is_one)
+            _require(config, name, f"to be one of {names}", value in typing.get_args(hint))
+        kind = numbers.Real if float in kinds else numbers.Integral
+        words = "a number" if float in kinds else "a whole number"
+        is_open = kinds.isdisjoint({int, float}) or value is None or value == "auto"
+        for number in () if is_open else value if isinstance(value, tuple | list) else (value,):
+            is_number = isinstance(number, kind) and not isinstance(number, bool)
+            _require(config, name, f"to be {words}", is_number and number == number)
+            bounds = f"in [-{FARTHEST:g}, {FARTHEST:g}]"
+            _require(config, name, bounds, abs(number) <= FARTHEST)
+
+
+def _kinds_of(hint: Any) -> set[Any]:  # noqa: ANN401
+    """Return the types that an annotation names."""
+    parts = typing.get_args(hint)
+    return set().union(*map(_kinds_of, parts)) if parts else {hint}
 
 
 def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401

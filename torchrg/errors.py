@@ -8,6 +8,19 @@ OUT_OF_MEMORY = "out of memory; use a machine with more, or a smaller part of th
 """Message where memory could not be had, whatever for."""
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error says that memory ran out; torch raises a RuntimeError.
+
+    Example:
+        >>> is_out_of_memory(MemoryError()), is_out_of_memory(RuntimeError("shape mismatch"))
+        (True, False)
+    """
+    words = ("can't allocate memory", "not enough memory", "out of memory")
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and any(word in str(error) for word in words)
+    )
+
+
 class TorchrgError(Exception):
     """Base of every error raised by torchrg."""
 

@@ -22,6 +22,8 @@ FARTHEST = 1e12
 """Largest coordinate of a point. Programs write 1e20, 1e30 or the largest float32 for a missing
 one."""
 
+MAX_POINTS = 2**31 - 1
+"""Most points of a cloud, as lists of neighbors hold int32."""
 
 Array = NDArray[Any]
 """An array of numbers or text, of any shape."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order, gather_patches, search_knn
 from torchrg.neighbors import knn as knn_module
 
@@ -90,10 +90,21 @@ def test_canonical_order_keeps_near_points_together(rng):
     assert along < 0.2 * points.diff(dim=0).norm(dim=1).mean()
 
 
-@pytest.mark.parametrize("k", [0, 6])
-def test_too_many_neighbors_are_refused(k):
+@pytest.mark.parametrize("k", [0, 6, -1, 10**23, 1e300, float("nan")])
+def test_no_memory_is_taken_for_more_neighbors_than_points(k):
     with pytest.raises(ShapeError, match=r"expected k from 1 to the number of points \(5\), got"):
         search_knn(torch.rand(5, 3), k)
+
+
+def test_more_points_than_lists_of_int32_can_name_are_refused():
+    with pytest.raises(ShapeError, match="expected at most 2,147,483,647 points, got 2,147,483,6"):
+        search_knn(torch.zeros(1, 3).expand(2**31, 3), 5)
+
+
+@pytest.mark.parametrize("max_distance", [-1.0, float("nan")])
+def test_a_distance_that_is_none_is_refused(max_distance):
+    with pytest.raises(ConfigError, match="search_knn: expected max_distance >= 0, got"):
+        search_knn(torch.rand(5, 3), 2, max_distance=max_distance)
 
 
 def test_points_that_are_not_finite_are_refused():

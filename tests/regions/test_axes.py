@@ -127,7 +127,7 @@ def test_what_has_no_axes_is_refused():
     ):
         with pytest.raises(ConfigError, match="expected a floor, a ceiling, or walls"):
             align_axes(planes)
-    with pytest.raises(ConfigError, match="expected up to be three numbers"):
+    with pytest.raises(ConfigError, match="expected up to be a direction"):
         align_axes(table([[0, 0, 1]], [9.0]), up=(0, 0, 0))
 
 

@@ -359,7 +359,7 @@ def test_wrong_arguments_are_refused():
     points = torch.rand(5, 3)
     with pytest.raises(ShapeError, match=r"summarize_planes: expected labels of shape \(N\)"):
         summarize_planes(points, points, torch.zeros(4, dtype=torch.int64))
-    with pytest.raises(ConfigError, match="expected up to be three numbers"):
+    with pytest.raises(ConfigError, match="expected up to be a direction"):
         summarize_planes(points, points, one_region(points), up=(0, 0, 0))
 
 

@@ -393,6 +393,8 @@ def test_a_superpoint_is_on_the_plane_of_more_than_half_of_its_points():
     parts = torch.tensor([0, 0, 1, 1, 1, 2, 2, -1])
     planes = torch.tensor([3, -1, 3, 4, 4, -1, -1, 5])
     assert superpoints.main_planes(parts, planes).tolist() == [-1, 4, -1]
+    large = torch.where(planes >= 0, planes * 10**18, -1)
+    assert superpoints.main_planes(parts, large).tolist() == [-1, 4 * 10**18, -1]
 
 
 def test_neighbors_that_are_known_are_not_searched_again(monkeypatch):

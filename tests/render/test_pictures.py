@@ -232,9 +232,9 @@ def test_input_that_needs_gradients_is_drawn(room):
         ({"points": torch.zeros(5, 3).long()}, ShapeError, "points of float32 or float64"),
         ({"view": "inside"}, ConfigError, "view to be one of cutaway, above, outside, sensor"),
         ({"up": (0.0, 0.0, 0.0)}, ConfigError, "up to be a direction"),
-        ({"width": 0}, ConfigError, "width >= 1, got 0"),
-        ({"height": 0}, ConfigError, "height >= 1, got 0"),
-        ({"supersampling": 0}, ConfigError, "supersampling >= 1, got 0"),
+        ({"width": 0}, ConfigError, "width from 1 to 8,192, got 0"),
+        ({"height": 0}, ConfigError, "height from 1 to 8,192, got 0"),
+        ({"supersampling": 0}, ConfigError, "supersampling from 1 to 16, got 0"),
     ],
 )
 def test_wrong_arguments_are_refused(changes, error, message):
@@ -245,7 +245,7 @@ def test_wrong_arguments_are_refused(changes, error, message):
 
 def test_render_points_checks_its_arguments():
     points, colors = square(2.0, RED, count=3)
-    with pytest.raises(ConfigError, match="render_points: expected supersampling >= 1"):
+    with pytest.raises(ConfigError, match="render_points: expected supersampling from 1 to 16"):
         render_points(points, colors, front_camera(), supersampling=0)
     with pytest.raises(ShapeError, match="render_points: expected colors"):
         render_points(points, colors[:2], front_camera())

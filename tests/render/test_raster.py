@@ -2,8 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from torchrg.render import raster
 from torchrg.render.raster import DepthBuffer, Discs, close_gaps, depth_and_colors
@@ -143,3 +145,38 @@ def test_a_gap_takes_the_surface_about_it_not_what_is_in_front():
     both = torch.maximum(keys, drawn(front, (slice(None),), 30, 30, 0))
     paint = depth_and_colors(close_gaps(both, reach=2, thickness=0.1))[1]
     assert bool((paint[hole] == torch.tensor([255, 0, 0])).all())
+
+
+def literal_gaps(keys, reach, thickness):
+    """Every key around each gap is looked at, one gap after the other."""
+    depth = depth_and_colors(keys)[0].numpy()
+    side = 2 * reach + 1
+    closing = ndimage.maximum_filter(depth, side, mode="constant", cval=0)
+    closing = ndimage.minimum_filter(closing, side, mode="constant", cval=np.inf)
+    filled = keys.clone()
+    for row, column in np.argwhere(closing > depth + thickness * depth * closing):
+        rows, columns = (slice(max(place - reach, 0), place + reach + 1) for place in (row, column))
+        limit = closing[row, column] / max(1 - thickness * closing[row, column], 0.5)
+        behind = torch.from_numpy(depth[rows, columns] <= limit)
+        filled[row, column] = keys[rows, columns][behind].max()
+    return filled, closing
+
+
+@pytest.mark.parametrize("reach", [1, 3, 8])
+def test_gaps_take_what_a_look_at_every_pixel_around_finds(rng, reach):
+    keys = drawn(random_discs(rng, count=40), width=60, height=50)
+    for thickness in (0.05, 0.5):
+        expected, _ = literal_gaps(keys, reach, thickness)
+        found = close_gaps(keys, reach=reach, thickness=thickness)
+        assert torch.equal(found, expected)
+        assert int((found != keys).sum()) > 10
+
+
+def test_gaps_of_few_large_discs_take_the_closing(rng):
+    keys = drawn(random_discs(rng, count=5), width=90, height=70)
+    _, closing = literal_gaps(keys, 21, 0.05)
+    found = close_gaps(keys, reach=21, thickness=0.05)
+    depth, is_gap = depth_and_colors(found)[0].numpy(), (found != keys).numpy()
+    assert (depth[is_gap] == closing[is_gap]).all()
+    assert np.isin(found.numpy(), keys.numpy()).all()
+    assert is_gap.sum() > 100

@@ -188,9 +188,11 @@ def test_points_are_in_random_order():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_points": 0}, "sample_scene: expected num_points >= 1, got 0"),
-        ({"noise": -1}, "sample_scene: expected noise >= 0 metres, got -1"),
-        ({"noise": float("nan")}, "expected noise >= 0 metres, got nan"),
+        ({"num_points": 0}, "sample_scene: expected num_points from 1 to 2,147,483,647, got 0"),
+        ({"num_points": 10**23}, "expected num_points from 1 to 2,147,483,647, got 1000"),
+        ({"noise": -1}, r"sample_scene: expected noise from 0 to 1e\+12 meters, got -1"),
+        ({"noise": float("nan")}, "expected noise .* got nan"),
+        ({"noise": 1e300}, r"expected noise .* got 1e\+300"),
         ({"seed": -1}, "expected seed >= 0, got -1"),
     ],
 )
@@ -207,11 +209,15 @@ def test_unknown_directions_of_noise_are_refused():
 @pytest.mark.parametrize(
     ("layout", "message"),
     [
-        ({"num_doors": -1}, "RoomLayout: expected num_doors >= 0, got -1"),
+        ({"num_doors": -1}, "RoomLayout: expected num_doors >= 0 and .* got -1"),
         ({"num_small_boxes": 9}, "expected num_small_boxes <= 8, got 9"),
         ({"plate_thickness": 0}, "expected plate_thickness > 0, got 0"),
         ({"num_viewpoints": 0}, "expected num_viewpoints > 0, got 0"),
-        ({"size": (3, 0.5, 2.5)}, r"of at least 1 x 1 x 2.3 metres, got \(3, 0.5, 2.5\)"),
+        ({"num_viewpoints": 10**23}, "expected num_viewpoints in "),
+        ({"num_tables": 10**6}, "expected num_tables >= 0 and at most 1,000, got 1000000"),
+        ({"heading_deg": float("nan")}, "expected heading_deg to be a number, got nan"),
+        ({"size": (3, 0.5, 2.5)}, r"of at least 1 x 1 x 2.3 and .* got \(3, 0.5, 2.5\)"),
+        ({"size": (3, 3, 1e6)}, r"at most 1,000 meters, got \(3, 3, 1000000.0\)"),
         ({"num_tables": 40}, "expected a place on the floor for each object"),
         ({"num_windows": 40}, "expected a place on the walls for each object"),
         ({"min_plane_gap": 0.5}, "expected no face within min_plane_gap=0.5 of the plane"),

@@ -371,9 +371,10 @@ def _oriented(
     if voxel is None:
         return seg._replace(normals=orient_cloud(cloud, seg.normals, orient))
     rows, inverse = sample_voxels(cloud.points, voxel)
-    front = None if cloud.front is None else cloud.front[rows]
+    kept = rows.numpy()  # NumPy takes a tensor of one element for a number.
+    front = None if cloud.front is None else cloud.front[kept]
     few = replace(
-        cloud, coordinates=cloud.coordinates[rows], fields={}, grid_shape=None, front=front
+        cloud, coordinates=cloud.coordinates[kept], fields={}, grid_shape=None, front=front
     )
     turned = orient_cloud(few, seg.normals[rows], orient)
     return seg._replace(normals=restore_points(turned, inverse))

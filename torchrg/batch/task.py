@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
-from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError
+from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError, is_out_of_memory
 from torchrg.io.files import is_disk_full
 
 Status = Literal["converted", "kept", "failed", "not started"]
@@ -73,7 +73,7 @@ def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
             warnings.simplefilter("ignore", PrecisionWarning)
             report = work(clock.begin)
     except Exception as error:  # noqa: BLE001 One task must never end the others.
-        is_foreseen = isinstance(error, TorchrgError | OSError) or _is_out_of_memory(error)
+        is_foreseen = isinstance(error, TorchrgError | OSError) or is_out_of_memory(error)
         report = TaskReport(
             name,
             "failed",
@@ -103,16 +103,9 @@ class _StageClock:
 
 def _reason(error: Exception) -> str:
     """Return an error as one line that names the file where it can."""
-    if _is_out_of_memory(error):
+    if is_out_of_memory(error):
         return OUT_OF_MEMORY
     if isinstance(error, OSError):
         return f"{error.filename or 'a file'}: {error.strerror or error}."
     text = " ".join(str(error).split())
     return text if isinstance(error, TorchrgError) else f"{type(error).__name__}: {text}"
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Return whether memory could not be had; torch says so by a RuntimeError."""
-    return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
-    )

@@ -17,7 +17,13 @@ from torchrg.cli.ending import (
     raising_interrupts,
     warn,
 )
-from torchrg.errors import OUT_OF_MEMORY, ConfigError, PrecisionWarning, TorchrgError
+from torchrg.errors import (
+    OUT_OF_MEMORY,
+    ConfigError,
+    PrecisionWarning,
+    TorchrgError,
+    is_out_of_memory,
+)
 
 COMMANDS = {
     "segment": "label the planes of scans",
@@ -61,7 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(end="", flush=True)
     except TorchrgError as error:
         return fail(str(error))
-    except MemoryError:
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
         return fail(f"{name}: {OUT_OF_MEMORY}")
     except OSError as error:
         # What could not be printed Python would try again when it ends, and complain.

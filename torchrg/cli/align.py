@@ -19,6 +19,7 @@ from torchrg.cli.loop import STAGES, check_apart, note_input, output_paths, run_
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
+from torchrg.linalg import unit_direction
 from torchrg.pipeline import segment_planes
 from torchrg.regions.axes import align_axes, move_cloud, move_planes
 from torchrg.structures import Segmentation
@@ -54,8 +55,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, align each input and write it."""
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg align", default=start)
-    if not any(arguments.up):
-        raise ConfigError(f"expected --up to be a direction, got {arguments.up}; try 0 0 1.")
+    unit_direction("align", arguments.up)
     flags.use_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)

@@ -52,12 +52,14 @@ INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
 KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, int32_t* starts,
                   int64_t width, int64_t height, double x, double y, double z, double size,
                   int32_t* rows, int32_t* cells, double* sorted) {
-  if (width > num_cells || height > num_cells) return TOO_WIDE;
+  if (num_points > INT32_MAX || num_cells > INT32_MAX) return TOO_WIDE;  // rows and cells: int32
+  if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
+  const double length = double(num_cells / (width * height));
   for (int64_t c = 0; c < num_cells; c++) starts[c] = 0;
   for (int64_t i = 0; i < num_points; i++) {
     const double* p = points + 3 * i;
     const double u = (p[0] - x) / size, v = (p[1] - y) / size, w = (p[2] - z) / size;
-    bool inside = u >= 0 && u < num_cells && v >= 0 && v < width - 2 && w >= 0 && w < height - 2;
+    bool inside = u >= 0 && u < length && v >= 0 && v < width - 2 && w >= 0 && w < height - 2;
     if (!inside) return NO_SUCH_ROW;
     const int64_t cell = (int64_t(u + 1) * width + int64_t(v + 1)) * height + int64_t(w + 1);
     if (cell + 1 >= num_cells) return NO_SUCH_ROW;
@@ -66,7 +68,7 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
   int32_t before = 0;
   for (int64_t c = 0; c < num_cells; c++) before += starts[c], starts[c] = before;
   for (int64_t i = num_points - 1; i >= 0; i--) {
-    const int32_t place = --starts[cells[i]];
+    const int64_t place = --starts[cells[i]];
     rows[place] = int32_t(i);
     for (int axis = 0; axis < 3; axis++) sorted[3 * place + axis] = points[3 * i + axis];
   }
@@ -81,6 +83,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
                     double x, double y, double z, double size) {
   if (k < 1 || k > MOST || from < 0 || to > num_cells - 1) return TOO_WIDE;
   if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
+  if (num_points > INT32_MAX || num_cells > INT32_MAX) return TOO_WIDE;
   Candidates all;
   const int64_t step = width * height;
   double guess = 0;
@@ -108,7 +111,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
     for (int64_t place = starts[c]; place < starts[c + 1]; place++) {
       if (place < 0 || place >= num_points) return NO_SUCH_ROW;
       const int32_t row = rows[place];
-      if (uint32_t(row) >= uint64_t(num_points)) return NO_SUCH_ROW;
+      if (!is_row(row, num_points)) return NO_SUCH_ROW;
       if (!asked[row]) continue;
       const double *own = sorted + 3 * place, px = own[0], py = own[1], pz = own[2];
       for (int t = 0; t < n; t++) {

@@ -43,7 +43,7 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   if (64 * num_words < k) return TOO_WIDE;
   for (int64_t r = 0; r < num_roots; r++) {
     const int32_t root = order[r];
-    if (uint32_t(root) >= uint64_t(num_points)) return NO_SUCH_ROW;
+    if (!is_row(root, num_points)) return NO_SUCH_ROW;
     if (roots[root] >= 0 || !valid[root]) continue;
     roots[root] = root, queue[0] = root;
     int64_t count = 1;
@@ -58,7 +58,7 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
             const int bit = __builtin_ctzll(edges);
             if (64 * word + bit >= k) return TOO_WIDE;
             const int32_t target = indices[seed * k + 64 * word + bit];
-            if (uint32_t(target) >= uint64_t(num_points)) return NO_SUCH_ROW;
+            if (!is_row(target, num_points)) return NO_SUCH_ROW;
             if (roots[target] >= 0 || !valid[target]) continue;
             roots[target] = root;
             if (claims) continue;

@@ -103,9 +103,9 @@ int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) 
 KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t* counts,
                     int64_t* sizes, int64_t* places, int64_t* rows) {
   if (most < 1) return TOO_WIDE;
-  int64_t end = 0;
-  for (int64_t i = 0; i < n; i++) end = larger(end, labels[i] + 1);
-  if (end > num) return NO_SUCH_ROW;
+  bool inside = true;
+  for (int64_t i = 0; i < n; i++) inside &= labels[i] < num;
+  if (!inside) return NO_SUCH_ROW;
   for (int64_t m = 0; m < num; m++) sizes[m] = counts[m] = 0;
   visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
     if (m >= 0) sizes[m] += to - from;

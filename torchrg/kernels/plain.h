@@ -142,10 +142,14 @@ struct Patch {
   }
 };
 
-// Whether numbers name rows.
+// Whether numbers name rows; a negative one names none, however many rows there are.
+INLINE bool is_row(int32_t number, int64_t num_rows) {
+  return (number >= 0) & (int64_t(number) < num_rows);
+}
 INLINE bool are_rows(const int32_t* numbers, int64_t count, int64_t num_rows) {
+  const uint32_t end = uint32_t(smaller(num_rows, int64_t(INT32_MAX) + 1));
   bool inside = true;
-  for (int64_t j = 0; j < count; j++) inside &= uint32_t(numbers[j]) < uint64_t(num_rows);
+  for (int64_t j = 0; j < count; j++) inside &= uint32_t(numbers[j]) < end;
   return inside;
 }
 

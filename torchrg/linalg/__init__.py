@@ -12,6 +12,7 @@ from torchrg.linalg.angles import (
     signs,
     sq_chord_to_deg,
     sq_chords,
+    unit_direction,
     unsigned_angle_deg,
 )
 from torchrg.linalg.eigen import (
@@ -43,5 +44,6 @@ __all__ = [
     "smallest_normal",
     "sq_chord_to_deg",
     "sq_chords",
+    "unit_direction",
     "unsigned_angle_deg",
 ]

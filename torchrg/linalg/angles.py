@@ -7,7 +7,39 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg.errors import ConfigError
+
 _ASIN_DEGREE = 10
+
+
+def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
+    """Return an upward direction, three numbers or the name of an axis, as a unit vector, float64.
+
+    ``caller`` is the public function that messages begin with.
+
+    Raises:
+        ConfigError: If it is no direction.
+
+    Example:
+        >>> unit_direction("f", "-y").tolist(), unit_direction("f", (0, 0, 1e-300)).tolist()
+        ([0.0, -1.0, 0.0], [0.0, 0.0, 1.0])
+    """
+    numbers: Sequence[float] | str = up
+    if isinstance(up, str):
+        length, name = (-1.0 if up.startswith("-") else 1.0), up.removeprefix("-")
+        numbers = [length * (name == axis) + 0.0 for axis in "xyz"]
+    try:
+        direction = torch.tensor([float(number) for number in numbers], dtype=torch.float64)
+    except (TypeError, ValueError, OverflowError):
+        direction = torch.empty(0)
+    if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
+        raise ConfigError(
+            f"{caller}: expected up to be a direction, as three numbers that are not all zero or "
+            f"the name of an axis, got {up!r}."
+        )
+    direction /= direction.abs().amax()
+    direction /= direction.norm()
+    return direction
 
 
 def unsigned_angle_deg(a: Tensor, b: Tensor) -> Tensor:

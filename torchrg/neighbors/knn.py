@@ -20,10 +20,10 @@ from torchrg._parallel import (
     map_tasks,
     sequential_operations,
 )
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.order import canonical_order, distinct_rows, mark_first
-from torchrg.structures import Neighbors, Rows, bounding_box
+from torchrg.structures import MAX_POINTS, Neighbors, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Points that tell how far the k-th neighbour is."""
@@ -81,6 +81,13 @@ def search_knn(
     tensor = as_tensor("search_knn", "points", points)
     check_shapes("search_knn", points=(tensor, "N 3"))
     check_floating("search_knn", points=tensor)
+    if len(tensor) > MAX_POINTS:
+        raise ShapeError(
+            f"search_knn: expected at most {MAX_POINTS:,} points, got {len(tensor):,}; cut the "
+            "cloud into parts."
+        )
+    if max_distance is not None and not max_distance >= 0:
+        raise ConfigError(f"search_knn: expected max_distance >= 0, got {max_distance!r}.")
     coordinates = tensor.detach().cpu().numpy()
     if not np.isfinite(coordinates).all():
         num_bad = int((~np.isfinite(coordinates)).any(axis=1).sum())
@@ -89,14 +96,15 @@ def search_knn(
             "or Inf; leave them out first."
         )
     bounds = _cloud_bounds(offset, len(coordinates))
+    least = min((stop - start for start, stop in bounds), default=MAX_POINTS)
+    if not 1 <= k <= least:
+        raise ShapeError(
+            f"search_knn: expected k from 1 to the number of points ({least:,}), got {k}; lower k "
+            "or pass a larger cloud."
+        )
     indices = scratch.empty((len(coordinates), k), np.int32)
     outside = None if max_distance is None else np.empty(indices.shape, dtype=bool)
     for start, stop in bounds:
-        if not 1 <= k <= stop - start:
-            raise ShapeError(
-                f"search_knn: expected k from 1 to the number of points ({stop - start:,}), got "
-                f"{k}; lower k or pass a larger cloud."
-            )
         cloud = coordinates[start:stop]
         order = None if canonical else canonical_order(cloud).numpy()
         cloud = cloud if order is None else cloud[order]
@@ -353,7 +361,7 @@ def search_cells(
         if len(rows) < _MIN_FOR_CELLS:
             break
         counts = extent / size + 4
-        if counts.prod() > max(_CELLS_A_POINT * len(points), 2**20):
+        if counts.prod() > min(max(_CELLS_A_POINT * len(points), 2**20), MAX_POINTS - 1):
             continue
         _, width, height = (int(count) for count in counts)
         starts = torch.empty(int(counts[0]) * width * height + 1, dtype=torch.int32, device="cpu")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrg._checks import made_on_cpu
 from torchrg.errors import ConfigError
-from torchrg.linalg.eigen import eigh3_of_few
+from torchrg.linalg import eigh3_of_few, unit_direction
 from torchrg.regions.fit import with_table_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
@@ -65,12 +65,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
         True
     """
     planes = seg.planes if isinstance(seg, Segmentation) else seg
-    upwards = torch.tensor([float(number) for number in up], dtype=torch.float64)
-    if upwards.shape != (3,) or not bool(upwards.isfinite().all() and upwards.any()):
-        raise ConfigError(
-            f"align_axes: expected up to be three numbers, not all zero, got {tuple(up)!r}."
-        )
-    upwards = upwards / upwards.norm()
+    upwards = unit_direction("align_axes", up)
     normals = planes.normal.cpu().double()
     areas = torch.where(planes.curved.cpu(), 0.0, planes.area.cpu().double())
     axis = _find_up(normals, areas, upwards)

@@ -115,7 +115,7 @@ def partition_points(
     partitions = _partition_places(
         distinct.points.detach().cpu(),
         normals[distinct.rows].detach().cpu(),
-        labels[distinct.rows].cpu(),
+        labels[distinct.rows].long().cpu(),
         config,
         None if shades is None else shades.cpu(),
         edges,
@@ -561,8 +561,9 @@ def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
     on_plane = has_one & (labels >= 0)
     if not bool(on_plane.any()):
         return main
-    width = int(labels.max()) + 1
-    keys = superpoints[on_plane] * width + labels[on_plane]
+    planes, rows = torch.unique(labels[on_plane].long(), return_inverse=True)
+    keys = superpoints[on_plane] * len(planes) + rows
     keys, shared = torch.unique(keys, return_counts=True)
-    mostly = 2 * shared > sizes[keys // width]
-    return main.index_copy(0, keys[mostly] // width, keys[mostly] % width)
+    mostly = 2 * shared > sizes[keys // len(planes)]
+    chosen = keys[mostly]
+    return main.index_copy(0, chosen // len(planes), planes[chosen % len(planes)])

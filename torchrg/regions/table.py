@@ -15,8 +15,8 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._optional import require
 from torchrg._parallel import map_tasks, places_of
 from torchrg.config import Auto
-from torchrg.errors import ConfigError, ShapeError
-from torchrg.linalg import eigh3_of_few
+from torchrg.errors import ShapeError
+from torchrg.linalg import eigh3_of_few, unit_direction
 from torchrg.linalg.moments import Segments, reduce_runs
 from torchrg.neighbors import distinct_rows, mark_first
 from torchrg.regions.adjacency import find_adjacency
@@ -132,7 +132,9 @@ def summarize_planes(
     planes = measure_planes(segments, places, fit, outline=outline)
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
-        planes = replace(planes, kind=classify_planes(planes, _direction(up, points)))
+        planes = replace(
+            planes, kind=classify_planes(planes, unit_direction("summarize_planes", up))
+        )
     if neighbors is not None:
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
@@ -227,21 +229,6 @@ def _without(vectors: Tensor, normals: Tensor) -> Tensor:
     return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
 
 
-def _direction(up: Sequence[float] | str, points: Tensor) -> Tensor:
-    """Return a direction beside the points, or say what is wrong with it."""
-    numbers = up
-    if isinstance(up, str):
-        length, name = (-1.0 if up.startswith("-") else 1.0), up.removeprefix("-")
-        numbers = [length * (name == axis) for axis in "xyz"]
-    direction = torch.tensor(list(numbers), dtype=points.dtype, device=points.device)
-    if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
-        raise ConfigError(
-            "summarize_planes: expected up to be three numbers, not all zero, or the name of an "
-            f"axis, got {up!r}."
-        )
-    return direction
-
-
 def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     """Return the role of each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
 
@@ -254,7 +241,7 @@ def classify_planes(planes: Planes, up: Tensor) -> Tensor:
     kind = torch.full_like(planes.count, kinds["other"])
     if len(kind) == 0:
         return kind
-    up = up.to(planes.normal.dtype) / up.to(planes.normal.dtype).norm()
+    up = up.to(planes.normal)
     steepness = (planes.normal * up).sum(dim=1).abs()
     height = (planes.center * up).sum(dim=1)
     reach = ((planes.axes * up).sum(dim=2).abs() * planes.extent).sum(dim=1) / 2

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
+from torchrg.linalg import unit_direction
 from torchrg.metrics.contingency import check_labels, contingency_table, number_labels
 from torchrg.metrics.labels import match_regions
 from torchrg.neighbors import search_knn
@@ -178,9 +179,7 @@ def color_normals(
     tensor = as_tensor("color_normals", "normals", normals)
     check_shapes("color_normals", normals=(tensor, "* 3"))
     check_floating("color_normals", normals=tensor)
-    if not any(up):
-        raise ConfigError("color_normals: expected up to be a direction, got zeros.")
-    axis = torch.nn.functional.normalize(tensor.new_tensor(up), dim=0)
+    axis = unit_direction("color_normals", up).to(tensor)
     east = torch.zeros_like(axis)
     east[axis.abs().argmin()] = 1
     east = torch.nn.functional.normalize(east - (east @ axis) * axis, dim=0)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from torchrg.linalg import unit_direction
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
 from torchrg.plane_table import Json, describe_planes
@@ -79,7 +80,7 @@ class Shown(NamedTuple):
 
 def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
     """Return the axes of a page for its first cloud."""
-    third = functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
+    third = unit_direction("make_page", up)
     # With z up, x stays x; else the axis least along the upward one, so that x is never up.
     start = torch.zeros(3, dtype=torch.float64)
     start[int(third.abs().argmin())] = 1

@@ -29,6 +29,7 @@ from torchrg._checks import check_choices
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
+from torchrg.linalg import unit_direction
 from torchrg.neighbors.order import restore_rows
 from torchrg.plane_table import encode_csv
 from torchrg.render.channels import MODES, channels_of, encode_directions
@@ -172,8 +173,8 @@ def _check_settings(
     check_choices("make_page", view=(view, View))
     if max_points < 1:
         raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
-    if up is not None and not any(up):
-        raise ConfigError("make_page: expected up to be a direction, got zeros.")
+    if up is not None:
+        unit_direction("make_page", up)
     if truth is not None and len(truth) != len(cloud):
         raise ConfigError(
             f"{truth.source or 'make_page'}: expected a truth of {len(cloud):,} points, got "

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path, refusing
+from torchrg.linalg import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides
@@ -38,8 +38,11 @@ _LARGEST = 4
 """Largest radius of a disc in units of the usual one, so that stray points stay small."""
 _WIDEST = 0.02
 """Largest radius of a disc in widths of the picture, which bounds the time of drawing it."""
-_ALWAYS = 8.0
-"""Radius in pixels of the picture that a disc may always have, however small the picture is."""
+_ALWAYS, _MAX_RADIUS = 8.0, 64.0
+"""Radii in pixels of the picture: one that a disc may always have, however small the picture is,
+and the largest, however wide it is, as time grows with the square."""
+_MAX_SIDE, _MAX_SUPERSAMPLING = 2**13, 16
+"""Most pixels along a side, those of a screen of 8K, and within a pixel: memory holds them."""
 _GAP = 0.6
 """Half the width of the gaps that are closed, in radii of a disc."""
 _STEEPEST = 0.05
@@ -76,7 +79,7 @@ def draw_picture(
     lengths = _RADIUS * surface.spacing.clamp(max=_LARGEST * float(surface.spacing.median()))
     places = is_shown.nonzero().squeeze(-1)
     radius, length = _usual_radius(project, surface.points, lengths, places)
-    widest = supersampling * max(_ALWAYS, _WIDEST * width)
+    widest = supersampling * min(max(_ALWAYS, _WIDEST * width), _MAX_RADIUS)
     buffer = DepthBuffer(
         width * supersampling, height * supersampling, max_radius=widest, device=places.device
     )
@@ -196,8 +199,9 @@ def render_cloud(
             largest wall that is nearest to x; clouds of one room are seen from one place.
             Default: of eight, the one from which most surface is seen.
         elevation_deg: Angle of the viewer over the horizon. Default: 35, from above 90.
-        width: In pixels.
-        height: In pixels. Default: what the cloud needs, from a quarter of the width to all of it.
+        width: In pixels, at most 8,192.
+        height: In pixels, at most 8,192. Default: what the cloud needs, from a quarter of the width
+            to all of it.
         supersampling: Each pixel is the mean of the square of this many pixels a side.
 
     Returns:
@@ -219,9 +223,9 @@ def render_cloud(
         (planes,) = check_labels("render_cloud", labels=labels)
         check_shapes("render_cloud", points=(cloud, "N 3"), labels=(planes, "N"))
     check_choices("render_cloud", view=(view, View))
-    if not any(up):
-        raise ConfigError("render_cloud: expected up to be a direction, got zeros.")
-    _check_at_least_one("render_cloud", width=width, height=height, supersampling=supersampling)
+    upward = unit_direction("render_cloud", up)
+    _check_sizes("render_cloud", _MAX_SIDE, width=width, height=height)
+    _check_sizes("render_cloud", _MAX_SUPERSAMPLING, supersampling=supersampling)
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
         return _white(height or round(0.75 * width), width, cloud.device)
@@ -230,7 +234,7 @@ def render_cloud(
     if view == "sensor":
         camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
     else:
-        upward = functional.normalize(surface.points.new_tensor(up), dim=0)
+        upward = upward.to(surface.points)
         sides = find_sides(surface, None if planes is None else planes[surface.rows], upward)
         viewpoint = choose_viewpoint(
             surface, sides, view, upward, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
@@ -265,7 +269,7 @@ def render_points(
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If ``supersampling`` is below 1.
+        ConfigError: If ``supersampling`` is not from 1 to 16.
 
     Example:
         >>> from torchrg.render import make_camera
@@ -276,7 +280,7 @@ def render_points(
         [[255, 255, 255], [207, 0, 0]]
     """
     cloud, paint, slant = _check_cloud("render_points", points, colors, normals)
-    _check_at_least_one("render_points", supersampling=supersampling)
+    _check_sizes("render_points", _MAX_SUPERSAMPLING, supersampling=supersampling)
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
         return _white(int(camera.height), int(camera.width), cloud.device)
@@ -351,7 +355,8 @@ def _check_cloud(
     return cloud, paint, None if slant is None else slant.detach()
 
 
-def _check_at_least_one(caller: str, **settings: int | None) -> None:
+def _check_sizes(caller: str, most: int, **settings: int | None) -> None:
+    """Raise ConfigError unless numbers of pixels are from 1 to ``most``."""
     for name, value in settings.items():
-        if value is not None and value < 1:
-            raise ConfigError(f"{caller}: expected {name} >= 1, got {value!r}.")
+        if value is not None and not 1 <= value <= most:
+            raise ConfigError(f"{caller}: expected {name} from 1 to {most:,}, got {value!r}.")

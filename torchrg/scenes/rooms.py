@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from torchrg.config import check_values
 from torchrg.errors import ConfigError
 from torchrg.scenes import parts as draw
 from torchrg.scenes.geometry import Array, Frame, Triple
@@ -48,6 +49,8 @@ _PARALLEL = 1 - 0.02**2 / 2
 """Least cosine between faces that count as parallel, of about one degree."""
 _CLEARANCES = (1.0, 0.6, 0.4, 0.2)
 """Metres of free space around a scanner, the first that there is."""
+_MAX_SIDE, _MAX_COUNT = 1000, 1000
+"""Longest side of a room in meters, and most objects of a kind: places are listed one by one."""
 _PLACE_TRIES = 50
 """Times that a place for a scanner is drawn with each clearance."""
 
@@ -83,10 +86,14 @@ class RoomLayout:
     """Places where a scanner may stand, spread along the room."""
 
     def __post_init__(self) -> None:
+        check_values(self)
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name.startswith("num_") and value < 0:
-                raise ConfigError(f"RoomLayout: expected {field.name} >= 0, got {value}.")
+            if field.name.startswith("num_") and not 0 <= value <= _MAX_COUNT:
+                raise ConfigError(
+                    f"RoomLayout: expected {field.name} >= 0 and at most {_MAX_COUNT:,}, got "
+                    f"{value}."
+                )
         if self.num_small_boxes > self.num_tables:
             raise ConfigError(
                 f"RoomLayout: expected num_small_boxes <= {self.num_tables}, "
@@ -95,9 +102,10 @@ class RoomLayout:
         for name in ("plate_thickness", "panel_thickness", "num_viewpoints"):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"RoomLayout: expected {name} > 0, got {getattr(self, name)}.")
-        if min(self.size[:2]) < 1 or self.size[2] < 2.3:
+        if min(self.size[:2]) < 1 or self.size[2] < 2.3 or max(self.size) > _MAX_SIDE:
             raise ConfigError(
-                f"RoomLayout: expected size of at least 1 x 1 x 2.3 metres, got {self.size}."
+                f"RoomLayout: expected size of at least 1 x 1 x 2.3 and at most {_MAX_SIDE:,} "
+                f"meters, got {self.size}."
             )
 
     def draw_wall(self, number: int, wall: Frame, length: float, holes: Sequence[Hole]) -> Part:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrg.errors import ConfigError
 from torchrg.scenes.geometry import Array, Floats
 from torchrg.scenes.surfaces import Solid, Surface
+from torchrg.structures import FARTHEST, MAX_POINTS
 
 NoiseDirection = Literal["normal", "isotropic"]
 
@@ -135,10 +136,14 @@ def sample_scene(
         >>> sample_scene(build_room(seed=3), 1000, noise=0.002).points.shape
         torch.Size([1000, 3])
     """
-    if num_points < 1:
-        raise ConfigError(f"sample_scene: expected num_points >= 1, got {num_points}.")
-    if not 0 <= noise < float("inf"):
-        raise ConfigError(f"sample_scene: expected noise >= 0 metres, got {noise}.")
+    if not 1 <= num_points <= MAX_POINTS:
+        raise ConfigError(
+            f"sample_scene: expected num_points from 1 to {MAX_POINTS:,}, got {num_points}."
+        )
+    if not 0 <= noise <= FARTHEST:
+        raise ConfigError(
+            f"sample_scene: expected noise from 0 to {FARTHEST:g} meters, got {noise}."
+        )
     if noise_direction not in get_args(NoiseDirection):
         options = ", ".join(get_args(NoiseDirection))
         raise ConfigError(
