@@ -1,6 +1,7 @@
 """Depth frames with their cameras, poses and colours, as a data set."""
 
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,14 @@ from torchrg.datasets.rgbd_files import (
     read_depth,
     refuse_recording,
 )
-from torchrg.datasets.rgbd_layouts import LAYOUTS, FrameLayout, find_layout, find_recordings
-from torchrg.depth.camera import Pinhole, check_camera
-from torchrg.errors import ConfigError, FormatError
+from torchrg.datasets.rgbd_layouts import (
+    LAYOUTS,
+    find_layout,
+    find_recordings,
+    recording_camera,
+)
+from torchrg.depth.camera import Pinhole, check_camera, doubt_view
+from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.transforms.rows import SampleDict
 
 
@@ -37,6 +43,7 @@ class RGBDFrame:
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, if it is known.
         no_depth: Stored value that means "no depth" beside 0, if there is one.
         sources: Further files that intrinsics and pose were read from.
+        origin: Where the intrinsics are from, in words.
 
     Raises:
         ShapeError: If a matrix has another shape.
@@ -51,6 +58,7 @@ class RGBDFrame:
     pose: Tensor | None = None
     no_depth: int | None = None
     sources: tuple[Path, ...] = ()
+    origin: str = ""
 
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
@@ -160,7 +168,7 @@ class RGBDFrames(SceneDataset):
         if name not in LAYOUTS:
             names = ", ".join(sorted(LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = [*_find(folder, LAYOUTS[name], intrinsics, depth_scale)]
+        frames = [*_find(folder, name, intrinsics, depth_scale)]
         if not frames:
             suffixes = " ".join(DEPTH_SUFFIXES)
             raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
@@ -187,17 +195,35 @@ class RGBDFrames(SceneDataset):
 
 
 def _find(
-    root: Path, layout: FrameLayout, intrinsics: Tensor | Pinhole | None, depth_scale: float | None
+    root: Path, name: str, intrinsics: Tensor | Pinhole | None, depth_scale: float | None
 ) -> Iterator[RGBDFrame]:
-    """Yield the frames of a folder, of one recording or of several beside each other."""
+    """Yield the frames of a folder, of one recording or of several beside each other.
+
+    Warns:
+        DepthWarning: If the camera is the data set's, for want of a file; once for each camera. If
+            it is improbable for an image; once for each recording.
+    """
+    layout = LAYOUTS[name]
+    assumed: set[Pinhole] = set()
     for prefix, folder in find_recordings(root, layout):
-        camera: Tensor | Pinhole | None = intrinsics
-        files: tuple[Path, ...] = ()
-        if camera is None and layout.camera is not None:
-            camera, files = layout.camera(folder)
+        camera, files, origin = intrinsics, tuple[Path, ...](), "given"
+        if intrinsics is None:
+            camera, files = recording_camera(folder, root, layout)
+            origin = f"{files[0].name}" if files else f"built in, {name}"
+        if isinstance(camera, Pinhole) and origin.startswith("built") and camera not in assumed:
+            assumed.add(camera)
+            numbers = ",".join(f"{number:g}" for number in camera[:4])
+            warnings.warn(
+                f"{folder}: no camera file found; taking the built-in camera of {name}, {numbers}; "
+                "pass --intrinsics if the frames are of another.",
+                DepthWarning,
+                stacklevel=3,
+            )
+        is_doubted = False
         for frame in layout.frames(folder):
             chosen = frame.camera if camera is None else camera
-            scales = (depth_scale, frame.depth_scale, layout.depth_scale)
+            own = chosen.depth_scale if isinstance(chosen, Pinhole) else None
+            scales = (depth_scale, own, frame.depth_scale, layout.depth_scale)
             scale = next((value for value in scales if value is not None), None)
             if chosen is None or scale is None:
                 missing = "intrinsics" if chosen is None else "depth_scale"
@@ -205,11 +231,36 @@ def _find(
                     f"{frame.depth}: expected {missing}, which depth images do not hold; pass it"
                     f"{': 1 for metres, 1000 for millimetres' if chosen is not None else ''}."
                 )
-            matrix = (
-                chosen.matrix(image_size(frame.depth)) if isinstance(chosen, Pinhole) else chosen
-            )
-            name, sources = prefix + frame.name, files + frame.sources
-            no_depth = layout.no_depth
+            files_of_camera = files or (frame.sources if camera is None else ())
+            source = f"{(*files_of_camera, frame.depth)[0]}"
+            matrix, doubt = fit_camera(source, chosen, frame.depth)
+            if doubt and not is_doubted:
+                warnings.warn(doubt, DepthWarning, stacklevel=3)
+            is_doubted |= bool(doubt)
             yield RGBDFrame(
-                frame.depth, matrix, scale, name, frame.color, frame.pose, no_depth, sources
+                frame.depth,
+                matrix,
+                scale,
+                prefix + frame.name,
+                frame.color,
+                frame.pose,
+                layout.no_depth,
+                files + frame.sources,
+                origin if camera is not None else frame.sources[0].name,
             )
+
+
+def fit_camera(source: str, camera: Tensor | Pinhole, image: Path) -> tuple[Tensor, str]:
+    """Return the camera matrix for a depth image, and why it is improbable, if it is.
+
+    ``source`` is what messages begin with: the file of the camera, or the image.
+
+    Raises:
+        ConfigError: If the camera cannot be that of the image.
+    """
+    size = image_size(image)
+    matrix = camera.matrix(size, source) if isinstance(camera, Pinhole) else camera
+    check_shapes(source, intrinsics=(matrix, "3 3"))
+    check_camera(source, matrix)
+    values = matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return matrix, doubt_view(source, Pinhole(*values), size, name="--intrinsics") if size else ""

@@ -68,7 +68,7 @@ def segment_depth(
         ([0, 0, 1, 1], [2.0, 3.0])
     """
     depth = as_tensor("segment_depth", "depth", depth)
-    intrinsics = read_intrinsics("segment_depth", intrinsics)
+    intrinsics = read_intrinsics("segment_depth", intrinsics, depth)
     intrinsics = intrinsics[0] if intrinsics.shape[:-2] == (1,) else intrinsics
     check_shapes(
         "segment_depth",
@@ -85,6 +85,12 @@ def _segment(
     depth: Tensor, intrinsics: Tensor, config: DepthConfig, pose: Tensor | None
 ) -> Segmentation:
     """Do what :func:`segment_depth` says."""
+    if depth.numel() == 0:
+        pixel = _segment(depth.new_zeros(1, 1), intrinsics, config, pose)
+        labels, normals, curvature, sharp, valid = (
+            image.new_zeros(*depth.shape, *image.shape[2:]) for image in pixel[:5]
+        )
+        return Segmentation(labels, normals, curvature, sharp, valid, pixel.planes)
     if config.max_depth is not None:
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = has_depth(depth)
