@@ -314,14 +314,14 @@ class ScanNetSource(CloudSource):
     def read(self, scan: Scan) -> Reading:
         """Read a scan."""
         mesh = scan.inputs[0]
+        dataset, objects = _dataset_of_mesh(mesh), None
         with collecting_notes() as notes:
             arrays = read_scannet_scan(mesh, self.root)
+            if self.layout == "scannet" and dataset == "ScanNet":
+                objects = read_objects(mesh, len(arrays["coord"]))
         front = arrays.pop("front", None)
         colors = {name: arrays[name] for name in arrays.keys() & {"color"}}
         cloud = Cloud(arrays["coord"], colors, source=str(mesh), front=front)
-        dataset, objects = _dataset_of_mesh(mesh), None
-        if self.layout == "scannet" and dataset == "ScanNet":
-            objects = read_objects(mesh, len(cloud))
         if "instance" not in arrays and not scan.name.startswith("test/"):
             notes.append("no labels: annotations or the table of their words are missing")
         return Reading(cloud, arrays, dataset, objects, notes=tuple(notes))

@@ -135,7 +135,7 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
         raise ConfigError(
             f"{path}: expected {flag}, which depth images do not hold; pass it, {hint}."
         )
-    matrix, doubt = fit_camera(f"{path}", camera, path)
+    matrix, doubt = fit_camera(path, camera)
     if doubt:
         warn(doubt)
     return RGBDFrame(path, matrix, scale)

@@ -1,5 +1,6 @@
 """Depth frames with their cameras, poses and colours, as a data set."""
 
+import math
 import os
 import warnings
 from collections.abc import Iterator, Sequence
@@ -13,6 +14,7 @@ from torchrg._checks import check_shapes
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
+    MAX_PIXELS,
     image_size,
     read_color,
     read_depth,
@@ -231,9 +233,8 @@ def _find(
                     f"{frame.depth}: expected {missing}, which depth images do not hold; pass it"
                     f"{': 1 for metres, 1000 for millimetres' if chosen is not None else ''}."
                 )
-            files_of_camera = files or (frame.sources if camera is None else ())
-            source = f"{(*files_of_camera, frame.depth)[0]}"
-            matrix, doubt = fit_camera(source, chosen, frame.depth)
+            of_camera = files or (frame.sources if camera is None else ())
+            matrix, doubt = fit_camera(frame.depth, chosen, *of_camera[:1])
             if doubt and not is_doubted:
                 warnings.warn(doubt, DepthWarning, stacklevel=3)
             is_doubted |= bool(doubt)
@@ -250,17 +251,24 @@ def _find(
             )
 
 
-def fit_camera(source: str, camera: Tensor | Pinhole, image: Path) -> tuple[Tensor, str]:
+def fit_camera(
+    image: Path, camera: Tensor | Pinhole, file: Path | None = None
+) -> tuple[Tensor, str]:
     """Return the camera matrix for a depth image, and why it is improbable, if it is.
 
-    ``source`` is what messages begin with: the file of the camera, or the image.
+    Args:
+        image: The depth image. The size of one that is too large to be read does not count.
+        camera: The camera, or its matrix.
+        file: Where the camera was read from, for messages.
 
     Raises:
         ConfigError: If the camera cannot be that of the image.
     """
+    caller = f"{image}" if file is None else f"{image}: {file.name}"
     size = image_size(image)
-    matrix = camera.matrix(size, source) if isinstance(camera, Pinhole) else camera
-    check_shapes(source, intrinsics=(matrix, "3 3"))
-    check_camera(source, matrix)
+    size = None if size and math.prod(size) > MAX_PIXELS else size
+    matrix = camera.matrix(size, caller) if isinstance(camera, Pinhole) else camera
+    check_shapes(caller, intrinsics=(matrix, "3 3"))
+    check_camera(caller, matrix)
     values = matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return matrix, doubt_view(source, Pinhole(*values), size, name="--intrinsics") if size else ""
+    return matrix, doubt_view(caller, Pinhole(*values), size, name="--intrinsics") if size else ""

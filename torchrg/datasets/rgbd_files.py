@@ -36,7 +36,7 @@ _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1
 """Beginning of a binary PGM: width, height and the largest value."""
 _LONGEST_HEAD = 512
 _MOST_OF_8_BITS, _MOST_OF_16_BITS = 255, 65535
-_MOST_PIXELS = 1 << 26
+MAX_PIXELS = 1 << 26
 """Pixels of the largest image that is read, 8192 x 8192. No depth camera has as many, and what is
 made of them on the way to metres takes 1.5 GB. A library that has less ends the process."""
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
@@ -135,9 +135,9 @@ def _read_image(source: Path, kinds: str) -> Array:
     from kornia_rs import io
 
     check_file(source)
-    if source.suffix.lower() == ".png" and (count := num_pixels(source)) > _MOST_PIXELS:
+    if source.suffix.lower() == ".png" and (count := num_pixels(source)) > MAX_PIXELS:
         raise FormatError(
-            f"{source}: expected an image of at most {_MOST_PIXELS:,} pixels, got {count:,} in its "
+            f"{source}: expected an image of at most {MAX_PIXELS:,} pixels, got {count:,} in its "
             "header; the file is damaged, fetch it again, or make it smaller."
         )
     with refusing(f"{source}: expected a {kinds} image, got: ", Exception):

@@ -430,7 +430,8 @@ def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path
     for path in sorted(marked, key=lambda path: path != root and path.is_symlink()):
         first_names.setdefault(path.resolve(), path)
     folders = [path for path in marked if first_names[path.resolve()] == path]
-    warn_of_links(root, [path for path in marked if path not in folders])
+    passed = [path for path in marked if path not in folders]
+    warn_of_links(root, [path for path in passed if not {*path.parents} & {*passed}])
     if not folders:
         raise FormatError(f"{root}: expected recordings with {layout.mark} in them, got none.")
     for folder in folders:

@@ -44,7 +44,10 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a camera matrix is none.
+        ConfigError: If a camera matrix is none, or cannot be of such images.
+
+    Warns:
+        DepthWarning: If a camera is improbable; see :func:`check_view`.
 
     Example:
         >>> camera = torch.tensor([[2.0, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
@@ -52,7 +55,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         tensor([[-1., nan],
                 [-1.,  1.]])
     """
-    intrinsics = read_intrinsics("depth_to_points", intrinsics, depth)
+    intrinsics = read_intrinsics("depth_to_points", intrinsics)
     check_shapes(
         "depth_to_points",
         depth=(depth, "B H W"),
@@ -60,6 +63,8 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         poses=(poses, "B 4 4"),
     )
     check_floating("depth_to_points", depth=depth)
+    if has_values(intrinsics):
+        check_view("depth_to_points", intrinsics, (depth.shape[2], depth.shape[1]))
     return _unproject(depth, intrinsics, poses)
 
 
@@ -76,12 +81,11 @@ def _unproject(depth: Tensor, intrinsics: Tensor, poses: Tensor | None) -> Tenso
     return points.to(poses.dtype) @ poses[:, None, :3, :3].mT + poses[:, None, None, :3, 3]
 
 
-def read_intrinsics(caller: str, source: Any, depth: Tensor | None = None) -> Tensor:  # noqa: ANN401
+def read_intrinsics(caller: str, source: Any) -> Tensor:  # noqa: ANN401
     """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)`` of pinhole cameras without skew.
 
     ``source`` are such matrices, tensors or arrays, those of 4 x 4 as kornia has them, or its
-    ``PinholeCamera``, of which the intrinsics are taken and nothing else. They are checked against
-    the size of ``depth`` ``(*, H, W)``; see :func:`check_view`.
+    ``PinholeCamera``, of which the intrinsics are taken and nothing else.
 
     Raises:
         ShapeError: If it is no tensor, array or camera.
@@ -95,8 +99,6 @@ def read_intrinsics(caller: str, source: Any, depth: Tensor | None = None) -> Te
     tensor = tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
     if tensor.shape[-2:] == (3, 3) and has_values(tensor):
         check_camera(caller, tensor)
-        if depth is not None and depth.ndim > 1:
-            check_view(caller, tensor, (depth.shape[-1], depth.shape[-2]))
     return tensor
 
 
@@ -138,7 +140,7 @@ def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
     rows = intrinsics.detach().reshape(-1, 9)[:, [0, 4, 2, 5]].double().cpu().tolist()
     for row in dict.fromkeys(map(tuple, rows)):
         if doubt := doubt_view(caller, Pinhole(*row), size):
-            warnings.warn(doubt, DepthWarning, stacklevel=4)
+            warnings.warn(doubt, DepthWarning, stacklevel=3)
 
 
 def doubt_view(

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import places_of, sequential_operations
 from torchrg.config import DepthConfig, settings_of
-from torchrg.depth.camera import has_depth, read_intrinsics
+from torchrg.depth.camera import check_view, has_depth, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import fit_pixels
 from torchrg.depth.pixels import Pixels, describe_pixels
@@ -57,7 +57,11 @@ def segment_depth(
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If ``intrinsics`` is no matrix of a camera, or a setting is wrong.
+        ConfigError: If ``intrinsics`` cannot be of a camera of such images, or a setting is wrong.
+
+    Warns:
+        DepthWarning: If ``intrinsics`` are improbable; see
+            :func:`torchrg.depth.camera.check_view`.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -68,7 +72,7 @@ def segment_depth(
         ([0, 0, 1, 1], [2.0, 3.0])
     """
     depth = as_tensor("segment_depth", "depth", depth)
-    intrinsics = read_intrinsics("segment_depth", intrinsics, depth)
+    intrinsics = read_intrinsics("segment_depth", intrinsics)
     intrinsics = intrinsics[0] if intrinsics.shape[:-2] == (1,) else intrinsics
     check_shapes(
         "segment_depth",
@@ -77,6 +81,7 @@ def segment_depth(
         pose=(pose, "4 4"),
     )
     check_floating("segment_depth", depth=depth)
+    check_view("segment_depth", intrinsics, (depth.shape[1], depth.shape[0]))
     settings = settings_of("segment_depth", DepthConfig, config, changes)
     return _segment(depth, intrinsics, settings, pose)
 
