@@ -28,7 +28,7 @@ from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.fields import COLUMNS_RULE
-from torchrg.structures import Sampling
+from torchrg.structures import FARTHEST, Sampling
 
 _MOST_THREADS = 1024
 """More than any machine has cores; many more cannot be started, and torch ends with the process."""
@@ -237,10 +237,20 @@ def parse_intrinsics(text: str | None) -> Pinhole | None:
     """Return the camera of ``fx,fy,cx,cy`` or of a file; None where none is given."""
     if text is None:
         return None
+    numbers: list[float] = []
     with suppress(ValueError):
-        fx, fy, cx, cy = map(float, text.split(","))
+        numbers = [*map(float, text.split(","))]
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+        if 0 in (fx, fy) or not all(abs(number) <= FARTHEST for number in numbers):
+            raise ConfigError(
+                f"expected finite --intrinsics with fx and fy not 0, got {text}; pass pixels."
+            )
         if min(fx, fy) < 0:
-            warn(f"--intrinsics {text}: a negative focal length turns the image over.")
+            warn(
+                f"--intrinsics {text}: a negative focal length turns the image over; leave out the "
+                "minus unless that is meant."
+            )
         return Pinhole(fx, fy, cx, cy)
     is_file = False
     with suppress(OSError):

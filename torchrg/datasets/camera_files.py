@@ -20,7 +20,7 @@ from torchrg.io.files import DAMAGES, check_file, read_text, refusing
 from torchrg.structures import FARTHEST
 
 Record = Mapping[str, Any]
-SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".npy", ".pincam")
+SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".npy", ".pincam", ".k")
 """Suffixes of files that are taken for camera files by their name."""
 _SECTIONS = ("intrinsic", "intrinsics", "camera", "cam", "cam0", "depth", "depth_intrinsics")
 """Sections of a file that hold the camera of depth images: of Open3D, NICE-SLAM and Kalibr."""
@@ -190,7 +190,8 @@ def read_record(path: Path, *parts: str) -> dict[str, Any]:
                 raise ValueError("aliases, which grow without bounds")
             content = next(iter(yaml.safe_load_all(text)), None)
     if not isinstance(content, dict):
-        raise FormatError(f"{path}: expected names with values, got {type(content).__name__}.")
+        got = repr(content[:40]) if isinstance(content, str) else type(content).__name__
+        raise FormatError(f"{path}: expected names with values, got {got}.")
     inside = (content[section] for section in parts if isinstance(content.get(section), dict))
     record: dict[str, Any] = next(inside, content)
     return record
@@ -225,8 +226,8 @@ def camera_of(path: Path, record: Record) -> Pinhole:
         )
     if min(fx, fy) < 0:
         warnings.warn(
-            f"{path}: expected positive focal lengths, got {fx:g} and {fy:g}; a negative one turns "
-            "the image over.",
+            f"{path}: a negative focal length, {min(fx, fy):g}, turns the image over; leave out "
+            "the minus unless that is meant.",
             DepthWarning,
             stacklevel=2,
         )
@@ -329,7 +330,7 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
         if cameras:
             (path, camera), *others = cameras.items()
             for other, its in others:
-                if its[:4] != camera[:4]:
+                if its[:4] != camera[:4] and ("depth" in other.name) == ("depth" in path.name):
                     warnings.warn(
                         f"{path}: taken as the camera, although {other.name} has another; pass "
                         "--intrinsics to choose.",
