@@ -168,7 +168,7 @@ def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
         list_jobs(source, tmp_path / "out")
 
 
-@pytest.mark.filterwarnings("ignore:.*no camera file found")
+@pytest.mark.filterwarnings("ignore:.*get the built-in camera")
 def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
     for name in ("seq-01", "seq-02"):
         (root / name).mkdir()

@@ -152,21 +152,27 @@ def test_a_camera_file_next_to_the_frames_wins(scene, name):
     assert only_frame(scene, depth_scale=500.0).depth_scale == 500
 
 
-@pytest.mark.parametrize("place", ["scene/seq-01", "scene", ""])
-@pytest.mark.parametrize("start", ["scene/seq-01", "scene", ""])
-def test_the_nearest_camera_file_counts(scene, place, start):
+BUILT_IN = "frames without a camera file get the built-in camera of 7-scenes, 585,585,320,240; pass"
+
+
+@pytest.mark.parametrize(("place", "up"), [("scene/seq-01", 0), ("scene", 1), ("", 2)])
+@pytest.mark.parametrize(("start", "down"), [("scene/seq-01", 0), ("scene", 1), ("", 2)])
+def test_the_nearest_camera_file_counts(scene, place, up, start, down):
     root = scene.parent
-    np.save(root / "far.npy", K)
     np.savetxt(root / place / "camera-intrinsics.txt", K)
-    if place == "" and start == "scene/seq-01":
-        # Two folders above: it may be anybody's.
-        with pytest.warns(DepthWarning, match="no camera file found"):
-            assert only_frame(root / start).origin == "built in, 7-scenes"
+    for folder in [root / place, *(root / place).parents][1 : 1 + 2 - up]:
+        np.savetxt(folder / "intrinsics.txt", np.diag([50.0, 50, 1]))
+    if up > down + 1:  # Two folders above what was named: it may be of anything.
+        with pytest.warns(DepthWarning, match=BUILT_IN):
+            frame = only_frame(root / start)
+        assert frame.origin == "built in, 7-scenes"
         return
-    assert only_frame(root / start).intrinsics[0].tolist() == [FX, 0, CX]
-    if place:
-        np.savetxt(root / place / ".." / "camera-intrinsics.txt", np.diag([50.0, 50, 1]) + K * 0)
-        assert only_frame(root / start).intrinsics[0].tolist() == [FX, 0, CX]
+    if up > down:
+        with pytest.warns(DepthWarning, match=r"camera-intrinsics.txt, outside of this folder"):
+            frame = only_frame(root / start)
+    else:
+        frame = only_frame(root / start)
+    assert frame.intrinsics[0].tolist() == [FX, 0, CX]
 
 
 @pytest.mark.parametrize("layout", ["tum", "icl-nuim", "images", "scannet"])
@@ -183,11 +189,10 @@ def test_a_camera_without_a_file_is_named_once(scene, tmp_path, run):
     write_depth(scene / "seq-02" / "frame-0.depth.png", np.full((HEIGHT, WIDTH), 1.5))
     done = run("convert", "rgbd", scene, tmp_path / "out", "--dry-run")
     assert done.err.count("torchrg: ") == 1
-    line = "seq-01: no camera file found; taking the built-in camera of 7-scenes, 585,585,320,240"
-    assert f"{line}; pass --intrinsics" in done.err
+    assert f"{scene}: {BUILT_IN} --intrinsics" in done.err
 
 
-@pytest.mark.filterwarnings("ignore:.*no camera file found")
+@pytest.mark.filterwarnings("ignore:.*get the built-in camera")
 def test_the_record_names_the_camera_and_a_new_file_changes_the_input(scene, tmp_path):
     source = RGBDSource(scene, DepthConfig(), "7-scenes")
     (job,) = list_jobs(source, tmp_path / "out")
@@ -203,6 +208,18 @@ def test_the_record_names_the_camera_and_a_new_file_changes_the_input(scene, tmp
     record = json.loads((job.folder / "provenance.json").read_text())
     assert record["measured"]["camera"] == "camera-intrinsics.txt"
     assert not make_plan(jobs).reasons
+
+
+def test_images_of_several_cameras_have_the_nearest(tmp_path):
+    for name, focal in (("a", 30.0), ("b", 40.0)):
+        write_depth(tmp_path / name / "depth" / "0.png", np.full((HEIGHT, WIDTH), 1.5))
+        write_file(tmp_path / name / "camera.json", {**REALSENSE, "fx": focal, "fy": focal})
+    frames = RGBDFrames.from_folder(tmp_path, depth_scale=1000.0).frames
+    assert [float(frame.intrinsics[0, 0]) for frame in frames] == [30, 40]
+    assert frames[1].files == (tmp_path / "b/depth/0.png", tmp_path / "b/camera.json")
+    (tmp_path / "b" / "camera.json").unlink()
+    with pytest.raises(ConfigError, match=r"b/depth/0.png: expected intrinsics, which depth"):
+        RGBDFrames.from_folder(tmp_path, depth_scale=1000.0)
 
 
 def test_two_camera_files_that_differ_are_told_apart(scene):
@@ -222,7 +239,7 @@ def test_files_that_only_sometimes_hold_a_camera_are_passed_over(scene):
     (scene / "metadata.json").write_text('{"frames": 3}')
     (scene / "intrinsics_color.txt").write_text(rows(2 * K))
     (scene / "camera_poses.txt").write_text("0 0 0")
-    with pytest.warns(DepthWarning, match="no camera file found"):
+    with pytest.warns(DepthWarning, match=BUILT_IN):
         only_frame(scene)
     (scene / "camera.txt").write_text("525 525 oops")
     with pytest.raises(FormatError, match=r"camera.txt: expected names with values, got '525 52"):

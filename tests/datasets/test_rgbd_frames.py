@@ -19,7 +19,7 @@ from torchrg.errors import ConfigError, FormatError, ShapeError
 from torchrg.render import write_png
 from torchrg.transforms import DepthToCloud
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*no camera file found")
+pytestmark = pytest.mark.filterwarnings("ignore:.*get the built-in camera")
 HALF = math.sqrt(0.5)
 # A quarter turn about z, as x y z w, and as a matrix.
 CAMERA = make_intrinsics(5.0, 5.0, 2.5, 1.5)
@@ -253,7 +253,7 @@ def test_wrong_folders_are_refused(tmp_path):
     camera = torch.eye(3)
     with pytest.raises(FormatError, match="expected depth images"):
         RGBDFrames.from_folder(tmp_path, "images", intrinsics=camera, depth_scale=1)
-    (tmp_path / "depth").mkdir()
+    write_depth(tmp_path / "depth" / "0.png", 1500)
     with pytest.raises(FormatError, match=r"expected intrinsic/intrinsic_depth.txt or intrinsics_"):
         RGBDFrames.from_folder(tmp_path, "scannet")
     write_text(tmp_path / "intrinsic" / "intrinsic_depth.txt", "1 2 3\n")

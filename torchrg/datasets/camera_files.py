@@ -329,6 +329,13 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
                 cameras[path] = read_camera(path)
         if cameras:
             (path, camera), *others = cameras.items()
+            if not place.is_relative_to(top) and place != folder:
+                warnings.warn(
+                    f"{root}: taking the camera of {path}, outside of this folder; pass "
+                    "--intrinsics to choose another.",
+                    DepthWarning,
+                    stacklevel=3,
+                )
             for other, its in others:
                 if its[:4] != camera[:4] and ("depth" in other.name) == ("depth" in path.name):
                     warnings.warn(
@@ -343,7 +350,7 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
 
 def _camera_files(folder: Path) -> list[Path]:
     """Return the camera files of a folder and of its folders of cameras, those of depth first."""
-    entries = listed(folder)
+    entries = listed(folder) if folder.is_dir() else []
     folders = [path for path in entries if _FOLDERS.fullmatch(path.name.lower()) and path.is_dir()]
     files = [path for place in (entries, *map(listed, folders)) for path in place]
     names = {path: path.stem.lower().replace("-", "_").strip("_") for path in files}

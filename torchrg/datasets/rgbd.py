@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_shapes
+from torchrg.datasets.camera_files import find_camera
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
@@ -20,12 +21,7 @@ from torchrg.datasets.rgbd_files import (
     read_depth,
     refuse_recording,
 )
-from torchrg.datasets.rgbd_layouts import (
-    LAYOUTS,
-    find_layout,
-    find_recordings,
-    recording_camera,
-)
+from torchrg.datasets.rgbd_layouts import LAYOUTS, find_layout, find_recordings
 from torchrg.depth.camera import Pinhole, check_camera, doubt_view
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.transforms.rows import SampleDict
@@ -202,39 +198,34 @@ def _find(
     """Yield the frames of a folder, of one recording or of several beside each other.
 
     Warns:
-        DepthWarning: If the camera is the data set's, for want of a file; once for each camera. If
-            it is improbable for an image; once for each recording.
+        DepthWarning: If a camera is improbable for an image; once for each recording.
     """
     layout = LAYOUTS[name]
-    assumed: set[Pinhole] = set()
     for prefix, folder in find_recordings(root, layout):
-        camera, files, origin = intrinsics, tuple[Path, ...](), "given"
-        if intrinsics is None:
-            camera, files = recording_camera(folder, root, layout)
-            origin = f"{files[0].name}" if files else f"built in, {name}"
-        if isinstance(camera, Pinhole) and origin.startswith("built") and camera not in assumed:
-            assumed.add(camera)
-            numbers = ",".join(f"{number:g}" for number in camera[:4])
-            warnings.warn(
-                f"{folder}: no camera file found; taking the built-in camera of {name}, {numbers}; "
-                "pass --intrinsics if the frames are of another.",
-                DepthWarning,
-                stacklevel=3,
-            )
+        shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}
         is_doubted = False
         for frame in layout.frames(folder):
-            chosen = frame.camera if camera is None else camera
-            own = chosen.depth_scale if isinstance(chosen, Pinhole) else None
+            camera: Tensor | Pinhole | None = intrinsics
+            files, origin = tuple[Path, ...](), "given"
+            if camera is None and frame.camera is not None:
+                camera, files = frame.camera, frame.sources[:1]
+            elif camera is None:
+                place = frame.depth.parent
+                if place not in shared:
+                    shared[place] = _shared_camera(place, folder, root, name)
+                camera, files = shared[place]
+            if intrinsics is None:
+                origin = files[0].name if files else f"built in, {name}"
+            own = camera.depth_scale if isinstance(camera, Pinhole) else None
             scales = (depth_scale, own, frame.depth_scale, layout.depth_scale)
             scale = next((value for value in scales if value is not None), None)
-            if chosen is None or scale is None:
-                missing = "intrinsics" if chosen is None else "depth_scale"
+            if camera is None or scale is None:
+                missing = "intrinsics" if camera is None else "depth_scale"
                 raise ConfigError(
                     f"{frame.depth}: expected {missing}, which depth images do not hold; pass it"
-                    f"{': 1 for metres, 1000 for millimetres' if chosen is not None else ''}."
+                    f"{': 1 for metres, 1000 for millimetres' if camera is not None else ''}."
                 )
-            of_camera = files or (frame.sources if camera is None else ())
-            matrix, doubt = fit_camera(frame.depth, chosen, *of_camera[:1])
+            matrix, doubt = fit_camera(frame.depth, camera, *files[:1])
             if doubt and not is_doubted:
                 warnings.warn(doubt, DepthWarning, stacklevel=3)
             is_doubted |= bool(doubt)
@@ -246,9 +237,35 @@ def _find(
                 frame.color,
                 frame.pose,
                 layout.no_depth,
-                files + frame.sources,
-                origin if camera is not None else frame.sources[0].name,
+                tuple(dict.fromkeys((*files, *frame.sources))),
+                origin,
             )
+
+
+def _shared_camera(
+    place: Path, folder: Path, root: Path, name: str
+) -> tuple[Pinhole | None, tuple[Path, ...]]:
+    """Return the camera of the images of a recording in one place, and the file it was read from.
+
+    A camera file wins over the built-in camera of the data set. It is None where there is neither.
+
+    Warns:
+        DepthWarning: If the camera is built in.
+    """
+    if found := find_camera(place, root):
+        return found[0], found[1:]
+    layout = LAYOUTS[name]
+    if layout.camera is None:
+        return None, ()
+    camera = layout.camera(folder)
+    numbers = ",".join(f"{number:g}" for number in camera[:4])
+    warnings.warn(
+        f"{root}: frames without a camera file get the built-in camera of {name}, {numbers}; pass "
+        "--intrinsics if they are of another.",
+        DepthWarning,
+        stacklevel=4,
+    )
+    return camera, ()
 
 
 def fit_camera(

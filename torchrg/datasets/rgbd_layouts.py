@@ -15,7 +15,6 @@ from torch import Tensor
 
 from torchrg.datasets.camera_files import (
     camera_of,
-    find_camera,
     matrix_of,
     number_of,
     read_info,
@@ -88,11 +87,11 @@ class FrameLayout(NamedTuple):
     Attributes:
         frames: Yields the frames of a recording in natural order.
         mark: Pattern of the name of an entry of every recording; nothing where a folder is one.
-        camera: The camera of a recording without a camera file, None where none is known.
+        camera: The camera of a recording without a camera file, None where none is known or frames
+            have their own.
         depth_scale: Stored value of one metre, None where frames have their own or none is known.
         no_depth: As of :class:`torchrg.datasets.RGBDFrame`.
         places: Where recordings are below a folder of several, as patterns.
-        has_cameras: Whether every frame has a camera of its own.
         signs: Patterns of further entries, one of which tells the layout from others with the same
             mark; nothing where the mark is enough, no pattern where a folder does not show it.
     """
@@ -103,7 +102,6 @@ class FrameLayout(NamedTuple):
     depth_scale: float | None = None
     no_depth: int | None = None
     places: tuple[str, ...] = ("", "*/")
-    has_cameras: bool = False
     signs: tuple[str, ...] = ("",)
 
 
@@ -345,19 +343,15 @@ LAYOUTS = {
         "pose_intrinsic_imu.json",
         depth_scale=1000.0,
         places=_IPHONES,
-        has_cameras=True,
     ),
     "arkitscenes": FrameLayout(
         _arkitscenes_frames,
         "lowres_depth",
         depth_scale=1000.0,
         places=("", "*/", "*/*/", "*/*/*/"),
-        has_cameras=True,
     ),
-    "3rscan": FrameLayout(
-        _3rscan_frames, "_info.txt", places=("", "*/", "*/sequence/"), has_cameras=True
-    ),
-    "replica": FrameLayout(_replica_frames, "traj.txt", has_cameras=True),
+    "3rscan": FrameLayout(_3rscan_frames, "_info.txt", places=("", "*/", "*/sequence/")),
+    "replica": FrameLayout(_replica_frames, "traj.txt"),
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
     "icl-nuim": FrameLayout(
         _icl_nuim_frames, "depth", _same_camera(*_ICL_NUIM_INTRINSICS), 5000.0, signs=()
@@ -378,7 +372,7 @@ LAYOUTS = {
         no_depth=65535,
         places=("", "*/", "*/*/"),
     ),
-    "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json", has_cameras=True),
+    "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json"),
     "images": FrameLayout(_all_images),
 }
 """Shapes of folders of frames by their names, as :func:`find_layout` tries them: ScanNet++ (ICCV,
@@ -399,20 +393,6 @@ def find_layout(root: Path) -> str:
             if any(not sign or any(folder.glob(sign)) for sign in layout.signs):
                 return name
     return "images"
-
-
-def recording_camera(
-    folder: Path, root: Path, layout: FrameLayout
-) -> tuple[Pinhole | None, tuple[Path, ...]]:
-    """Return the camera of a recording, if it is known, and the file that it was read from.
-
-    A camera file wins over the camera of the data set, which has no file.
-    """
-    if layout.has_cameras:
-        return None, ()
-    if found := find_camera(folder, root):
-        return found[0], found[1:]
-    return layout.camera(folder) if layout.camera else None, ()
 
 
 def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path]]:
