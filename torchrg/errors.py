@@ -43,3 +43,7 @@ class MissingDependencyError(TorchrgError, ImportError):
 
 class PrecisionWarning(UserWarning):
     """Coordinates have lost digits that the spacing of their points needs."""
+
+
+class DepthWarning(UserWarning):
+    """A camera or a depth scale is assumed, or hardly belongs to its depth image."""

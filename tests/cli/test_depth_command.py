@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
+from torchrg.batch.sources import RGBDSource
+from torchrg.cli.flags import parse_intrinsics
+from torchrg.config import DepthConfig
+from torchrg.datasets import RGBDFrames
 from torchrg.depth import segment_depth
-from torchrg.depth.camera import depth_to_points, make_intrinsics
+from torchrg.depth.camera import Pinhole, depth_to_points, make_intrinsics
+from torchrg.errors import DepthWarning, FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.render import write_png
 from torchrg.structures import Cloud
@@ -218,6 +225,79 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
     ):
         assert message in run("depth", "--out", tmp_path / "a.png", *arguments).error
     assert not (tmp_path / "a.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("K.txt", "50 0 39.5\n0 50 29.5\n0 0 1\n"),
+        ("intrinsic_depth.txt", "50,0,39.5,0\n0,50,29.5,0\n0,0,1,0\n0,0,0,1\n"),
+        ("cam.K", "[[50. 0. 39.5]\n [0. 50. 29.5]\n [0. 0. 1.]]"),
+        ("camera", "50 50 39.5 29.5"),
+        ("frame.pincam", "80 60 50 50 39.5 29.5"),
+        (
+            "info.txt",
+            "m_depthShift=1000\nm_calibrationDepthIntrinsic=50 0 39.5 0 50 29.5 0 0 1",
+        ),
+        ("cameras.txt", "1 SIMPLE_PINHOLE 160 120 100 80 60\n"),
+    ],
+)
+def test_a_matrix_file_is_a_camera(tmp_path, frame, run, name, content):
+    (tmp_path / name).write_text(content)
+    assert run("depth", frame, *CAMERA, "--out", tmp_path / "expected.png").code == 0
+    flags = ["--intrinsics", tmp_path / name]
+    flags += [] if "Shift" in content else CAMERA[2:4]
+    done = run("depth", frame, *flags, "--out", tmp_path / "labels.png")
+    assert (done.code, done.err) == (0, "")
+    for suffix in (".png", ".json"):
+        expected = (tmp_path / f"expected{suffix}").read_bytes()
+        assert (tmp_path / f"labels{suffix}").read_bytes() == expected
+
+
+def test_a_matrix_of_numpy_is_a_camera(tmp_path):
+    np.save(tmp_path / "K.npy", INTRINSICS.numpy())
+    assert parse_intrinsics(f"{tmp_path / 'K.npy'}") == Pinhole(50.0, 50.0, 39.5, 29.5)
+    for array in (np.zeros((60, 80)), np.array(["a"]), np.zeros(9, complex)):
+        np.save(tmp_path / "K.npy", array)
+        with pytest.raises(FormatError, match=r"K\.npy: expected an? (matrix|array)"):
+            parse_intrinsics(f"{tmp_path / 'K.npy'}")
+
+
+@pytest.mark.parametrize(("scale", "median"), [("1", "2,000 m"), ("1e6", "0.002 m")])
+def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, scale, median):
+    root = tmp_path / "in"
+    root.mkdir()
+    frame.rename(root / frame.name)
+    flags = [*CAMERA[:3], scale]
+    told = f"frame.png: expected a median depth of 0.05 to 100 m, got {median} with --depth-scale "
+    for command in (
+        ("depth", root / frame.name, "--out", tmp_path / "labels.png"),
+        ("depth", root, "--out", tmp_path / "labels.npz"),
+        ("convert", "rgbd", root, tmp_path / "out", "--dry-run"),
+    ):
+        (line,) = run(*command, *flags).err.splitlines()
+        assert told in line
+        assert "pass 1000 for millimeters" in line
+    camera = parse_intrinsics(CAMERA[1])
+    source = RGBDSource(root, DepthConfig(), "images", camera, float(scale))
+    with pytest.warns(DepthWarning, match="expected a median depth"):
+        jobs = list_jobs(source, tmp_path / "out")
+    (note,) = convert_scan(jobs[0]).warnings
+    assert told in note
+    data = RGBDFrames.from_folder(root, intrinsics=camera, depth_scale=float(scale))
+    with pytest.warns(DepthWarning, match="expected a median depth"):
+        _ = data[0]
+
+
+def test_a_cloud_is_checked_against_a_camera_that_is_given(tmp_path, depth, run):
+    source, out = tmp_path / "scan.pcd", ["--out", tmp_path / "out.png"]
+    write_cloud(source, Cloud(points_of(depth).numpy(), grid_shape=(60, 80)))
+    assert run("depth", source, *CAMERA[:2], *out).err == ""
+    for camera in ("55,55,39.5,29.5", "50,50,36,29.5", "50,-50,39.5,29.5"):
+        error = run("depth", source, "--intrinsics", camera, *out).err.splitlines()[-1]
+        assert "scan.pcd: expected --intrinsics of the camera that the points are of" in error
+    done = run("depth", source, "--depth-scale", "1000", *out)
+    assert "--depth-scale has no effect on a cloud" in done.err
 
 
 def test_segment_says_where_depth_images_went(tmp_path, frame, run):

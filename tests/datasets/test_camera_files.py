@@ -79,7 +79,8 @@ def test_a_lens_that_bends_lines_is_told(tmp_path):
         ("a.json", "{", "expected JSON or YAML, got: Expecting property name"),
         ("a.yaml", "a: [", "expected JSON or YAML, got: while parsing a flow"),
         ("a.yaml", "", "expected names with values, got NoneType"),
-        ("a.json", "[1, 2]", "expected names with values, got list"),
+        ("a.json", "[1, 2]", "expected a matrix of 3 x 3, 3 x 4 or 4 x 4, fx fy cx cy, or width"),
+        ("a.json", '["a"]', "expected names with values, got list"),
         (
             "a.json",
             '{"fov": 60}',
@@ -130,4 +131,4 @@ def test_sizes_may_differ_by_a_rounded_pixel():
     assert camera.matrix((225, 127)).isfinite().all()
     with pytest.raises(ConfigError, match="got 224 x 172; pass the camera of the depth images"):
         camera.matrix((224, 172))
-    assert torch.equal(camera._replace(size=None).matrix((3, 999)), camera.matrix())
+    assert torch.equal(camera._replace(size=None).matrix((999, 500)), camera.matrix())

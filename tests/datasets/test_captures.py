@@ -246,7 +246,7 @@ def test_portable_graymaps_are_read_as_they_are_stored(tmp_path):
     path.write_bytes(b"P5\n# a comment 3 4\n3 2\n65535\n" + bytes(range(12)))
     assert image_size(path) == (3, 2)
     expected = [[0x0001, 0x0203, 0x0405], [0x0607, 0x0809, 0x0A0B]]
-    assert (read_depth(path, depth_scale=1) == torch.tensor(expected)).all()
+    assert (read_depth(path, depth_scale=1024) * 1024 == torch.tensor(expected)).all()
     for content, message in (
         (b"P5\n3 2\n65535\n" + bytes(11), "expected 12 bytes for its pixels, got 11"),
         (b"P5\n3 2\n255\n" + bytes(6), "expected a binary PGM of 16 bits, P5, got b'P5"),

@@ -19,6 +19,7 @@ from torchrg.datasets.scannet import read_objects, read_scannet_scan
 from torchrg.errors import ConfigError, FormatError
 from torchrg.scenes import make_room
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*segments are in two objects:UserWarning")
 SCAN = "scene0270_00"
 NUM_POINTS = 400
 # The first object is no wall, the third takes a segment of the second, the last one of the third.

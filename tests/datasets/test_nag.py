@@ -16,6 +16,7 @@ from torchrg.datasets.nag import encode_nag
 from torchrg.errors import ShapeError
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
+from torchrg.structures import Superpoints
 
 Data = pytest.importorskip("torch_geometric.data", reason="needs PyG").Data
 
@@ -78,6 +79,22 @@ def test_points_without_a_superpoint_are_refused(nested):
     points = torch.cat([torch.rand(50, 3), torch.full((1, 3), torch.nan)])
     with pytest.raises(ShapeError, match="expected a superpoint of every point, got 1 points"):
         make_nag(points, make_superpoints(points))
+
+
+@pytest.mark.parametrize(
+    ("fine", "coarse", "message"),
+    [
+        ([0, 1, 3, 3], [], "superpoints of level 0 numbered from 0 without gaps, got 2 of no p"),
+        ([0, 1, 2, 2], [[0, 0, 2, 2]], "superpoints of level 1 numbered .*, got 1 of no point"),
+        ([0, 1, 2, 2], [[0, 0, 1, -1]], "superpoints of level 1 numbered .*, got -1 for a point"),
+        ([0, 1, 2, 2], [[0, 0, 1, 0]], "each superpoint in one of level 1, got 2 in two; make"),
+        ([0, 1, 2, 2], [[0, 0, 1]], r"expected labels of shape \(N\), got \(3,\)|with N=4"),
+    ],
+)
+def test_levels_that_do_not_nest_are_refused_by_the_first(fine, coarse, message):
+    parts = Superpoints(torch.tensor(fine), torch.zeros(4), tuple(map(torch.tensor, coarse)))
+    with pytest.raises(ShapeError, match=message):
+        make_nag(torch.eye(4, 3), parts, data=dict)
 
 
 def read_h5(content):

@@ -14,12 +14,15 @@ from torchrg.batch.sources import RGBDSource
 from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import read_color, read_depth, read_trajectory
+from torchrg.depth.camera import make_intrinsics
 from torchrg.errors import ConfigError, FormatError, ShapeError
 from torchrg.render import write_png
 from torchrg.transforms import DepthToCloud
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*get the built-in camera")
 HALF = math.sqrt(0.5)
 # A quarter turn about z, as x y z w, and as a matrix.
+CAMERA = make_intrinsics(5.0, 5.0, 2.5, 1.5)
 QUARTER = f"0 0 {HALF} {HALF}"
 TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
 POSE_ROWS = "0 -1 0 0.5\n1 0 0 0.25\n0 0 1 2\n0 0 0 1\n"
@@ -74,7 +77,8 @@ def test_tum_frames_are_matched_in_time(tum):
         assert first["depth"].dtype == torch.float32
         assert first["depth"][0, 0, :2].tolist() == [0, 1]
         assert second["depth"][0, 1, 1] == 2
-        assert first["intrinsics"].diagonal().tolist() == [535.4, 539.2, 1]
+        # The camera is that of 640 x 480 pixels, the images have 6 x 4.
+        assert first["intrinsics"].diagonal().tolist() == [535.4 * 6 / 640, 539.2 * 4 / 480, 1]
         assert first["color"][:, 0, 0].tolist() == [5, 5, 5]
         torch.testing.assert_close(first["pose"], expected_pose())
         assert "color" not in second
@@ -104,8 +108,7 @@ def test_the_camera_of_tum_is_not_guessed(tum):
     other = tum.rename(tum.parent / "desk")
     with pytest.raises(ConfigError, match="desk: expected intrinsics, as the name says none of"):
         RGBDFrames.from_folder(other, "tum")
-    camera = torch.eye(3)
-    data = RGBDFrames.from_folder(other, "tum", intrinsics=camera, depth_scale=1000)
+    data = RGBDFrames.from_folder(other, "tum", intrinsics=CAMERA.float(), depth_scale=1000)
     assert data[0]["depth"].max() == 5
     assert data[0]["intrinsics"].dtype == torch.float64
 
@@ -124,7 +127,7 @@ def test_icl_nuim_frames_are_matched_by_number(tmp_path):
     data = RGBDFrames.from_folder(root, "icl-nuim")
     assert [scene.name for scene in data.scenes] == [f"living_room_traj0/{n}" for n in (0, 2, 10)]
     assert [float(sample["depth"].max()) for sample in data] == pytest.approx([1, 1.0004, 1.002])
-    assert data[0]["intrinsics"].diagonal().tolist() == [481.2, -480, 1]
+    assert data[0]["intrinsics"].diagonal().tolist() == pytest.approx([481.2 * 6 / 640, -4, 1])
     assert "pose" not in data[0]
     torch.testing.assert_close(data[1]["pose"], expected_pose())
     assert torch.equal(data[2]["pose"], torch.eye(4).double())
@@ -134,7 +137,7 @@ def test_scannet_frames_have_files_of_their_own(tmp_path):
     for scene in ("scene0000_00", "scene0000_01"):
         root = tmp_path / scene
         for number in (0, 1):
-            write_depth(root / "depth" / f"{number}.png", 1500)
+            write_depth(root / "depth" / f"{number}.png", 1500, (480, 640))
             write_color(root / "color" / f"{number}.jpg")
         write_text(root / "pose" / "0.txt", POSE_ROWS)
         write_text(root / "pose" / "1.txt", "-inf -inf -inf -inf\n" * 4)
@@ -180,21 +183,20 @@ def test_any_folder_of_images_needs_its_camera(tmp_path):
     write_depth(tmp_path / "b" / "10.png", 300)
     np.save(tmp_path / "b" / "9.npy", np.full((4, 6), 1.25, dtype=np.float32))
     for given, missing in (
-        ({"intrinsics": torch.eye(3)}, "depth_scale"),
+        ({"intrinsics": CAMERA}, "depth_scale"),
         ({"depth_scale": 1.0}, "intrinsics"),
     ):
         with pytest.raises(ConfigError, match=f"expected {missing}, which depth images do not"):
             RGBDFrames.from_folder(tmp_path, "images", **given)
-    data = RGBDFrames.from_folder(tmp_path, "images", intrinsics=torch.eye(3), depth_scale=1)
+    data = RGBDFrames.from_folder(tmp_path, "images", intrinsics=CAMERA, depth_scale=1)
     assert [scene.name for scene in data.scenes] == ["b/9", "b/10"]
     assert data[0]["depth"].unique().tolist() == [1.25]
 
 
 def test_frames_of_one_size_are_batched_and_transformed(tum):
-    camera = torch.eye(3)
-    data = RGBDFrames.from_folder(tum, "tum", intrinsics=camera, transform=DepthToCloud())
+    data = RGBDFrames.from_folder(tum, "tum", intrinsics=CAMERA, transform=DepthToCloud())
     assert data[0]["coord"].shape == (23, 3)
-    plain = [RGBDFrame(frame.depth, camera, 5000.0, frame.name) for frame in data.frames]
+    plain = [RGBDFrame(frame.depth, CAMERA, 5000.0, frame.name) for frame in data.frames]
     loader = torch.utils.data.DataLoader(RGBDFrames(plain), batch_size=2, num_workers=2)
     batch = next(iter(loader))
     assert batch["depth"].shape == (2, 1, 4, 6)
@@ -258,11 +260,11 @@ def test_wrong_folders_are_refused(tmp_path):
     camera = torch.eye(3)
     with pytest.raises(FormatError, match="expected depth images"):
         RGBDFrames.from_folder(tmp_path, "images", intrinsics=camera, depth_scale=1)
-    (tmp_path / "depth").mkdir()
-    with pytest.raises(FormatError, match=r"intrinsic_depth.txt: cannot be read"):
+    write_depth(tmp_path / "depth" / "0.png", 1500)
+    with pytest.raises(FormatError, match=r"expected intrinsic/intrinsic_depth.txt or intrinsics_"):
         RGBDFrames.from_folder(tmp_path, "scannet")
     write_text(tmp_path / "intrinsic" / "intrinsic_depth.txt", "1 2 3\n")
-    with pytest.raises(FormatError, match="expected 4 rows of 4 numbers, got 1 rows"):
+    with pytest.raises(FormatError, match=r"_depth.txt: expected a matrix of .*, got 3 numbers"):
         RGBDFrames.from_folder(tmp_path, "scannet")
 
 
@@ -296,7 +298,7 @@ def test_poses_that_lead_nowhere_are_none(tum, tmp_path, value):
     (tum / "groundtruth.txt").write_text(f"1.01 0.5 {value} 2 {QUARTER}\n")
     assert RGBDFrames.from_folder(tum, "tum").frames[0].pose is None
     root = tmp_path / "scans" / "scene0000_00"
-    write_depth(root / "depth" / "0.png", 1500)
+    write_depth(root / "depth" / "0.png", 1500, (480, 640))
     write_text(root / "pose" / "0.txt", POSE_ROWS.replace("0.5", value))
     write_text(
         root / "intrinsic" / "intrinsic_depth.txt", "577 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n"

@@ -84,6 +84,15 @@ def test_a_copy_without_its_original_is_an_object(room):
     assert found.notes == ()
 
 
+def test_two_objects_of_the_same_points_are_told(room):
+    rows = rows_of(3, 40)
+    objects = {"chair_1": rows[:20], "chair_2": rows[20:], "table_1": rows[20:]}
+    write_objects(room, {f"{name}.txt": text_of(part) for name, part in objects.items()})
+    found = read_room(room)
+    assert found.notes == ("table_1.txt has the points of chair_2.txt, too",)
+    assert len(found.coord) == 60
+
+
 def test_class_orders_name_the_same_objects(room):
     write_clean_room(room, 2, {f"{name}_1": 3 for name in CLASS_ORDERS["pointcept"]})
     names = {

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tests.datasets.scannet_tree import ALIGNMENT, write_scan, write_scan_plus, write_tables
-from torchrg import Cloud, write_cloud
+from torchrg import Cloud, load_config, write_cloud
+from torchrg.batch.sources import ScanNetSource
 from torchrg.datasets import ScanNet, read_scannet_scan
 from torchrg.datasets.scannet import IDS_200, NYU_IDS, _places
 from torchrg.errors import ConfigError, FormatError
@@ -227,6 +228,44 @@ def test_annotations_that_are_none_are_refused_by_file_and_place(tree, name, con
     assert re.match(rf"{re.escape(str(path))}: {message}", str(caught.value))
     assert "\n" not in str(caught.value)
     assert data[0]["instance"].tolist() == [1, 1, 0, 0, -1, -1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("objects", "first"),
+    [
+        ([("floor", [12345, 777])], "object 0: .* got 12345, which is not there; take the ann"),
+        ([("floor", [40, 555]), ("chair", [999])], "object 0: expected segments of .*, got 555,"),
+        ([("floor", [40]), ("chair", [7, 8])], "object 1: expected segments of .*, got 8, which"),
+    ],
+)
+def test_segments_of_another_mesh_are_refused_by_the_first(scans, tmp_path, objects, first):
+    write_scan(tmp_path / "scans", "scene0001_00", *scans, SEGMENTS, objects, with_labels=False)
+    write_scan_plus(tmp_path / "plus", "0a5c013435", *scans, SEGMENTS, objects)
+    for root, name in ((tmp_path, "aggregation.json"), (tmp_path / "plus", "segments_anno.json")):
+        with pytest.raises(FormatError, match=rf"{name}: {first}"):
+            _ = ScanNet(root)[0]
+
+
+def test_what_two_objects_claim_is_told_and_the_later_has_it(scans, tmp_path):
+    objects = [("floor", [40, 7]), ("table", [7, 3, 40]), ("beanbag", [12])]
+    write_scan(tmp_path / "in/scans", "scene0001_00", *scans, SEGMENTS, objects, with_labels=False)
+    write_tables(tmp_path / "in", ["scene0001_00"], [])
+    with pytest.warns(UserWarning, match="segments are in two|objects have labels"):
+        sample = ScanNet(tmp_path / "in")[0]
+    assert sample["instance"].tolist() == [1, 1, 1, 1, 1, 1, 2, 2]
+    source = ScanNetSource(tmp_path / "in", load_config("classic"), layout="scannet")
+    notes = source.read(source.list_scans()[0]).notes
+    assert [note.partition("aggregation.json: ")[2] for note in notes] == [
+        "segments are in two objects, of which the later is taken: 7 and 1 more.",
+        "objects have labels that scannetv2-labels.combined.tsv does not have: 'beanbag'.",
+    ]
+
+
+def test_two_objects_of_one_number_are_told(tree):
+    path = tree / "scans" / "scene0010_00" / GROUPS
+    path.write_text(groups(segments=[40]))
+    with pytest.warns(UserWarning, match=r"number of another and become one with it: 0\.$"):
+        assert ScanNet(tree)[1]["instance"].tolist() == [0, 0, 0, 0, -1, -1, -1, -1]
 
 
 @pytest.mark.parametrize("label", [2**31 - 1, 65_536, -3])

@@ -138,13 +138,15 @@ def test_pixels_without_depth_belong_to_nothing():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 3), (40, 2), (48, 64)])
 def test_images_without_depth_and_tiny_ones_have_no_planes(shape, dtype):
+    height, width = shape
+    camera = make_intrinsics(0.6 * max(shape), 0.6 * max(shape), (width - 1) / 2, (height - 1) / 2)
     for depth in (torch.zeros(shape, dtype=dtype), torch.full(shape, torch.nan, dtype=dtype)):
-        seg = segment_depth(depth, SMALL)
+        seg = segment_depth(depth, camera)
         assert not seg.valid.any()
         assert seg.labels.shape == shape
         assert len(seg.planes) == 0
     if min(shape) < 40:
-        assert len(segment_depth(torch.ones(shape, dtype=dtype), SMALL).planes) == 0
+        assert len(segment_depth(torch.ones(shape, dtype=dtype), camera).planes) == 0
 
 
 def test_random_depth_is_no_plane(rng):
@@ -206,7 +208,8 @@ def test_a_negative_focal_length_turns_the_axis_over():
 def test_depth_beyond_the_limit_is_left_out():
     depth = torch.full((60, 80), 2.0)
     depth[:, 40:] = 5.0
-    seg = segment_depth(depth, SMALL, DepthConfig(max_depth=4.0))
+    camera = make_intrinsics(50.0, 50.0, 39.5, 29.5)
+    seg = segment_depth(depth, camera, DepthConfig(max_depth=4.0))
     assert not seg.valid[:, 40:].any()
     assert seg.planes.count.tolist() == [2400]
 

@@ -7,6 +7,7 @@ and a test.
 import dataclasses
 import json
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -29,7 +30,7 @@ from torchrg.batch.scans import (
     write_results,
     write_scan,
 )
-from torchrg.batch.task import Begin, TaskReport
+from torchrg.batch.task import Begin, TaskReport, collecting_notes
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets import (
     S3DIS,
@@ -48,7 +49,7 @@ from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import num_pixels, read_depth
 from torchrg.datasets.scannet import MESH_PLUSPLUS, read_objects
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.depth.camera import Pinhole, points_of_image
+from torchrg.depth.camera import Pinhole, numbers_of, points_of_image
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.colors import read_colors
@@ -318,17 +319,17 @@ class ScanNetSource(CloudSource):
     def read(self, scan: Scan) -> Reading:
         """Read a scan."""
         mesh = scan.inputs[0]
-        arrays = read_scannet_scan(mesh, self.root)
+        dataset, objects = _dataset_of_mesh(mesh), None
+        with collecting_notes() as notes:
+            arrays = read_scannet_scan(mesh, self.root)
+            if self.layout == "scannet" and dataset == "ScanNet":
+                objects = read_objects(mesh, len(arrays["coord"]))
         front = arrays.pop("front", None)
         colors = {name: arrays[name] for name in arrays.keys() & {"color"}}
         cloud = Cloud(arrays["coord"], colors, source=str(mesh), front=front)
-        dataset, objects = _dataset_of_mesh(mesh), None
-        if self.layout == "scannet" and dataset == "ScanNet":
-            objects = read_objects(mesh, len(cloud))
-        notes: tuple[str, ...] = ()
         if "instance" not in arrays and not scan.name.startswith("test/"):
-            notes = ("no labels: annotations or the table of their words are missing",)
-        return Reading(cloud, arrays, dataset, objects, notes=notes)
+            notes.append("no labels: annotations or the table of their words are missing")
+        return Reading(cloud, arrays, dataset, objects, notes=tuple(notes))
 
 
 def _dataset_of_mesh(mesh: Path) -> str:
@@ -387,6 +388,9 @@ class RGBDSource(Source):
         data = RGBDFrames.from_folder(
             self.root, self.layout, intrinsics=self.intrinsics, depth_scale=self.depth_scale
         )
+        # A wrong scale is the same in all frames, and a warning helps before the work.
+        with suppress(FormatError, OSError):
+            data.read_sample(0)
         return [
             Scan(frame.name, (frame.depth, *frame.sources), num_pixels(frame.depth), _plain(frame))
             for frame in data.frames
@@ -396,7 +400,8 @@ class RGBDSource(Source):
         """Read a frame, segment it, and write its results, each file whole or not at all."""
         begin("read")
         frame = _frame(scan.item)
-        depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
+        with collecting_notes() as notes:
+            depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
         if not bool((depth > 0).any()):
             raise FormatError(
                 f"{frame.depth}: expected pixels with depth, got none; take this frame out."
@@ -409,8 +414,20 @@ class RGBDSource(Source):
         begin("write")
         files = tuple(write_results(folder, coord, seg))
         num_planes = len(seg.planes)
-        notes = () if num_planes else ("no plane found",)
-        return TaskReport(scan.name, "converted", depth.numel(), num_planes, files, warnings=notes)
+        notes += [] if num_planes else ["no plane found"]
+        return TaskReport(
+            scan.name,
+            "converted",
+            depth.numel(),
+            num_planes,
+            files,
+            warnings=tuple(notes),
+            measured={
+                "intrinsics": numbers_of(frame.intrinsics),
+                "camera": frame.origin,
+                "depth_scale": frame.depth_scale,
+            },
+        )
 
 
 def orient_image(seg: Segmentation, points: Tensor, orient: CloudOrientation) -> Segmentation:

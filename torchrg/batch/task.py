@@ -5,12 +5,19 @@ import platform
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
-from torchrg.errors import OUT_OF_MEMORY, PrecisionWarning, TorchrgError, is_out_of_memory
+from torchrg.errors import (
+    OUT_OF_MEMORY,
+    DepthWarning,
+    PrecisionWarning,
+    TorchrgError,
+    is_out_of_memory,
+)
 from torchrg.io.files import is_disk_full
 
 Status = Literal["converted", "kept", "failed", "not started"]
@@ -69,8 +76,9 @@ def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
     reset_peak_memory()
     try:
         with warnings.catch_warnings():
-            # It is among the warnings of the report.
+            # They are among the warnings of the report, or were printed before the first task.
             warnings.simplefilter("ignore", PrecisionWarning)
+            warnings.simplefilter("ignore", DepthWarning)
             report = work(clock.begin)
     except Exception as error:  # noqa: BLE001 One task must never end the others.
         is_foreseen = isinstance(error, TorchrgError | OSError) or is_out_of_memory(error)
@@ -84,6 +92,23 @@ def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
     clock.begin("done")
     host = f"{platform.node()} ({os.getpid()})"
     return replace(report, seconds=clock.seconds, peak_memory=peak_memory(), host=host)
+
+
+@contextmanager
+def collecting_notes() -> Iterator[list[str]]:
+    """Collect warnings as notes for a report, a line each.
+
+    Example:
+        >>> with collecting_notes() as notes:
+        ...     warnings.warn("no labels")
+        >>> notes
+        ['no labels']
+    """
+    notes: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield notes
+        notes += dict.fromkeys(str(warning.message) for warning in caught)
 
 
 class _StageClock:

@@ -1,6 +1,7 @@
 """``torchrg depth``: planes of depth images and of organised clouds, found in the image."""
 
 import time
+import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -16,16 +17,16 @@ from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn, warnings_as_lines
 from torchrg.cli.loop import check_apart, note_input, output_paths, paths_beside, run_each
 from torchrg.datasets import RGBDFrame, RGBDFrames
+from torchrg.datasets.rgbd import fit_camera
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
-    image_size,
     num_pixels,
     read_depth,
     refuse_recording,
 )
 from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
-from torchrg.depth.camera import Pinhole, points_of_image
-from torchrg.errors import ConfigError, FormatError
+from torchrg.depth.camera import Pinhole, find_misfit, numbers_of, points_of_image
+from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place, make_folder
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
@@ -38,6 +39,9 @@ _COLORED_FROM = 200
 must differ in colour. Choosing colours from all pixels would take as long as finding the planes."""
 _NO_IMAGES = ("planes", "points", "neighbors", "sampling", "num_copies")
 """Parts of a segmentation of an image that are no images."""
+_MAX_MISFIT = 0.01
+"""Median distance of points from their pixels, as a fraction of the longer side of the image, up to
+which a camera may be that of a cloud."""
 _LEAST_BYTES_A_PIXEL = 300
 """Memory that labelling takes at least for each pixel."""
 
@@ -119,15 +123,22 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
             )
         return frame
     if path.suffix.lower() not in DEPTH_SUFFIXES:
+        if arguments.depth_scale is not None:
+            warn(f"{path}: --depth-scale has no effect on a cloud, whose points keep their unit.")
         return None
-    if camera is None or arguments.depth_scale is None:
+    own = None if camera is None else camera.depth_scale
+    scale = own if arguments.depth_scale is None else arguments.depth_scale
+    if camera is None or scale is None:
         flag, hint = "--depth-scale", "1000 for millimetres, 1 for metres"
         if camera is None:
             flag, hint = "--intrinsics fx,fy,cx,cy", "or the file of the camera"
         raise ConfigError(
             f"{path}: expected {flag}, which depth images do not hold; pass it, {hint}."
         )
-    return RGBDFrame(path, camera.matrix(image_size(path)), arguments.depth_scale)
+    matrix, doubt = fit_camera(path, camera)
+    if doubt:
+        warn(doubt)
+    return RGBDFrame(path, matrix, scale)
 
 
 def _label(
@@ -144,7 +155,8 @@ def _label(
     scale = arguments.depth_scale
     if isinstance(given, RGBDFrame):
         scale = given.depth_scale
-        cloud, depth, camera = _read_image(given)
+        with warnings_as_lines():
+            cloud, depth, camera = _read_image(given)
     else:
         cloud, depth, camera = _read_cloud(source, given)
     if not _is_png(target):
@@ -153,7 +165,10 @@ def _label(
     # Results are about the cloud's origin.
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -torch.from_numpy(cloud.origin)
-    seg = segment_depth(depth, camera, arguments.depth, pose=pose)
+    with warnings.catch_warnings():
+        # The camera was checked against the size of the image, or found from the points.
+        warnings.simplefilter("ignore", DepthWarning)
+        seg = segment_depth(depth, camera, arguments.depth, pose=pose)
     points = cloud.points.view(*depth.shape, 3)
     seg = orient_image(seg, points, arguments.orient)
     num_planes = len(seg.planes)
@@ -169,7 +184,7 @@ def _label(
     else:
         provenance = describe_run(source, arguments.depth) | {
             "config": {"depth": asdict(arguments.depth)},
-            "intrinsics": given and _numbers_of(camera),
+            "intrinsics": given and numbers_of(camera),
             "depth_scale": scale,
             "orient": arguments.orient,
         }
@@ -203,12 +218,6 @@ def _is_png(path: Path) -> bool:
     return path.suffix.lower() == ".png"
 
 
-def _numbers_of(camera: Tensor) -> str:
-    """Return a camera matrix as ``fx,fy,cx,cy``."""
-    values = camera[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return ",".join(f"{value:.15g}" for value in values)
-
-
 def _read_image(frame: RGBDFrame) -> tuple[Cloud, Tensor, Tensor]:
     """Return the cloud of an image in camera coordinates, its depth ``(H, W)``, and its camera."""
     depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
@@ -231,11 +240,17 @@ def _read_cloud(path: Path, given: Pinhole | None) -> tuple[Cloud, Tensor, Tenso
         )
     height, width = cloud.grid_shape
     points = torch.from_numpy(cloud.coordinates).view(height, width, 3)
-    camera = find_intrinsics(points) if given is None else given.matrix((width, height))
+    camera = find_intrinsics(points) if given is None else given.matrix((width, height), f"{path}")
     if camera is None:
         raise FormatError(
             f"{path}: expected points of a pinhole camera in its own coordinates, got others; "
             "use torchrg segment."
+        )
+    off = 0.0 if given is None else find_misfit(points, camera)
+    if off > _MAX_MISFIT * max(height, width):
+        raise FormatError(
+            f"{path}: expected --intrinsics of the camera that the points are of, got one that "
+            f"puts half of them {off:.3g} pixels or more off; leave it out."
         )
     depth = points[..., 2]
     return cloud, torch.where(depth.isfinite(), depth, 0.0), camera

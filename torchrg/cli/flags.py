@@ -4,6 +4,7 @@ import dataclasses
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import pairwise
@@ -13,7 +14,7 @@ from typing import Annotated, Any, Literal
 import torch
 
 from torchrg.cli.arguments import ALSO, Argument
-from torchrg.cli.ending import warnings_as_lines
+from torchrg.cli.ending import warn, warnings_as_lines
 from torchrg.config import (
     DEFAULT_PRESET,
     WHITENESS,
@@ -22,12 +23,12 @@ from torchrg.config import (
     Up,
     load_config,
 )
-from torchrg.datasets.camera_files import CAMERA_SUFFIXES, read_camera
+from torchrg.datasets.camera_files import SUFFIXES, read_camera
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.fields import COLUMNS_RULE
-from torchrg.structures import Sampling
+from torchrg.structures import FARTHEST, Sampling
 
 _MOST_THREADS = 1024
 """More than any machine has cores; many more cannot be started, and torch ends with the process."""
@@ -74,8 +75,9 @@ IntrinsicsFlag = Annotated[
     Argument(
         metavar="CAMERA",
         text="Camera, as fx,fy,cx,cy in pixels, where the middle of the first pixel is 0,0, or its "
-        "file: Open3D's or nerfstudio's .json, ROS's .yaml. One of larger images is scaled. "
-        "Default: that of the folder.",
+        "file: a matrix of 3 x 3 or 4 x 4 numbers, JSON, YAML, info.txt, COLMAP's cameras.txt. A "
+        "camera file that names a larger image size is scaled. Default: the camera file of the "
+        "folder.",
     ),
 ]
 DepthScaleFlag = Annotated[
@@ -235,17 +237,31 @@ def parse_intrinsics(text: str | None) -> Pinhole | None:
     """Return the camera of ``fx,fy,cx,cy`` or of a file; None where none is given."""
     if text is None:
         return None
-    if text.lower().endswith(CAMERA_SUFFIXES):
+    numbers: list[float] = []
+    with suppress(ValueError):
+        numbers = [*map(float, text.split(","))]
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+        if 0 in (fx, fy) or not all(abs(number) <= FARTHEST for number in numbers):
+            raise ConfigError(
+                f"expected finite --intrinsics with fx and fy not 0, got {text}; pass pixels."
+            )
+        if min(fx, fy) < 0:
+            warn(
+                f"--intrinsics {text}: a negative focal length turns the image over; leave out the "
+                "minus unless that is meant."
+            )
+        return Pinhole(fx, fy, cx, cy)
+    is_file = False
+    with suppress(OSError):
+        is_file = Path(text).is_file()
+    if is_file or text.lower().endswith(SUFFIXES[1:]):
         with warnings_as_lines():
             return read_camera(Path(text))
-    try:
-        fx, fy, cx, cy = map(float, text.split(","))
-    except ValueError:
-        raise ConfigError(
-            "expected --intrinsics fx,fy,cx,cy, four numbers without blanks, or a file that ends "
-            f"in {' '.join(CAMERA_SUFFIXES)}, got {text!r}."
-        ) from None
-    return Pinhole(fx, fy, cx, cy)
+    raise ConfigError(
+        "expected --intrinsics fx,fy,cx,cy, four numbers without blanks, or a camera file, got "
+        f"{text!r}."
+    )
 
 
 def use_threads(threads: int | None) -> None:

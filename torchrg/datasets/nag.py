@@ -55,7 +55,8 @@ def make_nag(
         last, ``super_index``. Where ``y`` counts classes, ``(N, C)``, so it does above.
 
     Raises:
-        ShapeError: If some points have no superpoint, as those that are not finite.
+        ShapeError: If some points have no superpoint, as those that are not finite, a number of a
+            superpoint is not in use, or a superpoint is in two of the next level.
         MissingDependencyError: If PyG is not installed and ``data`` is not given.
 
     References:
@@ -90,10 +91,12 @@ def make_nag(
     entries: dict[str, Any] = {"pos": pos, **values}
     below = torch.arange(len(pos), device=pos.device)
     levels = []
-    for labels in (superpoints.labels, *superpoints.levels):
+    for level, labels in enumerate((superpoints.labels, *superpoints.levels)):
+        check_shapes("make_nag", points=(pos, "N 3"), labels=(labels, "N"))
         labels, count = labels.to(pos.device), int(labels.max()) + 1 if len(labels) else 0
         # Every point of a node below is in one node here.
         super_index = labels.new_empty(len(entries["pos"])).index_copy(0, below, labels)
+        _check_level(level, labels, count, below, super_index)
         levels.append(data(**entries, super_index=super_index))
         order = super_index.argsort(stable=True)
         pointers = torch.bincount(super_index, minlength=count).cumsum(0)
@@ -107,6 +110,29 @@ def make_nag(
             counts = as_tensor("make_nag", "y", counts)
             entries["y"] = counts.new_zeros(count, counts.shape[1]).index_add(0, labels, counts)
     return [*levels, data(**entries)]
+
+
+def _check_level(
+    level: int, labels: Tensor, count: int, below: Tensor, super_index: Tensor
+) -> None:
+    """Refuse a level with a number that no point has, or one that cuts a node of the level below.
+
+    ``labels`` and ``below`` are the nodes of the points here and below, ``super_index`` the node
+    here of each node below.
+    """
+    sizes = torch.bincount(labels.clamp(min=0), minlength=count)
+    if len(empty := (sizes == 0).nonzero()) or int((labels < 0).sum()):
+        number = int(empty[0]) if len(empty) else int(labels.min())
+        raise ShapeError(
+            f"make_nag: expected superpoints of level {level} numbered from 0 without gaps, got "
+            f"{number} {'of no point' if len(empty) else 'for a point'}; number them by "
+            "torch.unique(labels, return_inverse=True)[1]."
+        )
+    if len(cut := (super_index[below] != labels).nonzero()):
+        raise ShapeError(
+            f"make_nag: expected each superpoint in one of level {level}, got {int(below[cut[0]])} "
+            "in two; make coarser levels of the finer ones."
+        )
 
 
 def encode_nag(levels: Iterable[Mapping[str, Any]]) -> bytes:

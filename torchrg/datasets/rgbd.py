@@ -1,6 +1,8 @@
 """Depth frames with their cameras, poses and colours, as a data set."""
 
+import math
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,17 +11,19 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_shapes
+from torchrg.datasets.camera_files import find_camera
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
+    MAX_PIXELS,
     image_size,
     read_color,
     read_depth,
     refuse_recording,
 )
-from torchrg.datasets.rgbd_layouts import LAYOUTS, FrameLayout, find_layout, find_recordings
-from torchrg.depth.camera import Pinhole, check_camera
-from torchrg.errors import ConfigError, FormatError
+from torchrg.datasets.rgbd_layouts import LAYOUTS, find_layout, find_recordings
+from torchrg.depth.camera import Pinhole, check_camera, doubt_view
+from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.transforms.rows import SampleDict
 
 
@@ -37,6 +41,7 @@ class RGBDFrame:
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, if it is known.
         no_depth: Stored value that means "no depth" beside 0, if there is one.
         sources: Further files that intrinsics and pose were read from.
+        origin: Where the intrinsics are from, in words.
 
     Raises:
         ShapeError: If a matrix has another shape.
@@ -51,6 +56,7 @@ class RGBDFrame:
     pose: Tensor | None = None
     no_depth: int | None = None
     sources: tuple[Path, ...] = ()
+    origin: str = ""
 
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
@@ -160,7 +166,7 @@ class RGBDFrames(SceneDataset):
         if name not in LAYOUTS:
             names = ", ".join(sorted(LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = [*_find(folder, LAYOUTS[name], intrinsics, depth_scale)]
+        frames = [*_find(folder, name, intrinsics, depth_scale)]
         if not frames:
             suffixes = " ".join(DEPTH_SUFFIXES)
             raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
@@ -187,29 +193,99 @@ class RGBDFrames(SceneDataset):
 
 
 def _find(
-    root: Path, layout: FrameLayout, intrinsics: Tensor | Pinhole | None, depth_scale: float | None
+    root: Path, name: str, intrinsics: Tensor | Pinhole | None, depth_scale: float | None
 ) -> Iterator[RGBDFrame]:
-    """Yield the frames of a folder, of one recording or of several beside each other."""
+    """Yield the frames of a folder, of one recording or of several beside each other.
+
+    Warns:
+        DepthWarning: If a camera is improbable for an image; once for each recording.
+    """
+    layout = LAYOUTS[name]
     for prefix, folder in find_recordings(root, layout):
-        camera: Tensor | Pinhole | None = intrinsics
-        files: tuple[Path, ...] = ()
-        if camera is None and layout.camera is not None:
-            camera, files = layout.camera(folder)
+        shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}
+        is_doubted = False
         for frame in layout.frames(folder):
-            chosen = frame.camera if camera is None else camera
-            scales = (depth_scale, frame.depth_scale, layout.depth_scale)
+            camera: Tensor | Pinhole | None = intrinsics
+            files, origin = tuple[Path, ...](), "given"
+            if camera is None and frame.camera is not None:
+                camera, files = frame.camera, frame.sources[:1]
+            elif camera is None:
+                place = frame.depth.parent
+                if place not in shared:
+                    shared[place] = _shared_camera(place, folder, root, name)
+                camera, files = shared[place]
+            if intrinsics is None:
+                origin = files[0].name if files else f"built in, {name}"
+            own = camera.depth_scale if isinstance(camera, Pinhole) else None
+            scales = (depth_scale, own, frame.depth_scale, layout.depth_scale)
             scale = next((value for value in scales if value is not None), None)
-            if chosen is None or scale is None:
-                missing = "intrinsics" if chosen is None else "depth_scale"
+            if camera is None or scale is None:
+                missing = "intrinsics" if camera is None else "depth_scale"
                 raise ConfigError(
                     f"{frame.depth}: expected {missing}, which depth images do not hold; pass it"
-                    f"{': 1 for metres, 1000 for millimetres' if chosen is not None else ''}."
+                    f"{': 1 for metres, 1000 for millimetres' if camera is not None else ''}."
                 )
-            matrix = (
-                chosen.matrix(image_size(frame.depth)) if isinstance(chosen, Pinhole) else chosen
-            )
-            name, sources = prefix + frame.name, files + frame.sources
-            no_depth = layout.no_depth
+            matrix, doubt = fit_camera(frame.depth, camera, *files[:1])
+            if doubt and not is_doubted:
+                warnings.warn(doubt, DepthWarning, stacklevel=3)
+            is_doubted |= bool(doubt)
             yield RGBDFrame(
-                frame.depth, matrix, scale, name, frame.color, frame.pose, no_depth, sources
+                frame.depth,
+                matrix,
+                scale,
+                prefix + frame.name,
+                frame.color,
+                frame.pose,
+                layout.no_depth,
+                tuple(dict.fromkeys((*files, *frame.sources))),
+                origin,
             )
+
+
+def _shared_camera(
+    place: Path, folder: Path, root: Path, name: str
+) -> tuple[Pinhole | None, tuple[Path, ...]]:
+    """Return the camera of the images of a recording in one place, and the file it was read from.
+
+    A camera file wins over the built-in camera of the data set. It is None where there is neither.
+
+    Warns:
+        DepthWarning: If the camera is built in.
+    """
+    if found := find_camera(place, root):
+        return found[0], found[1:]
+    layout = LAYOUTS[name]
+    if layout.camera is None:
+        return None, ()
+    camera = layout.camera(folder)
+    numbers = ",".join(f"{number:g}" for number in camera[:4])
+    warnings.warn(
+        f"{root}: frames without a camera file get the built-in camera of {name}, {numbers}; pass "
+        "--intrinsics if they are of another.",
+        DepthWarning,
+        stacklevel=4,
+    )
+    return camera, ()
+
+
+def fit_camera(
+    image: Path, camera: Tensor | Pinhole, file: Path | None = None
+) -> tuple[Tensor, str]:
+    """Return the camera matrix for a depth image, and why it is improbable, if it is.
+
+    Args:
+        image: The depth image. The size of one that is too large to be read does not count.
+        camera: The camera, or its matrix.
+        file: Where the camera was read from, for messages.
+
+    Raises:
+        ConfigError: If the camera cannot be that of the image.
+    """
+    caller = f"{image}" if file is None else f"{image}: {file.name}"
+    size = image_size(image)
+    size = None if size and math.prod(size) > MAX_PIXELS else size
+    matrix = camera.matrix(size, caller) if isinstance(camera, Pinhole) else camera
+    check_shapes(caller, intrinsics=(matrix, "3 3"))
+    check_camera(caller, matrix)
+    values = matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return matrix, doubt_view(caller, Pinhole(*values), size, name="--intrinsics") if size else ""

@@ -4,6 +4,7 @@ import math
 import os
 import re
 import struct
+import warnings
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io.colors import narrow_colors
 from torchrg.io.files import DAMAGES, check_file, check_promise, read_text, refusing
 from torchrg.structures import FARTHEST, Array
@@ -36,9 +37,11 @@ _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1
 """Beginning of a binary PGM: width, height and the largest value."""
 _LONGEST_HEAD = 512
 _MOST_OF_8_BITS, _MOST_OF_16_BITS = 255, 65535
-_MOST_PIXELS = 1 << 26
+MAX_PIXELS = 1 << 26
 """Pixels of the largest image that is read, 8192 x 8192. No depth camera has as many, and what is
 made of them on the way to metres takes 1.5 GB. A library that has less ends the process."""
+_MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
+"""Median depths in meters beyond which the depth scale is doubted. Depth cameras see 0.1 to 20."""
 _MOST_SECONDS = 0.02
 """Most seconds between an image and a pose that belong together."""
 
@@ -51,6 +54,9 @@ def read_depth(
     It is 0 where there is none (0, negative, not finite, or ``no_depth``, as 65535 in 7-Scenes).
     ``depth_scale`` is the stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for
     metres. It is not in the files, and never guessed.
+
+    Warns:
+        DepthWarning: If the median depth is below 5 cm or beyond 100 m.
 
     Example:
         >>> import tempfile
@@ -77,6 +83,15 @@ def read_depth(
         bad = ~(np.isfinite(depth) & (depth > 0))
     if no_depth is not None:
         bad |= stored == no_depth
+    median = float(np.median(depth[~bad])) / depth_scale if not bad.all() else _MIN_MEDIAN_DEPTH
+    if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:
+        warnings.warn(
+            f"{source}: expected a median depth of {_MIN_MEDIAN_DEPTH} to {_MAX_MEDIAN_DEPTH:g} m, "
+            f"got {median:,.4g} m with --depth-scale {depth_scale:g}; pass 1000 for millimeters, 1 "
+            "for meters.",
+            DepthWarning,
+            stacklevel=2,
+        )
     return torch.from_numpy((np.where(bad, 0, depth) / depth_scale).astype(np.float32))
 
 
@@ -123,9 +138,9 @@ def _read_image(source: Path, kinds: str) -> Array:
     from kornia_rs import io
 
     check_file(source)
-    if source.suffix.lower() == ".png" and (count := num_pixels(source)) > _MOST_PIXELS:
+    if source.suffix.lower() == ".png" and (count := num_pixels(source)) > MAX_PIXELS:
         raise FormatError(
-            f"{source}: expected an image of at most {_MOST_PIXELS:,} pixels, got {count:,} in its "
+            f"{source}: expected an image of at most {MAX_PIXELS:,} pixels, got {count:,} in its "
             "header; the file is damaged, fetch it again, or make it smaller."
         )
     with refusing(f"{source}: expected a {kinds} image, got: ", Exception):

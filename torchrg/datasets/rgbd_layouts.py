@@ -4,7 +4,8 @@ A new shape is a function here that lists the frames of a recording, a row of :d
 name among the choices of ``torchrg convert rgbd``, and a test.
 """
 
-from collections import Counter
+import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +13,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg.datasets.camera_files import camera_of, matrix_of, number_of, read_info, read_record
+from torchrg.datasets.camera_files import (
+    camera_of,
+    matrix_of,
+    number_of,
+    read_info,
+    read_record,
+)
 from torchrg.datasets.folder import check_folder, files_below, listed, natural_key, warn_of_links
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
@@ -25,7 +32,7 @@ from torchrg.datasets.rgbd_files import (
     read_trajectory,
 )
 from torchrg.depth.camera import Pinhole
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io.files import refusing
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -38,6 +45,17 @@ _TUM_INTRINSICS = {
 _ICL_NUIM_INTRINSICS = (481.2, -480.0, 319.5, 239.5)
 """The scenes were rendered with y upwards: rows count against it."""
 _SEVEN_SCENES_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
+_KINECT_SIZE = (640, 480)
+"""Width and height of the images of these cameras."""
+_NO_DEPTH = frozenset(
+    re.findall(
+        "[a-z]+",
+        "albedo annotation annotations color colors confidence curvature extrinsics instance "
+        "instances intrinsic intrinsics label labels mask masks normal normals plane planes pose "
+        "poses rendered rgb seg segmentation segmentations semantic semantics semseg",
+    )
+)
+"""Words in the names of files and folders whose images are not depth."""
 _IPHONES = ("", "iphone/", "*/iphone/", "data/*/iphone/")
 _SCANNETPP_COLOR = {"width": 1920, "height": 1440}
 """Sides of the colour images, which the intrinsics of ScanNet++ are of."""
@@ -59,8 +77,8 @@ class ListedFrame(NamedTuple):
     depth_scale: float | None = None
 
 
-Camera = Callable[[Path], tuple[Pinhole, tuple[Path, ...]]]
-"""Returns the camera of a recording, and the files that it was read from."""
+Camera = Callable[[Path], Pinhole]
+"""Returns the camera of a recording that has no camera file."""
 
 
 class FrameLayout(NamedTuple):
@@ -69,10 +87,13 @@ class FrameLayout(NamedTuple):
     Attributes:
         frames: Yields the frames of a recording in natural order.
         mark: Pattern of the name of an entry of every recording; nothing where a folder is one.
-        camera: The camera of a recording, None where frames have their own or none is known.
+        camera: The camera of a recording without a camera file, None where none is known or frames
+            have their own.
         depth_scale: Stored value of one metre, None where frames have their own or none is known.
         no_depth: As of :class:`torchrg.datasets.RGBDFrame`.
         places: Where recordings are below a folder of several, as patterns.
+        signs: Patterns of further entries, one of which tells the layout from others with the same
+            mark; nothing where the mark is enough, no pattern where a folder does not show it.
     """
 
     frames: Callable[[Path], Iterable[ListedFrame]]
@@ -81,6 +102,7 @@ class FrameLayout(NamedTuple):
     depth_scale: float | None = None
     no_depth: int | None = None
     places: tuple[str, ...] = ("", "*/")
+    signs: tuple[str, ...] = ("",)
 
 
 def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -99,12 +121,12 @@ def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
         yield ListedFrame(Path(image).stem, folder / image, beside, pose, sources)
 
 
-def _tum_camera(folder: Path) -> tuple[Pinhole, tuple[Path, ...]]:
-    """Return the camera matrix of a recording by its name."""
+def _tum_camera(folder: Path) -> Pinhole:
+    """Return the camera of a recording by its name."""
     name = folder.resolve().name.lower()
     for camera, values in _TUM_INTRINSICS.items():
         if camera in name:
-            return Pinhole(*values), ()
+            return Pinhole(*values, _KINECT_SIZE)
     raise ConfigError(
         f"{folder}: expected intrinsics, as the name says none of {', '.join(_TUM_INTRINSICS)}; "
         "pass them."
@@ -129,6 +151,8 @@ def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterato
 
     def frames(folder: Path) -> Iterator[ListedFrame]:
         for name, image in _depth_images(folder, depth):
+            if name.endswith(".rendered"):
+                continue
             path = folder / pose.replace("*", name)
             posed = (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
             yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *posed)
@@ -155,20 +179,43 @@ def _color_image(path: Path) -> Path | None:
 
 def _same_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
     """Return what gives every recording the same camera."""
-    return lambda folder: (Pinhole(fx, fy, cx, cy), ())
+    return lambda folder: Pinhole(fx, fy, cx, cy, _KINECT_SIZE)
 
 
-def _scannet_camera(folder: Path) -> tuple[Pinhole, tuple[Path, ...]]:
-    """Return the camera matrix of a scan."""
-    calibration = folder / "intrinsic" / "intrinsic_depth.txt"
-    return camera_of(calibration, {"intrinsic": read_matrix(calibration)}), (calibration,)
+def _scannet_camera(folder: Path) -> Pinhole:
+    """Refuse a scan without a camera file."""
+    raise FormatError(
+        f"{folder}: expected intrinsic/intrinsic_depth.txt or intrinsics_depth.txt, got none; add "
+        "it, or pass --intrinsics."
+    )
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
-    """Yield all depth images below a folder, by one camera, without colours and poses."""
-    for path in files_below(folder):
-        if path.suffix.lower() in DEPTH_SUFFIXES:
-            yield ListedFrame(path.relative_to(folder).with_suffix("").as_posix(), path)
+    """Yield all depth images below a folder, by one camera, without colours and poses.
+
+    Where names speak of depth, the images without that word are left out, and everywhere those
+    whose names speak of something else.
+
+    Warns:
+        DepthWarning: If images are left out.
+    """
+    images = [path for path in files_below(folder) if path.suffix.lower() in DEPTH_SUFFIXES]
+    words = {
+        path: {*re.findall("[a-z]+", path.relative_to(folder).as_posix().lower())}
+        for path in images
+    }
+    chosen = [path for path in images if words[path].isdisjoint(_NO_DEPTH)]
+    if any("depth" in words[path] for path in chosen):
+        chosen = [path for path in chosen if "depth" in words[path]]
+    if others := [path for path in images if path not in {*chosen}]:
+        warnings.warn(
+            f"{folder}: left out {len(others):,} of {len(images):,} images, which are not depth by "
+            f"their names, {others[0].relative_to(folder)} first; rename them if they are.",
+            DepthWarning,
+            stacklevel=2,
+        )
+    for path in chosen:
+        yield ListedFrame(path.relative_to(folder).with_suffix("").as_posix(), path)
 
 
 def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -248,8 +295,12 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
     for name, image in _depth_images(folder, "results/depth*"):
         color = _color_image(folder / "results" / f"frame{name}")
-        has_row = name.isdecimal() and int(name) < len(poses)
-        pose = known_pose(poses[int(name)]) if has_row else None
+        if not (name.isdecimal() and int(name) < len(poses)):
+            raise FormatError(
+                f"{track}: expected a row for each depth image, got {len(poses):,} rows and "
+                f"{image.name}; take both of one recording."
+            )
+        pose = known_pose(poses[int(name)])
         yield ListedFrame(name, image, color, pose, (calibration, track), camera, scale)
 
 
@@ -277,29 +328,41 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
 
 
 def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of 3RScan, ``frame-000000.depth.pgm``, without what was rendered beside."""
+    """Yield the frames of 3RScan, ``frame-000000.depth.pgm``, and of others with ``_info.txt``."""
     path = folder / "_info.txt"
     record = read_info(path)
     camera = camera_of(path, record)
     scale = number_of(path, record, "m_depthShift")
     for frame in _named_frames("*.depth", "*.color", "*.pose.txt")(folder):
-        if frame.depth.suffix.lower() == ".pgm":
-            yield frame._replace(sources=(path, *frame.sources), camera=camera, depth_scale=scale)
+        yield frame._replace(sources=(path, *frame.sources), camera=camera, depth_scale=scale)
 
 
 LAYOUTS = {
     "scannetpp": FrameLayout(
-        _scannetpp_frames, "pose_intrinsic_imu.json", None, 1000.0, places=_IPHONES
+        _scannetpp_frames,
+        "pose_intrinsic_imu.json",
+        depth_scale=1000.0,
+        places=_IPHONES,
     ),
     "arkitscenes": FrameLayout(
-        _arkitscenes_frames, "lowres_depth", None, 1000.0, places=("", "*/", "*/*/", "*/*/*/")
+        _arkitscenes_frames,
+        "lowres_depth",
+        depth_scale=1000.0,
+        places=("", "*/", "*/*/", "*/*/*/"),
     ),
     "3rscan": FrameLayout(_3rscan_frames, "_info.txt", places=("", "*/", "*/sequence/")),
     "replica": FrameLayout(_replica_frames, "traj.txt"),
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
-    "icl-nuim": FrameLayout(_icl_nuim_frames, "depth", _same_camera(*_ICL_NUIM_INTRINSICS), 5000.0),
+    "icl-nuim": FrameLayout(
+        _icl_nuim_frames, "depth", _same_camera(*_ICL_NUIM_INTRINSICS), 5000.0, signs=()
+    ),
     "scannet": FrameLayout(
-        _named_frames("depth/*", "color/*", "pose/*.txt"), "depth", _scannet_camera, 1000.0
+        _named_frames("depth/*", "color/*", "pose/*.txt"),
+        "depth",
+        _scannet_camera,
+        1000.0,
+        places=("", "*/", "*/*/"),
+        signs=("intrinsic*_depth.txt", "intrinsic*/intrinsic*_depth.txt"),
     ),
     "7-scenes": FrameLayout(
         _named_frames("*.depth", "*.color", "*.pose.txt"),
@@ -307,6 +370,7 @@ LAYOUTS = {
         _same_camera(*_SEVEN_SCENES_INTRINSICS),
         1000.0,
         no_depth=65535,
+        places=("", "*/", "*/*/"),
     ),
     "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json"),
     "images": FrameLayout(_all_images),
@@ -320,14 +384,14 @@ Nerfstudio (SIGGRAPH, 2023); and any other."""
 
 
 def find_layout(root: Path) -> str:
-    """Return the layout whose mark a folder has; one that two share tells neither.
+    """Return the layout whose mark a folder has, and its sign where the mark is not enough.
 
     It is ``images`` where there is no mark.
     """
-    marks = Counter(layout.mark for layout in LAYOUTS.values())
     for name, layout in LAYOUTS.items():
-        if layout.mark and marks[layout.mark] == 1 and any(_marked(root, layout)):
-            return name
+        for folder in _marked(root, layout) if layout.mark and layout.signs else ():
+            if any(not sign or any(folder.glob(sign)) for sign in layout.signs):
+                return name
     return "images"
 
 
@@ -346,7 +410,8 @@ def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path
     for path in sorted(marked, key=lambda path: path != root and path.is_symlink()):
         first_names.setdefault(path.resolve(), path)
     folders = [path for path in marked if first_names[path.resolve()] == path]
-    warn_of_links(root, [path for path in marked if path not in folders])
+    passed = [path for path in marked if path not in folders]
+    warn_of_links(root, [path for path in passed if not {*path.parents} & {*passed}])
     if not folders:
         raise FormatError(f"{root}: expected recordings with {layout.mark} in them, got none.")
     for folder in folders:

@@ -7,6 +7,7 @@ Each repair is reported, and every other line that is not six numbers is an erro
 """
 
 import filecmp
+import hashlib
 import itertools
 import os
 import re
@@ -67,8 +68,9 @@ class Room(NamedTuple):
             ``(N,)``, int16, or int32 with more objects than that holds.
         repairs: A line for each byte that was read as another one: file, line and column, counted
             from one, and the line before and after. The file itself is not changed.
-        notes: A line for each entry of the folder that is no object, and for each file whose class
-            is not among the 13, ``stairs`` for example; and what reading colors took for granted.
+        notes: A line for each entry of the folder that is no object, for each file whose class is
+            not among the 13, ``stairs`` for example, and for each with the points of another; and
+            what reading colors took for granted.
     """
 
     coord: NDArray[np.float32]
@@ -182,6 +184,10 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
     coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
     numbers = [classes.index(name if name in classes else _OTHER_CLASS) for name, _ in objects]
     notes += [f"{file.name} taken as clutter" for name, file in objects if name not in classes]
+    first: dict[bytes, str] = {}
+    for (_, file), coord in zip(objects, coords, strict=True):
+        other = first.setdefault(hashlib.sha256(coord.tobytes()).digest(), file.name)
+        notes += [] if other == file.name else [f"{file.name} has the points of {other}, too"]
     color, more = read_colors(path, np.concatenate(colors))
     counts = [len(coord) for coord in coords]
     dtype = np.int16 if len(objects) <= np.iinfo(np.int16).max else np.int32

@@ -62,6 +62,8 @@ _MOST_LABELS = 3
 """Objects that a vertex of ScanNet++ may be of at once."""
 _LARGEST_CLASS = 65_535
 """Largest number of a class: labels of the release have 16 bits."""
+_MAX_ID = np.iinfo(np.int32).max
+"""Largest number of an object of ScanNet."""
 _NONE = -1
 
 
@@ -195,10 +197,9 @@ def read_objects(mesh: Path, count: int) -> list[tuple[dict[str, Any], NDArray[n
     files = _files_of(mesh)
     if not {"segments", "groups"} <= files.keys():
         return None
-    most = np.iinfo(np.int32).max
     return [
         ({"id": number, "objectId": other, "label": label}, rows)
-        for label, (number, other), rows in _groups(files, count, ("id", "objectId"), most)
+        for label, (number, other), _, rows in _groups(files, count, ("id", "objectId"), _MAX_ID)
     ]
 
 
@@ -292,9 +293,17 @@ def _labels(files: Mapping[str, Path], root: Path, count: int) -> Arrays:
     if "groups" in files and "segments" in files:
         instance = np.full(count, _NONE, dtype=np.int64)
         numbers = np.zeros((count, 2), dtype=np.int64)
-        for label, (number,), rows in _groups(files, count, ["id"], np.iinfo(np.int32).max):
+        owners: dict[int, int] = {}
+        shared, unknown = [], []
+        for label, (number,), segments, rows in _groups(files, count, ["id"], _MAX_ID):
             instance[rows] = number
             numbers[rows] = words.get(label, (0, 0))
+            shared += [id_ for id_ in segments if owners.get(id_, number) != number]
+            owners |= dict.fromkeys(segments, number)
+            unknown += [label] if words and label not in words else []
+        path = files["groups"]
+        _warn_of_first(path, "segments are in two objects, of which the later is taken", shared)
+        _warn_of_first(path, f"objects have labels that {CATEGORIES} does not have", unknown)
         arrays["instance"] = instance
         if words:
             arrays |= {"category": numbers[:, 0], "segment200": _places(numbers[:, 1], IDS_200)}
@@ -328,7 +337,7 @@ def _labels_plus(mesh: Path, root: Path, count: int) -> Arrays:
     instance = segment.copy()
     sizes = np.full(segment.shape, np.inf)
     used = np.zeros(count, dtype=np.int64)
-    for word, (number,), inside in _groups(files, count, ["objectId"], np.iinfo(np.int16).max):
+    for word, (number,), _, inside in _groups(files, count, ["objectId"], np.iinfo(np.int16).max):
         label = classes.get(renamed.get(word, ""))
         rows = inside[used[inside] < _MOST_LABELS]
         if label is None or not len(rows):
@@ -346,10 +355,16 @@ def _labels_plus(mesh: Path, root: Path, count: int) -> Arrays:
 
 def _groups(
     files: Mapping[str, Path], count: int, keys: Sequence[str], most: int
-) -> Iterator[tuple[str, list[int], NDArray[np.integer]]]:
-    """Yield label and numbers of each object of an annotation with the rows of its vertices.
+) -> Iterator[tuple[str, list[int], list[int], NDArray[np.integer]]]:
+    """Yield label, numbers, segments and rows of the vertices of each object of an annotation.
 
     The numbers are under some keys, and at most so large.
+
+    Raises:
+        FormatError: If an object has a segment that no vertex has, or a file is damaged.
+
+    Warns:
+        UserWarning: If two objects have one number.
     """
     path = files["segments"]
     segments = _read_list(path, "segIndices")
@@ -359,7 +374,9 @@ def _groups(
             "fetch it again."
         )
     of_vertices = _whole(path, "segIndices", segments)
-    path = files["groups"]
+    known, path = np.unique(of_vertices), files["groups"]
+    seen: set[int] = set()
+    repeated = []
     for place, group in enumerate(_read_list(path, "segGroups")):
         entries = group if isinstance(group, dict) else {}
         label, members = entries.get("label"), entries.get("segments")
@@ -372,7 +389,23 @@ def _groups(
                 "again."
             )
         whole = _whole(path, f"segments of object {place}", members)
-        yield label, numbers, np.flatnonzero(np.isin(of_vertices, whole))
+        absent = whole[~np.isin(whole, known)]
+        if len(absent):
+            raise FormatError(
+                f"{path}: object {place}: expected segments of {files['segments'].name}, got "
+                f"{absent[0]}, which is not there; take the annotation of the same mesh."
+            )
+        repeated += [numbers[0]] if numbers[0] in seen else []
+        seen.add(numbers[0])
+        yield label, numbers, whole.tolist(), np.flatnonzero(np.isin(of_vertices, whole))
+    _warn_of_first(path, "objects have the number of another and become one with it", repeated)
+
+
+def _warn_of_first(path: Path, what: str, entries: Sequence[object]) -> None:
+    """Warn of entries of a file that do not fit others, if there are any, and name the first."""
+    if entries:
+        more = f" and {len(entries) - 1:,} more" if len(entries) > 1 else ""
+        warnings.warn(f"{path}: {what}: {shortened(entries[0])}{more}.", stacklevel=2)
 
 
 def _read_list(path: Path, key: str) -> list[Any]:

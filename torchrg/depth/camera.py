@@ -1,13 +1,27 @@
 """Pinhole cameras: depth images to points, through kornia, and back from organised clouds."""
 
+import math
+import warnings
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, has_values
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, DepthWarning
 from torchrg.structures import FARTHEST
+
+_MAX_ANGLE_DEG, _WIDE_ANGLE_DEG = 85.0, 75.0
+"""Angles from the optical axis to the farthest pixel, in degrees, that are impossible and
+improbable. A pinhole camera cannot see 90, and lenses beyond 75 bend lines."""
+_MIN_VIEW_DEG, _NARROW_VIEW_DEG = 0.001, 5.0
+"""Fields of view along the longer side, in degrees, that are impossible and improbable. Depth
+cameras see 40 to 120."""
+_MAX_ASPECT = 1.25
+"""Ratio of the focal lengths beyond which pixels are improbably far from square."""
+_MAX_OFF_CENTER, _SLIGHTLY_OFF_CENTER = 0.15, 0.05
+"""Distances of the optical axis from the center, as fractions of a side. Depth cameras reach 0.09.
+The smaller limit holds where ``cx`` and ``cy`` in the other order fit three times as well."""
 
 
 def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = None) -> Tensor:
@@ -30,7 +44,10 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a camera matrix is none.
+        ConfigError: If a camera matrix is none, or cannot be of such images.
+
+    Warns:
+        DepthWarning: If a camera is improbable; see :func:`check_view`.
 
     Example:
         >>> camera = torch.tensor([[2.0, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
@@ -46,6 +63,13 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         poses=(poses, "B 4 4"),
     )
     check_floating("depth_to_points", depth=depth)
+    if has_values(intrinsics):
+        check_view("depth_to_points", intrinsics, (depth.shape[2], depth.shape[1]))
+    return _unproject(depth, intrinsics, poses)
+
+
+def _unproject(depth: Tensor, intrinsics: Tensor, poses: Tensor | None) -> Tensor:
+    """Do what :func:`depth_to_points` says."""
     from kornia.geometry.depth import depth_to_3d_v2
 
     seen = has_depth(depth)
@@ -98,10 +122,81 @@ def check_camera(caller: str, intrinsics: Tensor) -> None:
         )
 
 
+def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
+    """Check that cameras ``(*, 3, 3)`` may belong to images of a size, width and height.
+
+    Raises:
+        ConfigError: If one cannot.
+
+    Warns:
+        DepthWarning: If one hardly does. Crops and squeezed images are improbable, not wrong.
+
+    Example:
+        >>> check_view("f", make_intrinsics(0.8, 1.1, 0.5, 0.5), (640, 480))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ConfigError: f: expected intrinsics fx,fy,cx,cy of images of 640 x 480 ...
+    """
+    rows = intrinsics.detach().reshape(-1, 9)[:, [0, 4, 2, 5]].double().cpu().tolist()
+    for row in dict.fromkeys(map(tuple, rows)):
+        if doubt := doubt_view(caller, Pinhole(*row), size):
+            warnings.warn(doubt, DepthWarning, stacklevel=3)
+
+
+def doubt_view(
+    caller: str, camera: "Pinhole", size: tuple[int, int], *, name: str = "intrinsics"
+) -> str:
+    """Return why a camera is improbable for images of a size; nothing where it is probable.
+
+    ``name`` is the argument or flag that gives the camera.
+
+    Raises:
+        ConfigError: If it is impossible.
+    """
+    if 0 in size:
+        return ""
+    focal, axis = (abs(camera.fx), abs(camera.fy)), (camera.cx, camera.cy)
+    rows = list(zip(focal, axis, size, strict=True))
+    angle = math.degrees(math.atan(max(max(c + 0.5, side - 0.5 - c) / f for f, c, side in rows)))
+    view = math.degrees(2 * math.atan(max(side / (2 * f) for f, _, side in rows)))
+    off = _off_center(axis, size)
+    if angle > _WIDE_ANGLE_DEG:
+        doubt = f"with pixels {angle:.3g} degrees off the optical axis; give pixels, not fractions"
+    elif view < _NARROW_VIEW_DEG:
+        doubt = f"with a field of view of {view:.2g} degrees; give focal lengths in pixels"
+    elif max(focal) > _MAX_ASPECT * min(focal):
+        doubt = "with pixels that are not square; check the order of the numbers"
+    elif off > _MAX_OFF_CENTER:
+        doubt = "with an optical axis off the center; give the camera of images of this size"
+    elif off > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
+        doubt = "which fit better with cx and cy in the other order; exchange them"
+    else:
+        return ""
+    numbers = ",".join(f"{value:g}" for value in camera[:4])
+    text = (
+        f"{caller}: expected {name} fx,fy,cx,cy of images of {size[0]} x {size[1]} pixels, got "
+        f"{numbers}, {doubt}."
+    )
+    if angle > _MAX_ANGLE_DEG or view < _MIN_VIEW_DEG:
+        raise ConfigError(text)
+    return text
+
+
+def _off_center(axis: tuple[float, ...], size: tuple[int, int]) -> float:
+    """Return the distance of an optical axis from the center of images, as a fraction of a side.
+
+    Half a pixel is free: programs differ in where the center of the first pixel is.
+    """
+    return max((abs(c + 0.5 - side / 2) - 0.5) / side for c, side in zip(axis, size, strict=True))
+
+
 def points_of_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:
-    """Do as :func:`depth_to_points` for one image ``(H, W)``, in float64: ``(H, W, 3)``."""
+    """Do as :func:`depth_to_points` for one image ``(H, W)``, in float64: ``(H, W, 3)``.
+
+    The camera is checked already.
+    """
     poses = None if pose is None else pose[None]
-    return depth_to_points(depth[None].double(), intrinsics[None].double(), poses)[0]
+    return _unproject(depth[None].double(), intrinsics[None].double(), poses)[0]
 
 
 def has_depth(depth: Tensor) -> Tensor:
@@ -132,16 +227,26 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     return matrix
 
 
+def numbers_of(intrinsics: Tensor) -> str:
+    """Return a camera matrix ``(3, 3)`` as ``fx,fy,cx,cy``."""
+    values = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return ",".join(f"{value:.15g}" for value in values)
+
+
 class Pinhole(NamedTuple):
-    """A pinhole camera in pixels, of images of a size, width and height, where that is known."""
+    """A pinhole camera in pixels, of images of a size, width and height, where that is known.
+
+    ``depth_scale`` is the stored value of one meter in its depth images, where that is known.
+    """
 
     fx: float
     fy: float
     cx: float
     cy: float
     size: tuple[int, int] | None = None
+    depth_scale: float | None = None
 
-    def matrix(self, size: tuple[int, int] | None = None) -> Tensor:
+    def matrix(self, size: tuple[int, int] | None = None, caller: str = "Pinhole") -> Tensor:
         """Return the camera matrix ``(3, 3)``, float64, for images that are resized to ``size``.
 
         Convention:
@@ -149,24 +254,36 @@ class Pinhole(NamedTuple):
             a pixel beyond the middles of its outermost pixels: ``cx + 0.5`` grows as ``fx`` does.
 
         Raises:
-            ConfigError: If the sides of the images are in another ratio, by more than a pixel.
+            ConfigError: If the sides of the images are in another ratio, by more than a pixel, or
+                the optical axis is outside of them.
 
         Example:
             >>> Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((160, 120))[0].tolist()
             [150.0, 0.0, 79.5]
         """
-        fx, fy, cx, cy, calibrated = self
-        if size is None or calibrated is None:
+        fx, fy, cx, cy, calibrated, _ = self
+        if size is None:
             return make_intrinsics(fx, fy, cx, cy)
-        across, down = size[0] / calibrated[0], size[1] / calibrated[1]
-        if abs(size[0] * calibrated[1] - size[1] * calibrated[0]) > max(calibrated):
+        (width, height), (old_width, old_height) = size, calibrated or size
+        if abs(width * old_height - height * old_width) > max(old_width, old_height):
+            is_turned = abs(height * old_height - width * old_width) <= max(old_width, old_height)
+            repair = "turn the images back, or " if is_turned else ""
             raise ConfigError(
-                f"Pinhole: expected images of {calibrated[0]} x {calibrated[1]} pixels, as its "
-                f"camera's, or in "
-                f"their ratio, got {size[0]} x {size[1]}; pass the camera of the depth images."
+                f"{caller}: expected images of {old_width} x {old_height} pixels, as its camera's, "
+                f"or in their ratio, got {width} x {height}; {repair}pass the camera of the depth "
+                "images."
             )
-        middle = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
-        return make_intrinsics(fx * across, fy * down, *middle)
+        if size != (old_width, old_height):
+            across, down = width / old_width, height / old_height
+            fx, fy = fx * across, fy * down
+            cx, cy = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
+        if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+            raise ConfigError(
+                f"{caller}: expected an optical axis within images of {width} x {height} pixels, "
+                f"got {cx:g},{cy:g}; pass the camera of the depth images, or a file that names its "
+                "width and height."
+            )
+        return make_intrinsics(fx, fy, cx, cy)
 
 
 def find_intrinsics(points: Tensor) -> Tensor | None:
@@ -199,6 +316,19 @@ def find_intrinsics(points: Tensor) -> Tensor | None:
         return None
     (fx, cx), (fy, cy) = (line for line in lines if line is not None)
     return make_intrinsics(fx, fy, cx, cy)
+
+
+def find_misfit(points: Tensor, intrinsics: Tensor) -> float:
+    """Return how far a camera puts points from their pixels: the median, in pixels.
+
+    ``points`` ``(H, W, 3)`` are in camera coordinates. It is 0 where none is in front.
+    """
+    seen = points.isfinite().all(dim=-1) & (points[..., 2] > 0)
+    rows, columns = (place.double() for place in seen.nonzero().unbind(dim=1))
+    projected = points[seen].double() @ intrinsics.to(points.device, torch.float64).T
+    across, down = (projected[:, axis] / projected[:, 2] for axis in (0, 1))
+    off = torch.hypot(across - columns, down - rows)
+    return float(off.median()) if len(off) else 0.0
 
 
 def _fit_line(slopes: Tensor, places: Tensor) -> tuple[float, float] | None:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
 from torchrg._parallel import places_of, sequential_operations
 from torchrg.config import DepthConfig, settings_of
-from torchrg.depth.camera import has_depth, read_intrinsics
+from torchrg.depth.camera import check_view, has_depth, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import fit_pixels
 from torchrg.depth.pixels import Pixels, describe_pixels
@@ -57,7 +57,11 @@ def segment_depth(
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If ``intrinsics`` is no matrix of a camera, or a setting is wrong.
+        ConfigError: If ``intrinsics`` cannot be of a camera of such images, or a setting is wrong.
+
+    Warns:
+        DepthWarning: If ``intrinsics`` are improbable; see
+            :func:`torchrg.depth.camera.check_view`.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -77,6 +81,7 @@ def segment_depth(
         pose=(pose, "4 4"),
     )
     check_floating("segment_depth", depth=depth)
+    check_view("segment_depth", intrinsics, (depth.shape[1], depth.shape[0]))
     settings = settings_of("segment_depth", DepthConfig, config, changes)
     return _segment(depth, intrinsics, settings, pose)
 
@@ -85,6 +90,12 @@ def _segment(
     depth: Tensor, intrinsics: Tensor, config: DepthConfig, pose: Tensor | None
 ) -> Segmentation:
     """Do what :func:`segment_depth` says."""
+    if depth.numel() == 0:
+        pixel = _segment(depth.new_zeros(1, 1), intrinsics, config, pose)
+        labels, normals, curvature, sharp, valid = (
+            image.new_zeros(*depth.shape, *image.shape[2:]) for image in pixel[:5]
+        )
+        return Segmentation(labels, normals, curvature, sharp, valid, pixel.planes)
     if config.max_depth is not None:
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = has_depth(depth)

@@ -1,5 +1,6 @@
 """Depth images: as modules to clouds and to planes, and several of them as one cloud."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -37,12 +38,16 @@ class DepthTransform(SampleTransform):
         if key in sample:
             sample = {**sample, key: read_intrinsics(type(self).__name__, sample[key])}
         depth, intrinsics = self.read(sample, "depth"), self.read(sample, "intrinsics")
-        if depth.ndim not in (2, 3, 4) or (depth.ndim > 2 and depth.shape[-3] != 1):
+        if (
+            depth.ndim not in (2, 3, 4)
+            or (depth.ndim > 2 and depth.shape[-3] != 1)
+            or (depth.ndim == 4 and not len(depth))
+        ):
             raise ShapeError(
                 f"{type(self).__name__}: expected depth of shape (H, W), (1, H, W) or "
-                f"(B, 1, H, W), got {tuple(depth.shape)}."
+                f"(B, 1, H, W) of at least one image, got {tuple(depth.shape)}."
             )
-        depth = depth.reshape(-1, *depth.shape[-2:])
+        depth = depth.reshape(math.prod(depth.shape[:-2]), *depth.shape[-2:])
         has_pose = sample.get(self.key(sample, "pose")) is not None
         poses = self.read(sample, "pose") if has_pose else None
         return (
@@ -110,8 +115,8 @@ class DepthToCloud(DepthTransform):
 
 def _colors(color: Tensor, seen: Tensor) -> Tensor:
     """Return the colours of some pixels, shape ``(N, 3)``, from images of any size."""
-    images = color.reshape(-1, *color.shape[-3:])
-    if images.shape[:2] != (len(seen), 3):
+    images = color.reshape(math.prod(color.shape[:-3]), *color.shape[-3:])
+    if images.shape[:2] != (len(seen), 3) or (seen.numel() and not images.numel()):
         raise ShapeError(
             f"DepthToCloud: expected color of shape (3, H, W) or (B, 3, H, W), got "
             f"{tuple(color.shape)} for {len(seen)} depth images."
