@@ -25,6 +25,9 @@ REPORT = "report.json"
 """Name of the report in the output directory."""
 LOCK = ".torchrg.lock"
 """Name of the file in the output directory that is locked; it stays there, empty."""
+DATA_SETS = ".torchrg.scans.json"
+"""Name of the file in the output directory that lists the scans of its data sets; see
+:mod:`torchrg.batch.stale`."""
 PATIENCE_SECONDS = 5.0
 """Seconds to wait for a lock: a command that is interrupted ends its workers by then."""
 
@@ -98,12 +101,21 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
         )
     source.check_results(scans, out)
     _check_names(source.root, scans)
-    chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
+    return match_jobs([Job(source, scan, out) for scan in scans], only)
+
+
+def match_jobs(jobs: Sequence[Job], only: str | None) -> list[Job]:
+    """Return the jobs of the scans whose names match a pattern, all without one.
+
+    Raises:
+        ConfigError: If no name matches.
+    """
+    chosen = [job for job in jobs if only is None or fnmatchcase(job.name, only)]
     if not chosen:
-        names = ", ".join(scan.name for scan in scans[:5])
-        more = f" and {len(scans) - 5:,} more" if len(scans) > 5 else ""
+        names = ", ".join(job.name for job in jobs[:5])
+        more = f" and {len(jobs) - 5:,} more" if len(jobs) > 5 else ""
         raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
-    return [Job(source, scan, out) for scan in chosen]
+    return chosen
 
 
 def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
@@ -118,7 +130,7 @@ def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
 
 def _check_names(root: Path, scans: Sequence[Scan]) -> None:
     """Refuse scans whose results would share a folder, or replace files of the batch."""
-    batch_files = {folded_name(name): name for name in (REPORT, LOCK)}
+    batch_files = {folded_name(name): name for name in (REPORT, LOCK, DATA_SETS)}
     taken: dict[str, str] = {}
     for name in (scan.name for scan in scans):
         key = folded_name(name)
