@@ -14,12 +14,12 @@ from typing import NamedTuple
 import filelock
 
 from torchrg.batch.records import Record, describe_versions, read_record, reason_to_convert
-from torchrg.batch.scans import Job, Scan, Source
+from torchrg.batch.scans import Job, Scan, Source, mark_of
 from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import check_space
+from torchrg.io.files import check_space, marked_parts
 
 REPORT = "report.json"
 """Name of the report in the output directory."""
@@ -28,6 +28,9 @@ LOCK = ".torchrg.lock"
 DATA_SETS = ".torchrg.scans.json"
 """Name of the file in the output directory that lists the scans of its data sets; see
 :mod:`torchrg.batch.stale`."""
+_BYTES_PER_SCAN = 32_768
+"""Space that files of a scan take beyond their content: six to eight, half a block of 4 KiB lost in
+each, and its tables."""
 PATIENCE_SECONDS = 5.0
 """Seconds to wait for a lock: a command that is interrupted ends its workers by then."""
 
@@ -81,6 +84,14 @@ class Plan(NamedTuple):
     def done(self) -> list[Job]:
         """The jobs that are done."""
         return [job for job in self.jobs if job.name not in self.reasons]
+
+    @property
+    def num_bytes(self) -> int:
+        """The disk space that the jobs that are not done take, by the estimates of the scans."""
+        return sum(
+            _BYTES_PER_SCAN + job.source.bytes_per_point * job.scan.num_points
+            for job in self.to_convert
+        )
 
 
 def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job]:
@@ -177,11 +188,9 @@ def make_plan(
 
 def check_room(plan: Plan) -> None:
     """Raise FormatError if the disk has no room for the results, by the estimates of the scans."""
-    if plan.to_convert:
-        source, jobs = plan.jobs[0].source, plan.to_convert
-        needed = source.bytes_per_point * sum(job.scan.num_points for job in jobs)
+    if num_scans := len(plan.to_convert):
         repair = "convert fewer with --only"
-        check_space(plan.jobs[0].out, needed, f"{len(jobs):,} scans", repair=repair)
+        check_space(plan.jobs[0].out, plan.num_bytes, f"{num_scans:,} scans", repair=repair)
 
 
 @dataclass(frozen=True)
@@ -303,5 +312,5 @@ def run_plan(
 
 def write_report(out: Path, report: BatchReport) -> None:
     """Write ``report.json`` into the output directory; raise FormatError if it cannot be."""
-    with atomic_path(out / REPORT) as beside:
+    with marked_parts(mark_of(REPORT)), atomic_path(out / REPORT) as beside:
         beside.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")

@@ -17,7 +17,7 @@ from torchrg.batch.records import (
     is_unchanged,
     read_record,
 )
-from torchrg.batch.run import DATA_SETS, LOCK
+from torchrg.batch.run import DATA_SETS, LOCK, REPORT
 from torchrg.batch.scans import Job, mark_of
 from torchrg.datasets.folder import natural_key
 from torchrg.datasets.pointcept import written_files
@@ -169,7 +169,7 @@ def note_data_set(jobs: Sequence[Job], removed: Sequence[StaleResult]) -> None:
             scans = {n: i for n, i in data_set.items() if (out / n).is_dir()} | scans
     after = sorted([*others, dict(sorted(scans.items()))], key=min)
     if after != before:
-        with marked_parts(mark_of(DATA_SETS)), atomic_path(out / DATA_SETS) as temporary:
+        with marked_parts(mark_of(REPORT)), atomic_path(out / DATA_SETS) as temporary:
             temporary.write_text(json.dumps(after, indent=0), encoding="utf-8")
 
 

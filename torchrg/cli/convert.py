@@ -49,7 +49,7 @@ from torchrg.config import DepthConfig, SuperpointsConfig, Up
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
-from torchrg.io.files import check_place, free_space, make_folder
+from torchrg.io.files import check_place, free_space, make_folder, remove_leftovers
 from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
@@ -294,6 +294,7 @@ def run(argv: list[str]) -> int:
         make_folder(pages)
         check_gallery(pages, [job.name for job in jobs])
     with lock_folder(out):
+        remove_leftovers(out, mark_of(REPORT))
         stale = _find_stale(scans, arguments)
         check_stale(stale, root, prune=arguments.prune)
         plan = _look_at(jobs, arguments)
