@@ -327,6 +327,14 @@ def test_files_of_other_layouts_go_with_their_scan(root, out, convert):
     assert MOVED.encode() not in found["train_database.yaml"]
     assert "superpoints/scene0002_00.npy" in found
     assert "train/scene0001_00.h5" in found
+    # Without its fingerprint nobody knows whether a file was changed.
+    path = out / "val" / MOVED / RECORD
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
+    assert convert("scannet", root, out, "--layout", "nag").code == 0
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
+    move(root, train=SCANS, val=[])
+    error = convert("scannet", root, out, "--layout", "nag").error
+    assert f"{out}/planes/{MOVED}.npy: expected a file as torchrg wrote it" in error
 
 
 def test_a_scan_without_a_split_in_its_name_leaves_the_old_one_too(tmp_path, out, convert):
@@ -381,7 +389,7 @@ def test_records_of_other_versions_end_in_no_loss(root, out, convert, change):
         assert (done.code, done.err) == (0, "")
         assert not path.exists()
     else:
-        assert "coord.npy: expected a file as torchrg wrote it" in done.error
+        assert "npy: expected a file as torchrg wrote it" in done.error
         assert results_of(out) == before
 
 

@@ -23,7 +23,9 @@ from torchrg.result import RECORD as RECORD
 Record = dict[str, Any]
 """A record, or a piece of one, as JSON holds it."""
 _USUAL = "pointcept"
-"""Layout of a record that names none."""
+"""Layout of a source that names none."""
+_RESULTS = {"points": int, "regions": int, "repairs": list, "warnings": list}
+"""Types of the parts of a record that reports repeat."""
 _BYTES_AT_ONCE = 1 << 20
 """Bytes of a file that are read together, which bounds the memory."""
 
@@ -125,7 +127,7 @@ def split_by_layout(record: Record, layout: str) -> tuple[Record, Record]:
     """
     layouts = dict(record["other_layouts"])
     replaced, outputs = dict(layouts.pop(layout, {})), record["outputs"]
-    earlier = layout_of(record)
+    earlier = layout_of(record) or layout
     shared = {name: outputs[name] for name in outputs if "/" in name and earlier != layout}
     if shared:
         layouts[earlier] = shared
@@ -133,9 +135,9 @@ def split_by_layout(record: Record, layout: str) -> tuple[Record, Record]:
 
 
 def layout_of(record: Record) -> str:
-    """Return the layout that a record or a description of a scan names."""
+    """Return the layout that a record or a description of a scan names, "" without a source."""
     source = record.get("source")
-    return str(source.get("layout", _USUAL)) if isinstance(source, dict) else _USUAL
+    return str(source.get("layout", _USUAL)) if isinstance(source, dict) else ""
 
 
 def file_of_record(out: Path, folder: Path, name: str) -> Path | None:
@@ -170,7 +172,7 @@ def reason_to_convert(job: Recorded) -> str:
     """Return why a scan is not done, or nothing if it is.
 
     ``"new"`` without a record; else which of input, settings, version or results is another than
-    the record says.
+    the record says, or that the record is damaged.
     """
     record = read_record(job.folder)
     if record is None:
@@ -183,6 +185,8 @@ def reason_to_convert(job: Recorded) -> str:
     for key, name in changes.items():
         if record.get(key) != description[key]:
             return f"{name} changed"
+    if not all(isinstance(record.get(name), kind) for name, kind in _RESULTS.items()):
+        return "record damaged"
     for name, noted in record["outputs"].items():
         try:
             if fingerprint(job.folder / name) != noted:

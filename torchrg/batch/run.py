@@ -271,8 +271,8 @@ def _kept_report(job: Job) -> TaskReport:
         num_points=record.get("points", 0),
         num_regions=record.get("regions", 0),
         files=tuple(record.get("outputs", ())),
-        repairs=tuple(record.get("repairs", ())),
-        warnings=tuple(record.get("warnings", ())),
+        repairs=tuple(map(str, record.get("repairs", ()))),
+        warnings=tuple(map(str, record.get("warnings", ()))),
         attempts=0,
     )
 

@@ -208,10 +208,10 @@ def _first_input(folder: Path, kind: object) -> str:
 
 def _files_of(folder: Path) -> dict[str, Record | None]:
     """Return the files of a result with their fingerprints, None for those without a record."""
-    record = read_record(folder)
+    names, record = written_files(folder), read_record(folder)
     if record is None:
-        return dict.fromkeys(written_files(folder))
-    parts = (record["outputs"], *record["other_layouts"].values())
+        return dict.fromkeys(names)
+    parts = (dict.fromkeys(names), record["outputs"], *record["other_layouts"].values())
     return {name: noted or {} for part in parts for name, noted in part.items()}
 
 
