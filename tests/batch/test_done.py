@@ -60,6 +60,15 @@ def test_a_damaged_record_is_none(job, text):
     assert reason_to_convert(job) == "new"
 
 
+@pytest.mark.parametrize(
+    "change", [{"points": "x"}, {"regions": None}, {"repairs": 3}, {"warnings": {}}]
+)
+def test_a_record_that_a_report_cannot_repeat_is_noticed(job, change):
+    record = json.loads((job.folder / RECORD).read_text())
+    (job.folder / RECORD).write_text(json.dumps(record | change))
+    assert reason_to_convert(job) == "record damaged"
+
+
 def test_records_hold_no_place_or_time(faults, tmp_path):
     records = []
     for folder in ("here", "there"):

@@ -2,9 +2,10 @@
 
 import sys
 from contextlib import closing
+from multiprocessing import Pipe
 from pathlib import Path
 
-from torchrg.batch.local import run_local
+from torchrg.batch.local import _serve, run_local
 from torchrg.batch.memory import memory_of_scan
 
 PLENTY = 10**12
@@ -49,6 +50,16 @@ def test_failures_and_deaths_stop_no_other_scan(faults, tmp_path):
     again = [name for name, what in log if what != "done"][len(jobs) :]
     assert sorted(again) == ["4_f", "7_c", "9_a"]
     assert log.index(("5_e", "done")) < log.index(("9_a", "done"))
+
+
+def test_a_worker_ends_in_silence_when_nobody_takes_its_report(faults, tmp_path, set_threads):
+    set_threads(1)
+    (job,) = faults.make_jobs(tmp_path, {"9_a": "plain"})
+    ours, theirs = Pipe()
+    ours.send(job)
+    ours.close()
+    _serve(theirs, None)
+    assert log_of(tmp_path)[-1] == ("9_a", "done")
 
 
 def test_a_worker_that_cannot_begin_is_told_by_its_cause(faults, tmp_path, capfd):

@@ -1,10 +1,14 @@
 """A whole batch: a full disk and an interrupt end it, and the next run goes on from there."""
 
 import json
+import os
 
-from torchrg.batch.run import make_plan, run_plan, write_report
-from torchrg.batch.scans import convert_scan
-from torchrg.cli.report import format_report, format_table
+import pytest
+
+from torchrg.batch.run import REPORT, make_plan, run_plan, write_report
+from torchrg.batch.scans import convert_scan, mark_of
+from torchrg.cli.report import format_costs, format_report, format_table
+from torchrg.io.files import remove_leftovers
 
 
 def run(jobs, on_report=lambda report: None):
@@ -60,6 +64,29 @@ def test_the_report_has_everything_and_the_table_what_fits(faults, tmp_path):
     assert "9_a: was plain" in table
     kept = run(jobs).with_status("kept")[0]
     assert (kept.num_points, kept.num_regions, kept.warnings) == (9, 1, ("was plain",))
+
+
+def test_a_report_that_was_not_completed_is_removed_the_next_time(faults, tmp_path, monkeypatch):
+    report = run(faults.make_jobs(tmp_path, {"9_a": "plain"}))
+    with monkeypatch.context() as killed:
+        killed.setattr(os, "unlink", lambda path: None)
+        killed.setattr(os, "replace", lambda *paths: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            write_report(tmp_path, report)
+    (left,) = tmp_path.glob(".report.*.json")
+    remove_leftovers(tmp_path, mark_of(REPORT))
+    assert not left.exists()
+
+
+def test_many_small_scans_take_room_and_time_of_their_own(faults, tmp_path):
+    plan = make_plan(faults.make_jobs(tmp_path, {f"1_{number}": "plain" for number in range(99)}))
+    assert plan.num_bytes > 99 * 6 * 4096
+    costs = format_costs(plan, 1, 10**10, 10**10, (10.0, "points"))
+    assert "disk: about 0.003 GB" in costs
+    assert "time: about 0.00 hours" in costs
+    assert "time: about 0.08 hours" in format_costs(
+        plan._replace(jobs=plan.jobs * 100), 1, 10**10, 10**10, (10.0, "points")
+    )
 
 
 def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):

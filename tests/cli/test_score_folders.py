@@ -83,6 +83,8 @@ def test_mistakes_are_one_line(folders, tmp_path, run):
     (truth / "scan9.pcd").touch()
     for arguments, message in {
         (ours, tmp_path / "empty"): "empty: expected files that end in one of",
+        (ours, tmp_path / "none"): "none: no such file; check the spelling.",
+        (tmp_path / "none", truth): "none: no such file; check the spelling.",
         (ours, truth / "scan9.npz"): "scan9.npz: expected a folder",
         (truth / "scan9.npz", ours): "scan9.npz: expected a folder",
         (ours, truth): "got scan9.npz and scan9.pcd",

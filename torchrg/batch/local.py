@@ -149,16 +149,15 @@ def _serve(pipe: Connection, stderr: Connection | None) -> None:
 
     Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
-    while True:
-        try:
+    # Reading and writing fail once the process that hands over scans is gone.
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
             job = pipe.recv()
-        except EOFError:
-            return
-        if stderr is not None:
-            os.dup2(stderr.fileno(), _STDERR)
-            stderr.close()
-            stderr = None
-        pipe.send(convert_scan(job))
+            if stderr is not None:
+                os.dup2(stderr.fileno(), _STDERR)
+                stderr.close()
+                stderr = None
+            pipe.send(convert_scan(job))
 
 
 def _end_with_parent() -> None:

@@ -14,17 +14,23 @@ from typing import NamedTuple
 import filelock
 
 from torchrg.batch.records import Record, describe_versions, read_record, reason_to_convert
-from torchrg.batch.scans import Job, Scan, Source
+from torchrg.batch.scans import Job, Scan, Source, mark_of
 from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import folded_name
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import check_space
+from torchrg.io.files import check_space, marked_parts
 
 REPORT = "report.json"
 """Name of the report in the output directory."""
 LOCK = ".torchrg.lock"
 """Name of the file in the output directory that is locked; it stays there, empty."""
+DATA_SETS = ".torchrg.scans.json"
+"""Name of the file in the output directory that lists the scans of its data sets; see
+:mod:`torchrg.batch.stale`."""
+_BYTES_PER_SCAN = 32_768
+"""Space that files of a scan take beyond their content: six to eight, half a block of 4 KiB lost in
+each, and its tables."""
 PATIENCE_SECONDS = 5.0
 """Seconds to wait for a lock: a command that is interrupted ends its workers by then."""
 
@@ -79,6 +85,14 @@ class Plan(NamedTuple):
         """The jobs that are done."""
         return [job for job in self.jobs if job.name not in self.reasons]
 
+    @property
+    def num_bytes(self) -> int:
+        """The disk space that the jobs that are not done take, by the estimates of the scans."""
+        return sum(
+            _BYTES_PER_SCAN + job.source.bytes_per_point * job.scan.num_points
+            for job in self.to_convert
+        )
+
 
 def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job]:
     """Return a job for each scan of a source whose results go to ``out``, in natural order.
@@ -98,12 +112,21 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
         )
     source.check_results(scans, out)
     _check_names(source.root, scans)
-    chosen = [scan for scan in scans if only is None or fnmatchcase(scan.name, only)]
+    return match_jobs([Job(source, scan, out) for scan in scans], only)
+
+
+def match_jobs(jobs: Sequence[Job], only: str | None) -> list[Job]:
+    """Return the jobs of the scans whose names match a pattern, all without one.
+
+    Raises:
+        ConfigError: If no name matches.
+    """
+    chosen = [job for job in jobs if only is None or fnmatchcase(job.name, only)]
     if not chosen:
-        names = ", ".join(scan.name for scan in scans[:5])
-        more = f" and {len(scans) - 5:,} more" if len(scans) > 5 else ""
+        names = ", ".join(job.name for job in jobs[:5])
+        more = f" and {len(jobs) - 5:,} more" if len(jobs) > 5 else ""
         raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
-    return [Job(source, scan, out) for scan in chosen]
+    return chosen
 
 
 def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
@@ -118,7 +141,7 @@ def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
 
 def _check_names(root: Path, scans: Sequence[Scan]) -> None:
     """Refuse scans whose results would share a folder, or replace files of the batch."""
-    batch_files = {folded_name(name): name for name in (REPORT, LOCK)}
+    batch_files = {folded_name(name): name for name in (REPORT, LOCK, DATA_SETS)}
     taken: dict[str, str] = {}
     for name in (scan.name for scan in scans):
         key = folded_name(name)
@@ -165,11 +188,9 @@ def make_plan(
 
 def check_room(plan: Plan) -> None:
     """Raise FormatError if the disk has no room for the results, by the estimates of the scans."""
-    if plan.to_convert:
-        source, jobs = plan.jobs[0].source, plan.to_convert
-        needed = source.bytes_per_point * sum(job.scan.num_points for job in jobs)
+    if num_scans := len(plan.to_convert):
         repair = "convert fewer with --only"
-        check_space(plan.jobs[0].out, needed, f"{len(jobs):,} scans", repair=repair)
+        check_space(plan.jobs[0].out, plan.num_bytes, f"{num_scans:,} scans", repair=repair)
 
 
 @dataclass(frozen=True)
@@ -250,8 +271,8 @@ def _kept_report(job: Job) -> TaskReport:
         num_points=record.get("points", 0),
         num_regions=record.get("regions", 0),
         files=tuple(record.get("outputs", ())),
-        repairs=tuple(record.get("repairs", ())),
-        warnings=tuple(record.get("warnings", ())),
+        repairs=tuple(map(str, record.get("repairs", ()))),
+        warnings=tuple(map(str, record.get("warnings", ()))),
         attempts=0,
     )
 
@@ -291,5 +312,5 @@ def run_plan(
 
 def write_report(out: Path, report: BatchReport) -> None:
     """Write ``report.json`` into the output directory; raise FormatError if it cannot be."""
-    with atomic_path(out / REPORT) as beside:
+    with marked_parts(mark_of(REPORT)), atomic_path(out / REPORT) as beside:
         beside.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")

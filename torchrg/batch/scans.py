@@ -8,7 +8,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,15 +23,18 @@ from torchrg.batch.records import (
     Record,
     describe_versions,
     fingerprint,
+    is_unchanged,
+    layout_of,
     read_record,
     remove_earlier,
+    split_by_layout,
     write_record,
 )
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig, SuperpointsConfig
 from torchrg.datasets.folder import folded_name
 from torchrg.datasets.layouts import LayoutScan, split_name, stem_of, write_layout
-from torchrg.datasets.pointcept import write_arrays, write_pointcept_scene
+from torchrg.datasets.pointcept import keeping_files, write_arrays, write_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io.colors import narrow_colors
 from torchrg.io.fields import are_whole
@@ -134,8 +137,11 @@ class Source:
     def check_results(self, scans: Sequence[Scan], out: Path) -> None:
         """Raise FormatError if files of the results would replace those of others."""
 
-    def write_lists(self, out: Path, mark: str) -> None:
-        """Write what results have for the data set as a whole, from all scans in ``out``."""
+    def write_lists(self, out: Path, mark: str, *, without: Collection[Path] = ()) -> None:
+        """Write what results have for the data set as a whole, from all scans in ``out``.
+
+        The scans of files in ``without`` are about to be removed.
+        """
 
 
 @dataclass(frozen=True)
@@ -172,15 +178,17 @@ class Job:
         """Mark of the names that results are written under before they have their own."""
         return mark_of(self.scan.name)
 
+    def input_name(self, path: Path) -> str:
+        """Return the path of an input file from the root of the data set, as records name it."""
+        root = self.source.root
+        return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+
     def describe(self) -> Record:
         """Return what decides the results, as JSON holds it; OSError if an input cannot be read."""
-        root, config, table = self.source.root, asdict(self.source.settings), self.source.table
+        config, table = asdict(self.source.settings), self.source.table
         # It never changes a result, and lowering it after running out of memory must cost nothing.
         config.pop("chunk_size", None)
-        inputs = [
-            (path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name, path)
-            for path in self.scan.inputs
-        ]
+        inputs = [(self.input_name(path), path) for path in self.scan.inputs]
         return {
             "versions": describe_versions(),
             "config": config,
@@ -232,22 +240,29 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         if path == job.out:
             break
     check_place(folder / RECORD)
-    earlier, table = read_record(folder, is_ours=True) or {"outputs": {}}, job.source.table
+    earlier = read_record(folder, is_ours=True) or {"outputs": {}, "other_layouts": {}}
+    table = job.source.table
     if table is not None and table not in earlier["outputs"] and (folder / table).exists():
         raise FormatError(
             f"{folder / table}: was not written by torchrg; move it away, or give another --table."
         )
     job.clean()
     (folder / RECORD).unlink(missing_ok=True)
-    with marked_parts(job.mark):
+    replaced, other_layouts = split_by_layout(earlier, layout_of(description))
+    edited = [n for n, noted in replaced.items() if not is_unchanged(folder / n, noted)]
+    with marked_parts(job.mark), keeping_files(edited):
         report = job.source.convert(job.scan, folder, begin)
         if table is not None:
             described = json.loads((folder / PLANES_FILE).read_text("utf-8"))
             write_table(folder / table, {k: v for k, v in described.items() if k != "written"})
             report = replace(report, files=(*report.files, table))
         begin("record")
-        remove_earlier(folder, earlier, report.files)
-        write_record(folder, description, report)
+        for name in report.files:
+            replaced.pop(name, None)
+        changed = remove_earlier(job.out, folder, replaced)
+        notes = [f"{name} stays, as it was changed since torchrg wrote it" for name in changed]
+        report = replace(report, warnings=(*report.warnings, *notes))
+        write_record(folder, description, report, other_layouts)
     return report
 
 

@@ -150,9 +150,11 @@ class CloudSource(Source):
         check_stems(self.layout, {scan.name: _place_of(scan) for scan in scans})
         check_lists(self.layout, self.dataset, out)
 
-    def write_lists(self, out: Path, mark: str) -> None:
+    def write_lists(self, out: Path, mark: str, *, without: Collection[Path] = ()) -> None:
         """Write what the layout has for the data set as a whole, from all scans in ``out``."""
-        write_lists(self.layout, self.dataset, out, mark)
+        # A scan that is removed leaves the lists of all layouts that it was written in.
+        for layout in layouts.LAYOUTS if without else (self.layout,):
+            write_lists(layout, self.dataset, out, mark, without=without)
 
 
 def _place_of(scan: Scan) -> str:

@@ -18,11 +18,19 @@ from torchrg.batch.run import (
     list_jobs,
     lock_folder,
     make_plan,
+    match_jobs,
     run_plan,
     write_report,
 )
 from torchrg.batch.scans import Job, Source, mark_of
 from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, ScanNetSource, find_areas
+from torchrg.batch.stale import (
+    StaleResult,
+    check_stale,
+    find_stale,
+    note_data_set,
+    remove_stale,
+)
 from torchrg.batch.task import Reports
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
@@ -41,7 +49,7 @@ from torchrg.config import DepthConfig, SuperpointsConfig, Up
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
-from torchrg.io.files import check_place, free_space, make_folder
+from torchrg.io.files import check_place, free_space, make_folder, remove_leftovers
 from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
@@ -74,9 +82,13 @@ class Arguments:
     """Name of a file with the table of planes in the folder of each scan, as planes.csv: as that of
     torchrg segment --table. planes.json is written there in any case."""
     only: str | None = None
-    """Pattern for the names of the scans to convert, as in a shell: "Area_5/*"."""
+    """Pattern for the names of the scans to convert, as in a shell: "Area_5/*". Results of scans
+    that are not in ROOT any more stay."""
     force: bool = False
     """Convert what is done already, too."""
+    prune: bool = False
+    """Remove results of scans that are not in ROOT any more, unless they were changed. Without it
+    the command names them and stops."""
     dry_run: bool = False
     """Say what would be done and why, and write nothing."""
     unit: ClassVar[str] = "scan"
@@ -264,12 +276,15 @@ def run(argv: list[str]) -> int:
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with warnings_as_lines():
         source = dataclasses.replace(arguments.source(root, out), table=arguments.table)
-        jobs = list_jobs(source, out, only=arguments.only)
+        scans = list_jobs(source, out)
+    jobs = match_jobs(scans, arguments.only)
     if arguments.dry_run:
-        plan = _look_at(jobs, arguments)
+        plan, stale = _look_at(jobs, arguments), _find_stale(scans, arguments)
         resources = (arguments.workers or num_cores(), _memory_limit(arguments), free_space(out))
         print(format_plan(plan))
+        say(*(f"remove {result.name}: {result.reason}" for result in stale if result.files))
         print(format_costs(plan, *resources, arguments.seconds_per_million))
+        check_stale(stale, root, prune=arguments.prune)
         check_room(plan)
         return 0
     make_folder(out)
@@ -279,7 +294,13 @@ def run(argv: list[str]) -> int:
         make_folder(pages)
         check_gallery(pages, [job.name for job in jobs])
     with lock_folder(out):
-        return _convert(_look_at(jobs, arguments), out, arguments)
+        remove_leftovers(out, mark_of(REPORT))
+        stale = _find_stale(scans, arguments)
+        check_stale(stale, root, prune=arguments.prune)
+        plan = _look_at(jobs, arguments)
+        check_room(plan)
+        _remove_stale(stale, scans)
+        return _convert(plan, out, arguments)
 
 
 def _check(arguments: Arguments) -> None:
@@ -328,9 +349,27 @@ def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
         return make_plan(jobs, force=arguments.force, threads=num_cores(), on_scan=bar.update)
 
 
+def _find_stale(scans: list[Job], arguments: Arguments) -> list[StaleResult]:
+    """Return the stale results; with --only, those of scans that are gone stay as they are."""
+    is_whole = arguments.only is None or arguments.prune
+    return [result for result in find_stale(scans) if is_whole or result.scan is not None]
+
+
+def _remove_stale(stale: list[StaleResult], scans: list[Job]) -> None:
+    """Take stale results off the lists and remove them, and note the scans of the data set."""
+    source, out = scans[0].source, scans[0].out
+    paths = {path for result in stale for path in result.paths}
+    if paths:
+        source.write_lists(out, mark_of(REPORT), without=paths)
+    for result in stale:
+        remove_stale(result)
+        if result.files:
+            say(f"{result.folder}: removed, as {result.reason}")
+    note_data_set(scans, stale)
+
+
 def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
     """Convert the scans of a plan, print what became of them, and return the exit code."""
-    check_room(plan)
     jobs, workers, limit = plan.to_convert, arguments.workers, _memory_limit(arguments)
     for job in jobs:
         if job.memory > limit:

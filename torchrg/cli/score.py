@@ -74,6 +74,9 @@ def run(argv: list[str]) -> int:
     if arguments.match_distance is not None and not arguments.match_distance > 0:
         raise ConfigError(f"expected --match-distance > 0, got {arguments.match_distance}.")
     predicted, truth = arguments.predicted, arguments.truth
+    for path in (predicted, truth):
+        if not path.exists():
+            raise FormatError(f"{path}: no such file; check the spelling.")
     of_folders = _holds_scans(predicted)
     if of_folders != _holds_scans(truth):
         file, folder = (truth, predicted) if of_folders else (predicted, truth)

@@ -6,7 +6,7 @@ Lists of names that a program brings itself stay, and get only what they lack.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,9 @@ def check_lists(layout: str, dataset: str, out: Path) -> None:
             )
 
 
-def write_lists(layout: str, dataset: str, out: Path, mark: str) -> None:
+def write_lists(
+    layout: str, dataset: str, out: Path, mark: str, *, without: Collection[Path] = ()
+) -> None:
     """Write the lists of a directory from the entries of the scans that are there, if any is.
 
     Args:
@@ -53,6 +55,7 @@ def write_lists(layout: str, dataset: str, out: Path, mark: str) -> None:
         dataset: A key of its row.
         out: The output directory.
         mark: See :func:`torchrg.io.files.marked_parts`; what a killed process left is removed.
+        without: Files of entries that the lists leave out, below ``out``.
 
     Raises:
         FormatError: If an entry is damaged, or a list cannot be written.
@@ -60,16 +63,16 @@ def write_lists(layout: str, dataset: str, out: Path, mark: str) -> None:
     out = out.resolve()
     remove_leftovers(out, mark)
     with marked_parts(mark):
-        _write_all(layout, dataset, out)
+        _write_all(layout, dataset, out, without)
 
 
-def _write_all(layout: str, dataset: str, out: Path) -> None:
+def _write_all(layout: str, dataset: str, out: Path, without: Collection[Path]) -> None:
     """Write the lists of a directory."""
     if (layout, dataset) == ("mmdet3d", "ScanNet"):
-        _write_names(out, [f"meta_data/scannetv2_{split}" for split in MODES])
+        _write_names(out, [f"meta_data/scannetv2_{split}" for split in MODES], without)
     folders, contents = _DATABASES.get((layout, dataset), _NONE)
-    entries = {folder: _read_entries(out, folder) for folder in folders}
-    if any(entries.values()):
+    entries = {folder: _read_entries(out, folder, without) for folder in folders}
+    if any(entries.values()) or _entries_in(out, folders, without):
         import yaml
 
         for name, content in contents(entries).items():
@@ -77,17 +80,25 @@ def _write_all(layout: str, dataset: str, out: Path) -> None:
             _write(out, name, text)
 
 
-def _write_names(out: Path, folders: Iterable[str]) -> None:
-    """Write lists of names for MMDetection3D, which asks for all of them, also for empty ones."""
-    listed_in = {folder: [e["name"] for e in _read_entries(out, folder)] for folder in folders}
-    for folder, scans in listed_in.items() if any(listed_in.values()) else ():
+def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -> None:
+    """Write lists of names for MMDetection3D, which asks for all of them, also for empty ones.
+
+    A scan is on one list: a list loses the names that have their entries in another split.
+    """
+    listed_in = {
+        folder: [e["name"] for e in _read_entries(out, folder, without)] for folder in folders
+    }
+    removed = {path.stem for path in _entries_in(out, folders, without)}
+    for folder, scans in listed_in.items() if any(listed_in.values()) or removed else ():
         path = out / f"{folder}.txt"
         with refusing(f"{path}: expected a name a line, got: ", ValueError):
             text = path.read_text(encoding="utf-8") if path.is_file() else ""
-        listed = [line.strip() for line in text.splitlines() if line.strip()]
+        before = [line.strip() for line in text.splitlines() if line.strip()]
+        elsewhere = removed.union(*listed_in.values()) - set(scans)
+        listed = [name for name in before if name not in elsewhere]
         others = set(listed) - set(scans)
         missing = [name for name in scans if name not in listed]
-        if missing or not others:
+        if missing or not others or listed != before:
             # A list of the program itself keeps its order; one of ours has that of the entries.
             names = [*listed, *missing] if others else scans
             _write(out, path.relative_to(out), "".join(f"{name}\n" for name in names))
@@ -100,9 +111,16 @@ def _write(out: Path, name: str | Path, text: str) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def _read_entries(out: Path, folder: str) -> list[Entry]:
+def _entries_in(out: Path, folders: Sequence[str], files: Collection[Path]) -> list[Path]:
+    """Return the files that are entries of the lists of some folders."""
+    places = {out / folder for folder in folders}
+    return [path for path in files if path.parent in places]
+
+
+def _read_entries(out: Path, folder: str, without: Collection[Path]) -> list[Entry]:
     """Return the entries of a list, with files by their whole paths."""
-    paths = sorted((out / folder).glob("[!.]*.json"), key=lambda path: natural_key(path.stem))
+    found = [path for path in (out / folder).glob("[!.]*.json") if path not in without]
+    paths = sorted(found, key=lambda path: natural_key(path.stem))
     entries = []
     for path in paths:
         message = f"{path}: expected an entry of a list, got: "

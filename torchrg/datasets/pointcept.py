@@ -10,8 +10,9 @@ and passes over the others; ``import torchrg.transforms.pointcept`` makes it kno
 
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,23 @@ _SCANNET = ("segment20", "segment200")
 _LABELS = ("segment", *_SCANNET, "instance", "superpoint", "plane")
 _FEATURES = ("strength", "curvature")
 """Arrays of numbers that have two axes in files, whatever they have elsewhere."""
+
+
+_kept: ContextVar[Collection[str]] = ContextVar("_kept", default=())
+"""Names of files that :func:`write_files` does not remove."""
+
+
+@contextmanager
+def keeping_files(names: Collection[str]) -> Iterator[None]:
+    """Keep files of these names where :func:`write_files` would remove them, in this thread.
+
+    A record has fingerprints, and tells so which files a user has changed.
+    """
+    token = _kept.set(names)
+    try:
+        yield
+    finally:
+        _kept.reset(token)
 
 
 def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -153,7 +171,7 @@ def write_files(
             )
     for folder in {place, *(path.parent for path in paths.values())}:
         make_folder(folder)
-    for name in owned - set(contents):
+    for name in owned - set(contents) - set(_kept.get()):
         (place / name).unlink(missing_ok=True)
     with ExitStack() as stack:
         # Files take their places in reverse: the claim on them first, the coordinates last.
@@ -209,6 +227,16 @@ def _short(labels: Array) -> Array:
     return labels.astype(np.int16 if fit else np.int32)
 
 
+def written_files(place: Path) -> list[str]:
+    """Return the files that torchrg wrote for a scene, as paths from its folder.
+
+    Raises:
+        FormatError: If ``planes.json`` is of another program.
+    """
+    names = _written(place)
+    return [name if "/" in name else f"{name}.npy" for name in names] + [PLANES_FILE] * bool(names)
+
+
 def _owned(place: Path, others: Collection[str] = ()) -> set[str]:
     """Return the files that torchrg wrote here: arrays, and those of others that it names."""
     names = {name if name in others else f"{name}.npy" for name in _written(place)}
@@ -219,7 +247,7 @@ def _written(place: Path) -> list[str]:
     """Return what ``planes.json`` says that torchrg wrote."""
     try:
         written = json.loads((place / PLANES_FILE).read_text(encoding="utf-8"))["written"]
-        return sorted(set(written))
+        return sorted(map(str, set(written)))
     except (FileNotFoundError, NotADirectoryError):
         return []
     except (OSError, *DAMAGES) as error:

@@ -124,11 +124,19 @@ def remove_leftovers(folder: Path, mark: str) -> None:
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['.a.other.txt', 'a.txt']
     """
+    for path in find_leftovers(folder, mark):
+        path.unlink(missing_ok=True)
+
+
+def find_leftovers(folder: Path, mark: str) -> list[Path]:
+    """Return the files that :func:`remove_leftovers` removes."""
     name = re.compile(rf"\..*\.{mark}[0-9a-f]{{8}}(\.[^.]*)?")
     with os.scandir(folder) as entries:
-        for entry in entries:
-            if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
-                Path(entry.path).unlink(missing_ok=True)
+        return [
+            Path(entry.path)
+            for entry in entries
+            if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)
+        ]
 
 
 def sync_folder(folder: Path) -> None:

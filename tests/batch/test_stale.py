@@ -1,0 +1,417 @@
+"""Results of scans that have another name now, or left the data set, do not stay in silence."""
+
+import json
+import os
+import shutil
+from functools import partial
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.batch.test_interruptions import results_of
+from tests.datasets.s3dis_tree import write_clean_room
+from tests.datasets.scannet_tree import write_scan, write_tables
+from torchrg.batch.records import RECORD
+from torchrg.batch.run import DATA_SETS, LOCK, REPORT, list_jobs
+from torchrg.batch.scans import convert_scan
+from torchrg.batch.sources import ScanNetSource
+from torchrg.batch.stale import check_stale, find_stale, remove_stale
+from torchrg.config import load_config
+from torchrg.datasets.layouts import LAYOUTS
+from torchrg.scenes import make_room
+
+FIRST, MOVED, LAST = SCANS = ("scene0001_00", "scene0002_00", "scene0003_00")
+ROOM = make_room(num_points=300, seed=1)
+LISTS = ("train_database.yaml", "validation_database.yaml", "test_database.yaml")
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory):
+    """Three scans of ScanNet, the last of them for validation."""
+    root = tmp_path_factory.mktemp("release")
+    coord, faces = ROOM.points.float().numpy(), ROOM.labels.numpy()
+    objects = [("wall" if face % 2 else "table", [face]) for face in np.unique(faces)]
+    for number, name in enumerate(SCANS):
+        write_scan(
+            root / "scans", name, coord, np.full(coord.shape, number, np.uint8), faces, objects
+        )
+    write_tables(root, [FIRST, MOVED], [LAST])
+    return root
+
+
+@pytest.fixture
+def root(release, tmp_path):
+    """A copy that a test may change."""
+    return shutil.copytree(release, tmp_path / "scannet")
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def convert(run, monkeypatch):
+    """``convert(kind, root, out, ...)``: the command, which converts in this process."""
+
+    def convert_here(jobs, *, workers, memory_limit):
+        return (convert_scan(job) for job in jobs)
+
+    monkeypatch.setattr("torchrg.cli.convert.run_local", convert_here)
+    return lambda *arguments: run("convert", *arguments, "--preset", "classic")
+
+
+def move(root, *, train=(FIRST,), val=(MOVED, LAST)):
+    """Change the lists of splits."""
+    for split, names in (("train", train), ("val", val)):
+        (root / "meta_data" / f"scannetv2_{split}.txt").write_text("".join(f"{n}\n" for n in names))
+
+
+def files_of(out):
+    """Return results and lists by name, without what a run notes for itself."""
+    files = {path.relative_to(out).as_posix(): path for path in out.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in files.items() if name not in (LOCK, REPORT)}
+
+
+def save_rooms(folder, *names):
+    """Write small rooms, each of its own points."""
+    for seed, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(folder / name, make_room(num_points=300, seed=seed).points)
+
+
+@pytest.mark.parametrize("layout", ["pointcept", *LAYOUTS])
+def test_a_scan_that_changes_its_split_leaves_the_old_one(root, out, tmp_path, convert, layout):
+    if layout == "nag":
+        pytest.importorskip("h5py")
+    command = ("scannet", root, out, "--layout", layout)
+    assert convert(*command).code == 0
+    before = files_of(out)
+    move(root)
+    told = f"remove train/{MOVED}: its scan is val/{MOVED} now\n"
+    assert told in convert(*command, "--dry-run").out
+    assert files_of(out) == before
+    done = convert(*command)
+    assert (done.code, done.err) == (0, "")
+    assert f"{out}/train/{MOVED}: removed, as its scan is val/{MOVED} now\n" in done.out
+    assert "removed" not in convert(*command).out
+    found = files_of(out)
+    shutil.rmtree(out)
+    assert convert(*command).code == 0
+    # Everything is as if the first run had not been: files, lists, and no folder is left.
+    assert files_of(out) == found
+    assert not [path for path in out.rglob("*") if path.is_dir() and not any(path.iterdir())]
+
+
+@pytest.mark.parametrize("flags", [[], ["--dry-run"]])
+@pytest.mark.parametrize("layout", ["pointcept", "nag", "mask3d", "mmdet3d"])
+def test_a_scan_that_left_the_data_set_is_named(root, out, convert, layout, flags):
+    if layout == "nag":
+        pytest.importorskip("h5py")
+    command = ("scannet", root, out, "--layout", layout)
+    assert convert(*command).code == 0
+    before = files_of(out)
+    shutil.rmtree(root / "scans" / MOVED)
+    move(root, train=[FIRST], val=[LAST])
+    done = convert(*command, *flags)
+    assert done.code == 2
+    assert done.error == (
+        f"torchrg: {out}/train/{MOVED}: expected the scan of each result in {root}, got none; "
+        "remove such results with --prune, or keep them with --only '*'.\n"
+    )
+    assert files_of(out) == before
+    assert convert(*command, "--only", "*").code == 0
+    assert files_of(out) == before
+    assert convert(*command, "--prune", *flags).code == 0
+    assert (files_of(out) == before) == bool(flags)
+    if not flags:
+        texts = (content for name, content in files_of(out).items() if name != DATA_SETS)
+        assert not [name for name in files_of(out) if MOVED.removeprefix("scene") in name]
+        assert not [text for text in texts if MOVED.encode() in text]
+
+
+def test_lists_lose_the_scans_of_other_splits_and_keep_other_names(root, out, convert):
+    command = ("scannet", root, out, "--layout", "mmdet3d")
+    (out / "meta_data").mkdir(parents=True)
+    (out / "meta_data" / "scannetv2_train.txt").write_text(f"scene0700_00\n{MOVED}\n")
+    move(root)
+    assert convert(*command).code == 0
+    lists = {split: f"meta_data/scannetv2_{split}.txt" for split in ("train", "val")}
+    assert files_of(out)[lists["train"]].decode().split() == ["scene0700_00", FIRST]
+    assert files_of(out)[lists["val"]].decode().split() == [MOVED, LAST]
+
+
+@pytest.mark.parametrize("layout", ["pointcept", "isbnet"])
+def test_what_a_user_changed_or_added_is_never_removed(root, out, convert, layout):
+    command = ("scannet", root, out, "--layout", layout, "--superpoints")
+    assert convert(*command).code == 0
+    move(root)
+    folder = out / "train" / MOVED
+    changed = folder / "plane.npy" if layout == "pointcept" else out / "planes" / f"{MOVED}.pth"
+    whole = changed.read_bytes()
+    for path, content in ((changed, b"by hand"), (folder / "notes.txt", b"mine")):
+        before = path.read_bytes() if path.exists() else None
+        path.write_bytes(content)
+        held = files_of(out)
+        for flags in ([], ["--dry-run"], ["--only", "val/*"]):
+            done = convert(*command, *flags)
+            assert done.code == 2
+            assert f"{path}: expected a file as torchrg wrote it, got another" in done.error
+            assert f"its scan is val/{MOVED} now; move it away.\n" in done.error
+            assert files_of(out) == held
+        path.unlink() if before is None else path.write_bytes(before)
+    changed.unlink()
+    changed.symlink_to(out.parent / "elsewhere")
+    (out.parent / "elsewhere").write_bytes(whole)
+    assert f"{changed}: expected a file" in convert(*command).error
+    changed.unlink()
+    assert convert(*command).code == 0
+    assert not folder.exists()
+
+
+def test_a_file_that_a_user_changed_stays_when_options_change(root, out, convert):
+    command = ("scannet", root, out, "--only", f"*{FIRST}")
+    assert convert(*command, "--superpoints", "--table", "planes.csv").code == 0
+    for name in ("superpoint.npy", "planes.csv"):
+        (out / "train" / FIRST / name).write_bytes(b"by hand")
+    done = convert(*command)
+    assert done.code == 0
+    for name in ("superpoint.npy", "planes.csv"):
+        assert (out / "train" / FIRST / name).read_bytes() == b"by hand"
+        assert f"{name} stays, as it was changed since torchrg wrote it" in done.out
+    again = convert(*command, "--superpoints")
+    assert again.code == 3
+    assert "superpoint.npy" in again.err
+
+
+def test_a_removal_that_is_killed_at_any_moment_goes_on(root, out, convert, monkeypatch):
+    assert convert("scannet", root, out, "--layout", "mask3d").code == 0
+    start = shutil.copytree(out, out.with_name("start"))
+    move(root)
+    jobs = list_jobs(ScanNetSource(root, load_config("classic"), layout="mask3d"), out)
+
+    def remove():
+        for result in find_stale(jobs):
+            check_stale([result], root, prune=False)
+            remove_stale(result)
+        return files_of(out), [*out.rglob("*")]
+
+    expected = remove()
+    assert not [name for name in expected[0] if "2_00" in name and not name.startswith("val")]
+    calls = {name: getattr(os, name) for name in ("unlink", "rmdir")}
+    for moment in range(20):
+        shutil.rmtree(out)
+        shutil.copytree(start, out)
+        left = iter(range(moment))
+
+        def call(path, *given, name, left=left):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return calls[name](path, *given)
+
+        with monkeypatch.context() as patch:
+            for name in calls:
+                patch.setattr(os, name, partial(call, name=name))
+            try:
+                remove()
+                break
+            except KeyboardInterrupt:
+                pass
+        assert remove() == expected
+    assert moment > 6
+
+
+def test_what_a_killed_command_left_of_a_scan_that_moved_goes_too(root, out, convert):
+    assert convert("scannet", root, out).code == 0
+    folder = out / "train" / MOVED
+    (folder / RECORD).unlink()
+    (folder / "coord.npy").unlink()
+    shutil.rmtree(out / "train" / FIRST)
+    (out / "train" / FIRST).mkdir()
+    move(root, train=[], val=SCANS)
+    done = convert("scannet", root, out)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.count("removed, as its scan is") == 1
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["val"]
+
+
+def test_scans_that_were_not_asked_for_are_not_missing(tmp_path, out, convert):
+    pytest.importorskip("pyarrow")
+    for area in (1, 2):
+        counts = {"wall_1": 200, "floor_1": 100}
+        write_clean_room(tmp_path / "s3dis" / f"Area_{area}" / "office_1", area, counts)
+    command = ("s3dis", tmp_path / "s3dis", out, "--layout", "mask3d")
+    for areas in ([1], [2], [1, 2], [1]):
+        assert convert(*command, "--areas", *areas).code == 0
+    databases = [yaml.safe_load((out / f"Area_{n}_database.yaml").read_text()) for n in (1, 2)]
+    assert [[row["scene"] for row in rows] for rows in databases] == [["office_1"], ["office_1"]]
+    shutil.rmtree(tmp_path / "s3dis" / "Area_2")
+    done = convert(*command)
+    assert done.code == 2
+    assert f"{out}/Area_2/office_1: expected the scan" in done.err
+    assert convert(*command, "--prune").code == 0
+    assert yaml.safe_load((out / "Area_2_database.yaml").read_text()) == []
+
+
+def test_data_sets_share_a_directory(tmp_path, out, convert):
+    roots = {name: tmp_path / name for name in ("one", "two")}
+    save_rooms(roots["one"], "a.npy", "b.npy", "c.npy")
+    save_rooms(roots["two"], "d.npy", "sub/e.npy")
+    for name in ("one", "two", "one", "two"):
+        done = convert("folder", roots[name], out)
+        assert (done.code, done.err) == (0, "")
+    names = {"a", "b", "c", "d", "sub/e"}
+    assert {name for name in names if (out / name / RECORD).exists()} == names
+    (roots["one"] / "b.npy").unlink()
+    assert convert("folder", roots["two"], out).code == 0
+    # Copies of a data set are the same data set.
+    copy = shutil.copytree(roots["one"], tmp_path / "copy")
+    for root in (roots["one"], copy):
+        assert (
+            f"{out}/b: expected the scan of each result in {root}"
+            in convert("folder", root, out).error
+        )
+    # Without the list of scans, those of which none was converted here are another data set.
+    (out / DATA_SETS).unlink()
+    save_rooms(tmp_path / "three", "f.npy")
+    assert convert("folder", tmp_path / "three", out).code == 0
+    (out / DATA_SETS).unlink()
+    error = convert("folder", roots["one"], out).error
+    assert f"{out}/b, {out}/d, {out}/f and 1 more: expected" in error
+
+
+def test_results_in_other_output_directories_and_of_other_kinds_are_left_alone(
+    tmp_path, root, out, convert
+):
+    save_rooms(tmp_path / "in", "a.npy", "b.npy")
+    assert convert("folder", tmp_path / "in", out).code == 0
+    save_rooms(tmp_path / "more", "x.npy")
+    assert convert("folder", tmp_path / "more", out / "more").code == 0
+    assert convert("scannet", root, out).code == 0
+    (out / DATA_SETS).unlink()
+    (tmp_path / "in" / "b.npy").unlink()
+    assert convert("folder", tmp_path / "in", out, "--prune").code == 0
+    assert not (out / "b").exists()
+    for name in ("a", "more/x", f"train/{FIRST}", f"val/{LAST}"):
+        assert (out / name / RECORD).is_file()
+
+
+def test_a_folder_of_results_may_be_a_link(root, out, tmp_path, convert):
+    (tmp_path / "disk").mkdir()
+    out.mkdir()
+    (out / "train").symlink_to(tmp_path / "disk")
+    assert convert("scannet", root, out).code == 0
+    assert len([*(tmp_path / "disk").iterdir()]) == 2
+    move(root)
+    assert convert("scannet", root, out).code == 0
+    assert [path.name for path in (tmp_path / "disk").iterdir()] == [FIRST]
+    shutil.move(out / "val" / LAST, tmp_path / "last")
+    (out / "val" / LAST).symlink_to(tmp_path / "last")
+    move(root, train=SCANS, val=[])
+    assert (
+        f"{out}/val/{LAST}: expected a file as torchrg wrote it"
+        in convert("scannet", root, out).error
+    )
+    assert (tmp_path / "last" / RECORD).exists()
+
+
+def test_files_of_other_layouts_go_with_their_scan(root, out, convert):
+    pytest.importorskip("h5py")
+    for layout in ("nag", "mask3d", "npy"):
+        assert convert("scannet", root, out, "--layout", layout).code == 0
+    move(root)
+    assert convert("scannet", root, out, "--layout", "npy").code == 0
+    found = files_of(out)
+    assert not [name for name in found if name.startswith("train") and "0002_00" in name]
+    assert MOVED.encode() not in found["train_database.yaml"]
+    assert "superpoints/scene0002_00.npy" in found
+    assert "train/scene0001_00.h5" in found
+    # Without its fingerprint nobody knows whether a file was changed.
+    path = out / "val" / MOVED / RECORD
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
+    assert convert("scannet", root, out, "--layout", "nag").code == 0
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
+    move(root, train=SCANS, val=[])
+    error = convert("scannet", root, out, "--layout", "nag").error
+    assert f"{out}/planes/{MOVED}.npy: expected a file as torchrg wrote it" in error
+
+
+def test_a_scan_without_a_split_in_its_name_leaves_the_old_one_too(tmp_path, out, convert):
+    scene = tmp_path / "in" / "hall"
+    scene.mkdir(parents=True)
+    np.save(scene / "coord.npy", ROOM.points.float().numpy())
+    command, file = ("folder", tmp_path / "in", out, "--layout"), "hall_inst_nostuff.pth"
+    for layout in ("spformer", "isbnet"):
+        for label in ("segment20", "instance"):
+            (scene / f"{label}.npy").unlink(missing_ok=True)
+        assert convert(*command, layout).code == 0
+        assert (out / "test" / file).exists()
+        for label in ("segment20", "instance"):
+            np.save(scene / f"{label}.npy", ROOM.labels.numpy().clip(0, 19))
+        assert convert(*command, layout).code == 0
+        assert ((out / "test" / file).exists(), (out / "train" / file).exists()) == (False, True)
+        shutil.rmtree(out)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[3]", '[{"../../x": "a"}]', '[["a"]]', "\x00"])
+def test_a_damaged_list_of_scans_is_written_again(tmp_path, out, convert, text):
+    save_rooms(tmp_path / "in", "a.npy", "b.npy")
+    assert convert("folder", tmp_path / "in", out).code == 0
+    whole = (out / DATA_SETS).read_bytes()
+    (out / DATA_SETS).write_text(text)
+    assert convert("folder", tmp_path / "in", out).code == 0
+    if "x" not in text:
+        assert (out / DATA_SETS).read_bytes() == whole
+    (tmp_path / "in" / "b.npy").unlink()
+    assert f"{out}/b: expected the scan" in convert("folder", tmp_path / "in", out).error
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"inputs": 3},
+        {"inputs": [3]},
+        {"source": None},
+        {"outputs": {"coord.npy": None}},
+        {"outputs": {"coord.npy": {}, "../../../x": {}}},
+        {"versions": {"torchrg": "9.9"}},
+    ],
+)
+def test_records_of_other_versions_end_in_no_loss(root, out, convert, change):
+    assert convert("scannet", root, out).code == 0
+    path = out / "train" / MOVED / RECORD
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    before = results_of(out)
+    move(root)
+    done = convert("scannet", root, out)
+    if "versions" in change or change.keys() & {"inputs", "source"}:
+        assert (done.code, done.err) == (0, "")
+        assert not path.exists()
+    else:
+        assert "npy: expected a file as torchrg wrote it" in done.error
+        assert results_of(out) == before
+
+
+def test_a_damaged_record_says_nothing_of_changes(root, out, convert):
+    assert convert("scannet", root, out).code == 0
+    (out / "train" / MOVED / RECORD).write_text("{")
+    before = files_of(out)
+    move(root)
+    assert (
+        f"{MOVED}/{RECORD}: expected a file as torchrg wrote it"
+        in convert("scannet", root, out).error
+    )
+    assert files_of(out) == before
+
+
+def test_the_scans_of_a_directory_are_listed_before_the_first(tmp_path, out, convert, monkeypatch):
+    save_rooms(tmp_path / "in", "a.npy", "b.npy")
+
+    def killed(jobs, *, workers, memory_limit):
+        assert json.loads((out / DATA_SETS).read_text()) == [{"a": "a.npy", "b": "b.npy"}]
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr("torchrg.cli.convert.run_local", killed)
+    assert convert("folder", tmp_path / "in", out, "--only", "a").code == 130
