@@ -254,18 +254,21 @@ def _read_vertices(
     count = vertex.num_records
     if not vertex.has_lists:
         dtype = np.dtype([(prop.name, order + prop.code) for prop in vertex.properties])
+        rows: Values
         if order:
-            records = np.fromfile(stream, dtype, count)
+            rows = np.fromfile(stream, dtype, count)
         else:
-            records = read_rows(path, stream, dtype, count, "vertices", line_number=line_number)
-        return {name: records[name] for name in records.dtype.names or ()}, []
+            rows = read_rows(path, stream, dtype, count, "vertices", line_number=line_number)
+        return {name: rows[name] for name in dtype.names or ()}, []
     parts: dict[str, list[Values]] = {prop.name: [] for prop in vertex.properties}
     for records in _read_records(path, stream, vertex, order, size, line_number):
         for prop in vertex.properties:
             parts[prop.name] += records.values(path, prop)
     lists = [prop.name for prop in vertex.properties if prop.length_code is not None]
-    uneven = [name for name in lists if {part.shape[1] for part in parts[name]} - {0} != 1]
-    return {name: np.concatenate(parts[name]) for name in parts if name not in uneven}, uneven
+    widths = {name: {part.shape[1] for part in parts[name]} for name in lists}
+    uneven = [name for name in lists if len(widths[name]) != 1 or widths[name] == {0}]
+    kept = (name for name in parts if name not in uneven)
+    return {name: np.concatenate(parts[name] or [np.empty(0)]) for name in kept}, uneven
 
 
 def _go_to(path: Path, stream: BinaryIO, header: _Header, place: int, size: int) -> int:
@@ -388,10 +391,11 @@ def _find_starts(content: NDArray[np.uint8], element: _Element, order: str) -> N
     while at <= size:
         found.append(at)
         at = int(far[at])
-    starts = np.array(found)
+    starts = np.array(found, np.int64)
     for end in reversed(ends):
         starts = np.stack([starts, end[starts]], axis=1).reshape(-1)
-    return starts[ends[0][starts] <= size]
+    whole: NDArray[np.int64] = starts[ends[0][starts] <= size]
+    return whole
 
 
 def _read_records(
@@ -447,8 +451,8 @@ def _read_lines(
     """
     start, left, surplus = stream.tell(), element.num_records, 0
     # A digit and what separates it from the next; the last may end with the file.
-    least, content = 2 * left * len(element.properties) - 1, f"{left:,} records of {element.name}"
-    check_promise(path, start, least, content, available=size - start, at_least=True)
+    least, what = 2 * left * len(element.properties) - 1, f"{left:,} records of {element.name}"
+    check_promise(path, start, least, what, available=size - start, at_least=True)
     while left:
         block = stream.read(_BYTES_AT_ONCE) + stream.readline()
         if not block:
@@ -478,6 +482,9 @@ def _read_lines(
         yield records
         line_number += block.count(b"\n")
         left -= len(lines)
+        if not left:
+            end = len(b"\n".join(block.split(b"\n")[: lines[-1] + 1]))
+            stream.seek(end - len(block), os.SEEK_CUR)
 
 
 def _count_words(block: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
