@@ -215,7 +215,7 @@ def check_file(path: Path) -> int:
     if stat.S_ISDIR(status.st_mode):
         raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
     if status.st_size == 0:
-        raise FormatError(f"{path}: byte 0: the file is empty; fetch or write it again.")
+        raise FormatError(f"{path}: byte 0: the file is empty; copy or write it again.")
     return status.st_size
 
 

@@ -141,7 +141,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
         if not raw.endswith(b"\n") or stream.tell() > _LONGEST_HEADER:
             raise FormatError(
                 f"{path}: line {number}: expected the header to end with a line DATA; "
-                "the file is cut off or no PCD file, fetch it again."
+                "the file is cut off or no PCD file, write or copy it again."
             )
         words = words_of(raw)
         if words and not words[0].startswith("#"):
@@ -277,7 +277,8 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     if full_size not in (needed, padded) or full_size > packed_size * _LARGEST_LZF_RATIO:
         raise FormatError(
             f"{path}: byte {start - 4}: expected {needed:,} bytes for {header.num_points:,} points "
-            f"from a block of {packed_size:,}, got {full_size:,}; fetch the file again."
+            f"from a block of {packed_size:,}, got {full_size:,}; the file is damaged or its header "
+            "is wrong, write or copy it again."
         )
     try:
         block = lzf.decompress(stream.read(packed_size), full_size)
@@ -286,7 +287,7 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     if block is None or len(block) != full_size:
         raise FormatError(
             f"{path}: byte {start}: expected a block that unpacks to {full_size:,} bytes; "
-            "the file is damaged, fetch it again."
+            "the file is damaged, write or copy it again."
         )
     fields, offset = {}, 0
     for name in names if full_size == needed else header.dtype.names or ():

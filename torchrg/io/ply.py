@@ -203,7 +203,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
         if not raw.endswith(b"\n") or stream.tell() > _LONGEST_HEADER:
             raise FormatError(
                 f"{path}: line {number}: expected the header to end with 'end_header'; "
-                "the file is cut off, fetch it again."
+                "the file is cut off or no PLY file, write or copy it again."
             )
         match words:
             case [] | ["ply" | "comment" | "obj_info", *_]:
