@@ -277,8 +277,8 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     if full_size not in (needed, padded) or full_size > packed_size * _LARGEST_LZF_RATIO:
         raise FormatError(
             f"{path}: byte {start - 4}: expected {needed:,} bytes for {header.num_points:,} points "
-            f"from a block of {packed_size:,}, got {full_size:,}; the file is damaged or its header "
-            "is wrong, write or copy it again."
+            f"from a block of {packed_size:,}, got {full_size:,}; the file is damaged or its "
+            "header is wrong, write or copy it again."
         )
     try:
         block = lzf.decompress(stream.read(packed_size), full_size)

@@ -366,9 +366,9 @@ def _find_records(
         length = np.ones_like(starts)
         if prop.length_code is not None:
             numbers = _numbers_at_bytes(content, order, prop.length_code)
-            length = numbers[at]
-            fits = (length >= 0) & (length <= outside) & (length == np.floor(length))
-            length = np.where(fits, length, outside).astype(np.int64)
+            length = numbers[at].astype(np.int64)
+            fits = (length == numbers[at]) & (length >= 0) & (length <= outside)
+            length = np.where(fits, length, outside)
             at = at + numbers.itemsize
         places[prop.name], lengths[prop.name] = at, length
         itemsize = np.dtype(prop.code if order else np.float64).itemsize
