@@ -161,6 +161,11 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
     width, height, start = int(header[1]), int(header[2]), header.end()
     available = len(content) - start
     check_promise(source, start, 2 * width * height, "its pixels", available=available)
+    if available > 2 * width * height:
+        raise FormatError(
+            f"{source}: expected {2 * width * height:,} bytes for {width} x {height} pixels, got "
+            f"{available:,}; correct the size in its header, or write it again."
+        )
     values = np.frombuffer(content, ">u2", width * height, start)
     return values.astype(np.uint16).reshape(height, width)
 

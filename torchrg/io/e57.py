@@ -6,8 +6,9 @@ extensions lose their prefix. Of what a file holds beside points, names and pose
 coordinate system are read.
 """
 
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -23,7 +24,8 @@ from torchrg.io.colors import WIDEN, read_colors
 from torchrg.io.faces import Fronts
 from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import DAMAGES, check_promise, refusing
-from torchrg.structures import Cloud
+from torchrg.io.headers import check_grid, distance_from_box
+from torchrg.structures import FARTHEST, Cloud
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -33,6 +35,10 @@ _LIMITS = "colorLimits"
 _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _SYSTEM_NODE, SYSTEM = "coordinateMetadata", "coordinate_metadata"
 """Where the coordinate reference system is in a file, and in the header of a cloud."""
+_BOUNDS = tuple(f"{axis}{end}" for end in ("Minimum", "Maximum") for axis in "xyz")
+_MAX_DEVIATION, _MAX_ROTATION = 0.01, 2.0
+"""Largest deviation of a quaternion's length from 1 without a note, and largest factor between them
+that is not an error. Programs round quaternions."""
 _PAGE_BYTES = 1024
 """The standard's page, the last four bytes of which are the CRC-32C of the others."""
 _BYTES_PER_POINT = 12
@@ -91,29 +97,43 @@ def read_e57(path: Path, size: int) -> Cloud:
     message = f"{path}: expected an E57 file, got: "
     errors = (pye57.libe57.E57Exception, *DAMAGES)
     with (
-        refusing(message, *errors, repair="; fetch it again"),
+        refusing(message, *errors, repair="; copy or write it again"),
         pye57.E57(str(path)) as file,
     ):
         headers = [file.get_header(i) for i in range(file.scan_count)]
         if not headers:
             raise FormatError(
-                f"{path}: expected at least one scan, got none; fetch the file again."
+                f"{path}: expected at least one scan, got none; check where it comes from."
             )
         counts = [header.point_count for header in headers]
         content = f"{sum(counts):,} points"
         # Coordinates that differ at all take a bit.
         check_promise(path, 0, sum(counts) // 8, content, available=size, at_least=True)
-        scans = tuple(map(_scan_of, headers))
-        blocks = [
-            _to_world(path, _read_points(pye57, file, header), scan)
-            for header, scan in zip(headers, scans, strict=True)
-        ]
+        scans = tuple(_scan_of(path, header) for header in headers)
+        blocks, num_outside = list[_Block](), 0
+        for header, scan in zip(headers, scans, strict=True):
+            points, fields = _read_points(path, pye57, file, header)
+            # pye57 moves the bounds of a scan that has a pose, which is not the standard.
+            bounds = () if scan.is_moved else _numbers(header.node, "cartesianBounds", _BOUNDS)
+            num_outside += bool(bounds and distance_from_box(points, np.reshape(bounds, (2, 3))))
+            blocks.append(_to_world(points, fields, scan))
         notes = _unify_colors(path, blocks, [_limits_of(pye57, header) for header in headers])
         root = file.root
         system = root[_SYSTEM_NODE].value() if root.isDefined(_SYSTEM_NODE) else ""
         num_pictures = len(root["images2D"]) if root.isDefined("images2D") else 0
     names = dict.fromkeys(name for block in blocks for name in block)
     lacks = [names.keys() - block.keys() for block in blocks]
+    num_turned = sum(abs(math.hypot(*scan.rotation) - 1) > _MAX_DEVIATION for scan in scans)
+    if num_turned:
+        notes += (
+            f"the rotations of {num_turned} of {len(scans)} scans have another length than 1, and "
+            "are scaled to it; those of length 0 turn nothing",
+        )
+    if num_outside:
+        notes += (
+            f"the points of {num_outside} of {len(scans)} scans lie outside of the bounds in its "
+            "header; check the scales",
+        )
     if any(lacks):
         missing = ", ".join(name for name in names if any(name in each for each in lacks))
         notes += (f"{sum(map(bool, lacks))} of {len(scans)} scans lack {missing}, zero there",)
@@ -224,51 +244,64 @@ def _check_pages(path: Path) -> None:
             if crc32c.value(page[:-4]) != int.from_bytes(page[-4:], "big"):
                 raise FormatError(
                     f"{path}: byte {start}: expected a page that agrees with its checksum, got "
-                    "another; the file is damaged, fetch it again."
+                    "another; the file is damaged, copy or write it again."
                 )
 
 
-def _scan_of(header: Any) -> ScanPose:  # noqa: ANN401
+def _scan_of(path: Path, header: Any) -> ScanPose:  # noqa: ANN401
     """Return the name and the pose of a scan."""
     name = header["name"].value() if "name" in header.scan_fields else ""
-    if not header.has_pose():
-        return ScanPose(name)
-    return ScanPose(name, tuple(header.rotation.tolist()), tuple(map(float, header.translation)))
+    rotation = _numbers(header.node, "pose/rotation", "wxyz") or ScanPose().rotation
+    translation = _numbers(header.node, "pose/translation", "xyz") or ScanPose().translation
+    length = math.hypot(*rotation)
+    if length and not 1 / _MAX_ROTATION <= length <= _MAX_ROTATION:
+        raise FormatError(
+            f"{path}: expected a rotation of length 1 as pose of scan {name!r}, got {length:.3g}; "
+            "correct the pose or write the file again."
+        )
+    if not all(abs(value) <= FARTHEST for value in translation):
+        raise FormatError(
+            f"{path}: expected a pose of scan {name!r} within {FARTHEST:g}, got "
+            f"{max(translation, key=abs):.3g}; correct the pose or write the file again."
+        )
+    return ScanPose(name, rotation, translation)
 
 
-def _read_points(pye57: ModuleType, file: Any, header: Any) -> _Block:  # noqa: ANN401
-    """Read all points of a scan, by the standard's names; texts are left out."""
+def _numbers(node: Any, place: str, names: Iterable[str]) -> tuple[float, ...]:  # noqa: ANN401
+    """Return the numbers of a structure by name, whatever their order; none if it lacks any."""
+    places = [f"{place}/{name}" for name in names]
+    if not all(map(node.isDefined, places)):
+        return ()
+    return tuple(float(node[each].value()) for each in places)
+
+
+def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple[Values, _Block]:  # noqa: ANN401
+    """Read the coordinates of a scan, shape ``(n, 3)``, and its fields by the standard's names.
+
+    Texts are left out.
+    """
     libe57, count = pye57.libe57, header.point_count
     prototype = libe57.StructureNode(header.points.prototype())
     nodes = {name: pye57.utils.get_node(prototype, name) for name in header.point_fields}
+    for name, node in nodes.items():
+        if name in (*_AXES, *_SPHERICAL) and isinstance(node, libe57.ScaledIntegerNode):
+            check_grid(path, name, [node.scale()], [node.offset()])
     block = {
         name: np.empty(count, _letter(libe57, node))
         for name, node in nodes.items()
         if not isinstance(node, libe57.StringNode)
     }
-    if count == 0:
-        return block
-    buffers = libe57.VectorSourceDestBuffer()
-    for name, column in block.items():
-        buffers.append(libe57.SourceDestBuffer(file.image_file, name, column, count, True, True))
-    reader = header.points.reader(buffers)
-    num_read = reader.read()
-    if num_read < count:
-        raise EOFError(f"{num_read:,} of {count:,} points")
-    reader.close()
-    return block
-
-
-def _letter(libe57: Any, node: Any) -> str:  # noqa: ANN401
-    """Return the letter of NumPy's type for a field; q is libe57's only one for 64 bits."""
-    if isinstance(node, libe57.IntegerNode):
-        return "q"
-    single = isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE
-    return "f" if single else "d"
-
-
-def _to_world(path: Path, block: _Block, scan: ScanPose) -> _Block:
-    """Move the points of a scan by its pose, and give the fields the names of columns."""
+    if count:
+        buffers = libe57.VectorSourceDestBuffer()
+        for name, column in block.items():
+            buffers.append(
+                libe57.SourceDestBuffer(file.image_file, name, column, count, True, True)
+            )
+        reader = header.points.reader(buffers)
+        num_read = reader.read()
+        if num_read < count:
+            raise EOFError(f"{num_read:,} of {count:,} points")
+        reader.close()
     if all(axis in block for axis in _AXES):
         points = np.stack([block.pop(axis) for axis in _AXES], axis=1)
     elif all(axis in block for axis in _SPHERICAL):
@@ -281,6 +314,19 @@ def _to_world(path: Path, block: _Block, scan: ScanPose) -> _Block:
     for name in _STATES:
         if name in block:
             points[block.pop(name) != 0] = np.nan
+    return points, block
+
+
+def _letter(libe57: Any, node: Any) -> str:  # noqa: ANN401
+    """Return the letter of NumPy's type for a field; q is libe57's only one for 64 bits."""
+    if isinstance(node, libe57.IntegerNode):
+        return "q"
+    single = isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE
+    return "f" if single else "d"
+
+
+def _to_world(points: Values, block: _Block, scan: ScanPose) -> _Block:
+    """Move the points of a scan by its pose, and give the fields the names of columns."""
     if scan.is_moved and all(name in block for name in _NORMALS):
         normals = np.stack([block[name] for name in _NORMALS], axis=1)
         block.update(zip(_NORMALS, scan.turn(normals).astype(normals.dtype).T, strict=True))

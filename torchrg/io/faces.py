@@ -57,10 +57,8 @@ def find_fronts(
             block = block[finite[block].all(axis=1)]
             normals = _vector_areas(places, block)
             sizes = np.linalg.norm(normals, axis=1)
-            for corner in block.T:
-                np.add.at(areas, corner, sizes)
-                for total, values in zip(sums, normals.T, strict=True):
-                    np.add.at(total, corner, values)
+            for total, values in zip((areas, *sums), (sizes, *normals.T), strict=True):
+                np.add.at(total, block.reshape(-1), np.repeat(values, block.shape[1]))
     length = np.linalg.norm(sums, axis=0)
     is_clear = length > _LEAST_AGREEMENT * areas
     fronts = np.where(is_clear, sums / np.where(is_clear, length, 1.0), 0.0)
@@ -69,10 +67,6 @@ def find_fronts(
 
 def _vector_areas(places: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the normals of faces, twice as long as their areas, shape ``(n, 3)``."""
-    first = places[faces[:, 0]]
-    normals, last = np.zeros_like(first), places[faces[:, 1]] - first
-    for number in range(2, faces.shape[1]):
-        arm = places[faces[:, number]] - first
-        normals += np.cross(last, arm)
-        last = arm
-    return normals
+    arms = places[faces[:, 1:]] - places[faces[:, :1]]
+    areas: NDArray[np.float64] = np.cross(arms[:, :-1], arms[:, 1:]).sum(axis=1)
+    return areas

@@ -53,6 +53,11 @@ _GUESSED_WIDTHS = (6, 7)
 """Columns of a table without names whose meaning the values tell."""
 LEFT_OUT = "_"
 """Name of a column that is not read, as in PCD."""
+_MAX_COLUMNS = 32
+"""Columns of a few rows without names. More are taken for points in columns; programs write up to a
+dozen values of a point without names."""
+_SHOWN_NAMES = 8
+"""Names of columns in a note; more are not shown one by one."""
 _GUESSED_ROWS = 1000
 """Rows from which the meaning of such columns is guessed."""
 COLUMNS_RULE = (
@@ -139,8 +144,10 @@ def assemble_table(
         is_pts = path.suffix.lower() == ".pts"
         names = names_by_rule(table, color_last=is_pts)
         if len(names) > 3:
+            many = len(names) > _SHOWN_NAMES
+            shown = [*names[: _SHOWN_NAMES - 1], "...", names[-1]] if many else names
             notes += (
-                f"its columns have no names and are taken as {' '.join(names)}; if they are "
+                f"its columns have no names and are taken as {' '.join(shown)}; if they are "
                 "others, name them with --columns",
             )
     columns = {name: table[:, i] for i, name in enumerate(names) if name != LEFT_OUT}
@@ -284,10 +291,10 @@ def _check_table(path: Path, table: Values) -> None:
         raise FormatError(
             f"{path}: expected points, got a matrix of 4 x 4, a pose; name the file of the cloud."
         )
-    if 3 <= num_rows <= max(_GUESSED_WIDTHS) < num_columns:
+    if 3 <= num_rows <= max(_GUESSED_WIDTHS) and num_columns > _MAX_COLUMNS:
         raise FormatError(
             f"{path}: expected a row for each point, got {num_rows} rows of {num_columns:,} "
-            "numbers; transpose them."
+            "numbers; transpose them, or name the columns with --columns."
         )
 
 

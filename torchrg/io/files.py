@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
+from typing import BinaryIO
 
 from torchrg.errors import FormatError
 
@@ -39,6 +40,8 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _MORE_BYTES = 1 << 20
 """Bytes that are tried on a disk that may be full. They are more than a library writes at a time,
 and do not fit where its last ones did not."""
+_CHECKED_END = 1 << 16
+"""Bytes after the last record that are looked at. Padding up to a page is shorter."""
 _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
 """Mark in the names that :func:`atomic_path` writes under here."""
 
@@ -220,7 +223,7 @@ def check_file(path: Path) -> int:
     if stat.S_ISDIR(status.st_mode):
         raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
     if status.st_size == 0:
-        raise FormatError(f"{path}: byte 0: the file is empty; fetch or write it again.")
+        raise FormatError(f"{path}: byte 0: the file is empty; copy or write it again.")
     return status.st_size
 
 
@@ -255,8 +258,29 @@ def check_promise(
         least = "at least " if at_least else ""
         raise FormatError(
             f"{path}: byte {byte}: expected {least}{promised:,} bytes for {content}, got "
-            f"{available:,}; the file is cut off or its header is wrong, fetch it again."
+            f"{available:,}; the file is cut off or its header is wrong, write or copy it again."
         )
+
+
+def check_end(path: Path, stream: BinaryIO, record_bytes: int = 0) -> tuple[str, ...]:
+    """Check that the last record of a file has been read, and return notes.
+
+    Text after it is left out with a note. Further bytes of a binary file, as many as a record or
+    more, are an error: the header may give other types than the points have. Zeros may follow, as
+    PCL fills files up to a page.
+    """
+    start = stream.tell()
+    rest = stream.read(_CHECKED_END).strip(b"\0 \t\r\n")
+    num_bytes = os.fstat(stream.fileno()).st_size - start
+    if not rest or len(rest) < record_bytes:
+        return ()
+    if not record_bytes:
+        return (f"{num_bytes:,} bytes after its last point left out, as its header counts no more",)
+    raise FormatError(
+        f"{path}: byte {start}: expected the end of the file, as its header says, got "
+        f"{num_bytes:,} more bytes; correct the number or the types in the header, or write the "
+        "file again."
+    )
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from torchrg.io.files import (
     first_line,
     refusing,
 )
+from torchrg.io.headers import LARGEST_INTEGER, check_grid, distance_from_box
 from torchrg.structures import Cloud, bounding_box
 
 _SPELLING = Spelling(
@@ -45,8 +46,17 @@ _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 """By point format without colour, the one that adds it."""
 _FIRST_LAYERED_FORMAT = 6
 """Point formats from here on are compressed field by field."""
+_REPAIR = "convert it to .las with LASzip or PDAL, or copy it again"
+"""What to do about a file that laspy does not read, which may be damaged or of a rare kind."""
+_POINTWISE, _MAX_PACKING = 1, 3
+"""LASzip's compressor without chunks, and the last version of its compression that lazrs reads."""
+_CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
+"""Places in LASzip's record of the number of points of a chunk, and of the number of items, each of
+which is a type, a size and a version."""
 _PACKING = ("laszip encoded", "copc")
 """Owners of the records that say how the points lie in the file."""
+_UNDESCRIBED = "Un-registered ExtraBytes"
+"""What laspy says of bytes that no record describes."""
 _RANGE_BITS = 0b110
 """Bits of the options of an extra dimension that promise its least and its largest value."""
 _UNFIT = "_value"
@@ -54,8 +64,6 @@ _UNFIT = "_value"
 _UNFIT_DESCRIPTION = "more than the standard one holds"
 """Description of such a dimension, of at most 32 bytes. It tells ours from a dimension that another
 program gave such a name."""
-LARGEST_INTEGER = 2**31 - 1
-"""Largest coordinate of a LAS file, in steps of its scale from its offset."""
 _VERSION_AT, _START_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 96, 107, 235, 247
 """Places in the header: minor version, first byte of points and number of records, number of
 points, extended records, and the number of points of 64 bits that version 1.4 has beside the old
@@ -77,8 +85,12 @@ def read_las(path: Path, size: int) -> Cloud:
         header = reader.header
         if header.point_count == 0:
             raise FormatError(
-                f"{path}: expected at least one point, got none; fetch the file again."
+                f"{path}: expected at least one point, got none; check where it comes from."
             )
+        check_grid(path, "x, y, z", header.scales, header.offsets)
+        for dimension in header.point_format.extra_dimensions:
+            if dimension.is_scaled:
+                check_grid(path, dimension.name, dimension.scales, dimension.offsets)
         _check_points(path, header, size)
         # By parts, memory grows with the points that are there, whatever the header promises.
         parts = list(map(_columns, reader.chunk_iterator(_POINTS_AT_ONCE)))
@@ -100,7 +112,38 @@ def read_las(path: Path, size: int) -> Cloud:
         for name in names
         if name not in unused
     }
-    return assemble_cloud(path, columns, header={"las": header})
+    notes = _notes_on(header, columns, size)
+    return assemble_cloud(path, columns, header={"las": header}, notes=notes)
+
+
+def _notes_on(header: Any, columns: Columns, size: int) -> tuple[str, ...]:  # noqa: ANN401
+    """Return what in a header contradicts the points, a line each."""
+    notes = list[str]()
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    far = distance_from_box(points, [header.mins, header.maxs], header.scales)
+    if far:
+        notes.append(
+            f"its points lie up to {far:.3g} outside of the box in its header; check its scales, "
+            "offsets and number of points"
+        )
+    count, returns = header.point_count, int(header.number_of_points_by_return.sum())
+    if returns not in (0, count):
+        notes.append(f"its header counts {count:,} points, but {returns:,} returns")
+    if not header.are_points_compressed:
+        start = header.offset_to_point_data + count * header.point_format.size
+        evlrs = header.start_of_first_evlr if header.number_of_evlrs else size
+        end = min(evlrs, header.start_of_waveform_data_packet_record or size)
+        if end - start >= header.point_format.size:
+            notes.append(
+                f"{end - start:,} bytes after its last point left out, as its header counts no more"
+            )
+    for dimension in header.point_format.extra_dimensions:
+        if dimension.description == _UNDESCRIBED:
+            notes.append(
+                f"bytes that its header does not describe are kept as {dimension.name}: "
+                f"{dimension.num_bytes} of each point"
+            )
+    return tuple(notes)
 
 
 @contextmanager
@@ -111,7 +154,7 @@ def _reading(laspy: ModuleType, path: Path) -> Iterator[Any]:
     try:
         # The parallel backend takes what memory a damaged table of chunks asks for.
         with (
-            refusing(message, *damages, repair="; fetch it again"),
+            refusing(message, *damages, repair=f"; {_REPAIR}"),
             laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
         ):
             yield reader
@@ -120,7 +163,7 @@ def _reading(laspy: ModuleType, path: Path) -> Iterator[Any]:
         if type(error).__name__ != "PanicException":
             raise
         raise FormatError(
-            f"{path}: expected whole compressed points, got: {first_line(error)}; fetch it again."
+            f"{path}: expected whole compressed points, got: {first_line(error)}; {_REPAIR}."
         ) from error
 
 
@@ -179,7 +222,8 @@ def _header(laspy: ModuleType, cloud: Cloud, *, colored: bool) -> Any:  # noqa: 
         header = laspy.LasHeader(version="1.4", point_format=7 if colored else 6)
         low, high = bounding_box(cloud.coordinates)
         middle = np.rint((low + high) / 2)
-        reach = max(float(np.abs([low - middle, high - middle]).max()), 1e-30)
+        step = max(float(np.spacing(np.abs(middle)).max()), 1e-30)
+        reach = max(float(np.abs([low - middle, high - middle]).max()), step)
         header.offsets = middle
         header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / LARGEST_INTEGER)))
         return header
@@ -318,7 +362,7 @@ def _check_header(path: Path, size: int) -> None:
     with path.open("rb") as stream:
         head = stream.read(255)
         if head[:4] != b"LASF" or len(head) < 227:
-            raise FormatError(f"{path}: byte 0: expected the header of a LAS file; fetch it again.")
+            raise FormatError(f"{path}: byte 0: expected the header of a LAS file; {_REPAIR}.")
         start, num_records = struct.unpack_from("<II", head, _START_AT)
         check_promise(path, _START_AT, start, "what comes before points", available=size)
         check_promise(path, _START_AT + 4, 54 * num_records, "header records", available=size)
@@ -345,8 +389,33 @@ def _check_points(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
 
 
 def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
-    """Check the number of compressed chunks; lazrs ends the process if memory for it fails."""
+    """Check how points are compressed, and the number of chunks.
+
+    lazrs ends the process if memory for them fails.
+    """
     start = header.offset_to_point_data
+    lazrs = require("lazrs", extra="las", purpose="read LAZ files")
+    (record,) = header.vlrs.get("LasZipVlr")
+    (compressor,) = struct.unpack_from("<H", record.record_data)
+    (num_items,) = struct.unpack_from("<H", record.record_data, _ITEMS_AT)
+    items = np.frombuffer(record.record_data, "<u2", 3 * num_items, _ITEMS_AT + 2).reshape(-1, 3)
+    version = int(items[:, 2].max(initial=0))
+    if version > _MAX_PACKING:
+        raise FormatError(
+            f"{path}: expected LAZ of compression version {_MAX_PACKING} or below, got {version}; "
+            "convert it to .las with LASzip or PDAL."
+        )
+    if items[:, 1].sum() != header.point_format.size:
+        raise FormatError(
+            f"{path}: expected compressed fields of {header.point_format.size} bytes a point, got "
+            f"{items[:, 1].sum()}; {_REPAIR}."
+        )
+    if compressor == _POINTWISE:
+        # LASzip does not look at the size of chunks then; lazrs takes some values for a table.
+        data = bytearray(record.record_data)
+        struct.pack_into("<I", data, _CHUNK_SIZE_AT, LARGEST_INTEGER)
+        record.record_data = bytes(data)
+        return
     with path.open("rb") as stream:
         stream.seek(start)
         offset = int.from_bytes(stream.read(8), "little", signed=True)
@@ -356,22 +425,18 @@ def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
             offset = int.from_bytes(stream.read(8), "little", signed=True)
         content = "the table of chunks"
         if offset < 0:
-            raise FormatError(
-                f"{path}: byte {start}: expected the place of {content}; fetch it again."
-            )
+            raise FormatError(f"{path}: byte {start}: expected the place of {content}; {_REPAIR}.")
         check_promise(path, offset, 8, content, available=size - offset)
         stream.seek(offset)
         _, num_chunks = struct.unpack("<II", stream.read(8))
         # The first point of a chunk is stored as it is.
         least, content = num_chunks * header.point_format.size, f"{num_chunks:,} chunks"
         check_promise(path, offset + 4, least, content, available=size, at_least=True)
-        lazrs = require("lazrs", extra="las", purpose="read LAZ files")
-        (record,) = header.vlrs.get("LasZipVlr")
         layout = lazrs.LazVlr(record.record_data)
         if layout.chunk_size() * num_chunks < header.point_count:
             raise FormatError(
                 f"{path}: byte {offset}: expected chunks for {header.point_count:,} points, got "
-                f"{num_chunks:,} of {layout.chunk_size():,}; the file is damaged, fetch it again."
+                f"{num_chunks:,} of {layout.chunk_size():,}; {_REPAIR}."
             )
         stream.seek(start)
         table = lazrs.read_chunk_table(stream, layout)
@@ -380,8 +445,11 @@ def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
 
 
 def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) -> None:  # noqa: ANN401
-    """Check the sizes of the layers of each chunk, each of which lazrs takes memory for."""
-    point_format = header.point_format
+    """Check the sizes of the layers of each chunk, each of which lazrs takes memory for.
+
+    Check the sum of the numbers of points that the chunks say they hold, too.
+    """
+    point_format, num_points = header.point_format, 0
     # Nine for the fields all points have, one for colour, one for near infrared, one for waves.
     num_layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point_format.id]
     num_layers += point_format.num_extra_bytes
@@ -390,11 +458,17 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
     for num_bytes in filter(None, chunks):
         # A whole point and the number of points come first.
         place = start + point_format.size + 4
-        stream.seek(place)
+        stream.seek(place - 4)
+        num_points += int.from_bytes(stream.read(4), "little")
         sizes = np.frombuffer(stream.read(4 * num_layers), "<u4")
         total = int(sizes.sum(dtype=np.uint64))
         check_promise(path, place, total, "the layers of a chunk", available=num_bytes)
         start += num_bytes
+    if num_points != header.point_count:
+        raise FormatError(
+            f"{path}: expected {header.point_count:,} points, as its header says, got "
+            f"{num_points:,} in its chunks; {_REPAIR}."
+        )
 
 
 def _columns(block: Any) -> dict[str, Values]:  # noqa: ANN401

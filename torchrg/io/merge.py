@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrg.errors import FormatError
 from torchrg.io.e57 import SYSTEM
-from torchrg.io.las import LARGEST_INTEGER
+from torchrg.io.headers import LARGEST_INTEGER
 from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.structures import Cloud
 

@@ -106,27 +106,39 @@ def read_npz(path: Path, size: int) -> Cloud:
     # What is left out is read, too, so that damage in it is told.
     with _open_archive(path) as archive:
         layouts = _check_members(path, archive, size)
-        coordinates, shape = _find_coordinates(path, layouts)
+        coordinates, num_points = _find_coordinates(path, layouts)
         arrays = {name: _read_member(path, archive, name) for name in layouts}
     arrays = {name: values for name, values in arrays.items() if name not in _NOT_PER_POINT}
-    others = [name for name, values in arrays.items() if values.shape[:1] != shape[:1]]
+    others = [name for name, values in arrays.items() if values.shape[:1] != (num_points,)]
     columns = {name: values for name, values in arrays.items() if name not in others}
-    notes = (f"{', '.join(others)} left out: not of {shape[0]:,} rows",) if others else ()
+    notes = (f"{', '.join(others)} left out: not of {num_points:,} rows",) if others else ()
+    if coordinates is not None and (names := layouts[coordinates][1].names) is not None:
+        # pyntcloud writes records, whose fields are columns.
+        records = columns.pop(coordinates)
+        columns = {**{name: records[name] for name in names}, **columns}
+        coordinates = None
     return assemble_cloud(path, columns, coordinates=coordinates, notes=notes)
 
 
 def count_npz(path: Path, size: int) -> int:
     """Return the number of rows of the coordinates."""
     with _open_archive(path) as archive:
-        return _find_coordinates(path, _check_members(path, archive, size))[1][0]
+        return _find_coordinates(path, _check_members(path, archive, size))[1]
 
 
-def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str, tuple[int, ...]]:
-    """Return the name and the shape of the array of an archive that holds coordinates."""
+def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str | None, int]:
+    """Return the name of the array of an archive that holds coordinates, and its number of rows.
+
+    There is none where each axis has an array of its own.
+    """
     for name in _COORDINATES:
         if name in layouts:
-            check_coordinates(path, *layouts[name])
-            return name, layouts[name][0]
+            shape, dtype = layouts[name]
+            if dtype.names is None or len(shape) != 1:
+                check_coordinates(path, shape, dtype)
+            return name, shape[0]
+    if {"x", "y", "z"} <= layouts.keys() and layouts["x"][0]:
+        return None, layouts["x"][0][0]
     names = ", ".join(map(repr, layouts)) or "none"
     raise FormatError(
         f"{path}: expected an array points (or coord), got {names}; rename the coordinates."
@@ -229,7 +241,7 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive; errors name it."""
     message = f"{path}: expected an archive of NumPy arrays, got: "
     with (
-        refusing(message, *ARCHIVE_DAMAGES, repair="; fetch or write it again"),
+        refusing(message, *ARCHIVE_DAMAGES, repair="; copy or write it again"),
         zipfile.ZipFile(path) as archive,
     ):
         yield archive
@@ -242,7 +254,7 @@ def _open_member(
     """Open an array of an archive; errors name both."""
     message = f"{path}: {member.filename!r}: "
     with (
-        refusing(message, *ARCHIVE_DAMAGES, repair="; fetch the file again"),
+        refusing(message, *ARCHIVE_DAMAGES, repair="; copy or write the file again"),
         archive.open(member) as stream,
     ):
         yield stream
@@ -304,4 +316,9 @@ def _check_array(path: Path, stream: IO[bytes], size: int, content: str) -> _Lay
         )
     promised, start = math.prod(shape) * dtype.itemsize, head.tell()
     check_promise(path, start, promised, f"{content} of shape {shape}", available=size - start)
+    if size - start > promised:
+        raise FormatError(
+            f"{path}: byte {start}: expected {promised:,} bytes for {content} of shape {shape}, "
+            f"got {size - start:,}; correct the shape or the type, or write it again."
+        )
     return shape, dtype

@@ -5,6 +5,7 @@ measured) takes the memory a header promises, misreads fields of COUNT > 1 in co
 needs every header line in place, and writes ASCII with ten decimals.
 """
 
+import math
 import struct
 from contextlib import suppress
 from pathlib import Path
@@ -15,16 +16,16 @@ import numpy as np
 from torchrg.errors import FormatError
 from torchrg.io.columns import Spelling, flatten_cloud, write_records
 from torchrg.io.fields import Columns, Values, assemble_cloud
-from torchrg.io.files import check_promise
+from torchrg.io.files import check_end, check_promise
 from torchrg.io.text import read_rows, words_of
-from torchrg.structures import Cloud
+from torchrg.structures import FARTHEST, Cloud
 
 _LONGEST_HEADER = 1 << 16
 """Bytes of the longest header; a longer one is taken for damage."""
 _LARGEST_RECORD = 1 << 20
 """Bytes of the largest point; a larger one is taken for damage."""
 _PADDING = "_"
-_TYPES = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
+_TYPES = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8", "B1")
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
 DEFAULT_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and quaternion w x y z of the sensor."""
@@ -44,12 +45,18 @@ def read_pcd(path: Path, size: int) -> Cloud:
         header = _read_header(path, stream)
         read = {"ascii": _read_text, "binary": _read_binary}.get(header.encoding, _read_compressed)
         stored = read(path, stream, header, size)
+        notes: tuple[str, ...] = ()
+        if header.encoding != "binary_compressed" and header.num_points:
+            is_binary = header.encoding == "binary"
+            notes = check_end(path, stream, header.dtype.itemsize if is_binary else 0)
     columns: dict[str, Values] = {}
     for name in header.field_names:
         columns |= _unpacked(name, stored[name])
     grid_shape = (header.height, header.width) if header.height > 1 else None
-    about = {"viewpoint": header.viewpoint}
-    return assemble_cloud(path, columns, grid_shape=grid_shape, header=about)
+    about = {"viewpoint": header.viewpoint or DEFAULT_VIEWPOINT}
+    if not header.viewpoint:
+        notes += ("its VIEWPOINT left out, as it is not a position and a rotation",)
+    return assemble_cloud(path, columns, grid_shape=grid_shape, header=about, notes=notes)
 
 
 def count_pcd(path: Path, size: int) -> int:
@@ -94,7 +101,7 @@ class _Header(NamedTuple):
     """What a header says, and how many lines it has.
 
     A point has ``dtype``, whose padding fields are called ``_ 0``, ``_ 1`` and so on; a cloud
-    without order is one row of ``width`` points.
+    without order is one row of ``width`` points. The viewpoint is empty where it is impossible.
     """
 
     dtype: np.dtype[np.void]
@@ -123,8 +130,8 @@ def _is_padding(name: str) -> bool:
 def _read_header(path: Path, stream: BinaryIO) -> _Header:
     """Read the header and leave the stream at the first byte of data.
 
-    ``VERSION``, ``COUNT``, ``HEIGHT``, ``VIEWPOINT`` and ``POINTS`` may be absent; the lines may
-    have any order as long as ``DATA`` is the last.
+    All lines but ``FIELDS``, ``DATA`` and one with the number of points may be absent, as in files
+    before version 0.7. The lines may have any order as long as ``DATA`` is the last.
     """
     lines: dict[str, tuple[int, list[str]]] = {}
     number = 0
@@ -134,15 +141,16 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
         if not raw.endswith(b"\n") or stream.tell() > _LONGEST_HEADER:
             raise FormatError(
                 f"{path}: line {number}: expected the header to end with a line DATA; "
-                "the file is cut off or no PCD file, fetch it again."
+                "the file is cut off or no PCD file, write or copy it again."
             )
         words = words_of(raw)
         if words and not words[0].startswith("#"):
             lines["FIELDS" if words[0] == "COLUMNS" else words[0]] = (number, words[1:])
     entries = _Entries(path, lines)
-    width, height = entries.integers("WIDTH", 1)[0], entries.integers("HEIGHT", 1, [1])[0]
-    points = entries.integers("POINTS", 1, [width * height])[0]
-    if points != width * height:
+    points = entries.integers("POINTS", 1) if "POINTS" in lines else None
+    width = entries.integers("WIDTH", 1, None if "HEIGHT" in lines else points)[0]
+    height = entries.integers("HEIGHT", 1, [1])[0]
+    if points not in (None, [width * height]):
         raise entries.error("POINTS", f"WIDTH x HEIGHT = {width * height}")
     encoding = " ".join(entries.words("DATA"))
     if encoding not in _ENCODINGS:
@@ -187,39 +195,47 @@ class _Entries(NamedTuple):
         return [int(word) for word in words]
 
     def viewpoint(self) -> tuple[float, ...]:
-        """Return position and quaternion of the sensor."""
+        """Return position and quaternion of the sensor, or nothing if they are impossible."""
         if "VIEWPOINT" not in self.lines:
             return DEFAULT_VIEWPOINT
         with suppress(ValueError):
             values = tuple(map(float, self.words("VIEWPOINT")))
             if len(values) == len(DEFAULT_VIEWPOINT):
-                return values
+                is_near = all(abs(value) <= FARTHEST for value in values[:3])
+                return values if is_near and 0 < math.hypot(*values[3:]) < math.inf else ()
         raise self.error("VIEWPOINT", "7 numbers")
 
 
 def _record_type(entries: _Entries) -> np.dtype[np.void]:
-    """Return the type of a point from the lines FIELDS, SIZE, TYPE and COUNT."""
+    """Return the type of a point from the lines FIELDS, SIZE, TYPE and COUNT.
+
+    PCL writes fields of COUNT 0, and leaves them out when it reads.
+    """
     names = entries.words("FIELDS")
-    sizes = entries.integers("SIZE", len(names))
-    kinds = entries.words("TYPE")
+    sizes = entries.integers("SIZE", len(names), [4] * len(names))
+    kinds = entries.words("TYPE") if "TYPE" in entries.lines else ["F"] * len(names)
     counts = entries.integers("COUNT", len(names), [1] * len(names))
     if len(kinds) != len(names):
         raise entries.error("TYPE", f"{len(names)} letters")
     used = [name for name in names if name != _PADDING]
     if not used or len(set(used)) != len(used):
         raise entries.error("FIELDS", "names that differ")
-    num_bytes = [size * count for size, count in zip(sizes, counts, strict=True)]
-    if 0 in num_bytes or sum(num_bytes) > _LARGEST_RECORD:
-        raise entries.error("COUNT", f"sizes of 1 to {_LARGEST_RECORD} bytes")
+    if sum(size * count for size, count in zip(sizes, counts, strict=True)) > _LARGEST_RECORD:
+        raise entries.error("COUNT", f"sizes of at most {_LARGEST_RECORD} bytes")
     parts: list[tuple[str, str, tuple[int, ...]]] = []
     for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
         shape = () if count == 1 else (count,)
-        if name == _PADDING:
+        if count == 0:
+            continue
+        if name == _PADDING and size:
             parts.append((f"{_PADDING} {i}", f"V{size}", shape))
         elif f"{kind}{size}" in _TYPES:
-            parts.append((name, f"<{kind.lower()}{size}", shape))
+            code = "u" if kind == "B" else kind.lower()
+            parts.append((name, f"<{code}{size}", shape))
         else:
             raise entries.error("TYPE", f"F, I or U of a known SIZE for {name}")
+    if not parts:
+        raise entries.error("COUNT", "above 0 for a field")
     return np.dtype(parts)
 
 
@@ -261,7 +277,8 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     if full_size not in (needed, padded) or full_size > packed_size * _LARGEST_LZF_RATIO:
         raise FormatError(
             f"{path}: byte {start - 4}: expected {needed:,} bytes for {header.num_points:,} points "
-            f"from a block of {packed_size:,}, got {full_size:,}; fetch the file again."
+            f"from a block of {packed_size:,}, got {full_size:,}; the file is damaged or its "
+            "header is wrong, write or copy it again."
         )
     try:
         block = lzf.decompress(stream.read(packed_size), full_size)
@@ -270,7 +287,7 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     if block is None or len(block) != full_size:
         raise FormatError(
             f"{path}: byte {start}: expected a block that unpacks to {full_size:,} bytes; "
-            "the file is damaged, fetch it again."
+            "the file is damaged, write or copy it again."
         )
     fields, offset = {}, 0
     for name in names if full_size == needed else header.dtype.names or ():

@@ -5,12 +5,15 @@ meshio reads ``uchar`` as signed, knows no ``short``, ends the process at elemen
 and face, and takes the memory a header promises; trimesh writes float32 and drops fields.
 """
 
+import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.columns import (
@@ -18,12 +21,11 @@ from torchrg.io.columns import (
     check_exact,
     flatten_cloud,
     narrow_integers,
-    slices,
     write_records,
 )
 from torchrg.io.faces import Fronts, find_fronts
-from torchrg.io.fields import Values, assemble_cloud
-from torchrg.io.files import check_promise
+from torchrg.io.fields import LARGEST_WHOLE, Values, assemble_cloud
+from torchrg.io.files import check_end, check_promise
 from torchrg.io.text import read_rows, skip_lines, words_of
 from torchrg.structures import Cloud
 
@@ -39,54 +41,55 @@ _TYPES = {
 }
 """NumPy's codes by the words that are written."""
 _NUMPY_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
-_READ_TYPES = _TYPES | {
-    name: np.dtype(name).str[1:] for name in (*_NUMPY_NAMES, "float32", "float64")
+_READ_TYPES = {
+    **_TYPES,
+    **{name: np.dtype(name).str[1:] for name in (*_NUMPY_NAMES, "float32", "float64")},
+    "bool": "u1",
 }
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
 """Bytes of the longest header; a longer one is taken for damage."""
-_LONGEST_LIST = 1 << 20
-"""Bytes of the longest list; a longer one is taken for damage."""
 _CORNERS = ("vertex_indices", "vertex_index")
 """Names of the list of a face's vertices."""
-_BYTES_AT_ONCE = 1 << 22
-"""Bytes of records with lists that are read together."""
-_LENGTH, _LIST = " length", " list"
-"""Ends of the names of a list and its length in records. Names in a PLY file have no spaces, so
-that no property is called so."""
+_BYTES_AT_ONCE = 1 << 19
+"""Bytes of records with lists that are read together, more where one record is longer."""
+_MARGIN = 9
+"""Zero bytes after such records: a number of 8 bytes can begin one byte after their end."""
+_MIN_EVEN_FRACTION = 0.25
+"""Fraction of the records of a block that must have the length of the first one, up to the first
+that differs, to be read without a search for their starts."""
+_DOUBLINGS = 4
+"""The search goes through a block in steps of 2 ** _DOUBLINGS records, and then halves the steps.
+Three to nine doublings take about the same time."""
 
 
 def read_ply(path: Path, size: int) -> Cloud:
     """Read a PLY file: every property of the element ``vertex``, and its front by the faces.
 
-    Other elements are left out, and so are faces that come before the vertices, or that have
-    different numbers of corners.
+    Lists of one length become fields of as many columns. Other lists and elements are left out.
     """
     with path.open("rb") as stream:
         header = _read_header(path, stream)
         vertex = header.place_of_vertices(path)
-        up_to_vertex = header._replace(elements=header.elements[: vertex + 1])
-        read = _read_binary if header.byte_order else _read_text
-        records = read(path, stream, up_to_vertex, size)
-    names = [name for name in records.dtype.names or () if not name.endswith(_LENGTH)]
-    columns = {name.removesuffix(_LIST): records[name] for name in names}
-    places = range(vertex + 1, len(header.elements))
-    face = next((i for i in places if _is_mesh(header.elements[i])), vertex)
+        columns, uneven = _read_vertices(path, stream, header, vertex, size)
+        notes = header.check_end(path, stream, vertex)
+    elements = list(enumerate(header.elements))
+    face = next((i for i, element in elements if _is_mesh(element)), None)
     others = [
         f"{element.num_records:,} of {element.name}"
-        for i, element in enumerate(header.elements)
+        for i, element in elements
         if i not in (vertex, face) and element.num_records
     ]
-    notes: tuple[str, ...] = ()
     if others:
         left = ", ".join(others)
-        notes = (f"elements left out, as only vertices and their faces are read: {left}",)
+        notes += (f"elements left out, as only vertices and their faces are read: {left}",)
+    if uneven:
+        notes += (f"lists left out, as they are empty or differ in length: {', '.join(uneven)}",)
     cloud = assemble_cloud(path, columns, notes=notes)
-    if face == vertex:
+    if face is None:
         return cloud
-    del records, columns
-    mesh = header._replace(elements=header.elements[: face + 1])
-    front, more = _fronts(path, mesh, size, cloud)
+    del columns
+    front, more = _fronts(path, header, face, size, cloud)
     return replace(cloud, front=front, notes=notes + more)
 
 
@@ -148,6 +151,16 @@ class _Element(NamedTuple):
     num_records: int
     properties: list[_Property]
 
+    @property
+    def has_lists(self) -> bool:
+        """Whether any property is a list."""
+        return any(prop.length_code is not None for prop in self.properties)
+
+    @property
+    def min_bytes(self) -> int:
+        """Bytes of a record in a binary file, where all lists are empty."""
+        return sum(np.dtype(prop.length_code or prop.code).itemsize for prop in self.properties)
+
 
 class _Header(NamedTuple):
     """What a header says, and how long it is; the byte order is empty for ASCII."""
@@ -167,6 +180,14 @@ class _Header(NamedTuple):
             )
         return names.index("vertex")
 
+    def check_end(self, path: Path, stream: BinaryIO, place: int) -> tuple[str, ...]:
+        """Check what follows an element that has been read, if the header has no further one."""
+        if any(element.num_records for element in self.elements[place + 1 :]):
+            return ()
+        element = self.elements[place]
+        is_binary = self.byte_order and element.num_records
+        return check_end(path, stream, element.min_bytes if is_binary else 0)
+
 
 def _read_header(path: Path, stream: BinaryIO) -> _Header:
     """Read the header and leave the stream at the first byte of data."""
@@ -182,7 +203,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
         if not raw.endswith(b"\n") or stream.tell() > _LONGEST_HEADER:
             raise FormatError(
                 f"{path}: line {number}: expected the header to end with 'end_header'; "
-                "the file is cut off, fetch it again."
+                "the file is cut off or no PLY file, write or copy it again."
             )
         match words:
             case [] | ["ply" | "comment" | "obj_info", *_]:
@@ -224,142 +245,267 @@ def _shown(raw: bytes) -> str:
     return repr(raw[:40].decode("latin-1").strip())
 
 
-def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
-    """Read the last of the elements of a binary file."""
-    dtype = _go_to_last(path, stream, header, size)
-    records = np.fromfile(stream, dtype, count=header.elements[-1].num_records)
-    _check_lists(path, header.elements[-1], records)
-    return records
+def _read_vertices(
+    path: Path, stream: BinaryIO, header: _Header, place: int, size: int
+) -> tuple[dict[str, Values], list[str]]:
+    """Return the properties of the vertices, and the names of lists that cannot be columns."""
+    vertex, order = header.elements[place], header.byte_order
+    line_number = _go_to(path, stream, header, place, size)
+    count = vertex.num_records
+    if not vertex.has_lists:
+        dtype = np.dtype([(prop.name, order + prop.code) for prop in vertex.properties])
+        rows: Values
+        if order:
+            rows = np.fromfile(stream, dtype, count)
+        else:
+            rows = read_rows(path, stream, dtype, count, "vertices", line_number=line_number)
+        return {name: rows[name] for name in dtype.names or ()}, []
+    parts: dict[str, list[Values]] = {prop.name: [] for prop in vertex.properties}
+    for records in _read_records(path, stream, vertex, order, size, line_number):
+        for prop in vertex.properties:
+            parts[prop.name] += records.values(path, prop)
+    lists = [prop.name for prop in vertex.properties if prop.length_code is not None]
+    widths = {name: {part.shape[1] for part in parts[name]} for name in lists}
+    uneven = [name for name in lists if len(widths[name]) != 1 or widths[name] == {0}]
+    kept = (name for name in parts if name not in uneven)
+    return {name: np.concatenate(parts[name] or [np.empty(0)]) for name in kept}, uneven
 
 
-def _go_to_last(path: Path, stream: BinaryIO, header: _Header, size: int) -> np.dtype[np.void]:
-    """Go to the last of the elements of a binary file, and return the type of its records."""
-    *before, last = header.elements
-    start = header.num_bytes
-    for element in before:
-        dtype = _check_element(path, stream, element, header.byte_order, start, size)
-        if any(prop.length_code for prop in element.properties):
-            for _ in _blocks(path, stream, element, dtype):
-                pass
-        start += element.num_records * dtype.itemsize
-    return _check_element(path, stream, last, header.byte_order, start, size)
+def _go_to(path: Path, stream: BinaryIO, header: _Header, place: int, size: int) -> int:
+    """Go to the first record of an element, and return the number of its line in an ASCII file.
 
-
-def _blocks(
-    path: Path, stream: BinaryIO, element: _Element, dtype: np.dtype[np.void]
-) -> Iterator[Values]:
-    """Yield the records of an element of a binary file, many at a time."""
-    for rows in slices(element.num_records, max(_BYTES_AT_ONCE // dtype.itemsize, 1)):
-        records = np.fromfile(stream, dtype, count=rows.stop - rows.start)
-        _check_lists(path, element, records)
-        yield records
-
-
-def _check_element(
-    path: Path, stream: BinaryIO, element: _Element, byte_order: str, start: int, size: int
-) -> np.dtype[np.void]:
-    """Return the type of the records of an element, all of which are there; go to the first.
-
-    Lists have the length that the first record gives them.
+    The records of a binary file are all there if they have no lists.
     """
-    parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    for prop in element.properties:
-        code = byte_order + prop.code
-        if prop.length_code is None:
-            parts.append((prop.name, code))
-            continue
-        parts.append((prop.name + _LENGTH, byte_order + prop.length_code))
-        stream.seek(start + np.dtype(parts).itemsize - np.dtype(prop.length_code).itemsize)
-        raw = np.fromfile(stream, byte_order + prop.length_code, min(element.num_records, 1))
-        length = int(raw[0]) if len(raw) else 0
-        if not 0 <= length * np.dtype(code).itemsize <= min(size, _LONGEST_LIST):
-            raise FormatError(
-                f"{path}: byte {stream.tell()}: expected a list that fits the file, got length "
-                f"{length:,}; the file is damaged, fetch it again."
-            )
-        parts.append((prop.name + _LIST, code, (length,)))
-    dtype = np.dtype(parts)
-    promised = element.num_records * dtype.itemsize
-    content = f"{element.num_records:,} records of {element.name}"
-    check_promise(path, start, promised, content, available=size - start)
-    stream.seek(start)
-    return dtype
-
-
-def _check_lists(path: Path, element: _Element, records: Values) -> None:
-    """Check that the lists of an element all have one length, so that records have one size."""
-    for name in (name for name in records.dtype.names or () if name.endswith(_LENGTH)):
-        (length,) = records.dtype[name.removesuffix(_LENGTH) + _LIST].shape
-        if (records[name] != length).any():
-            raise _lists_differ(path, element)
-
-
-def _lists_differ(path: Path, element: _Element) -> FormatError:
-    """Return the error that the lists of an element have several lengths."""
-    return FormatError(
-        f"{path}: expected lists of one length in element {element.name}; write the vertices "
-        "first and without lists, and only triangles as faces."
-    )
-
-
-def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
-    """Read the last of the elements of an ASCII file, the vertices."""
-    *before, vertex = header.elements
-    if any(prop.length_code for prop in vertex.properties):
-        raise FormatError(
-            f"{path}: expected vertices without lists in an ASCII file; write it as binary."
-        )
-    dtype = np.dtype([(prop.name, prop.code) for prop in vertex.properties])
-    number = header.num_lines + 1 + skip_lines(stream, _num_records(before))
-    return read_rows(path, stream, dtype, vertex.num_records, "vertices", line_number=number)
-
-
-def _num_records(elements: list[_Element]) -> int:
-    """Return the number of records of several elements."""
-    return sum(element.num_records for element in elements)
-
-
-def _corners_of_text(path: Path, stream: BinaryIO, header: _Header) -> Values:
-    """Read the vertices of the last of the elements of an ASCII file, the faces."""
-    *before, faces = header.elements
+    *before, element = header.elements[: place + 1]
     stream.seek(header.num_bytes)
-    number = header.num_lines + 1 + skip_lines(stream, _num_records(before))
-    start = stream.tell()
-    num_words = len(next(filter(bytes.strip, stream), b"").split())
-    stream.seek(start)
-    dtype = np.dtype([("row", "f8", (num_words,))])
-    read = read_rows(path, stream, dtype, faces.num_records, "faces", line_number=number)
-    rows, place, corners = read["row"], 0, slice(0)
-    for prop in faces.properties:
-        length = 1
+    if not header.byte_order:
+        lines = skip_lines(stream, sum(other.num_records for other in before))
+        return header.num_lines + 1 + lines
+    for other in before:
+        _check_promise(path, stream, other, size)
+        if other.has_lists:
+            for _ in _read_binary(path, stream, other, header.byte_order, size):
+                pass
+        else:
+            stream.seek(other.num_records * other.min_bytes, os.SEEK_CUR)
+    _check_promise(path, stream, element, size)
+    return 0
+
+
+def _check_promise(path: Path, stream: BinaryIO, element: _Element, size: int) -> None:
+    """Check that the records of a binary element fit into what the file has left."""
+    start, promised = stream.tell(), element.num_records * element.min_bytes
+    content, lists = f"{element.num_records:,} records of {element.name}", element.has_lists
+    check_promise(path, start, promised, content, available=size - start, at_least=lists)
+
+
+class _Records(NamedTuple):
+    """Consecutive records of an element, some of whose properties are lists.
+
+    Attributes:
+        content: Their bytes, and a margin. Each word of an ASCII file is a float64.
+        order: Byte order; empty for an ASCII file.
+        starts: First byte of each record's values of a property, by its name.
+        lengths: Numbers of these values.
+        ends: Byte after each record; the first one of the margin where it is not whole.
+    """
+
+    content: NDArray[np.uint8]
+    order: str
+    starts: dict[str, NDArray[np.int64]]
+    lengths: dict[str, NDArray[np.int64]]
+    ends: NDArray[np.int64]
+
+    def values(self, path: Path, prop: _Property) -> list[Values]:
+        """Return the values of a property, shape ``(n,)``.
+
+        Those of lists have shape ``(n, length)``, one array for each length, ascending.
+        """
+        numbers = _numbers_at_bytes(self.content, self.order, prop.code)
+        starts, lengths = self.starts[prop.name], self.lengths[prop.name]
+        if prop.length_code is None:
+            arrays = [numbers[starts]]
+        else:
+            is_even = (lengths == lengths[:1]).all()
+            arrays = [
+                numbers[part[:, None] + np.arange(length) * numbers.itemsize]
+                for length in (lengths[:1] if is_even else np.unique(lengths))
+                for part in [starts if is_even else starts[lengths == length]]
+            ]
+        return arrays if self.order else [_cast(path, prop, values) for values in arrays]
+
+
+def _numbers_at_bytes(content: NDArray[np.uint8], order: str, code: str) -> Values:
+    """Return the number that begins at each byte of some content."""
+    dtype = np.dtype(order + code if order else np.float64)
+    return np.ndarray(len(content) - dtype.itemsize + 1, dtype, content, strides=(1,))
+
+
+def _cast(path: Path, prop: _Property, values: NDArray[np.float64]) -> Values:
+    """Return the words of an ASCII file as numbers of the type of their property."""
+    cast: Values = values.astype(prop.code)
+    if cast.dtype.kind != "f":
+        wrong = values[(cast != values) | (np.abs(values) >= LARGEST_WHOLE)]
+        if wrong.size:
+            word = next(word for word, code in _READ_TYPES.items() if code == prop.code)
+            raise FormatError(
+                f"{path}: expected {prop.name} to be numbers of type {word}, got {wrong[0]:.17g}; "
+                "correct the number, or the type in the header."
+            )
+    return cast
+
+
+def _find_records(
+    content: NDArray[np.uint8], element: _Element, order: str, starts: NDArray[np.int64]
+) -> _Records:
+    """Return the records that begin at some bytes."""
+    outside = len(content) - _MARGIN + 1
+    at = np.minimum(starts, outside)
+    places, lengths = dict[str, NDArray[np.int64]](), dict[str, NDArray[np.int64]]()
+    for prop in element.properties:
+        length = np.ones_like(starts)
         if prop.length_code is not None:
-            place += 1
-            lengths = rows[:, place - 1 : place]
-            fits = lengths.size > 0 and 0 <= lengths[0, 0] <= num_words - place
-            if not fits or (lengths != lengths[0]).any():
-                raise _lists_differ(path, faces)
-            length = int(lengths[0, 0])
-            if prop.name in _CORNERS:
-                corners = slice(place, place + length)
-        place += length
-    if place != num_words:
-        raise _lists_differ(path, faces)
-    return rows[:, corners]
+            numbers = _numbers_at_bytes(content, order, prop.length_code)
+            length = numbers[at].astype(np.int64)
+            fits = (length == numbers[at]) & (length >= 0) & (length <= outside)
+            length = np.where(fits, length, outside)
+            at = at + numbers.itemsize
+        places[prop.name], lengths[prop.name] = at, length
+        itemsize = np.dtype(prop.code if order else np.float64).itemsize
+        at = np.minimum(at + length * itemsize, outside)
+    return _Records(content, order, places, lengths, at)
 
 
-def _fronts(path: Path, header: _Header, size: int, cloud: Cloud) -> Fronts:
-    """Return the front of each vertex by the last of the elements, and what is wrong with that."""
-    faces = header.elements[-1]
-    name = next(prop.name for prop in faces.properties if prop.name in _CORNERS) + _LIST
+def _find_starts(content: NDArray[np.uint8], element: _Element, order: str) -> NDArray[np.int64]:
+    """Return where the records begin that fill some content, as far as they are whole.
+
+    Each begins where the one before ends. That is known for a record at any byte, so the end of the
+    second, fourth, ... record after any byte comes from looking up ends of ends.
+    """
+    size = len(content) - _MARGIN
+    ends = [_find_records(content, element, order, np.arange(size + 2)).ends]
+    for _ in range(_DOUBLINGS):
+        ends.append(ends[-1].take(ends[-1]))
+    far, at = ends.pop(), 0
+    found = []
+    while at <= size:
+        found.append(at)
+        at = int(far[at])
+    starts = np.array(found, np.int64)
+    for end in reversed(ends):
+        starts = np.stack([starts, end[starts]], axis=1).reshape(-1)
+    whole: NDArray[np.int64] = starts[ends[0][starts] <= size]
+    return whole
+
+
+def _read_records(
+    path: Path, stream: BinaryIO, element: _Element, order: str, size: int, line_number: int
+) -> Iterator[_Records]:
+    """Yield the records of an element with lists, many at a time, from where a stream is."""
+    if order:
+        return _read_binary(path, stream, element, order, size)
+    return _read_lines(path, stream, element, size, line_number)
+
+
+def _read_binary(
+    path: Path, stream: BinaryIO, element: _Element, order: str, size: int
+) -> Iterator[_Records]:
+    """Yield the records of a binary element with lists, and leave the stream at their end."""
+    start, left, at_once = stream.tell(), element.num_records, _BYTES_AT_ONCE
+    while left:
+        content = np.zeros(min(at_once, size - start) + _MARGIN, np.uint8)
+        stream.seek(start)
+        stream.readinto(content[:-_MARGIN].data)  # type: ignore[attr-defined]
+        whole = len(content) - _MARGIN
+        (first,) = _find_records(content, element, order, np.zeros(1, np.int64)).ends.tolist()
+        if first > whole:
+            if whole == size - start:
+                raise FormatError(
+                    f"{path}: byte {start}: expected {left:,} more records of {element.name}, got "
+                    f"{whole:,} bytes without a whole one; the file is cut off or damaged, write "
+                    "or copy it again."
+                )
+            at_once *= 2
+            continue
+        starts = np.arange(min(left, whole // first)) * first
+        records = _find_records(content, element, order, starts)
+        differ = np.flatnonzero(records.ends != starts + first)
+        count = int(differ[0]) if len(differ) else len(starts)
+        if count < _MIN_EVEN_FRACTION * len(starts) and at_once == _BYTES_AT_ONCE:
+            starts = _find_starts(content, element, order)[:left]
+            count = len(starts)
+        if len(differ):
+            records = _find_records(content, element, order, starts[:count])
+        yield records
+        start += int(records.ends[-1])
+        left, at_once = left - count, _BYTES_AT_ONCE
+    stream.seek(start)
+
+
+def _read_lines(
+    path: Path, stream: BinaryIO, element: _Element, size: int, line_number: int
+) -> Iterator[_Records]:
+    """Yield the records of an ASCII element with lists, each of which is a line.
+
+    MeshLab ends all lines of faces with as many numbers more than its header names.
+    """
+    start, left, surplus = stream.tell(), element.num_records, 0
+    # A digit and what separates it from the next; the last may end with the file.
+    least, what = 2 * left * len(element.properties) - 1, f"{left:,} records of {element.name}"
+    check_promise(path, start, least, what, available=size - start, at_least=True)
+    while left:
+        block = stream.read(_BYTES_AT_ONCE) + stream.readline()
+        if not block:
+            raise FormatError(
+                f"{path}: line {line_number}: expected {left:,} more records of {element.name}, "
+                "got the end of the file; the file is cut off or its header is wrong, write or "
+                "copy it again."
+            )
+        lines, counts = (column[:left] for column in _count_words(block))
+        ends, numbers = np.cumsum(counts), list[float]()
+        with suppress(ValueError):
+            numbers += map(float, block.split()[: counts.sum()])
+        content = np.zeros(len(numbers) * 8 + _MARGIN, np.uint8)
+        content[:-_MARGIN] = np.array(numbers).view(np.uint8)
+        records = _find_records(content, element, "", (ends - counts) * 8)
+        if left == element.num_records and element.name != "vertex":
+            surplus = max(int((ends * 8 - records.ends)[:1].sum()), 0)
+        is_whole = records.ends <= len(numbers) * 8
+        wrong = np.flatnonzero(~is_whole | (records.ends + surplus != ends * 8))
+        if len(wrong):
+            line = int(lines[wrong[0]])
+            shown = _shown(block.split(b"\n")[line])
+            raise FormatError(
+                f"{path}: line {line_number + line}: expected a record of {element.name}, got "
+                f"{shown}; repair this line."
+            )
+        yield records
+        line_number += block.count(b"\n")
+        left -= len(lines)
+        if not left:
+            end = len(b"\n".join(block.split(b"\n")[: lines[-1] + 1]))
+            stream.seek(end - len(block), os.SEEK_CUR)
+
+
+def _count_words(block: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which lines of a text hold words, ascending from 0, and how many each."""
+    text = np.frombuffer(block, np.uint8)
+    is_word = (text != ord(" ")) & ((text < ord("\t")) | (text > ord("\r")))
+    begins = is_word & ~np.concatenate([[False], is_word[:-1]])
+    lines, counts = np.unique(np.cumsum(text == ord("\n"))[begins], return_counts=True)
+    return lines, counts
+
+
+def _fronts(path: Path, header: _Header, place: int, size: int, cloud: Cloud) -> Fronts:
+    """Return the front of each vertex by the faces, and what is wrong with these."""
+    faces = header.elements[place]
+    corners = next(prop for prop in faces.properties if prop.name in _CORNERS)
     try:
         with path.open("rb") as stream:
-            if header.byte_order:
-                dtype = _go_to_last(path, stream, header, size)
-                blocks = _blocks(path, stream, faces, dtype)
-                front = find_fronts((b[name] for b in blocks), cloud.coordinates, cloud.finite)
-            else:
-                corners = _corners_of_text(path, stream, header)
-                front = find_fronts([corners], cloud.coordinates, cloud.finite)
-        return front, ()
+            line_number = _go_to(path, stream, header, place, size)
+            blocks = _read_records(path, stream, faces, header.byte_order, size, line_number)
+            arrays = (array for records in blocks for array in records.values(path, corners))
+            front = find_fronts(arrays, cloud.coordinates, cloud.finite)
+            return front, header.check_end(path, stream, place)
     except FormatError as error:
         return None, (f"its faces left out: {str(error).removeprefix(f'{path}: ').rstrip('.')}",)

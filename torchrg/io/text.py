@@ -58,6 +58,8 @@ class _Form(NamedTuple):
 
 _FORMS = (_Form(";"), _Form(";", ","), _Form(","), _Form(), _Form(None, ","))
 """The first that makes numbers of all words of a line is its form."""
+_MARKS = {None: "blanks", ",": "commas", ";": "semicolons"}
+"""Names of what is between numbers, for people."""
 
 
 def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
@@ -66,13 +68,18 @@ def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cl
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         opening = _read_opening(path, stream, columns)
         table = np.concatenate(list(_parse_blocks(path, stream, opening)))
-    if len(table) < opening.num_points:
+    promised = sum(opening.counts)
+    if len(table) < promised:
         raise FormatError(
-            f"{path}: expected {opening.num_points:,} points, as the line before them says, "
-            f"got {len(table):,}; the file is cut off, fetch it again, or delete that line."
+            f"{path}: expected {promised:,} points, as the line before them says, got "
+            f"{len(table):,}; the file is cut off or the line is wrong, copy it again, or delete "
+            "that line."
         )
-    is_comma = opening.form.decimal == ","
-    notes = ("its commas are taken as decimal points",) if is_comma else ()
+    notes: tuple[str, ...] = ()
+    if opening.form.decimal == ",":
+        notes += ("its commas are taken as decimal points",)
+    if opening.counts and len(table) > promised:
+        notes += (f"the line before its points says {promised:,}, but {len(table):,} follow",)
     return assemble_table(path, table, opening.names, notes, opening.integers)
 
 
@@ -142,7 +149,7 @@ def _read_table(
         if not block:
             raise FormatError(
                 f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got "
-                f"{count:,}; the file is cut off or its header is wrong, fetch it again."
+                f"{count:,}; the file is cut off or its header is wrong, write or copy it again."
             )
         parts.append(_parse(path, block, dtype, line_number))
         count += len(parts[-1])
@@ -157,10 +164,28 @@ def _parse_blocks(path: Path, stream: TextIO, opening: "_Opening") -> Iterator[V
     while block := line + stream.read(CHARACTERS_AT_ONCE) + stream.readline():
         table = parse_numbers(block.encode(), opening.num_columns, *opening.form)
         if table is None:
-            lines = block.split("\n")
+            lines = _without_counts(block.split("\n"), opening.counts)
             table = _parse(path, lines, dtype, number, opening.form, opening.left_out)["row"]
         yield table
         line, number = "", number + block.count("\n")
+
+
+def _without_counts(lines: list[str], counts: list[int]) -> list[str]:
+    """Return lines with blank ones in place of counts of points, which are added to those before.
+
+    Each scan in a file of Cyclone begins with its count. Without one before the first, lines stay.
+    """
+    if counts:
+        for place, line in enumerate(lines):
+            if (count := _count_of(line.strip())) is not None:
+                counts.append(count)
+                lines[place] = ""
+    return lines
+
+
+def _count_of(text: str) -> int | None:
+    """Return the count of points that a line is, or None."""
+    return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
 
 
 def _parse(
@@ -217,10 +242,16 @@ def _parse(
 
 def _repair_of(text: str, num_columns: int, form: _Form | None) -> str:
     """Return what to do about a line that is not numbers of this form."""
-    if "," in text and form in (None, _Form(";"), _Form()):
-        return "write all decimals with points, or all with commas"
-    words = [] if form is None else form.split(text)
-    if len(words) == num_columns and not all(map(_is_number, words)):
+    expected = form or _Form()
+    for other in _FORMS:
+        words = other.split(text)
+        if other == expected or len(words) != num_columns or not all(map(_is_number, words)):
+            continue
+        if other.decimal == expected.decimal:
+            return f"separate all numbers with {_MARKS[expected.delimiter]}"
+        return "write all decimals with points" + (", or all with commas" if form else "")
+    words = expected.split(text)
+    if form is not None and len(words) == num_columns and not all(map(_is_number, words)):
         return (
             f"repair or delete this line, or leave a column of words out, {LEFT_OUT} in --columns"
         )
@@ -250,13 +281,13 @@ def _num_columns(dtype: np.dtype[Any]) -> int:
 class _Opening(NamedTuple):
     """What the lines up to the first point say, that point's line, and its number, from one.
 
-    Names are None without a header. The number of points is 0 where none is said.
+    Names are None without a header. Counts are numbers of points that follow, one at most so far.
     """
 
     names: list[str] | None
     form: _Form
     num_columns: int
-    num_points: int
+    counts: list[int]
     line: str
     line_number: int
 
@@ -293,8 +324,13 @@ def _read_opening(path: Path, lines: Iterable[str], columns: Sequence[str] | Non
         elif not bare.strip():
             continue
         elif len(words) == 1 and are_numbers[0]:
-            is_count = words[0].isdecimal() and len(words[0]) <= _MOST_DIGITS
-            counts.append(int(words[0]) if is_count else 0)
+            count = _count_of(words[0])
+            if count is None:
+                raise FormatError(
+                    f"{path}: line {number}: expected a count of points or a point, got "
+                    f"{text[:60]!r}; correct or delete this line."
+                )
+            counts.append(count)
             if len(counts) > 1:
                 raise FormatError(
                     f"{path}: line {number}: expected a point after the count of points, got a "
@@ -319,8 +355,8 @@ def _read_opening(path: Path, lines: Iterable[str], columns: Sequence[str] | Non
                 names: list[str] | None = list(columns)
             else:
                 names = _names_of(path, header, words, number) if header else None
-            return _Opening(names, form, len(words), max(counts, default=0), line, number)
-    raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+            return _Opening(names, form, len(words), counts, line, number)
+    raise FormatError(f"{path}: expected at least one point, got none; check where it comes from.")
 
 
 def _form_of(text: str) -> _Form:

@@ -27,6 +27,9 @@ PARALLEL_DEG = 15.0
 _CHUNKS_AT_ONCE = 16
 """Chunks whose edges threads share, so few that what is kept of them is little."""
 
+_MAX_CELL = 2.0**53
+"""Largest number of a cell on a line. float64 does not tell cells beyond it apart."""
+
 _REACH = 4.0
 """An edge that leads across the planes by at most this many of their thicknesses is within their
 noise."""
@@ -260,7 +263,7 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
         place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
-        cell = torch.where(place.isfinite(), place, 0.0).floor().long()
+        cell = place.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
         return _each_once(contacts.pair, cell)
 
     for found in border.map_contacts(find_cells):
@@ -279,9 +282,10 @@ def _each_once(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cells of pairs ascending, each once."""
     if len(cell) == 0:
         return pair, cell
-    low, width = cell.min(), cell.max() - cell.min() + 1
-    keys = torch.unique(pair * width + (cell - low))
-    return keys // width, keys % width + low
+    # Ranks of cells are small enough for a number with the pair, which cells far apart are not.
+    cells, rank = torch.unique(cell, return_inverse=True)
+    keys = torch.unique(pair * len(cells) + rank)
+    return keys // len(cells), cells[keys % len(cells)]
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,55 @@
+"""Checks of the numbers in a header that place the points of a file."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torchrg.errors import FormatError
+from torchrg.structures import FARTHEST
+
+LARGEST_INTEGER = 2**31 - 1
+"""Largest integer that stands for a coordinate, in steps of a scale from an offset."""
+_MAX_OUTSIDE = 0.01
+"""Largest distance of points from the box in a header, as a fraction of their extent, without a
+note. Programs round the box."""
+
+
+def check_grid(path: Path, what: str, scales: ArrayLike, offsets: ArrayLike) -> None:
+    """Check that integers become numbers that differ, and none too far away.
+
+    Example:
+        >>> check_grid(Path("a.las"), "x, y, z", [0.1, 0.1, 0], [7, 7, 7])  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.FormatError: a.las: expected a scale and offset of x, y, z that ...
+    """
+    scale, offset = np.abs(np.array([scales, offsets], np.float64))
+    min_reach = np.maximum(np.spacing(offset), np.finfo(np.float32).tiny)
+    is_grid = (scale * LARGEST_INTEGER >= min_reach) & (scale <= FARTHEST) & (offset <= FARTHEST)
+    if not is_grid.all():
+        shown = ", ".join(map(str, np.ravel(scales))), ", ".join(map(str, np.ravel(offsets)))
+        raise FormatError(
+            f"{path}: expected a scale and offset of {what} that keep values apart and within "
+            f"{FARTHEST:g}, got {' and '.join(shown)}; correct them or write the file again."
+        )
+
+
+def distance_from_box(points: NDArray[np.floating], box: ArrayLike, step: ArrayLike = 0.0) -> float:
+    """Return how far points ``(N, 3)`` reach out of the box ``(2, 3)`` that a header names.
+
+    It is 0 within rounding, of which ``step`` is a part, and where the header knows no box.
+    Points that are not finite do not count.
+
+    Example:
+        >>> distance_from_box(np.eye(3), [[0, 0, 0], [1, 1, 0.5]])
+        0.5
+    """
+    low, high = np.array(box, np.float64)
+    # Programs that know no box leave zeros.
+    if not len(points) or not np.isfinite(box).all() or not np.any(box):
+        return 0.0
+    least, most = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    outside = np.maximum(low - least, most - high)
+    allowed = np.maximum(2 * np.abs(step), _MAX_OUTSIDE * (most - least))
+    return float(outside.max()) if (outside > allowed).any() else 0.0
