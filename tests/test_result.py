@@ -297,13 +297,15 @@ def test_without_labels_there_is_no_table(tmp_path, cloud):
 
 
 @pytest.mark.parametrize(
-    "change", ["labels", "huge", "shape", "kind", "pairs", "number", "missing"]
+    "change", ["labels", "moved", "huge", "shape", "kind", "pairs", "number", "missing"]
 )
 def test_a_table_that_is_not_of_the_labels_is_left_out(tmp_path, cloud, seg, change):
     torchrg.write_cloud(tmp_path / "a.npz", cloud, seg)
     arrays = dict(np.load(tmp_path / "a.npz"))
     if change == "labels":
         arrays["labels"][arrays["labels"] == 0] = -1
+    elif change == "moved":
+        arrays["labels"][np.flatnonzero(arrays["labels"] == 1)[:5]] = 0
     elif change == "huge":
         arrays["labels"] = np.where(arrays["labels"] < 0, -7, arrays["labels"] * 10**15)
     elif change == "number":

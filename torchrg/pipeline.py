@@ -70,9 +70,10 @@ def segment_planes(
 
     Convention:
         The result does not depend on the order of the points, on chunk size, on the number of
-        threads or on where arrays are. Lengths are in the unit of the cloud. A unit that is a power
-        of two times another changes nothing. Other units, another origin, and float64 in place of
-        float32 change results where rounding decides, as between equal distances.
+        threads or on where arrays are. Lengths are in the unit of the cloud. Another unit, another
+        origin, and float64 in place of float32 change results where rounding decides, as between
+        equal distances. A unit that is a power of two times another changes nothing, but for
+        settings that are measured, in three digits.
 
         Points with equal coordinates are copies. Neighbors are searched among distinct points, and
         copies of a point have its result, so the normals and planes are those of the distinct

@@ -7,7 +7,7 @@ import torch
 from tests.kernels.clouds import definitions
 from torchrg import scratch, segment_planes
 from torchrg.errors import ShapeError
-from torchrg.neighbors import search_knn
+from torchrg.neighbors import sample_voxels, search_knn
 from torchrg.neighbors.knn import keep_within
 from torchrg.result import describe_planes
 from torchrg.structures import UNLABELED
@@ -85,12 +85,16 @@ def test_one_object_is_as_none(preset, room):
     assert same.planes.object.tolist() == [9] * len(seg.planes.count)
 
 
-def test_points_of_voxels_of_another_object_have_no_label(room):
+def test_voxels_that_objects_share_have_a_part_for_each(room):
     made = room(8000)
     objects = panels(made)
-    seg = segment_planes(made.points, "classic", voxel=0.15, within=objects)
+    seg = segment_planes(made.points, voxel=0.15, within=objects)
     assert_within(seg, objects)
     assert torch.equal(torch.bincount(seg.labels + 1)[1:], seg.planes.count)
+    rows, inverse = sample_voxels(made.points, 0.15)
+    is_other = objects != objects[rows][inverse]
+    assert is_other.sum() > 100
+    assert (seg.labels[is_other] >= 0).float().mean() > 0.7
 
 
 def test_the_table_names_the_object_beside_planes_that_meet_across(room):

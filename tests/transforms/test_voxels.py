@@ -1,5 +1,7 @@
 """Voxels against a loop over points; small transforms on every kind of sample."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -81,6 +83,34 @@ def test_planes_of_voxels_are_numbered_by_their_points(rng):
     assert seg.labels[:4000].mode().values == 1
     assert seg.labels[4000:].mode().values == 0
     assert seg.planes.normal[0].abs().argmax() == 1
+
+
+def test_planes_of_voxels_are_measured_on_all_points_and_meet_under_their_new_numbers(rng):
+    # Where voxels are most, points are fewest: every plane gets another number.
+    floor, wall, ramp = (torch.rand(count, 3, generator=rng) for count in (3000, 12000, 6000))
+    floor = floor * torch.tensor([2.0, 2.0, 0.0])
+    wall = wall * torch.tensor([2.0, 0.0, 1.0])
+    angle = math.radians(40)
+    ramp = ramp * torch.tensor([1.0, 1.5, 0.0]) + torch.tensor([0.0, 0.5, 0.0])
+    ramp = torch.stack(
+        [2 + ramp[:, 0] * math.cos(angle), ramp[:, 1], ramp[:, 0] * math.sin(angle)], dim=1
+    )
+    points = torch.cat([wall, ramp, floor]).double()
+    seg = segment_planes(points, voxel=0.04)
+    planes = seg.planes
+    assert planes.normal.abs().argmax(dim=1).tolist() == [1, 2, 2]
+    assert planes.adjacency.pairs.tolist() == [[0, 2], [1, 2]]
+    assert planes.adjacency.dihedral_deg.tolist() == pytest.approx([90, 40], abs=0.5)
+    assert planes.adjacency.boundary_length.tolist() == pytest.approx([2, 1.5], rel=0.1)
+    assert planes.area.tolist() == pytest.approx([2, 1.5, 4], rel=0.05)
+    for plane in planes:
+        members = points[seg.labels == plane.id]
+        assert plane.count == len(members)
+        torch.testing.assert_close(plane.centroid, members.mean(dim=0))
+        height = members @ plane.normal - plane.offset
+        assert plane.rms == pytest.approx(float(height.square().mean().sqrt()), abs=1e-9)
+        widths = (members @ plane.axes.T).aminmax(dim=0)
+        torch.testing.assert_close(plane.extent, widths.max - widths.min)
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, float("nan"), float("inf")])

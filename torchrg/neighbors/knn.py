@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
+from torchrg._checks import as_tensor, check_floating, check_shapes, is_tensor, of_clouds
 from torchrg._parallel import (
     ROWS_AT_ONCE,
     ROWS_IN_CACHE,
@@ -132,7 +132,13 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     Raises:
         ShapeError: If they are not as :class:`torchrg.structures.Neighbors` says.
     """
-    indices, num_points = neighbors.indices, len(points)
+    indices: object = getattr(neighbors, "indices", None)
+    if not is_tensor(indices):
+        raise ShapeError(
+            f"{caller}: expected neighbors as torchrg.structures.Neighbors of a tensor, got "
+            f"{type(neighbors).__name__}; pass Neighbors(torch.as_tensor(rows))."
+        )
+    num_points = len(points)
     check_shapes(
         caller,
         points=(points, "N 3"),

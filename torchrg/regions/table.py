@@ -18,7 +18,7 @@ from torchrg.config import Auto
 from torchrg.errors import ShapeError
 from torchrg.linalg import eigh3_of_few, unit_direction
 from torchrg.linalg.moments import Segments, reduce_runs
-from torchrg.neighbors import distinct_rows, mark_first
+from torchrg.neighbors import check_neighbors, distinct_rows, mark_first
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
 from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes, Rows
@@ -126,6 +126,8 @@ def summarize_planes(
         "summarize_planes", points=(points, "N 3"), normals=(normals, "N 3"), labels=(labels, "N")
     )
     check_floating("summarize_planes", points=points, normals=normals)
+    if neighbors is not None and not canonical:
+        check_neighbors("summarize_planes", neighbors, points)
     rows = _distinct_members(points, labels, canonical=canonical)
     segments, places = Segments(labels[rows]), points[rows]
     fit = fit_planes(segments, places, normals[rows]).flattened(facet_tolerance)
