@@ -95,6 +95,7 @@ def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):
     table = format_report(report)
     assert "8_b" in table
     assert "9_a" not in table
+    assert "1 scans have notes, which report.json holds" in table
 
 
 def test_an_empty_table_is_its_head():

@@ -362,8 +362,8 @@ class RGBDSource(Source):
 
     Args:
         layout: The shape of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
-        intrinsics: The camera. Default: the layout's.
-        depth_scale: Stored value of one metre. Default: the layout's.
+        intrinsics: The camera. Default: that of a camera file, or the layout's.
+        depth_scale: Stored value of one metre. Default: that of a camera file, or the layout's.
         orient: To which side normals point: to the camera, unless it says ``"interior"`` or
             ``"up"``.
     """

@@ -71,6 +71,8 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
             again = [f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []
             told = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
             notes += [printable(f"{scan.name}: {note}") for note in told]
+    if len(report.scans) > MOST_ROWS and (num_noted := sum(bool(s.warnings) for s in report.scans)):
+        notes.append(f"{num_noted:,} {unit}s have notes, which report.json holds")
     seconds = report.seconds or math.inf
     speed = (
         f"{report.num_points:,} points in {report.seconds:,.1f} s: "

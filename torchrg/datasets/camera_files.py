@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
@@ -70,8 +71,6 @@ _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 """Models of COLMAP that have one focal length; the others have two."""
 _NO_PINHOLE = ("FISHEYE", "EQUIRECT", "FOV", "THIN_PRISM", "OMNI", "EUCM")
 """Words in the names of camera models whose images are bent."""
-_MAX_SIDE = 4
-"""Rows of the largest matrix."""
 _NAMES = re.compile(
     r"(depth_)?(cameras?|cam|(camera_|cam_)?(intrinsics?|k|info|calib(ration)?)"
     r"|(camera_|cam_)(matrix|params?|parameters|primesense))(_depth)?|metadata|transforms"
@@ -107,7 +106,7 @@ def read_camera(path: Path) -> Pinhole:
         (9.0, 9.0, 3.5, 2.5, (8, 6))
     """
     record = _read_any(path)
-    if "frames" in record and "fl_x" not in record:
+    if isinstance(record.get("frames"), list) and "fl_x" not in record:
         raise FormatError(
             f"{path}: expected one camera, got one for each frame, or none; give the folder of the "
             "file to torchrg convert rgbd."
@@ -140,11 +139,11 @@ def _read_any(path: Path) -> Record:
 def _read_array(path: Path) -> list[float]:
     """Return the numbers of a ``.npy`` file."""
     check_file(path)
-    with refusing(f"{path}: expected an array of numbers, got: ", OSError, *DAMAGES):
+    with refusing(f"{path}: expected the numbers of a camera, got: ", OSError, *DAMAGES):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-        if array.dtype.kind not in "fiu":
-            raise TypeError(f"{array.dtype}")
-        numbers: list[float] = array[:_MAX_SIDE].astype(np.float64).ravel().tolist()
+        if array.dtype.kind not in "fiu" or array.size > max(_SHAPES):
+            raise TypeError(f"shape {array.shape} and {array.dtype}")
+        numbers: list[float] = array.astype(np.float64).ravel().tolist()
     return numbers
 
 
@@ -237,7 +236,7 @@ def camera_of(path: Path, record: Record) -> Pinhole:
 
 def _numbers_of(path: Path, record: Record) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy of a record, where the middle of the first pixel is 0."""
-    values = record.get("intrinsics")
+    values = record.get("intrinsics", record.get("intrinsic"))
     if isinstance(values, list) and len(values) == len(_FOUR) and not isinstance(values[0], list):
         record = dict(zip(_FOUR, values, strict=True))
     known = [names for names in _NUMBERS if names[0] in record]
@@ -280,14 +279,14 @@ def matrix_of(path: Path, record: Record, key: str, columns: int = 3) -> Tensor:
         values = torch.from_numpy(np.asarray(data, dtype=np.float64).ravel())
         if len(values) in _SHAPES and _SHAPES[len(values)][1] >= columns:
             return values.view(_SHAPES[len(values)])
-    raise FormatError(f"{path}: expected {key} to be a matrix, got {str(value)[:60]}; repair it.")
+    raise FormatError(f"{path}: expected {key} to be a matrix, got {shortened(value)}; repair it.")
 
 
 def number_of(path: Path, record: Record, key: str) -> float:
     """Return a number of a record, finite and not so large that it is none in float64."""
     value = record.get(key)
     if not isinstance(value, (int, float)) or not abs(value) <= FARTHEST:
-        raise FormatError(f"{path}: expected a number for {key}, got {value!r:.60}; add it.")
+        raise FormatError(f"{path}: expected a number for {key}, got {shortened(value)}; add it.")
     return float(value)
 
 
@@ -316,20 +315,22 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
         FormatError: If a camera file is damaged.
 
     Warns:
-        DepthWarning: If another file of the same folder has another camera.
+        DepthWarning: If another file of the same folder has another camera, or the file is outside
+            of ``root``.
     """
     # Links stay what they are: the folders above a recording are those that lead to it.
     start, top = (Path(os.path.abspath(path)) for path in (folder, root))  # noqa: PTH100
     above = (place for place in start.parents if place.is_relative_to(top.parent))
     for place in (folder, *above):
+        is_outside = place != folder and not place.is_relative_to(top)
         cameras: dict[Path, Pinhole] = {}
         for path in _camera_files(place):
             is_doubtful = path.stem.lower().strip("_") in (*_OTHERS, place.name.lower())
-            with suppress(*(TorchrgError,) if is_doubtful or cameras else ()):
+            with suppress(*(TorchrgError,) if is_doubtful or is_outside or cameras else ()):
                 cameras[path] = read_camera(path)
         if cameras:
             (path, camera), *others = cameras.items()
-            if not place.is_relative_to(top) and place != folder:
+            if is_outside:
                 warnings.warn(
                     f"{root}: taking the camera of {path}, outside of this folder; pass "
                     "--intrinsics to choose another.",
@@ -349,10 +350,15 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
 
 
 def _camera_files(folder: Path) -> list[Path]:
-    """Return the camera files of a folder and of its folders of cameras, those of depth first."""
-    entries = listed(folder) if folder.is_dir() else []
-    folders = [path for path in entries if _FOLDERS.fullmatch(path.name.lower()) and path.is_dir()]
-    files = [path for place in (entries, *map(listed, folders)) for path in place]
+    """Return the camera files of a folder and of its folders of cameras, those of depth first.
+
+    There are none in a folder that is missing or not readable.
+    """
+    files: list[Path] = []
+    with suppress(OSError):
+        files += listed(folder)
+        for place in [path for path in files if _FOLDERS.fullmatch(path.name.lower())]:
+            files += listed(place) if place.is_dir() else []
     names = {path: path.stem.lower().replace("-", "_").strip("_") for path in files}
     found = [
         path

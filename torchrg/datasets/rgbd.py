@@ -147,16 +147,22 @@ class RGBDFrames(SceneDataset):
                 ``scannetpp``, ``3rscan``, or ``images`` for any folder of depth images. Default:
                 the one that the folder shows.
             intrinsics: Camera matrix, shape ``(3, 3)``, or a camera of images of another size.
-                Default: the layout's; ``images`` has none.
-            depth_scale: Stored value of one metre. Default: the layout's; ``images`` has none.
+                Default: that of the frames or of a camera file next to them, else the built-in
+                camera of ``tum``, ``icl-nuim`` and ``7-scenes``.
+            depth_scale: Stored value of one metre. Default: that of the camera file, else the
+                layout's; ``images`` has none.
             transform: Called with each sample.
 
         Returns:
             The dataset, its frames in natural order.
 
         Raises:
-            ConfigError: If there is no such layout, or it needs intrinsics or a scale.
+            ConfigError: If there is no such layout, it needs intrinsics or a scale, or a camera
+                cannot be that of an image.
             FormatError: If there are no such frames in the folder, or a file is damaged.
+
+        Warns:
+            DepthWarning: If a camera is built in, or improbable for an image.
         """
         folder = Path(root)
         refuse_recording(folder)
