@@ -4,6 +4,7 @@ A source (:class:`~torchrg.batch.sources.FolderSource`, :class:`~torchrg.batch.s
 :class:`~torchrg.batch.sources.RGBDSource`, or a :class:`~torchrg.batch.sources.CloudSource` of your
 own) lists scans and reads one of them. :func:`~torchrg.batch.run.list_jobs` makes jobs of them,
 :func:`~torchrg.batch.run.make_plan` finds those that are not done,
+:func:`~torchrg.batch.stale.find_stale` finds results of scans that changed their name,
 :func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
 :func:`~torchrg.batch.run.run_plan` collects what becomes of them.
 

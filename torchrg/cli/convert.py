@@ -282,7 +282,9 @@ def run(argv: list[str]) -> int:
         plan, stale = _look_at(jobs, arguments), _find_stale(scans, arguments)
         resources = (arguments.workers or num_cores(), _memory_limit(arguments), free_space(out))
         print(format_plan(plan))
-        say(*(f"remove {result.name}: {result.reason}" for result in stale if result.files))
+        for result in stale:
+            if result.files and (result.scan is not None or arguments.prune):
+                say(f"remove {result.name}: {result.reason}")
         print(format_costs(plan, *resources, arguments.seconds_per_million))
         check_stale(stale, root, prune=arguments.prune)
         check_room(plan)
