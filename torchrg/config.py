@@ -259,8 +259,8 @@ class PlanesConfig:
     """What the table of planes says beyond the planes themselves."""
 
     up: Up | None = None
-    """Axis that points up. With it the table gives each plane a role: floor, ceiling, wall or
-    another. None: planes are not told apart."""
+    """Axis that points up. With it, the table names the class of each plane: floor, ceiling, wall
+    or another. None: no classes."""
     outline: bool = False
     """Whether the outline of each plane is traced; this needs shapely."""
 

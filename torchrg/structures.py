@@ -273,8 +273,8 @@ class NormalFit(NamedTuple):
 
 
 PLANE_KINDS = ("other", "floor", "ceiling", "wall", "horizontal", "vertical", "oblique")
-"""Names of the roles of planes: see :func:`torchrg.regions.table.classify_planes`. "other" is what
-is curved, "horizontal" and "vertical" what is so and neither floor nor ceiling nor wall."""
+"""Classes of planes; see :func:`torchrg.regions.classes.classify_planes`. Curved planes are
+"other", "horizontal" and "vertical" ones neither floor nor ceiling nor wall."""
 
 
 class PlaneAdjacency(NamedTuple):
@@ -344,7 +344,7 @@ class Planes:
         center: Center of that rectangle, shape ``(M, 3)``.
         curved: Whether the region is one smooth surface but not a plane, shape ``(M,)``, bool: a
             column, a bent wall. Its plane is the best there is, no more.
-        kind: Role of each plane as a place in :data:`PLANE_KINDS`, shape ``(M,)``, int64; None
+        kind: Class of each plane as a place in :data:`PLANE_KINDS`, shape ``(M,)``, int64; None
             where the up direction was not given.
         outline: Rings around each region, of shape ``(V, 3)``: outer ones counter-clockwise seen
             against the normal, holes clockwise; None where not asked for.

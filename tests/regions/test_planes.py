@@ -10,9 +10,8 @@ from torchrg.errors import ConfigError, MissingDependencyError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.pipeline import segment_planes
 from torchrg.regions import summarize_planes
-from torchrg.regions.table import classify_planes
 from torchrg.scenes import make_room
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Planes
+from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS
 
 
 def rotation(rng):
@@ -238,85 +237,6 @@ def test_kinds_follow_the_up_direction():
         kinds("xz")
     assert kinds((1, 0, 0)) == ["wall", "wall", "floor", "ceiling", "wall", "wall"]
     assert summarize_planes(points, normals, labels).kind is None
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_floors_ceilings_and_walls_of_made_rooms_are_told_from_the_rest(seed):
-    room = make_room(num_points=6000, noise=0.003, seed=seed)
-    faces, labels = torch.unique(room.labels, return_inverse=True)
-    labels = torch.where(room.labels < 0, -1, labels - int((faces < 0).sum()))
-    table = summarize_planes(room.points, room.normals, labels, up="z")
-    found = [PLANE_KINDS[kind] for kind in table.kind]
-    true = [room.kinds[face] for face in faces[faces >= 0]]
-    shell = {"floor", "ceiling", "wall"}
-    assert [kind for kind in found if kind in shell] == [kind for kind in true if kind in shell]
-    assert {a for a, b in zip(found, true, strict=True) if b in ("table top", "shelf")} == {
-        "horizontal"
-    }
-    assert "vertical" in {a for a, b in zip(found, true, strict=True) if b == "cabinet"}
-
-
-def lying(sides, height, tilt_deg=0.0, bend=None):
-    """A rectangle across a room, its middle at a height, turned about its first side."""
-    tilt = math.radians(tilt_deg)
-    second = (0, math.cos(tilt), math.sin(tilt))
-    return (0, -second[2], second[1]), (2, 2, height), ((1, 0, 0), second), sides, bend
-
-
-def standing(width, bottom, top, tilt_deg=0.0, bend=None):
-    """A rectangle that stands in a room, turned about its lower side."""
-    tilt, height = math.radians(tilt_deg), top - bottom
-    up = (0, math.sin(tilt), math.cos(tilt))
-    axes, sides = ((1, 0, 0), up), (width, height)
-    if width < height:
-        axes, sides = axes[::-1], sides[::-1]
-    return (0, up[2], -up[1]), (2, 2, (bottom + top) / 2), axes, sides, bend
-
-
-@pytest.mark.parametrize(
-    ("part", "role"),
-    [
-        (lying((3, 3), 1, tilt_deg=14), "horizontal"),
-        (lying((3, 3), 1, tilt_deg=16), "oblique"),
-        (standing(1, 0, 1, tilt_deg=14), "vertical"),
-        (standing(1, 0, 1, tilt_deg=16), "oblique"),
-        (lying((3, 3), 0.4), "floor"),
-        (lying((3, 3), 0.5), "horizontal"),
-        (lying((3, 3), 2.6), "ceiling"),
-        (lying((3, 3), 2.5), "horizontal"),
-        (lying((2.1, 1), 0.2), "floor"),
-        (lying((1.9, 1), 0.2), "horizontal"),
-        (standing(1, 1.4, 3), "wall"),
-        (standing(1, 1.6, 3), "vertical"),
-        (standing(0.65, 0, 3), "wall"),
-        (standing(0.55, 0, 3), "vertical"),
-        (standing(1, 0, 2.75), "wall"),
-        (standing(1, 0, 2.65), "vertical"),
-        (standing(1.6, 0, 2.5), "wall"),
-        (standing(1.4, 0, 2.5), "vertical"),
-        (standing(2, 0, 3, bend=0.019), "wall"),
-        (standing(2, 0, 3, bend=0.021), "other"),
-    ],
-)
-def test_roles_end_where_the_documentation_says(part, role):
-    """In a room of 5 by 4 by 3 metres: 20 square metres of floor, a largest wall of 15."""
-    floor, ceiling = (lying((5, 4), height) for height in (0, 3))
-    parts = [floor, ceiling, standing(5, 0, 3), part]
-    normals, centers, axes, sides, bends = (list(column) for column in zip(*parts, strict=True))
-    columns = {name: torch.zeros(4, *shape) for name, (_, shape) in PLANE_COLUMNS.items()}
-    extent = torch.tensor(sides, dtype=torch.float64)
-    columns |= {
-        "normal": torch.tensor(normals, dtype=torch.float64),
-        "center": torch.tensor(centers, dtype=torch.float64),
-        "axes": torch.tensor(axes, dtype=torch.float64),
-        "extent": extent,
-        "area": extent.prod(dim=1),
-        "rms": extent[:, 1] * torch.tensor([bend or 0 for bend in bends]),
-        "curved": torch.tensor([bend is not None for bend in bends]),
-        "count": torch.full((4,), 100),
-    }
-    found = classify_planes(Planes(**columns), torch.tensor([0.0, 0, 1]))
-    assert [PLANE_KINDS[kind] for kind in found] == ["floor", "ceiling", "wall", role]
 
 
 def test_outline_of_a_frame_has_a_hole_and_its_area():

@@ -97,9 +97,9 @@ TableFlag = Annotated[
     Argument(
         metavar="PLANES.csv",
         text="Table of the planes to write too, .csv or .json; for several inputs a directory. CSV "
-        "has a line for each plane, in the coordinates of the input: role, normal, offset, "
+        "has a line for each plane, in the coordinates of the input: class, normal, offset, "
         "centroid, area, dip, root mean square distance, outline as WKT POLYGON Z. Up is z. Of "
-        "clouds it asks for roles and outlines (pip install 'torchrg[outline]').",
+        "clouds it asks for classes and outlines (pip install 'torchrg[outline]').",
     ),
 ]
 WithinFlag = Annotated[
@@ -136,7 +136,7 @@ class PlaneSettings:
         """Return the settings of the preset or the file in the arguments: defaults of the flags.
 
         ``up`` is the axis that points up in a data set, where they name neither. A table of planes
-        has roles and outlines as far as they can be known.
+        has classes and outlines as far as they can be known.
 
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method

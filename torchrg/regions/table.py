@@ -1,4 +1,4 @@
-"""The plane table: what each region measures, which class it has, which others it meets."""
+"""The plane table: what each region measures, and which others it meets."""
 
 import math
 from collections.abc import Sequence
@@ -20,8 +20,9 @@ from torchrg.linalg import eigh3_of_few, unit_direction
 from torchrg.linalg.moments import Segments, reduce_runs
 from torchrg.neighbors import check_neighbors, distinct_rows, mark_first
 from torchrg.regions.adjacency import find_adjacency
+from torchrg.regions.classes import classify_planes
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
-from torchrg.structures import PLANE_KINDS, Neighbors, PlaneAdjacency, Planes, Rows
+from torchrg.structures import Neighbors, PlaneAdjacency, Planes, Rows
 
 _TIE = 1e-9
 """Rectangles whose areas differ by less than this share are equal but for rounding."""
@@ -47,32 +48,6 @@ _WIDE_ENOUGH = 1.05
 
 _CELL_ANGLE = math.radians(28.0)
 """Angle between cells and rectangle: along a parallel edge all cells would be cut alike."""
-
-MAX_TILT_DEG = 15.0
-"""A floor or ceiling is within this angle of horizontal, a wall of vertical."""
-
-_END_SHARE = 0.15
-"""A floor lies in this lowest share of the cloud's height, a ceiling in the highest."""
-
-_LEAST_AREA_SHARE = 0.1
-"""A floor or ceiling has at least this share of the largest horizontal plane's area."""
-
-_LEAST_WALL_SHARE = 0.5
-"""A wall reaches over at least this share of the cloud's height."""
-
-_LEAST_WIDTH_SHARE = 0.2
-"""A wall is at least this wide, as a share of the cloud's height."""
-
-_TOP_SHARE = 0.1
-"""A wall reaches into this share of the cloud at its top; a tall window ends below."""
-
-_WALL_AREA_SHARE = 0.25
-"""A wall that ends below has at least this share of the largest vertical plane's area,
-which is more than doors and sides of cabinets have."""
-
-_MOST_BEND = 0.02
-"""A region whose points are off its plane by at most this share of its short side is flat enough to
-have a role: a wall with a bulge is a wall, and a pillar is none."""
 
 _Outlines = tuple[tuple[Tensor, ...], ...]
 
@@ -135,7 +110,8 @@ def summarize_planes(
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
         planes = replace(
-            planes, kind=classify_planes(planes, unit_direction("summarize_planes", up))
+            planes,
+            kind=classify_planes(planes, points, labels, unit_direction("summarize_planes", up)),
         )
     if neighbors is not None:
         meeting = find_adjacency(
@@ -229,44 +205,6 @@ def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
 def _without(vectors: Tensor, normals: Tensor) -> Tensor:
     """Return vectors less their component along the normals."""
     return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
-
-
-def classify_planes(planes: Planes, up: Tensor) -> Tensor:
-    """Return the role of each plane, places in :data:`torchrg.structures.PLANE_KINDS`.
-
-    By the constants above: a level plane is a floor or a ceiling if it is broad, and low or high
-    among all planes, else "horizontal"; an upright one is a wall if it is tall, wide, as sides of
-    pillars are not, and, unlike doors and cabinets, reaches the top or is large, else "vertical".
-    Planes between are "oblique", bent ones "other". A single horizontal plane is a floor.
-    """
-    kinds = {name: place for place, name in enumerate(PLANE_KINDS)}
-    kind = torch.full_like(planes.count, kinds["other"])
-    if len(kind) == 0:
-        return kind
-    up = up.to(planes.normal)
-    steepness = (planes.normal * up).sum(dim=1).abs()
-    height = (planes.center * up).sum(dim=1)
-    reach = ((planes.axes * up).sum(dim=2).abs() * planes.extent).sum(dim=1) / 2
-    low, high = (height - reach).amin(), (height + reach).amax()
-    flat = ~planes.curved | (planes.rms <= _MOST_BEND * planes.extent[:, 1])
-    horizontal = flat & (steepness >= math.cos(math.radians(MAX_TILT_DEG)))
-    vertical = flat & (steepness <= math.sin(math.radians(MAX_TILT_DEG)))
-    kind[flat] = kinds["oblique"]
-    kind[horizontal] = kinds["horizontal"]
-    kind[vertical] = kinds["vertical"]
-    is_high = height + reach >= high - _TOP_SHARE * (high - low)
-    is_tall = vertical & (2 * reach >= _LEAST_WALL_SHARE * (high - low))
-    is_tall &= planes.extent[:, 1] >= _LEAST_WIDTH_SHARE * (high - low)
-    kind[is_tall & (is_high | _has_share(planes, vertical, _WALL_AREA_SHARE))] = kinds["wall"]
-    broad = horizontal & _has_share(planes, horizontal, _LEAST_AREA_SHARE)
-    kind[broad & (height >= high - _END_SHARE * (high - low))] = kinds["ceiling"]
-    kind[broad & (height <= low + _END_SHARE * (high - low))] = kinds["floor"]
-    return kind
-
-
-def _has_share(planes: Planes, among: Tensor, share: float) -> Tensor:
-    """Return which planes have a share of the area of the largest among some."""
-    return planes.area >= share * torch.where(among, planes.area, 0).amax()
 
 
 def _outlines(

@@ -14,7 +14,8 @@ from torchrg.linalg import unit_direction
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import finite_rows
 from torchrg.plane_table import Json, describe_planes
-from torchrg.regions.table import classify_planes, summarize_planes
+from torchrg.regions.classes import classify_planes
+from torchrg.regions.table import summarize_planes
 from torchrg.render.channels import MODES
 from torchrg.render.cutaway import Sides, find_sides
 from torchrg.render.surface import Surface, sample_surface
@@ -170,7 +171,8 @@ def describe_shown(result: Result, frame: Frame) -> Json:
     if not planes:
         return {"planes": []}
     if planes.kind is None:
-        planes = replace(planes, kind=classify_planes(planes, frame.rotation[2]))
+        cloud = result.cloud.points, result.labels
+        planes = replace(planes, kind=classify_planes(planes, *cloud, frame.rotation[2]))
     described = describe_planes(planes, origin=result.cloud.origin.tolist())
     for row, name in zip(described["planes"], result.names.tolist(), strict=True):
         row["id"] = name

@@ -16,7 +16,8 @@ from torchrg.config import load_config
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import number_labels
 from torchrg.pipeline import segment_planes
-from torchrg.regions.table import classify_planes, summarize_planes
+from torchrg.regions.classes import classify_planes
+from torchrg.regions.table import summarize_planes
 from torchrg.render.surface import Surface
 from torchrg.structures import PLANE_KINDS, UNLABELED, Planes
 
@@ -39,9 +40,6 @@ _LEAST_INSIDE = 0.05
 """Least share of the cloud on the inner side of an outer wall."""
 _THICKNESS = 1.5
 """Voxels nearer to a wall than this many of their edges, and twice its own noise, are in it."""
-_LEAST_AREA, _LEAST_BELOW = 0.3, 0.4
-"""Least shares of the area of the largest plane, and of the cloud's height below it, of a
-horizontal plane that is the ceiling of a lower room: more than a table has."""
 _BELOW_CEILING = 0.15
 """Share of the cloud's height below a ceiling that goes with it: lamps and beams hang there."""
 _MOST_PIXELS = 500
@@ -97,15 +95,12 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
         labels = segment_planes(centers, config).labels[surface.voxel_of]
     present, of_points = number_labels(labels.clamp(min=UNLABELED))
     of_voxels = of_points[surface.first]
-    planes = summarize_planes(centers, surface.normals, number_labels(of_voxels)[1])
+    numbers = number_labels(of_voxels)[1]
+    planes = summarize_planes(centers, surface.normals, numbers)
     altitude = centers @ up
     low, high = altitude.quantile(altitude.new_tensor([0.02, 0.98])).tolist()
-    kind = classify_planes(planes, up)
-    walls, ceilings, level = (
-        kind == PLANE_KINDS.index(name) for name in ("wall", "ceiling", "horizontal")
-    )
-    broad = planes.area >= _LEAST_AREA * functional.pad(planes.area, (0, 1)).amax()
-    ceilings |= level & broad & (planes.center @ up - low > _LEAST_BELOW * (high - low))
+    kind = classify_planes(planes, centers, numbers, up)
+    walls, ceilings = (kind == PLANE_KINDS.index(name) for name in ("wall", "ceiling"))
     directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
     powers = 1 << torch.arange(MOST_SIDES, device=centers.device)
     by_place = (covered * powers).sum(dim=1)
