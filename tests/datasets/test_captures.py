@@ -249,6 +249,7 @@ def test_portable_graymaps_are_read_as_they_are_stored(tmp_path):
     assert (read_depth(path, depth_scale=1024) * 1024 == torch.tensor(expected)).all()
     for content, message in (
         (b"P5\n3 2\n65535\n" + bytes(11), "expected 12 bytes for its pixels, got 11"),
+        (b"P5\n2 2\n65535\n" + bytes(12), "expected 8 bytes for 2 x 2 pixels, got 12; correct"),
         (b"P5\n3 2\n255\n" + bytes(6), "expected a binary PGM of 16 bits, P5, got b'P5"),
         (b"P2\n1 1\n65535\n7\n", "expected a binary PGM of 16 bits, P5, got b'P2"),
         (b"P5\n0 2\n65535\n", "expected a binary PGM of 16 bits"),

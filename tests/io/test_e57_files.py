@@ -75,12 +75,50 @@ def test_the_coordinate_system_is_kept_and_pictures_are_told(tmp_path, monkeypat
     assert "coordinate_metadata" not in found.header
 
 
-def write_columns(path, columns, extensions=(), pose=None):
-    """Write a scan of any columns."""
+def write_columns(path, columns, extensions=(), pose=None, *, order="wxyz", grid=None, bounds=()):
+    """Write a scan of any columns, whole numbers in 16 bits, the others in double precision.
+
+    ``pose`` is a quaternion w x y z, and may go on with a translation. With ``grid``, a scale and
+    an offset, columns that are not whole are integers in the file.
+    """
     with pye57.E57(str(path), "w") as file:
+        libe57, image = pye57.libe57, file.image_file
         for prefix in extensions:
-            file.image_file.extensionsAdd(prefix, f"urn:{prefix}")
-        append_scan(file, columns, pose)
+            image.extensionsAdd(prefix, f"urn:{prefix}")
+        prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+        for name, column in columns.items():
+            is_whole = column.dtype.kind == "i"
+            node = libe57.IntegerNode(image, 0, 0, 2**16) if is_whole else libe57.FloatNode(image)
+            if grid is not None and not is_whole:
+                node = libe57.ScaledIntegerNode(image, 0, -(2**20), 2**20, *grid)
+            prototype.set(name, node)
+            count = len(column)
+            buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
+        scan = libe57.StructureNode(image)
+        points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+        scan.set("guid", libe57.StringNode(image, "{1}"))
+        if pose is not None:
+            rotation, translation = libe57.StructureNode(image), libe57.StructureNode(image)
+            turn = dict(zip("wxyz", pose, strict=False))
+            for letter in order:
+                rotation.set(letter, libe57.FloatNode(image, float(turn[letter])))
+            for letter, value in zip("xyz", [*pose[4:], 0, 0, 0], strict=False):
+                translation.set(letter, libe57.FloatNode(image, float(value)))
+            place = libe57.StructureNode(image)
+            place.set("rotation", rotation)
+            place.set("translation", translation)
+            scan.set("pose", place)
+        if len(bounds):
+            box = libe57.StructureNode(image)
+            for i, value in enumerate(np.ravel(bounds)):
+                name = f"{'xyz'[i % 3]}{('Minimum', 'Maximum')[i // 3]}"
+                box.set(name, libe57.FloatNode(image, float(value)))
+            scan.set("cartesianBounds", box)
+        scan.set("points", points)
+        file.data3d.append(scan)
+        writer = points.writer(buffers)
+        writer.write(count)
+        writer.close()
     return path
 
 
@@ -255,3 +293,57 @@ def test_limits_of_colors_decide_their_range(tmp_path, scans, expected, note):
     cloud = read_cloud(tmp_path / "a.e57")
     np.testing.assert_array_equal(cloud.fields["color"], expected)
     assert [note in each for each in cloud.notes] == ([True] if note else [])
+
+
+@pytest.mark.parametrize("order", ["wxyz", "xyzw", "zwxy"])
+def test_poses_are_read_by_name_in_any_order(tmp_path, order):
+    columns = dict(zip(AXES, np.eye(3), strict=True))
+    path = write_columns(tmp_path / "a.e57", columns, pose=QUARTER, order=order)
+    expected = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+    np.testing.assert_allclose(read_cloud(path).coordinates, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ((1e300, 0, 0, 0), r"a rotation of length 1 as pose of scan '', got 1e\+300; correct"),
+        ((1e300, 1e300, 0, 0), "a rotation of length 1 as pose"),
+        ((5e-324, 0, 0, 0), "a rotation of length 1 as pose"),
+        ((0.1, 0, 0.1, 0), "a rotation of length 1 as pose of scan '', got 0.141"),
+        ((1, 0, 0, 0, 0, -1e13, 0), r"a pose of scan '' within 1e\+12, got -1e\+13; correct"),
+    ],
+)
+def test_poses_that_are_no_places_are_refused(tmp_path, pose, message):
+    path = write_columns(tmp_path / "a.e57", dict(zip(AXES, np.eye(3), strict=True)), pose=pose)
+    with pytest.raises(FormatError, match=rf"a\.e57: expected {message}"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(("length", "is_told"), [(1.001, False), (1.2, True), (0.0, True)])
+def test_rotations_of_another_length_are_told(tmp_path, length, is_told):
+    columns = dict(zip(AXES, np.eye(3), strict=True))
+    cloud = read_cloud(write_columns(tmp_path / "a.e57", columns, pose=length * QUARTER))
+    expected = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] if length else np.eye(3)
+    np.testing.assert_allclose(cloud.coordinates, expected, atol=1e-15)
+    told = [note for note in cloud.notes if note.startswith("the rotations of 1 of 1 scans have")]
+    assert len(told) == is_told
+
+
+@pytest.mark.parametrize("grid", [(1e300, 0.0), (1e-310, 0.0), (1e-30, 1e6)])
+def test_grids_on_which_points_have_no_places_are_refused(tmp_path, grid):
+    columns = dict(zip(AXES, np.zeros((3, 5)), strict=True))
+    path = write_columns(tmp_path / "a.e57", columns, grid=(1e-3, 0.0))
+    np.testing.assert_array_equal(read_cloud(path).coordinates, np.zeros((5, 3)))
+    columns = {name: column + grid[1] for name, column in columns.items()}
+    with pytest.raises(FormatError, match="expected a scale and offset of cartesianX that keep"):
+        read_cloud(write_columns(path, columns, grid=grid))
+
+
+def test_bounds_that_contradict_the_points_are_told(tmp_path):
+    columns = dict(zip(AXES, np.random.default_rng(0).random((3, 50)), strict=True))
+    notes = {}
+    for name, bounds in {"right": [[0] * 3, [1] * 3], "wrong": [[0] * 3, [1, 1e-3, 1]]}.items():
+        path = write_columns(tmp_path / f"{name}.e57", columns, bounds=bounds)
+        notes[name] = read_cloud(path).notes
+    told = "the points of 1 of 1 scans lie outside of the bounds in its header; check the scales"
+    assert notes == {"right": (), "wrong": (told,)}

@@ -1,6 +1,7 @@
 """LAS and LAZ: what came in goes out, in the format's own form."""
 
 import pickle
+import re
 import struct
 from dataclasses import replace
 from types import SimpleNamespace
@@ -281,6 +282,127 @@ def test_promises_of_compressed_chunks_are_checked(scanned, place, value, messag
     path.write_bytes(data)
     with pytest.raises(FormatError, match=rf"scan\.laz: {message}"):
         read_cloud(path)
+
+
+def put_in_record(path, place, layout, value):
+    """Change LASzip's record in a file."""
+    data = bytearray(path.read_bytes())
+    struct.pack_into(layout, data, data.index(b"laszip encoded") - 2 + 54 + place, value)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("chunk_size", [50_000, 0, 2**32 - 1])
+def test_points_compressed_without_chunks_are_read(scanned, chunk_size):
+    # LASzip's first compressor has no table of chunks, and nobody asks for their size.
+    path = scanned(3, "1.2", ".laz")
+    expected = read_cloud(path)
+    data = path.read_bytes()
+    start, _ = struct.unpack_from("<II", data, 96)
+    (table,) = struct.unpack_from("<q", data, start)
+    path.write_bytes(data[:start] + data[start + 8 : table])
+    put_in_record(path, 0, "<H", 1)
+    put_in_record(path, 12, "<I", chunk_size)
+    found = read_cloud(path)
+    np.testing.assert_array_equal(found.coordinates, expected.coordinates)
+    for name, values in expected.fields.items():
+        np.testing.assert_array_equal(found.fields[name], values)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (38, 4, "compression version 3 or below, got 4; convert it to .las with LASzip or PDAL"),
+        (36, 29, r"compressed fields of \d+ bytes a point, got \d+; convert it"),
+        (32, 0, r"compressed fields of \d+ bytes a point, got 0; convert it"),
+    ],
+)
+def test_compression_that_lazrs_does_not_know_is_refused(scanned, place, value, message):
+    path = scanned(7, "1.4", ".laz")
+    put_in_record(path, place, "<H", value)
+    with pytest.raises(FormatError, match=rf"scan\.laz: expected (LAZ of )?{message}"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        *((131, scale) for scale in (0.0, np.nan, np.inf, 1e300, 5e-324, 1e-310, 1e-25)),
+        *((171, offset) for offset in (np.nan, -np.inf, 1e300, 1e13)),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_grids_on_which_points_have_no_places_are_refused(scanned, suffix, place, value):
+    path = scanned(suffix=suffix)
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, place, value)
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=r"expected a scale and offset of x, y, z that keep val"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, 1e300])
+def test_scales_of_extra_dimensions_are_checked(described, value):
+    data = bytearray(described.read_bytes())
+    struct.pack_into("<d", data, data.index(b"Range".ljust(32, b"\0")) + 108, value)
+    described.write_bytes(data)
+    with pytest.raises(FormatError, match="expected a scale and offset of Range that keep values"):
+        read_cloud(described)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(
+    ("changes", "note"),
+    [
+        ([(131, "<d", 0.01)], "its points lie up to 8.9. outside of the box in its header; check"),
+        ([(131, "<d", -0.001)], "its points lie up to .* outside of the box in its header; check"),
+        ([(155, "<d", 7.0), (163, "<d", 5e5)], "its points lie up to .* outside of the box in its"),
+        ([(219, "<d", np.nan)], None),
+        ([(place, "<d", 0.0) for place in range(179, 227, 8)], None),
+        ([(111, "<I", 99)], r"its header counts 50 points, but \d+ returns"),
+    ],
+)
+def test_headers_that_contradict_the_points_are_told(scanned, suffix, changes, note):
+    path = scanned(suffix=suffix)
+    assert read_cloud(path).notes == ()
+    data = bytearray(path.read_bytes())
+    for place, layout, value in changes:
+        struct.pack_into(layout, data, place, value)
+    path.write_bytes(data)
+    notes = read_cloud(path).notes
+    assert len(notes) == (note is not None)
+    assert note is None or re.match(note, notes[0])
+
+
+def test_points_that_the_header_does_not_count_are_told(scanned):
+    path = scanned()
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, 107, 48)
+    path.write_bytes(data)
+    cloud = read_cloud(path)
+    assert len(cloud) == 48
+    size = cloud.header["las"].point_format.size
+    assert cloud.notes == (
+        "its header counts 48 points, but 50 returns",
+        f"{2 * size} bytes after its last point left out, as its header counts no more",
+    )
+    path = scanned(7, "1.4", ".laz")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<Q", data, 247, 48)
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="expected 48 points, as its header says, got 50 in its"):
+        read_cloud(path)
+
+
+def test_bytes_that_no_record_describes_are_told(scanned):
+    path = scanned()
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<H", data, data.index(b"LASF_Spec") + 16, 7)
+    path.write_bytes(data)
+    cloud = read_cloud(path)
+    assert "Range" not in cloud.fields
+    assert cloud.notes == (
+        "bytes that its header does not describe are kept as ExtraBytes: 18 of each point",
+    )
 
 
 def test_table_of_chunks_may_be_named_at_the_end(scanned):

@@ -32,7 +32,7 @@ def make_faces(count=60, corners=3, num_points=30):
 def fronts_by_loop(points, faces):
     """Sums of the normals of triangles around the first corner of each face."""
     sums = np.zeros((len(points), 3))
-    for face in faces:
+    for face in filter(None, faces):
         a = points[face[0]]
         for b, c in itertools.pairwise(face):
             sums[face] += np.cross(points[b] - a, points[c] - a)
@@ -150,13 +150,51 @@ def test_damaged_lists_are_left_out_with_a_note(tmp_path, order, change):
     assert str(path) not in note
 
 
+def put_faces_first(path):
+    """Move the element of the faces, and their records, before the vertices."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    start, vertex, face = head.index(b"element"), b"element vertex", b"element face"
+    elements = head[head.index(face) :] + head[head.index(vertex) : head.index(face)]
+    num_points = int(head[start:].split()[2])
+    if b"ascii" in head:
+        lines = body.splitlines(keepends=True)
+        body = b"".join([*lines[num_points:], *lines[:num_points]])
+    else:
+        body = body[num_points * 24 :] + body[: num_points * 24]
+    path.write_bytes(head[:start] + elements + b"end_header\n" + body)
+    return path
+
+
+MIXED = {
+    "one by one": [make_faces(80, 3 + i % 2)[i] for i in range(80)],
+    "larger first": [*make_faces(40, 5), *make_faces(40), *make_faces(40, 7)],
+    "one that differs": [*make_faces(79), *make_faces(1, 4)],
+    "edges and none": [[], *make_faces(20), *make_faces(3, 2), [], *make_faces(20, 6)],
+}
+
+
 @pytest.mark.parametrize("order", ORDERS)
-def test_faces_of_several_lengths_are_left_out_with_a_note(tmp_path, order):
-    faces = [*make_faces(4), *make_faces(4, 4)]
-    cloud = read_cloud(write_mesh(tmp_path / "a.ply", make_points(), faces, order))
-    assert cloud.front is None
-    (note,) = cloud.notes
-    assert note.startswith("its faces left out: ")
+@pytest.mark.parametrize("kind", MIXED)
+@pytest.mark.parametrize("at_once", [50, 500, 1 << 19])
+def test_faces_of_several_lengths_keep_their_side(tmp_path, order, kind, at_once, monkeypatch):
+    monkeypatch.setattr(ply, "_BYTES_AT_ONCE", at_once)
+    points, faces = make_points(), MIXED[kind]
+    extra = ("before short", "list uchar float")
+    path = write_mesh(tmp_path / "a.ply", points, faces, order, extra=extra)
+    for change in (lambda path: path, put_faces_first):
+        cloud = read_cloud(change(path))
+        np.testing.assert_allclose(cloud.front, fronts_by_loop(points, faces), atol=1e-6)
+        np.testing.assert_array_equal(cloud.coordinates, points)
+        assert cloud.notes == ()
+
+
+def test_numbers_that_end_all_lines_of_faces_are_passed_over(tmp_path):
+    points, faces = make_points(), make_faces()
+    path = write_mesh(tmp_path / "a.ply", points, faces, "ascii", extra=("float",))
+    # MeshLab writes colors of corners as a list, and names four numbers in the header.
+    path.write_bytes(path.read_bytes().replace(b" 5\n", b" 9 1 1 1 1 1 1 1 1 1\n"))
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.front, fronts_by_loop(points, faces), atol=1e-6)
 
 
 @pytest.mark.parametrize("order", ORDERS)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud, write_cloud
+from torchrg.io import estimate_points, read_cloud, write_cloud
 from torchrg.structures import Cloud
 
 POINTS = np.arange(12, dtype=np.float64).reshape(4, 3)
@@ -129,6 +129,40 @@ class Bomb:
 
     def __reduce__(self):
         return (pytest.fail, ("a pickle was loaded",))
+
+
+def test_archives_of_records_and_of_an_array_for_each_axis_are_read(tmp_path):
+    records = np.zeros(4, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("label", "i4")])
+    records["x"], records["y"], records["z"] = POINTS.T
+    records["label"] = range(4)
+    # pyntcloud keeps its mesh next to the points.
+    np.savez_compressed(tmp_path / "a.npz", points=records, mesh=np.zeros(2, [("v1", "i4")]))
+    np.savez(tmp_path / "b.npz", **{name: records[name] for name in records.dtype.names})
+    np.save(tmp_path / "c.npy", records)
+    expected = read_cloud(tmp_path / "c.npy")
+    np.testing.assert_array_equal(expected.coordinates, POINTS)
+    for name in ("a.npz", "b.npz"):
+        cloud = read_cloud(tmp_path / name)
+        np.testing.assert_array_equal(cloud.coordinates, expected.coordinates)
+        assert {key: values.tolist() for key, values in cloud.fields.items()} == {
+            key: values.tolist() for key, values in expected.fields.items()
+        }
+        assert estimate_points(tmp_path / name) == 4
+    np.savez(tmp_path / "d.npz", points=records[["x", "y"]])
+    with pytest.raises(FormatError, match=r"d\.npz: expected fields x, y, z, got 'x', 'y'"):
+        read_cloud(tmp_path / "d.npz")
+
+
+@pytest.mark.parametrize("change", [(b"(4, 3)", b"(3, 3)"), (b"<f8", b"<f4"), (b"4, 3", b"2, 3")])
+def test_headers_of_fewer_bytes_than_there_are_are_refused(tmp_path, change):
+    np.save(tmp_path / "a.npy", POINTS)
+    content = (tmp_path / "a.npy").read_bytes().replace(*change)
+    (tmp_path / "a.npy").write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("points.npy", content)
+    for name in ("a.npy", "a.npz"):
+        with pytest.raises(FormatError, match=r"expected \d+ bytes for .*, got 96; correct the sh"):
+            read_cloud(tmp_path / name)
 
 
 def test_pickles_are_never_loaded(tmp_path):

@@ -73,6 +73,68 @@ def test_compressed_padding_may_be_there(tmp_path):
     check(read_cloud(save(tmp_path / "a.pcd", HEADER.format(encoding="binary_compressed"), data)))
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_fields_of_no_values_are_left_out(tmp_path, encoding):
+    # Drivers of lidars, and PCL with their clouds, write padding of COUNT 0.
+    header = HEADER.replace("hist label", "hist label _ none", 1).replace("2 4\n", "2 4 1 8\n", 1)
+    header = header.replace("I U\n", "I U U F\n", 1).replace("2 1\n", "2 1 0 0\n", 1)
+    check(read_cloud(save(tmp_path / "a.pcd", header.format(encoding=encoding), body(encoding))))
+
+
+@pytest.mark.parametrize("points", ["POINTS 2\n", "WIDTH 2\n", "WIDTH 2\nHEIGHT 1\nPOINTS 2\n"])
+@pytest.mark.parametrize("columns", ["COLUMNS x y z\n", "FIELDS x y z\nTYPE F F F\n"])
+def test_headers_of_earlier_versions_are_read(tmp_path, points, columns):
+    header = f"# .PCD v.5\nVERSION .5\n{columns}{points}DATA "
+    cloud = read_cloud(save(tmp_path / "a.pcd", f"{header}ascii\n", b"1 2 3\n4 5 6\n"))
+    assert cloud.coordinates.tolist() == [[1, 2, 3], [4, 5, 6]]
+    data = struct.pack("<6f", *range(1, 7))
+    again = read_cloud(save(tmp_path / "a.pcd", f"{header}binary\n", data))
+    np.testing.assert_array_equal(again.coordinates, cloud.coordinates)
+    assert again.coordinates.dtype == np.float32
+
+
+def test_truth_values_of_pcl_are_read(tmp_path):
+    header = "FIELDS x y z on\nSIZE 4 4 4 1\nTYPE F F F B\nWIDTH 2\nHEIGHT 1\nDATA binary\n"
+    data = struct.pack("<fffBfffB", 1, 2, 3, 1, 4, 5, 6, 0)
+    assert read_cloud(save(tmp_path / "a.pcd", header, data)).fields["on"].tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "is_kept"),
+    [
+        ("1 2 3 0.5 0.5 0.5 0.5", True),
+        ("0 0 0 5e-324 0 0 0", True),
+        ("0 0 0 0 0 0 0", False),
+        ("nan 0 0 1 0 0 0", False),
+        ("0 0 0 1 nan 0 0", False),
+        ("0 0 0 inf 0 0 0", False),
+        ("0 1e13 0 1 0 0 0", False),
+    ],
+)
+def test_viewpoints_that_are_none_are_left_out(tmp_path, viewpoint, is_kept):
+    header = HEADER.replace("1 2 3 0 1 0 0", viewpoint).format(encoding="binary")
+    cloud = read_cloud(save(tmp_path / "a.pcd", header, body("binary")))
+    check(cloud)
+    expected = tuple(map(float, viewpoint.split())) if is_kept else (0, 0, 0, 1, 0, 0, 0)
+    assert cloud.header["viewpoint"] == expected
+    left = "its VIEWPOINT left out, as it is not a position and a rotation"
+    assert cloud.notes == (() if is_kept else (left,))
+
+
+def test_points_that_the_header_does_not_count_are_told(tmp_path):
+    fewer = HEADER.replace("WIDTH 3", "WIDTH 2").replace("POINTS 6", "POINTS 4")
+    path = save(tmp_path / "a.pcd", fewer.format(encoding="binary"), body("binary"))
+    with pytest.raises(FormatError, match=r"byte \d+: expected the end of .* 54 more bytes"):
+        read_cloud(path)
+    text = read_cloud(save(tmp_path / "a.pcd", fewer.format(encoding="ascii"), body("ascii")))
+    assert len(text) == 4
+    (note,) = text.notes
+    assert note.endswith("bytes after its last point left out, as its header counts no more")
+    # PCL fills files up to a page.
+    whole = HEADER.format(encoding="binary")
+    check(read_cloud(save(tmp_path / "a.pcd", whole, body("binary") + bytes(3900))))
+
+
 def test_header_lines_may_be_absent_or_swapped(tmp_path):
     header = "FIELDS x y z\nTYPE F F F\nSIZE 4 4 4\nWIDTH 2\nFOO bar\n\nDATA ascii\n"
     cloud = read_cloud(save(tmp_path / "a.pcd", header, b"1 2 3\n\n4 5 nan\n"))
@@ -168,8 +230,9 @@ def test_compressed_block_with_wrong_sizes_is_refused(tmp_path, sizes, message):
         ("SIZE.*", "SIZE 4 4 3 4 1 2 4", "line 5: expected TYPE to be F, I or U of a known SIZE"),
         ("TYPE.*", "TYPE F F F", "line 5: expected TYPE to be 7 letters, got 'F F F'"),
         ("TYPE.*", "TYPE F F Q F U I U", "line 5: expected TYPE to be F, I or U .* for z"),
-        ("COUNT.*", "COUNT 1 1 1 1 3 0 1", "line 6: expected COUNT to be sizes of 1 to"),
-        ("COUNT.*", "COUNT 1 1 1 1 3 9999999 1", "line 6: expected COUNT to be sizes of 1 to"),
+        ("COUNT.*", "COUNT 0 0 0 0 0 0 0", "line 6: expected COUNT to be above 0 for a field"),
+        ("COUNT.*", "COUNT 1 1 1 1 3 9999999 1", "line 6: expected COUNT to be sizes of at most"),
+        ("SIZE.*", "SIZE 4 4 4 4 0 2 4", "line 5: expected TYPE to be F, I or U of a known SIZE"),
         ("COUNT.*", "COUNT 1 2 1 1 1 1 1", "expected one number a point in each of x, y, z"),
         ("WIDTH.*", "WIDTH -3", "line 7: expected WIDTH to be 1 whole number, got '-3'"),
         (
@@ -189,6 +252,16 @@ def test_broken_headers_name_the_line(tmp_path, pattern, replacement, message):
     header = re.sub(pattern, replacement, HEADER.format(encoding="binary"))
     with pytest.raises(FormatError, match=rf"a\.pcd: {message}"):
         read_cloud(save(tmp_path / "a.pcd", header, body("binary")))
+
+
+def test_commas_between_numbers_have_another_repair_than_decimal_commas(tmp_path):
+    header = "FIELDS x y z\nWIDTH 2\nDATA ascii\n"
+    for line, repair in (
+        (b"0.5,0,0", "separate all numbers with blanks"),
+        (b"0,5 0 0", "write al"),
+    ):
+        with pytest.raises(FormatError, match=f"line 4: expected 3 numbers, got '.*'; {repair}"):
+            read_cloud(save(tmp_path / "a.pcd", header, line + b"\n1 0 0\n"))
 
 
 def test_broken_lines_are_named(tmp_path):

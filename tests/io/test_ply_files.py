@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud, write_cloud
+from torchrg.io import ply, read_cloud, write_cloud
 from torchrg.structures import Cloud
 
 POINTS = [(1.5, -2.0, 3.0), (4.0, 5.25, -6.0), (float("nan"), 0.0, 1e30)]
@@ -117,24 +117,110 @@ def test_names_are_read_in_the_letters_they_were_written_in(tmp_path, kind):
     assert list(read_cloud(tmp_path / f"b.{kind}").fields) == ["höhe_à", "h"]
 
 
-def test_lists_of_one_length_in_vertices_become_columns(tmp_path):
-    header = (
-        "ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
-        "property float y\nproperty float z\nproperty list uint float spectrum\nend_header\n"
-    )
-    body = struct.pack("<fffIfffffIff", 1, 2, 3, 2, 7, 8, 4, 5, 6, 2, 9, 10)
-    cloud = read_cloud(save(tmp_path / "a.ply", header, body))
-    assert cloud.fields["spectrum"].tolist() == [[7, 8], [9, 10]]
-    assert set(cloud.fields) == {"spectrum"}
-    broken = struct.pack("<fffIfffffIff", 1, 2, 3, 2, 7, 8, 4, 5, 6, 1, 9, 10)
-    with pytest.raises(FormatError, match=r"a\.ply: expected lists of one length in element"):
-        read_cloud(save(tmp_path / "a.ply", header, broken))
-    huge = struct.pack("<fffIff", 1, 2, 3, 2**32 - 1, 7, 8)
-    with pytest.raises(FormatError, match=r"byte \d+: expected a list that fits .* 4,294,967,295"):
-        read_cloud(save(tmp_path / "a.ply", header, huge))
-    header = header.replace("binary_little_endian", "ascii")
-    with pytest.raises(FormatError, match="expected vertices without lists in an ASCII file"):
-        read_cloud(save(tmp_path / "a.ply", header, b"1 2 3 2 7 8\n4 5 6 2 9 10\n"))
+def write_lists(path, order, lists, place, *, code="d", length="I"):
+    """Three points with a list before, between or after their coordinates."""
+    words = {"I": "uint", "b": "char", "Q": "uint64", "d": "double", "h": "short"}
+    axes = [f"property float {axis}" for axis in "xyz"]
+    axes.insert(place, f"property list {words[length]} {words[code]} spectrum")
+    head = f"ply\nformat {order} 1.0\nelement vertex {len(lists)}\n"
+    head = "\n".join([head + axes[0], *axes[1:], "end_header\n"])
+    body = b""
+    for point, values in zip(POINTS, lists, strict=True):
+        row, form = [*point], ["f"] * 3
+        row[place:place] = [len(values), *values]
+        form[place:place] = [length, code * len(values)]
+        if order == "ascii":
+            body += (" ".join(map(str, row)) + "\n").encode()
+        else:
+            body += struct.pack(ORDERS[order] + "".join(form), *row)
+    return save(path, head, body)
+
+
+@pytest.mark.parametrize("order", ["ascii", *ORDERS])
+@pytest.mark.parametrize("place", [0, 1, 3])
+@pytest.mark.parametrize("length", ["I", "b", "Q"])
+@pytest.mark.parametrize("lists", [[(1, 2), (3, 4), (5, 6)], [(1, 2), (3,), ()], [(), (1,), ()]])
+def test_lists_of_vertices_have_any_length_and_place(tmp_path, order, place, length, lists):
+    cloud = read_cloud(write_lists(tmp_path / "a.ply", order, lists, place, length=length))
+    np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
+    if len(lists[1]) == 2:
+        assert cloud.fields["spectrum"].tolist() == [[1, 2], [3, 4], [5, 6]]
+        assert cloud.fields["spectrum"].dtype == np.float64
+        assert cloud.notes == ()
+    else:
+        assert cloud.fields == {}
+        left = "lists left out, as they are empty or differ in length: spectrum"
+        assert cloud.notes == (left,)
+
+
+@pytest.mark.parametrize("order", ["ascii", *ORDERS])
+def test_lists_longer_than_a_block_are_read(tmp_path, order, monkeypatch):
+    monkeypatch.setattr(ply, "_BYTES_AT_ONCE", 64)
+    lists = [range(1000), range(3), range(1000)]
+    cloud = read_cloud(write_lists(tmp_path / "a.ply", order, lists, 1, code="h"))
+    np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("lists", [[(1, 2)] * 3, [(1, 2), (3,), (4, 5, 6)]])
+def test_lists_that_the_file_cannot_hold_are_damage_or_a_cut(tmp_path, order, lists):
+    whole = write_lists(tmp_path / "a.ply", order, lists, 3, length="b").read_bytes()
+    start = whole.index(b"end_header\n") + 11
+    (tmp_path / "a.ply").write_bytes(whole[:-1])
+    message = r"a\.ply: byte \d+: expected 1 more records of vertex, got \d+ bytes without a whole"
+    with pytest.raises(FormatError, match=message):
+        read_cloud(tmp_path / "a.ply")
+    for length in (-1, 127):
+        damaged = bytearray(whole)
+        struct.pack_into("b", damaged, start + 12, length)
+        (tmp_path / "a.ply").write_bytes(damaged)
+        with pytest.raises(FormatError, match=r"expected 3 more records .*; the file is cut off"):
+            read_cloud(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("word", ["1", "3", "-2", "2.5", "nan", "1e300", "five"])
+def test_lists_of_text_fill_their_lines(tmp_path, word):
+    path = write_lists(tmp_path / "a.ply", "ascii", [(1, 2), (3, 4), (5, 6)], 0)
+    path.write_bytes(path.read_bytes().replace(b"\n2 3 4", f"\n\n{word} 3 4".encode()))
+    with pytest.raises(FormatError, match=r"a\.ply: line 11: expected a record of vertex, got '"):
+        read_cloud(path)
+
+
+def test_numbers_beside_lists_of_text_have_the_types_of_their_properties(tmp_path):
+    path = write_lists(tmp_path / "a.ply", "ascii", [(1, 2), (3,), ()], 3, code="h")
+    for number in ("2.5", "40000", "nan"):
+        path.write_bytes(path.read_bytes().replace(b"2 1 2", f"2 1 {number}".encode()))
+        with pytest.raises(FormatError, match="expected spectrum to be numbers of type short"):
+            read_cloud(path)
+
+
+@pytest.mark.parametrize("order", ["ascii", *ORDERS])
+def test_records_that_the_header_does_not_count_are_told(tmp_path, order):
+    body = text_body() if order == "ascii" else binary_body(ORDERS[order])
+    header = HEADER.format(order=order).replace("vertex 3", "vertex 2")
+    path = save(tmp_path / "a.ply", header, body)
+    if order == "ascii":
+        cloud = read_cloud(path)
+        assert len(cloud) == 2
+        rest = len(text_body().splitlines()[2]) + 1
+        assert cloud.notes == (
+            f"{rest} bytes after its last point left out, as its header counts no more",
+        )
+    else:
+        # pyntcloud calls columns of float64 "float".
+        with pytest.raises(FormatError, match=r"expected the end of the file.* 17 more bytes"):
+            read_cloud(path)
+        short = HEADER.format(order=order)
+        np.testing.assert_array_equal(
+            read_cloud(save(path, short, body + bytes(4000))).coordinates,
+            np.array(POINTS, np.float32),
+        )
+
+
+def test_truth_values_of_pyntcloud_are_read(tmp_path):
+    header = HEADER.format(order="binary_little_endian").replace("uchar red", "bool red")
+    fields = read_cloud(save(tmp_path / "a.ply", header, binary_body("<"))).fields
+    assert fields["color"].tolist() == [[255, 128, 7]] * 3
 
 
 @pytest.mark.parametrize("order", ["ascii", *ORDERS])
@@ -175,7 +261,8 @@ def test_truncated_file_names_the_byte(tmp_path):
         (("vertex 3", "point 3"), "expected an element vertex with properties, got elements point"),
         (("float y", "float why"), "expected fields x, y, z, got 'x', 'why', 'z', 'red'"),
         (("vertex 3", "vertex 0"), "expected at least one point, got none"),
-        (("float z", "list uchar float z"), "expected vertices without lists in an ASCII file"),
+        (("float z", "list uchar float z"), "line 13: expected a record of vertex, got '1.5 -2.0"),
+        (("uchar red", "list float uchar red"), "line 8: expected a line of a PLY header"),
     ],
 )
 def test_broken_headers_name_the_line(tmp_path, change, message):

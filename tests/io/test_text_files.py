@@ -199,6 +199,39 @@ def test_text_between_blank_lines_and_comments(tmp_path):
         read_cloud(tmp_path / "a.txt")
 
 
+@pytest.mark.parametrize("has_arrow", [True, False])
+def test_counts_come_before_the_points_of_each_scan(tmp_path, monkeypatch, has_arrow):
+    if not has_arrow:
+        monkeypatch.setattr(text, "parse_numbers", lambda *_: None)
+    rows = [f"{i} 1.5 -2 {i} 255 128 7\n" for i in range(50)]
+    scans = [rows[:20], rows[20:21], rows[21:]]
+    counted = "".join(f"{len(scan)}\n{''.join(scan)}" for scan in scans)
+    expected = read_cloud(save(tmp_path / "a.pts", "".join(rows)))
+    for at_once in (40, 1 << 22):
+        monkeypatch.setattr(text, "CHARACTERS_AT_ONCE", at_once)
+        cloud = read_cloud(save(tmp_path / "b.pts", counted))
+        np.testing.assert_array_equal(cloud.coordinates, expected.coordinates)
+        assert cloud.fields.keys() == expected.fields.keys()
+        assert cloud.notes == expected.notes
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_more_points_than_their_count_are_told(tmp_path, count):
+    cloud = read_cloud(save(tmp_path / "a.pts", f"{count}\n0 1.5 -2\n3 4 1e3\n"))
+    assert cloud.coordinates.tolist() == POINTS
+    assert cloud.notes == (f"the line before its points says {count}, but 2 follow",)
+
+
+def test_a_few_points_may_have_many_columns(tmp_path):
+    rows = np.arange(36.0).reshape(3, 12)
+    np.savetxt(tmp_path / "a.txt", rows)
+    cloud = read_cloud(tmp_path / "a.txt")
+    np.testing.assert_array_equal(cloud.coordinates, rows[:, :3])
+    assert cloud.fields["column_12"].tolist() == [11, 23, 35]
+    (note,) = cloud.notes
+    assert "taken as x y z column_4 column_5 column_6 column_7 ... column_12; if" in note
+
+
 def test_names_in_the_first_line_name_the_columns(tmp_path):
     text = "R,G,B,X,Y,Z,Label,height\n255,0,7,1,2,3,4,0.5\n"
     cloud = read_cloud(save(tmp_path / "a.txt", text))
@@ -253,6 +286,15 @@ def test_written_text_says_what_its_columns_are(tmp_path):
             "'X Y Z R G B Scalar field'; name the 7 columns with --columns, or put _ in place",
         ),
         ("9\n0 1 2\n3 4 5\n", "expected 9 points, as the line before them says, got 2; the file"),
+        ("3\n0 1 2\n3 4 5\n", "expected 3 points, as the line before them says, got 2; the file"),
+        ("1\n0 1 2\n2\n3 4 5\n", "expected 3 points, as the line before them says, got 2"),
+        ("-2\n0 1 2\n3 4 5\n", "line 1: expected a count of points or a point, got '-2'; corr"),
+        ("2.5\n0 1 2\n3 4 5\n", "line 1: expected a count of points or a point, got '2.5'"),
+        ("nan\n0 1 2\n3 4 5\n", "line 1: expected a count of points or a point, got 'nan'"),
+        (f"{10**20}\n0 1 2\n", "line 1: expected a count of points or a point, got '1000"),
+        ("0 1 2\n2\n3 4 5\n", "line 2: expected 3 numbers, got '2'; repair or delete"),
+        ("0,1,2\n3 4 5\n", "line 2: expected 3 numbers, got '3 4 5'; separate all numbers with c"),
+        ("0 1 2\n3;4;5\n", "line 2: expected 3 numbers, got '3;4;5'; separate all .* with blanks"),
         ("2\n1\n0 0 0\n", "line 2: expected a point after the count of points, got a second count"),
         (
             "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n",
@@ -262,7 +304,6 @@ def test_written_text_says_what_its_columns_are(tmp_path):
             f"{'1 ' * 900}\n{'2 ' * 900}\n# z\n{'3 ' * 900}\n",
             "expected a row for each point, got 3 rows of 900 numbers; transpose them",
         ),
-        ("0,1,2\n3 4 5\n", "line 2: expected 3 numbers, got '3 4 5'"),
         ("a b c\n0 1 2\n", "line 1: expected numbers or names of columns with x, y and z, got 'a"),
         ("x y z x\n0 1 2 3\n", "line 1: expected numbers or names of columns"),
         ("x y z\nx y z\n", "line 2: expected 3 numbers, got 'x y z'"),

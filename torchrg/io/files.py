@@ -270,9 +270,9 @@ def check_end(path: Path, stream: BinaryIO, record_bytes: int = 0) -> tuple[str,
     PCL fills files up to a page.
     """
     start = stream.tell()
-    rest = stream.read(_CHECKED_END).strip(b"\0 \t\r\n")
+    is_padding = not stream.read(_CHECKED_END).strip(b"\0 \t\r\n")
     num_bytes = os.fstat(stream.fileno()).st_size - start
-    if not rest or len(rest) < record_bytes:
+    if is_padding or num_bytes < record_bytes:
         return ()
     if not record_bytes:
         return (f"{num_bytes:,} bytes after its last point left out, as its header counts no more",)
