@@ -196,12 +196,6 @@ class GrowingConfig:
         _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
-    @property
-    def needs_sampling(self) -> bool:
-        """Whether a setting is ``auto``."""
-        faceted = self.faceted if self.facet_tolerance is not None else False
-        return "auto" in (self.min_size, self.facet_tolerance, faceted)
-
     def at_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Return the settings with numbers; see :meth:`PipelineConfig.at_sampling`."""
         least, tolerance = self.min_size, self.facet_tolerance

@@ -36,7 +36,7 @@ from torchrg.neighbors.knn import keep_within
 from torchrg.normals import ESTIMATORS
 from torchrg.precision import warn_of_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
-from torchrg.regions.growth import number_by_count
+from torchrg.regions.growth import needs_sampling, number_by_count
 from torchrg.regions.superpoints import merge_copies
 from torchrg.structures import UNLABELED, Neighbors, Rows, Segmentation, Superpoints
 
@@ -268,7 +268,7 @@ def _split_places(inverse: Tensor, objects: Tensor, num_places: int) -> tuple[Ro
 def _has_auto(config: PipelineConfig) -> bool:
     """Return whether a setting that counts is measured."""
     scope = config.normals.method == "consensus" and config.normals.noise_scope
-    return scope == "auto" or config.growing.needs_sampling
+    return scope == "auto" or needs_sampling(config.growing)
 
 
 @of_clouds

@@ -10,8 +10,8 @@ from tests.regions.test_refine import flat_cloud, scattered, with_settings
 from torchrg import load_config, segment_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.fit import RegionPlanes, fit_regions
-from torchrg.regions.levels import split_levels
 from torchrg.regions.repair import assign_levels, merge_coplanar, refine_regions
+from torchrg.regions.splits import split_levels
 
 CONFIG = with_settings(min_size=50, facet_tolerance=0.005)
 NOISE = 0.003

@@ -47,7 +47,7 @@ _WITH_COLOR = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
 _FIRST_LAYERED_FORMAT = 6
 """Point formats from here on are compressed field by field."""
 _REPAIR = "convert it to .las with LASzip or PDAL, or copy it again"
-"""What to do about a file that laspy does not read, which may be damaged or of a rare kind."""
+"""Repair of a file that laspy does not read, which may be damaged or of a rare kind."""
 _POINTWISE, _MAX_PACKING = 1, 3
 """LASzip's compressor without chunks, and the last version of its compression that lazrs reads."""
 _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
@@ -56,7 +56,7 @@ which is a type, a size and a version."""
 _PACKING = ("laszip encoded", "copc")
 """Owners of the records that say how the points lie in the file."""
 _UNDESCRIBED = "Un-registered ExtraBytes"
-"""What laspy says of bytes that no record describes."""
+"""Message of laspy about bytes that no record describes."""
 _RANGE_BITS = 0b110
 """Bits of the options of an extra dimension that promise its least and its largest value."""
 _UNFIT = "_value"

@@ -21,11 +21,10 @@ from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
-from torchrg.regions.bridges import cut_bridges, find_mixed_regions
 from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
 from torchrg.regions.fit import LEAST_FITTED, RegionFits
-from torchrg.regions.levels import split_levels
 from torchrg.regions.repair import merge_facets, refine_regions
+from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
 from torchrg.structures import UNLABELED, Neighbors
 
 _ROOTS_AT_ONCE = 1024
@@ -124,10 +123,16 @@ def grow_regions(
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
-    if settings.needs_sampling:
+    if needs_sampling(settings):
         settings = settings.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
     labels = label_regions(cloud, grow(cloud, settings, chunk_size), settings, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
+
+
+def needs_sampling(config: GrowingConfig) -> bool:
+    """Whether a setting is ``auto``, to be chosen by :func:`measure_sampling`."""
+    faceted = config.faceted if config.facet_tolerance is not None else False
+    return "auto" in (config.min_size, config.facet_tolerance, faceted)
 
 
 def label_regions(
