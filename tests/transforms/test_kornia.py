@@ -7,7 +7,7 @@ from kornia.augmentation import AugmentationSequential, CenterCrop, RandomHorizo
 from kornia.geometry.camera import PinholeCamera
 
 from torchrg.depth import depth_to_points, segment_depth
-from torchrg.errors import ShapeError
+from torchrg.errors import DepthWarning, ShapeError
 from torchrg.transforms import DepthToCloud, SegmentDepth, fuse_depth
 
 HEIGHT, WIDTH = 60, 80
@@ -65,6 +65,21 @@ def test_a_batch_of_cameras_is_taken():
     assert torch.equal(points, depth_to_points(depth, CAMERA.expand(2, 3, 3)))
     found = SegmentDepth()({"depth": depth[:, None], "intrinsics": pinhole(2)})
     assert found["plane"].shape == (2, HEIGHT, WIDTH)
+
+
+@pytest.mark.filterwarnings("ignore:.*an optical axis off the center")
+def test_a_camera_of_another_size_is_doubted():
+    depth = torch.full((HEIGHT // 2, WIDTH // 2), 2.0)
+    small = pinhole().scale(torch.tensor([0.5]))
+    # Kornia leaves half a pixel out of its scaling, which no check may ask for.
+    segment_depth(depth, small)
+    for call in (
+        lambda: segment_depth(depth.repeat(2, 3), pinhole()),
+        lambda: SegmentDepth()({"depth": depth[None], "intrinsics": pinhole()}),
+        lambda: DepthToCloud()({"depth": depth[None], "intrinsics": pinhole()}),
+    ):
+        with pytest.warns(DepthWarning, match="got a PinholeCamera of 80 x 60; scale it"):
+            call()
 
 
 def test_what_is_no_camera_is_refused():

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes, has_values
+from torchrg._checks import as_tensor, check_floating, check_shapes, has_values, is_tensor
 from torchrg.errors import ConfigError, DepthWarning
 from torchrg.structures import FARTHEST
 
@@ -55,7 +55,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         tensor([[-1., nan],
                 [-1.,  1.]])
     """
-    intrinsics = read_intrinsics("depth_to_points", intrinsics)
+    intrinsics = read_intrinsics("depth_to_points", intrinsics, depth)
     check_shapes(
         "depth_to_points",
         depth=(depth, "B H W"),
@@ -81,24 +81,38 @@ def _unproject(depth: Tensor, intrinsics: Tensor, poses: Tensor | None) -> Tenso
     return points.to(poses.dtype) @ poses[:, None, :3, :3].mT + poses[:, None, None, :3, 3]
 
 
-def read_intrinsics(caller: str, source: Any) -> Tensor:  # noqa: ANN401
+def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa: ANN401
     """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)`` of pinhole cameras without skew.
 
     ``source`` are such matrices, tensors or arrays, those of 4 x 4 as kornia has them, or its
-    ``PinholeCamera``, of which the intrinsics are taken and nothing else.
+    ``PinholeCamera``, of which the intrinsics are taken; its images should have the size of
+    ``depth`` ``(*, H, W)``.
 
     Raises:
         ShapeError: If it is no tensor, array or camera.
         ConfigError: If it is no such matrix.
 
+    Warns:
+        DepthWarning: If a ``PinholeCamera`` is of images of another size.
+
     Example:
-        >>> read_intrinsics("f", torch.eye(4)[None]).shape
+        >>> read_intrinsics("f", torch.eye(4)[None], torch.zeros(2, 3)).shape
         torch.Size([1, 3, 3])
     """
     tensor = as_tensor(caller, "intrinsics", getattr(source, "camera_matrix", source))
     tensor = tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
     if tensor.shape[-2:] == (3, 3) and has_values(tensor):
         check_camera(caller, tensor)
+    sides = [getattr(source, side, None) for side in ("height", "width")]
+    if all(is_tensor(side) and has_values(side) for side in sides):
+        height, width = (int(side.flatten()[0]) for side in sides if side is not None)
+        if (height, width) != tuple(depth.shape[-2:]):
+            warnings.warn(
+                f"{caller}: expected intrinsics of images of {depth.shape[-1]} x "
+                f"{depth.shape[-2]} pixels, got a PinholeCamera of {width} x {height}; scale it.",
+                DepthWarning,
+                stacklevel=3,
+            )
     return tensor
 
 

@@ -72,7 +72,7 @@ def segment_depth(
         ([0, 0, 1, 1], [2.0, 3.0])
     """
     depth = as_tensor("segment_depth", "depth", depth)
-    intrinsics = read_intrinsics("segment_depth", intrinsics)
+    intrinsics = read_intrinsics("segment_depth", intrinsics, depth)
     intrinsics = intrinsics[0] if intrinsics.shape[:-2] == (1,) else intrinsics
     check_shapes(
         "segment_depth",

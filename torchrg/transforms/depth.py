@@ -34,10 +34,10 @@ class DepthTransform(SampleTransform):
         """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
         example = "{'depth': depth, 'intrinsics': matrix}"
         check_sample(type(self).__name__, sample, example)
-        key = self.key(sample, "intrinsics")
+        key, depth = self.key(sample, "intrinsics"), self.read(sample, "depth")
         if key in sample:
-            sample = {**sample, key: read_intrinsics(type(self).__name__, sample[key])}
-        depth, intrinsics = self.read(sample, "depth"), self.read(sample, "intrinsics")
+            sample = {**sample, key: read_intrinsics(type(self).__name__, sample[key], depth)}
+        intrinsics = self.read(sample, "intrinsics")
         if (
             depth.ndim not in (2, 3, 4)
             or (depth.ndim > 2 and depth.shape[-3] != 1)
