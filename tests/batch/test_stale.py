@@ -185,8 +185,14 @@ def test_a_file_that_a_user_changed_stays_when_options_change(root, out, convert
     assert "superpoint.npy" in again.err
 
 
-def test_a_removal_that_is_killed_at_any_moment_goes_on(root, out, convert, monkeypatch):
+@pytest.mark.parametrize("has_record", [True, False])
+def test_a_removal_that_is_killed_at_any_moment_goes_on(
+    root, out, convert, monkeypatch, has_record
+):
     assert convert("scannet", root, out, "--layout", "mask3d").code == 0
+    record = out / "train" / MOVED / RECORD
+    if not has_record:
+        record.unlink()
     start = shutil.copytree(out, out.with_name("start"))
     move(root)
     jobs = list_jobs(ScanNetSource(root, load_config("classic"), layout="mask3d"), out)
@@ -218,6 +224,9 @@ def test_a_removal_that_is_killed_at_any_moment_goes_on(root, out, convert, monk
                 break
             except KeyboardInterrupt:
                 pass
+        # The record stays until all files that it names are gone.
+        left_over = [name for name in files_of(out) if name not in expected[0]]
+        assert record.exists() or not has_record or not left_over
         assert remove() == expected
     assert moment > 6
 
