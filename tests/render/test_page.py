@@ -310,11 +310,14 @@ def test_points_are_as_large_as_the_space_around_them():
     rng = np.random.default_rng(0)
     dense, sparse = rng.random((4000, 3)), rng.random((4000, 3)) * 2 + 5
     dense[:, 2] = sparse[:, 2] = 0
-    page = make_page(Result(Cloud(np.concatenate([dense, sparse]))))
+    points = np.concatenate([dense, sparse])
+    page = make_page(Result(Cloud(points)))
     radii = unpacked(page)["radii"][:, 0]
     is_sparse = places(page)[:, 0] > 3
     octaves = (np.median(radii[is_sparse]) - np.median(radii[~is_sparse])) / 16
     assert octaves == pytest.approx(1, abs=0.25)
+    unlabeled = make_page(Result(Cloud(points, {"labels": np.full(8000, -1)})))
+    assert unpacked(unlabeled)["radii"].max() <= 128
 
 
 def test_the_table_as_csv_names_planes_as_the_file_does():

@@ -31,6 +31,24 @@ def test_spacing_along_a_line_is_its_step():
     assert 0.8 < float(sample_surface(line).spacing.median()) < 1.3
 
 
+def test_only_discs_in_planes_grow_where_points_are_sparse(rng):
+    dense, sparse = plane_grid(0.01), plane_grid(0.03) + torch.tensor([5.0, 0, 0])
+    stray = 3 * torch.rand(40, 3, generator=rng) + torch.tensor([0.0, 3, 1])
+    surface = sample_surface(torch.cat([dense, sparse, stray]))
+    usual, kind = (
+        surface.spacing.median(),
+        torch.bucketize(
+            surface.rows, torch.tensor([len(dense), len(dense) + len(sparse)]), right=True
+        ),
+    )
+    assert surface.spacing[kind == 2].median() > 4 * usual
+    for labels in (None, torch.where(kind == 2, -1, kind)):
+        found = surface.disc_spacing(4.0, labels)
+        assert torch.equal(found[kind < 2], surface.spacing[kind < 2].clamp(max=4 * usual))
+        assert (found[kind == 2] <= usual).double().mean() > 0.8
+    assert (surface.disc_spacing(4.0, torch.where(kind == 2, -1, kind))[kind == 2] <= usual).all()
+
+
 def test_duplicates_count_once(rng):
     points = torch.rand(3000, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
     once, many = sample_surface(points), sample_surface(points.repeat(5, 1))

@@ -125,12 +125,15 @@ def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
     return Shown(rows, levels, points, fields, surface, sides)
 
 
-def radii_of(surface: Surface) -> Tensor:
+def radii_of(shown: Shown) -> Tensor:
     """Return the radius of each point as a byte, 16 steps to an octave, 128 the usual one."""
+    surface, labels = shown.surface, shown.fields.get("labels")
     usual = float(surface.spacing.median()) if len(surface.spacing) else 0.0
     if usual == 0:
         return torch.full((len(surface.rows),), _USUAL_RADIUS, dtype=torch.uint8)
-    octaves = (surface.spacing / usual).clamp(1 / _LARGEST_SPACING, _LARGEST_SPACING).log2()
+    labels = None if labels is None else labels[surface.rows]
+    ratio = surface.disc_spacing(_LARGEST_SPACING, labels) / usual
+    octaves = ratio.clamp(min=1 / _LARGEST_SPACING).log2()
     return (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round().to(torch.uint8)
 
 

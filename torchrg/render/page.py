@@ -237,7 +237,7 @@ def _describe_cloud(
     steps = ((shown.points - low) * (_STEPS / PAGE_EXTENT)).round().clamp(0, _STEPS)
     arrays: dict[str, NDArray[np.generic]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
-    radii = radii_of(shown.surface)
+    radii = radii_of(shown)
     arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
     if planes:
         arrays["table"] = np.frombuffer(encode_csv(describe_shown(result, frame)), np.uint8)

@@ -35,7 +35,7 @@ _POINTS_AT_ONCE = 131_072
 _RADIUS = 1.3
 """Radius of a disc in units of the local spacing. Such discs close a surface but for a few gaps."""
 _LARGEST = 4
-"""Largest radius of a disc in units of the usual one, so that stray points stay small."""
+"""Largest radius of a disc in a plane in units of the usual one, which elsewhere is the largest."""
 _WIDEST = 0.02
 """Largest radius of a disc in widths of the picture, which bounds the time of drawing it."""
 _ALWAYS, _MAX_RADIUS = 8.0, 64.0
@@ -59,6 +59,7 @@ def draw_picture(
     colors: Tensor,
     normals: Tensor | None,
     *,
+    labels: Tensor | None = None,
     supersampling: int,
 ) -> Tensor:
     """Draw points of a cloud as discs, close gaps, shade, and average pixels.
@@ -69,6 +70,7 @@ def draw_picture(
         is_shown: Which of its n points to draw, shape ``(n,)``, bool.
         colors: Colours of all points, shape ``(N, 3)``, uint8.
         normals: Normals of all points, shape ``(N, 3)``. Default: those of the voxels.
+        labels: Plane of each of the n points, shape ``(n,)``, or negative.
         supersampling: Pixels along the side of each pixel of the picture.
 
     Returns:
@@ -76,7 +78,7 @@ def draw_picture(
     """
     width, height = int(camera.width), int(camera.height)
     project = projection_of(camera, surface.origin, finer=supersampling)
-    lengths = _RADIUS * surface.spacing.clamp(max=_LARGEST * float(surface.spacing.median()))
+    lengths = _RADIUS * surface.disc_spacing(_LARGEST, labels)
     places = is_shown.nonzero().squeeze(-1)
     radius, length = _usual_radius(project, surface.points, lengths, places)
     widest = supersampling * min(max(_ALWAYS, _WIDEST * width), _MAX_RADIUS)
@@ -229,13 +231,14 @@ def render_cloud(
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
         return _white(height or round(0.75 * width), width, cloud.device)
+    planes = None if planes is None else planes[surface.rows]
     near = surface.spacing <= _FAR_APART * surface.spacing.median()
     is_shown = torch.ones_like(near)
     if view == "sensor":
         camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
     else:
         upward = upward.to(surface.points)
-        sides = find_sides(surface, None if planes is None else planes[surface.rows], upward)
+        sides = find_sides(surface, planes, upward)
         viewpoint = choose_viewpoint(
             surface, sides, view, upward, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
         )
@@ -243,7 +246,9 @@ def render_cloud(
         shown = surface.points[is_shown & near].double() + surface.origin
         axes = view_axes(viewpoint.toward, viewpoint.up)
         camera = fit_camera(shown, axes, width=width, height=height)
-    return draw_picture(camera, surface, is_shown, paint, slant, supersampling=supersampling)
+    return draw_picture(
+        camera, surface, is_shown, paint, slant, labels=planes, supersampling=supersampling
+    )
 
 
 def render_points(

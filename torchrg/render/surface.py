@@ -65,6 +65,22 @@ class Surface(NamedTuple):
         best = heights.argmin(dim=1)
         return normals.index_copy(0, at_edge, around[torch.arange(len(best)), best])
 
+    def disc_spacing(self, most: float, labels: Tensor | None = None) -> Tensor:
+        """Return the spacing that a disc at each of the n points closes, shape ``(n,)``.
+
+        It is at most ``most`` times the usual one in a plane, and at most the usual one elsewhere,
+        so that stray points stay small.
+
+        Args:
+            most: Largest ratio to the usual spacing.
+            labels: Plane of each of the n points, shape ``(n,)``, or negative. Default: points are
+                in a plane where their voxels are.
+        """
+        in_plane = (self.normals != 0).any(dim=1)[self.voxel_of]
+        if labels is not None:
+            in_plane = in_plane & (labels >= 0)
+        return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, most, 1.0))
+
 
 def sample_surface(points: Tensor) -> Surface:
     """Sort the finite points of a cloud into voxels, and measure the surface around each voxel.
