@@ -2,7 +2,8 @@
 
 Each scan leaves an entry of its own among its files, and a list is its entries in natural order. So
 it holds whatever scans are there, whichever commands wrote them, and equal scans give equal lists.
-Lists of names that a program brings itself stay, and get only what they lack.
+Lists of names that a program brings itself stay, and get only what they lack. A scan is on the list
+of one split.
 """
 
 import json
