@@ -205,7 +205,7 @@ def test_what_are_no_objects_is_refused_in_one_line(scans, tmp_path, run, comman
     told = run("convert", "folder", scans[0], tmp_path / "out", "--within", field)
     assert told.code == 3
     assert message in told.err
-    assert set(files(tmp_path)) == {".torchrg.lock", "report.json"}
+    assert set(files(tmp_path)) == {".torchrg.lock", ".torchrg.scans.json", "report.json"}
 
 
 def test_lengths_that_differ_in_a_folder_are_refused(scans, tmp_path, run):
@@ -216,7 +216,7 @@ def test_lengths_that_differ_in_a_folder_are_refused(scans, tmp_path, run):
     told = run("convert", "folder", tmp_path / "root", tmp_path / "out", "--within", "instance")
     assert told.code == 3
     assert "instance.npy: expected 500 rows" in told.err or "499" in told.err
-    assert set(files(tmp_path / "out")) == {".torchrg.lock", "report.json"}
+    assert set(files(tmp_path / "out")) == {".torchrg.lock", ".torchrg.scans.json", "report.json"}
 
 
 def test_frames_have_tables_too(tmp_path, run):
