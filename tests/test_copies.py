@@ -277,7 +277,7 @@ def test_commands_say_how_many_copies_there_are(points, tmp_path, run):
     for command in ("segment", "normals"):
         for name, count in (("a", 1), ("b", 0)):
             source, out = tmp_path / "in" / f"{name}.ply", tmp_path / f"{command}_{name}.npz"
-            assert run(command, source, "--out", out).err.count(said) == count
+            assert run(command, source, "--out", out).out.count(said) == count
         one, two = (np.load(tmp_path / f"{command}_{name}.npz")["normals"] for name in "ba")
         assert np.array_equal(two, np.concatenate([one, one]))
     done = run("convert", "folder", tmp_path / "in", tmp_path / "out", "--workers", 1)

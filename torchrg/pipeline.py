@@ -91,7 +91,7 @@ def segment_planes(
             found on the voxels. Default: all points are segmented.
         within: Object of each point, shape ``(N,)``, integers, to keep planes within objects: no
             plane has points of two of them, and the table names that of each. Where objects share
-            a position or a voxel, its size counts once for each. Default: planes go across.
+            a position or a voxel, it counts once for each of them. Default: planes go across.
         keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
             that :func:`make_superpoints` need not search them again.
         on_stage: Called with the name of each stage when it starts, and with ``"done"``.

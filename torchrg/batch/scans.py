@@ -301,7 +301,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
 
 
 def note_on_copies(num_copies: int, num_points: int) -> tuple[str, ...]:
-    """Return a warning if points of a cloud repeat the coordinates of others.
+    """Return a line for people if points of a cloud repeat the coordinates of others.
 
     Example:
         >>> note_on_copies(2, 3)

@@ -106,7 +106,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         scanner = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
         turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=scanner)
     for note in note_on_copies(distinct.num_copies, len(cloud)):
-        warn(f"{source}: {note}.")
+        say(f"{source}: {note}")
     provenance = describe_run(source, arguments.normals)
     names = ("orient", "viewpoint", *["columns"] * (arguments.columns is not None))
     provenance |= {name: getattr(arguments, name) for name in names}

@@ -228,7 +228,7 @@ def _segment(
             begin=advance,
         )
     for note in note_on_copies(seg.num_copies, len(cloud)):
-        warn(f"{source}: {note}.")
+        say(f"{source}: {note}")
     if arguments.layout is None:
         provenance = _describe(arguments, sources, seg)
         write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)

@@ -31,7 +31,7 @@ def canonical_order(points: Tensor | NDArray[np.floating], ties: Sequence[Tensor
     Points are sorted along a Morton curve through the bounding box, within one cell of it
     lexicographically; only exact duplicates keep the order they came in. It breaks ties between
     equal distances, and points close in this order are close in space, which makes every later
-    gather faster. ``ties`` are columns ``(N,)`` that order exact duplicates, the first one first.
+    gather faster. ``ties`` are columns ``(N,)`` by which exact duplicates are sorted.
 
     Returns:
         Row numbers, shape ``(N,)``, int64: ``points[order]`` is in canonical order.

@@ -2,7 +2,8 @@
 
 ``config`` is settings, a dictionary of them, a whole configuration, or the name of a preset; where
 none is passed it is that of :func:`torchrg.load_config`. ``changes`` are single settings, as in
-``k=30``, of a whole configuration as in ``**{"normals.k": 30}``.
+``k=30``, of a whole configuration as in ``**{"normals.k": 30}``. Points with equal coordinates
+count once and get one result, as in :func:`torchrg.segment_planes`.
 """
 
 from collections.abc import Mapping, Sequence
