@@ -230,10 +230,10 @@ def test_fronts_of_copies_count_once(points):
 
 
 def test_tables_of_equal_labels_are_equal_to_the_bit(points, rows):
-    seg = segment_planes(points)
-    single = summarize_planes(points, seg.normals, seg.labels)
-    planes = summarize_planes(points[rows], seg.normals[rows], seg.labels[rows])
-    for name in MADE:
+    seg = segment_planes(points, **{"planes.up": "z"})
+    single = summarize_planes(points, seg.normals, seg.labels, up="z")
+    planes = summarize_planes(points[rows], seg.normals[rows], seg.labels[rows], up="z")
+    for name in (*MADE, "kind"):
         assert torch.equal(getattr(planes, name), getattr(single, name)), name
         assert torch.equal(getattr(planes, name), getattr(seg.planes, name)), name
     assert torch.equal(planes.count, torch.bincount(seg.labels[rows] + 1)[1:])

@@ -109,10 +109,8 @@ def summarize_planes(
     planes = measure_planes(segments, places, fit, outline=outline)
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
-        planes = replace(
-            planes,
-            kind=classify_planes(planes, points, labels, unit_direction("summarize_planes", up)),
-        )
+        direction = unit_direction("summarize_planes", up)
+        planes = replace(planes, kind=classify_planes(planes, places, labels[rows], direction))
     if neighbors is not None:
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
