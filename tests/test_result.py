@@ -342,6 +342,17 @@ def test_a_table_of_others_in_a_folder_is_left_out(tmp_path, cloud, seg, content
     assert torch.equal(result.planes.count, seg.planes.count)
 
 
+def test_planes_of_points_anywhere_are_found(tmp_path, cloud, seg):
+    path = tmp_path / "a.ply"
+    torchrg.write_cloud(path, cloud, seg)
+    content = path.read_bytes()
+    # A lost byte makes any number of each field.
+    path.write_bytes(content[: len(content) // 2] + content[len(content) // 2 + 1 :] + b"\0")
+    planes = torchrg.read_result(path).planes
+    assert len(planes) > len(seg.planes)
+    assert (planes.adjacency.boundary_length >= 0).all()
+
+
 def test_no_planes_are_read_back_too(tmp_path):
     points = np.random.default_rng(0).random((40, 3)).astype(np.float32)
     cloud = Cloud(points)

@@ -209,6 +209,15 @@ def test_a_face_of_a_vertex_that_there_is_not_is_damage(tmp_path, order, wrong):
     )
 
 
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_face_of_more_corners_than_its_mesh_can_have_is_damage(tmp_path, order):
+    faces = [*make_faces(6), [0, 1] * 31]
+    cloud = read_cloud(write_mesh(tmp_path / "a.ply", make_points(), faces, order))
+    assert cloud.front is None
+    told = "its faces left out: expected faces of 30 vertices, got one of 62 corners"
+    assert cloud.notes == (told,)
+
+
 @pytest.mark.parametrize("place", ["first", "last"])
 @pytest.mark.parametrize("word", [b"x" * 500, b"nan", b"-3", b"1e300", b"2", b"4"])
 def test_words_and_lengths_that_are_none_are_damage(tmp_path, place, word):

@@ -16,7 +16,7 @@ POINTS = np.arange(12, dtype=np.float64).reshape(4, 3)
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-@pytest.mark.parametrize("name", ["points", "coord"])
+@pytest.mark.parametrize("name", ["points", "coord", "positions"])
 def test_archives_of_numpy_are_read(tmp_path, save, name):
     arrays = {
         name: POINTS,

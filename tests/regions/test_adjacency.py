@@ -113,7 +113,7 @@ def test_rows_taken_at_a_time_change_no_bit(monkeypatch):
 
 def test_planes_that_meet_far_away_are_measured_as_near_ones():
     # Shifted bytes make coordinates of any size, and edges between them as long.
-    pairs, cells = torch.tensor([0, 0, 1, 1, 2, 2]), torch.tensor([-3, -3, 2, 7, 7, 2])
+    pairs, cells = torch.tensor([0, 0, 1, 1, 2000, 2000]), torch.tensor([-3, -3, 2, 7, 7, 2])
     far = torch.tensor([-(2**53), -(2**53), 2**53, 5, 5, 2**53])
     for cell in (cells, far):
         expected = sorted(set(zip(pairs.tolist(), cell.tolist(), strict=True)))

@@ -24,8 +24,8 @@ from torchrg.io.colors import WIDEN, read_colors
 from torchrg.io.faces import Fronts
 from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import DAMAGES, check_promise, refusing
-from torchrg.io.headers import check_grid, distance_from_box
-from torchrg.structures import FARTHEST, Cloud
+from torchrg.io.headers import check_grid, distance_outside
+from torchrg.structures import FARTHEST, Cloud, bounding_box
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -115,7 +115,10 @@ def read_e57(path: Path, size: int) -> Cloud:
             points, fields = _read_points(path, pye57, file, header)
             # pye57 moves the bounds of a scan that has a pose, which is not the standard.
             bounds = () if scan.is_moved else _numbers(header.node, "cartesianBounds", _BOUNDS)
-            num_outside += bool(bounds and distance_from_box(points, np.reshape(bounds, (2, 3))))
+            finite = points[np.isfinite(points).all(axis=1)]
+            if bounds and len(finite):
+                box = np.reshape(bounds, (2, 3))
+                num_outside += distance_outside(*bounding_box(finite), box) > 0
             blocks.append(_to_world(points, fields, scan))
         notes = _unify_colors(path, blocks, [_limits_of(pye57, header) for header in headers])
         root = file.root

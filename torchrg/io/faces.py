@@ -15,6 +15,9 @@ Fronts = tuple[NDArray[np.float32] | None, tuple[str, ...]]
 """Front of each point of a cloud, as :attr:`torchrg.Cloud.front`, and notes on it."""
 _CORNERS_AT_ONCE = 1 << 18
 """Corners of faces that are added up together, which take some tens of megabytes."""
+_MAX_CORNERS = 2
+"""Corners of a face by the vertices of its mesh. A face with holes has the vertices of the edges
+that lead to them twice; a larger one is damage, for which no memory is taken."""
 _LEAST_AGREEMENT = 1e-3
 """Least length of a sum of normals as a share of the areas. A shorter one is rounding, as where
 each face is there twice, once for each of its sides."""
@@ -47,18 +50,23 @@ def find_fronts(
     """
     places, count = coordinates.astype(np.float64, copy=False), len(coordinates)
     sums, areas = np.zeros((3, count)), np.zeros(count)
-    for corners in (block.astype(np.int64) for block in faces):
+    for block in faces:
+        if block.shape[1] > _MAX_CORNERS * count:
+            raise FormatError(
+                f"expected faces of {count:,} vertices, got one of {block.shape[1]:,} corners"
+            )
+        corners = block.astype(np.int64)
         if corners.size and not 0 <= corners.min() <= corners.max() < count:
             wrong = corners.min() if corners.min() < 0 else corners.max()
             raise FormatError(f"expected faces of {count:,} vertices, got vertex {wrong:,}")
         at_once = max(_CORNERS_AT_ONCE // max(corners.shape[1], 1), 1)
         for start in range(0, len(corners) if corners.shape[1] > 2 else 0, at_once):
-            block = corners[start : start + at_once]
-            block = block[finite[block].all(axis=1)]
-            normals = _vector_areas(places, block)
+            part = corners[start : start + at_once]
+            part = part[finite[part].all(axis=1)]
+            normals = _vector_areas(places, part)
             sizes = np.linalg.norm(normals, axis=1)
             for total, values in zip((areas, *sums), (sizes, *normals.T), strict=True):
-                np.add.at(total, block.reshape(-1), np.repeat(values, block.shape[1]))
+                np.add.at(total, part.reshape(-1), np.repeat(values, part.shape[1]))
     length = np.linalg.norm(sums, axis=0)
     is_clear = length > _LEAST_AGREEMENT * areas
     fronts = np.where(is_clear, sums / np.where(is_clear, length, 1.0), 0.0)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from torchrg.errors import FormatError
 from torchrg.structures import FARTHEST
@@ -35,21 +35,27 @@ def check_grid(path: Path, what: str, scales: ArrayLike, offsets: ArrayLike) -> 
         )
 
 
-def distance_from_box(points: NDArray[np.floating], box: ArrayLike, step: ArrayLike = 0.0) -> float:
-    """Return how far points ``(N, 3)`` reach out of the box ``(2, 3)`` that a header names.
+def distance_outside(
+    low: ArrayLike, high: ArrayLike, box: ArrayLike, step: ArrayLike = 0.0
+) -> float:
+    """Return how far points from ``low`` to ``high`` reach out of the box that a header names.
 
     It is 0 within rounding, of which ``step`` is a part, and where the header knows no box.
-    Points that are not finite do not count.
+
+    Args:
+        low: Least coordinates, shape ``(3,)``.
+        high: Largest coordinates, shape ``(3,)``.
+        box: Least and largest coordinates by the header, shape ``(2, 3)``.
+        step: Step of the coordinates.
 
     Example:
-        >>> distance_from_box(np.eye(3), [[0, 0, 0], [1, 1, 0.5]])
+        >>> distance_outside([0, 0, 0], [1, 1, 1], [[0, 0, 0], [1, 1, 0.5]])
         0.5
     """
-    low, high = np.array(box, np.float64)
     # Programs that know no box leave zeros.
-    if not len(points) or not np.isfinite(box).all() or not np.any(box):
+    if not np.isfinite(box).all() or not np.any(box):
         return 0.0
-    least, most = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    outside = np.maximum(low - least, most - high)
-    allowed = np.maximum(2 * np.abs(step), _MAX_OUTSIDE * (most - least))
+    (least, most), extent = np.array(box, np.float64), np.subtract(high, low)
+    outside = np.maximum(least - low, high - most)
+    allowed = np.maximum(2 * np.abs(step), _MAX_OUTSIDE * extent)
     return float(outside.max()) if (outside > allowed).any() else 0.0

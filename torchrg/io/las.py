@@ -29,7 +29,7 @@ from torchrg.io.files import (
     first_line,
     refusing,
 )
-from torchrg.io.headers import LARGEST_INTEGER, check_grid, distance_from_box
+from torchrg.io.headers import LARGEST_INTEGER, check_grid, distance_outside
 from torchrg.structures import Cloud, bounding_box
 
 _SPELLING = Spelling(
@@ -56,7 +56,7 @@ which is a type, a size and a version."""
 _PACKING = ("laszip encoded", "copc")
 """Owners of the records that say how the points lie in the file."""
 _UNDESCRIBED = "Un-registered ExtraBytes"
-"""Message of laspy about bytes that no record describes."""
+"""Description that laspy gives to bytes that no record describes."""
 _RANGE_BITS = 0b110
 """Bits of the options of an extra dimension that promise its least and its largest value."""
 _UNFIT = "_value"
@@ -119,8 +119,8 @@ def read_las(path: Path, size: int) -> Cloud:
 def _notes_on(header: Any, columns: Columns, size: int) -> tuple[str, ...]:  # noqa: ANN401
     """Return what in a header contradicts the points, a line each."""
     notes = list[str]()
-    points = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    far = distance_from_box(points, [header.mins, header.maxs], header.scales)
+    low, high = ([end(columns[axis]) for axis in "xyz"] for end in (np.min, np.max))
+    far = distance_outside(low, high, [header.mins, header.maxs], header.scales)
     if far:
         notes.append(
             f"its points lie up to {far:.3g} outside of the box in its header; check its scales, "

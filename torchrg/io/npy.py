@@ -1,8 +1,9 @@
 """NumPy's own files: ``.npy``, one array, and ``.npz``, several by name. No pickle is ever loaded.
 
-``.npz``: ``points`` (or ``coord``), shape (N, 3), and any arrays of N rows, which become fields.
-Arrays of another length are left out, and so is what a result says about its planes. See
-:func:`torchrg.io.write_cloud` for all names of a result.
+``.npz``: ``points`` (or ``coord``, or Open3D's ``positions``), shape (N, 3) or records, or ``x``,
+``y`` and ``z``, and any arrays of N rows, which become fields. Arrays of another length are left
+out, and so is what a result says about its planes. See :func:`torchrg.io.write_cloud` for all names
+of a result.
 ``.npy``: an array (N, 3) or wider, the columns of which are named when it is read or by
 :data:`torchrg.io.fields.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
 """
@@ -43,7 +44,7 @@ from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Supe
 
 _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
-_COORDINATES = ("points", "coord")
+_COORDINATES = ("points", "coord", "positions")
 POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 """Arrays of a segmentation that have a row for each point."""
 KEPT_FIELDS = ("color",)

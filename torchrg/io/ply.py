@@ -263,12 +263,14 @@ def _read_vertices(
     parts: dict[str, list[Values]] = {prop.name: [] for prop in vertex.properties}
     for records in _read_records(path, stream, vertex, order, size, line_number):
         for prop in vertex.properties:
-            parts[prop.name] += records.values(path, prop)
-    lists = [prop.name for prop in vertex.properties if prop.length_code is not None]
-    widths = {name: {part.shape[1] for part in parts[name]} for name in lists}
-    uneven = [name for name in lists if len(widths[name]) != 1 or widths[name] == {0}]
-    kept = (name for name in parts if name not in uneven)
-    return {name: np.concatenate(parts[name] or [np.empty(0)]) for name in kept}, uneven
+            if prop.name in parts:
+                new = records.values(path, prop)
+                parts[prop.name] += new
+                shapes = {part.shape[1:] for part in (*parts[prop.name][:1], *new)}
+                if len(shapes) > 1 or shapes == {(0,)}:
+                    del parts[prop.name]
+    uneven = [prop.name for prop in vertex.properties if prop.name not in parts]
+    return {name: np.concatenate(known or [np.empty(0)]) for name, known in parts.items()}, uneven
 
 
 def _go_to(path: Path, stream: BinaryIO, header: _Header, place: int, size: int) -> int:
@@ -307,7 +309,7 @@ class _Records(NamedTuple):
         order: Byte order; empty for an ASCII file.
         starts: First byte of each record's values of a property, by its name.
         lengths: Numbers of these values.
-        ends: Byte after each record; the first one of the margin where it is not whole.
+        ends: Byte after each record; one after the content where it is not whole.
     """
 
     content: NDArray[np.uint8]
@@ -325,14 +327,23 @@ class _Records(NamedTuple):
         starts, lengths = self.starts[prop.name], self.lengths[prop.name]
         if prop.length_code is None:
             arrays = [numbers[starts]]
+        elif (lengths == lengths[:1]).all():
+            arrays = [_take(numbers, starts, length) for length in lengths[:1]]
         else:
-            is_even = (lengths == lengths[:1]).all()
-            arrays = [
-                numbers[part[:, None] + np.arange(length) * numbers.itemsize]
-                for length in (lengths[:1] if is_even else np.unique(lengths))
-                for part in [starts if is_even else starts[lengths == length]]
-            ]
+            each = np.unique(lengths)
+            arrays = [_take(numbers, starts[lengths == length], length) for length in each]
         return arrays if self.order else [_cast(path, prop, values) for values in arrays]
+
+
+def _take(numbers: Values, starts: NDArray[np.int64], length: int) -> Values:
+    """Return so many numbers from each start on, shape ``(n, length)``."""
+    steps = np.diff(starts)
+    if (steps == steps[:1]).all():
+        step = int(steps[0]) if len(steps) else 0
+        shape, strides = (len(starts), length), (step, numbers.itemsize)
+        return np.lib.stride_tricks.as_strided(numbers[starts[0] :], shape, strides)
+    taken: Values = numbers[starts[:, None] + np.arange(length) * numbers.itemsize]
+    return taken
 
 
 def _numbers_at_bytes(content: NDArray[np.uint8], order: str, code: str) -> Values:
@@ -413,10 +424,9 @@ def _read_binary(
     """Yield the records of a binary element with lists, and leave the stream at their end."""
     start, left, at_once = stream.tell(), element.num_records, _BYTES_AT_ONCE
     while left:
-        content = np.zeros(min(at_once, size - start) + _MARGIN, np.uint8)
         stream.seek(start)
-        stream.readinto(content[:-_MARGIN].data)  # type: ignore[attr-defined]
-        whole = len(content) - _MARGIN
+        content = np.fromfile(stream, np.uint8, min(at_once, size - start))
+        whole, content = len(content), np.append(content, np.zeros(_MARGIN, np.uint8))
         (first,) = _find_records(content, element, order, np.zeros(1, np.int64)).ends.tolist()
         if first > whole:
             if whole == size - start:
@@ -462,11 +472,9 @@ def _read_lines(
                 "copy it again."
             )
         lines, counts = (column[:left] for column in _count_words(block))
-        ends, numbers = np.cumsum(counts), list[float]()
-        with suppress(ValueError):
-            numbers += map(float, block.split()[: counts.sum()])
-        content = np.zeros(len(numbers) * 8 + _MARGIN, np.uint8)
-        content[:-_MARGIN] = np.array(numbers).view(np.uint8)
+        ends = np.cumsum(counts)
+        numbers = _parse_words(block.split()[: counts.sum()])
+        content = np.append(numbers.view(np.uint8), np.zeros(_MARGIN, np.uint8))
         records = _find_records(content, element, "", (ends - counts) * 8)
         if left == element.num_records and element.name != "vertex":
             surplus = max(int((ends * 8 - records.ends)[:1].sum()), 0)
@@ -485,6 +493,16 @@ def _read_lines(
         if not left:
             end = len(b"\n".join(block.split(b"\n")[: lines[-1] + 1]))
             stream.seek(end - len(block), os.SEEK_CUR)
+
+
+def _parse_words(words: list[bytes]) -> NDArray[np.float64]:
+    """Return the numbers that words are, up to the first that is none."""
+    with suppress(ValueError):
+        return np.fromiter(map(float, words), np.float64, len(words))
+    numbers = list[float]()
+    with suppress(ValueError):
+        numbers += map(float, words)
+    return np.array(numbers)
 
 
 def _count_words(block: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

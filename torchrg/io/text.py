@@ -3,9 +3,10 @@
 Marks are commas, semicolons or tabs; decimals may begin with a comma where that is not the mark. A
 first line of names (``x y z red green blue``, with or without ``#`` or ``//``) names the columns,
 unless names are given; without either :data:`torchrg.io.fields.COLUMNS_RULE` does. A line of one
-number before the first point is the count of points, as Leica's ``.pts`` begins. Plain numbers are
-parsed by pyarrow where it is installed; what it does not take is parsed here, which gives the same
-bits and says what is wrong. The rows of numbers in ASCII files of other formats are read here, too.
+number before the first point is the count of points, as Leica's ``.pts`` begins; its further scans
+begin with theirs. Plain numbers are parsed by pyarrow where it is installed; what it does not take
+is parsed here, which gives the same bits and says what is wrong. The rows of numbers in ASCII files
+of other formats are read here, too.
 """
 
 import csv
