@@ -8,13 +8,14 @@ A module takes tensors and gives what the next one takes, so that they stand in 
 >>> normals = nn.Sequential(Covariance(), Eigh(), Normal())(patches)
 >>> bool((normals[:, 2].abs() > 0.99).all())
 True
->>> robust = nn.Sequential(DetMCD(starts="planes"), Eigh(), Normal())
+>>> robust = nn.Sequential(DetMCD(starts="planes", min_dimension=2), Eigh(), Normal())
 >>> model = nn.Sequential(robust, nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 2))
 >>> model(patches).shape
 torch.Size([8, 2])
 
 Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, these to :class:`Eigh`, and this to
-:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator.
+:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator. A robust fit is that of the
+majority, on a line too: with ``min_dimension=2`` lines are set aside, as normals need planes.
 """
 
 from collections.abc import Callable
@@ -159,6 +160,7 @@ class DetMCD(_Function):
     small_sample: bool = False
     scaling: Scaling = "consistency"
     inliers: Inliers = "raw"
+    min_dimension: int = 0
     chunk_size: int = 4096
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
@@ -180,6 +182,7 @@ class FastMCD(_Function):
     quantile: float = 0.975
     num_starts: int = 500
     small_sample: bool = False
+    min_dimension: int = 0
     chunk_size: int = 16
 
     def forward(
@@ -206,6 +209,7 @@ class MVE(_Function):
     quantile: float = 0.975
     num_starts: int = 500
     exhaustive: bool = False
+    min_dimension: int = 0
     chunk_size: int = 64
 
     def forward(
@@ -232,6 +236,7 @@ class DetS(_Function):
     _: KW_ONLY
     quantile: float = 0.975
     starts: Starts = "robustbase"
+    min_dimension: int = 0
     chunk_size: int = 2048
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
@@ -254,6 +259,7 @@ class DetMM(_Function):
     quantile: float = 0.975
     starts: Starts = "robustbase"
     tuned_for: Target = "shape"
+    min_dimension: int = 0
     chunk_size: int = 2048
 
     def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:

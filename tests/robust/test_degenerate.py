@@ -13,6 +13,7 @@ from tests.robust.oracle_cases import (
     local_float32,
     normal_of,
 )
+from torchrg.errors import ConfigError
 from torchrg.robust import fit_detmcd, fit_dets
 
 
@@ -112,26 +113,59 @@ def test_half_of_the_points_on_a_plane_is_no_exact_mcd(rng):
     assert fit_dets(patch).exact_fit
 
 
-def test_all_points_on_a_line_or_in_one_place_have_no_fit(estimator, dtype, rng):
+def test_all_points_on_a_line_or_in_one_place_have_no_plane(estimator, dtype, rng):
     line = torch.rand(50, 1, generator=rng, dtype=dtype) * torch.tensor([0.0, 2.0, 0.0]).to(dtype)
     diagonal = torch.randint(-9, 9, (50, 1), generator=rng).to(dtype).expand(-1, 3)
     for patch in (line, diagonal, torch.full((50, 3), 0.1, dtype=dtype), torch.zeros(50, 3)):
-        fit = estimator(patch)
+        fit = estimator(patch, min_dimension=2)
         assert not fit.valid
         assert not fit.support.any()
         assert not fit.covariance.any()
+        whole = estimator(patch)
+        assert whole.exact_fit
+        assert whole.support.all()
+        wide = patch.double().numpy()
+        np.testing.assert_allclose(whole.location, wide.mean(axis=0), atol=1e-6)
+        np.testing.assert_allclose(whole.covariance, np.cov(wide.T), rtol=1e-5, atol=1e-6)
 
 
-def test_majority_on_a_line_leaves_the_plane_of_the_others(estimator, rng):
+@pytest.mark.parametrize("count", [25, 36])
+@pytest.mark.parametrize("free", [0, 1])
+def test_a_majority_on_a_line_or_in_one_place_is_fitted_as_one_that_nearly_is(
+    estimator, count, free
+):
+    numbers = np.random.default_rng(3)
+    noise, patch = numbers.standard_normal((count, 3 - free)), numbers.standard_normal((40, 3))
+    fits = []
+    for away in (0, 1e-6):
+        patch[:count, free:] = away * noise
+        fits.append(estimator(torch.from_numpy(patch.copy())))
+        assert fits[-1].support[:count].sum() > 0.6 * count
+        assert not fits[-1].support[count:].any()
+    exact, near = fits
+    assert exact.exact_fit
+    assert exact.support[:count].all()
+    assert not near.exact_fit
+    assert (exact.location - near.location).abs().max() < 0.4 * free + 1e-5
+
+
+def test_a_least_dimension_that_points_do_not_have_is_refused(estimator, rng):
+    patch = torch.rand(9, 3, generator=rng)
+    assert estimator(patch, min_dimension=1).valid
+    for wrong in (-1, 3, 10**23):
+        with pytest.raises(ConfigError, match="expected min_dimension from 0 to 2, of points of 3"):
+            estimator(patch, min_dimension=wrong)
+
+
+def test_majority_on_a_line_leaves_the_plane_of_the_others_to_normals(estimator, rng):
     line = torch.randint(-512, 512, (30, 1), generator=rng) * torch.tensor([0.5, 1.0, 2.0]) / 64
     patch = torch.cat([line.double(), tilted_plane(rng, 20)])
-    fit = estimator(patch)
-    assert fit.exact_fit
-    assert angle_deg(normal_of(fit.covariance), NORMAL) < 1e-5
     place = torch.cat([torch.full((30, 3), 0.3).double(), tilted_plane(rng, 20)])
-    fit = estimator(place)
-    assert fit.exact_fit
-    assert angle_deg(normal_of(fit.covariance), NORMAL) < 1e-5
+    for points in (patch, place):
+        fit = estimator(points, min_dimension=2)
+        assert fit.exact_fit
+        assert angle_deg(normal_of(fit.covariance), NORMAL) < 1e-5
+        assert estimator(points).support.tolist() == [True] * 30 + [False] * 20
 
 
 def test_two_lines_span_a_plane(estimator):
@@ -140,7 +174,7 @@ def test_two_lines_span_a_plane(estimator):
     first = torch.stack([steps, zero, zero], dim=1)
     second = torch.stack([steps[:15], zero[:15] + 3, zero[:15] + 1.5], dim=1)
     more = first[:10] + torch.tensor([25.0, 0.0, 0.0])
-    fit = estimator(torch.cat([first, more, second]))
+    fit = estimator(torch.cat([first, more, second]), min_dimension=2)
     assert fit.exact_fit
     assert fit.support.all()
     expected = np.array([0, -0.5, 1]) / np.hypot(0.5, 1)
@@ -150,10 +184,11 @@ def test_two_lines_span_a_plane(estimator):
 def test_few_points(estimator, rng):
     patches = torch.randn(4, 6, 3, generator=rng, dtype=torch.float64)
     for count in range(7):
-        fit = estimator(patches[:, :count])
-        assert_sound(fit)
-        assert (fit.valid == (count >= 3)).all()
-        assert (fit.exact_fit == (count == 3)).all()
+        for least in (0, 1, 2):
+            fit = estimator(patches[:, :count], min_dimension=least)
+            assert_sound(fit)
+            assert (fit.valid == (count > least)).all()
+            assert (fit.exact_fit == (least < count <= 3)).all()
     fit = estimator(patches[:, :3])
     normal = torch.linalg.cross(patches[:, 1] - patches[:, 0], patches[:, 2] - patches[:, 0])
     for covariance, expected in zip(fit.covariance, normal, strict=True):
@@ -220,16 +255,19 @@ def patches(draw):
     patch=patches(),
     name=st.sampled_from(sorted(ESTIMATORS)),
     fraction=st.sampled_from([0.5, 0.75, 1.0]),
+    least=st.sampled_from([0, 1, 2]),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 @settings(max_examples=40, deadline=None)
-def test_no_degenerate_patch_is_unsound(patch, name, fraction, dtype):
+def test_no_degenerate_patch_is_unsound(patch, name, fraction, least, dtype):
     options = {} if name in ("dets", "detmm") else {"support_fraction": fraction}
+    options["min_dimension"] = least
     points = torch.from_numpy(patch).to(dtype)
     fit = ESTIMATORS[name](points[None], **options)
     assert_sound(fit)
     wide = points.double().numpy()
-    assert fit.valid.item() <= (np.linalg.matrix_rank(wide - wide[0]) >= 2)
+    assert fit.valid.item() <= (np.linalg.matrix_rank(wide - wide[0]) >= least)
+    assert fit.valid.item() or least > 0
 
 
 def test_degenerate_patches_leave_their_neighbors_alone(estimator, rng):
@@ -238,7 +276,7 @@ def test_degenerate_patches_leave_their_neighbors_alone(estimator, rng):
     line = torch.zeros(50, 3, dtype=torch.float64)
     line[:, 0] = torch.arange(50)
     mixed = torch.stack([regular[0], plane, regular[1], line, regular[2], line * 0, regular[3]])
-    fit, clean = estimator(mixed), estimator(regular)
+    fit, clean = estimator(mixed, min_dimension=2), estimator(regular)
     assert torch.equal(fit.covariance[::2], clean.covariance)
     assert torch.equal(fit.support[::2], clean.support)
     assert fit.exact_fit.tolist() == [False, True] + [False] * 5

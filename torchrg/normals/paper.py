@@ -22,6 +22,9 @@ from torchrg.robust import RobustFit, fit_detmcd
 from torchrg.robust.scale import QN_FACTOR, qn_exceeds
 from torchrg.structures import Neighbors, NormalFit
 
+_PLANE = 2
+"""Dimension of a plane: a robust fit to points on a line says nothing of a normal."""
+
 
 def fit_normals_robust(
     patches: Tensor,
@@ -59,7 +62,7 @@ def fit_normals_robust(
         tensor([0., 0., 1.])
     """
     check_patches("fit_normals_robust", patches, mask, resolution)
-    robust = estimator(patches.detach(), mask, **settings)
+    robust = estimator(patches.detach(), mask, **{"min_dimension": _PLANE, **settings})
     return fit_normals_pca(patches, robust.support & robust.valid[..., None], resolution=resolution)
 
 

@@ -85,6 +85,7 @@ def fit_detmcd(
     small_sample: bool = False,
     scaling: Scaling = "consistency",
     inliers: Inliers = "raw",
+    min_dimension: int = 0,
     chunk_size: int = PATCHES_IN_CACHE,
 ) -> RobustFit:
     """Fit location and scatter to the majority of each patch by the deterministic MCD.
@@ -126,6 +127,8 @@ def fit_detmcd(
         inliers: Which distances are cut. ``"raw"``: those to the raw fit. ``"reweighted"``: these
             first, then those to location and covariance of what is left, which become
             ``sq_distances``; location and covariance stay.
+        min_dimension: Least dimension of a flat that is an exact fit: 0 for a place, 1 for a line,
+            2 for a plane. What lies on smaller ones is set aside; see :class:`RobustFit`.
         chunk_size: Patches worked on together.
 
     Returns:
@@ -166,7 +169,7 @@ def fit_detmcd(
         return _Concentrated(torch.cat(members, dim=1), torch.cat(determinants))
 
     settings = _Settings(support_fraction, quantile, small_sample, scaling, inliers)
-    return _fit_mcd("fit_detmcd", patches, mask, settings, chunk_size, search)
+    return _fit_mcd("fit_detmcd", patches, mask, settings, min_dimension, chunk_size, search)
 
 
 @patchwise
@@ -178,6 +181,7 @@ def fit_fastmcd(
     quantile: float = 0.975,
     num_starts: int = 500,
     small_sample: bool = False,
+    min_dimension: int = 0,
     generator: torch.Generator | None = None,
     chunk_size: int = 16,
 ) -> RobustFit:
@@ -215,7 +219,7 @@ def fit_fastmcd(
         return _concentrate(columns, _distinct_best(quick, _NUM_KEPT), size, size, floor)
 
     settings = _Settings(support_fraction, quantile, small_sample)
-    return _fit_mcd("fit_fastmcd", patches, mask, settings, chunk_size, search)
+    return _fit_mcd("fit_fastmcd", patches, mask, settings, min_dimension, chunk_size, search)
 
 
 def _fit_mcd(
@@ -223,6 +227,7 @@ def _fit_mcd(
     patches: Tensor,
     mask: Tensor | None,
     settings: _Settings,
+    min_dimension: int,
     chunk_size: int,
     search: Callable[[list[Tensor], Tensor, int], _Concentrated],
 ) -> RobustFit:
@@ -270,6 +275,7 @@ def _fit_mcd(
         settings.quantile,
         chunk_size,
         estimator,
+        min_dimension,
         weigh=weigh,
     )
 

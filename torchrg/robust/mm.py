@@ -61,6 +61,7 @@ def fit_dets(
     *,
     quantile: float = 0.975,
     starts: Starts = "robustbase",
+    min_dimension: int = 0,
     chunk_size: int = 2048,
 ) -> RobustFit:
     """Fit location and scatter of each patch by the deterministic S-estimator.
@@ -73,7 +74,7 @@ def fit_dets(
     Returns:
         The fits. Location and covariance are the estimate itself, not reweighted, and the same as
         the raw ones; ``raw_support`` are the points with a weight above zero; ``log_det`` is that
-        of the covariance. More than half of the points on one plane are an exact fit.
+        of the covariance. More than half of the points on one flat are an exact fit.
 
     References:
         [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
@@ -90,7 +91,14 @@ def fit_dets(
         return _estimate(columns, shape, shape, scale, quantile)
 
     return _fit_shapes(
-        "fit_dets", patches, mask, quantile, chunk_size, estimator, breakdown_constant
+        "fit_dets",
+        patches,
+        mask,
+        quantile,
+        min_dimension,
+        chunk_size,
+        estimator,
+        breakdown_constant,
     )
 
 
@@ -102,6 +110,7 @@ def fit_detmm(
     quantile: float = 0.975,
     tuned_for: Target = "shape",
     starts: Starts = "robustbase",
+    min_dimension: int = 0,
     chunk_size: int = 2048,
 ) -> RobustFit:
     """Fit location and scatter of each patch by the deterministic MM-estimator.
@@ -134,7 +143,9 @@ def fit_detmm(
         return _estimate(columns, first, final, scale, quantile)
 
     cutoff_of = partial(efficiency_constant, target=tuned_for)
-    return _fit_shapes("fit_detmm", patches, mask, quantile, chunk_size, estimator, cutoff_of)
+    return _fit_shapes(
+        "fit_detmm", patches, mask, quantile, min_dimension, chunk_size, estimator, cutoff_of
+    )
 
 
 def _fit_shapes(
@@ -142,6 +153,7 @@ def _fit_shapes(
     patches: Tensor,
     mask: Tensor | None,
     quantile: float,
+    min_dimension: int,
     chunk_size: int,
     estimator: Estimator,
     cutoff_of: Callable[[int], float],
@@ -159,6 +171,7 @@ def _fit_shapes(
         quantile,
         chunk_size,
         estimator,
+        min_dimension,
         majority=half_size,
         weigh=weigh,
     )

@@ -37,6 +37,7 @@ def fit_mve(
     quantile: float = 0.975,
     num_starts: int = 500,
     exhaustive: bool = False,
+    min_dimension: int = 0,
     generator: torch.Generator | None = None,
     chunk_size: int = 64,
 ) -> RobustFit:
@@ -94,7 +95,14 @@ def fit_mve(
         )
 
     return fit_patchwise(
-        "fit_mve", patches, mask, support_fraction, quantile, chunk_size, estimator
+        "fit_mve",
+        patches,
+        mask,
+        support_fraction,
+        quantile,
+        chunk_size,
+        estimator,
+        min_dimension,
     )
 
 

@@ -43,6 +43,12 @@ class RobustFit(NamedTuple):
     :class:`torchrg.errors.ShapeError`, a setting out of range a
     :class:`torchrg.errors.ConfigError`.
 
+    Where a majority of the points lies exactly on a flat, such as a plane, a line, or one place,
+    the flat of least dimension is the fit: the limit of the fits to a majority ever closer to it.
+    Its covariance is singular. A normal needs a plane: with ``min_dimension=2`` points on a line or
+    in one place are set aside, and the others of the patch are fitted.
+    :func:`torchrg.normals.fit_normals_robust` and the normals of a cloud do so.
+
     ``location`` and ``covariance`` have gradients: those of the weighted mean
     ``m = sum w_i x_i / sum w_i`` and of ``c sum w_i (x_i - m) (x_i - m)^T``, with the weights ``w``
     (1 for the chosen points, those of the last step for DetS and DetMM) and the factor ``c`` held
@@ -51,18 +57,18 @@ class RobustFit(NamedTuple):
     Attributes:
         location: Mean of the points in ``support``, shape ``(*, P)``.
         covariance: Their covariance with its consistency factor, shape ``(*, P, P)``. Of an exact
-            fit: that of the points on the plane, singular.
+            fit: that of the points on the flat, singular.
         support: Points that are not outliers, shape ``(*, K)``, bool.
         sq_distances: Squared Mahalanobis distances to the raw fit, shape ``(*, K)``; these decide
-            ``support``. Of an exact fit: 0 on the plane and inf off it. Points that do not count,
+            ``support``. Of an exact fit: 0 on the flat and inf off it. Points that do not count,
             and all points of a patch that is not valid: inf.
         raw_location: Location before reweighting, shape ``(*, P)``.
         raw_covariance: Scatter before reweighting with its consistency factor, ``(*, P, P)``.
         raw_support: The points that ``raw_location`` and ``raw_covariance`` come from, ``(*, K)``.
         log_det: What the estimator minimised, shape ``(*)``; see its function. -inf for an exact
             fit, NaN where not valid.
-        exact_fit: Whether the points in ``support`` lie exactly on one plane (a hyperplane of P
-            coordinates) and are a majority, shape ``(*)``, bool.
+        exact_fit: Whether the points in ``support`` lie exactly on one flat, of dimension P - 1 or
+            less, and are a majority, shape ``(*)``, bool.
         valid: Whether there is a fit, shape ``(*)``, bool. Where not, everything else is zero.
     """
 
@@ -115,12 +121,13 @@ def fit_patchwise(
     quantile: float,
     chunk_size: int,
     estimator: Estimator,
+    min_dimension: int,
     majority: Callable[[int], int] | None = None,
     weigh: Callable[[RobustFit, Tensor], Tensor] = lambda fit, points: fit.support,
 ) -> RobustFit:
     """Apply an estimator to every patch, and answer the degenerate ones.
 
-    Patches are grouped by their number of points that count. Those on one plane are an exact fit if
+    Patches are grouped by their number of points that count. Those on one flat are an exact fit if
     they are ``majority(n)`` of n, by default h. Only gradients ask ``weigh`` for the weights
     ``(*, K)`` of the points that a fit is the mean of.
     """
@@ -136,13 +143,18 @@ def fit_patchwise(
     if chunk_size < 1:
         raise ConfigError(f"{caller}: expected chunk_size of at least 1, got {chunk_size!r}.")
     batch, (num_points, size) = patches.shape[:-2], patches.shape[-2:]
+    if not 0 <= min_dimension < max(size, 1):
+        raise ConfigError(
+            f"{caller}: expected min_dimension from 0 to {size - 1}, of points of {size} "
+            f"coordinates, got {min_dimension!r}."
+        )
     dense = patches.detach().reshape(batch.numel(), num_points, size)
     counted = torch.isfinite(dense).all(dim=-1)
     if mask is not None:
         counted &= mask.reshape(-1, num_points)
 
     def fit_dense(chunk: Tensor) -> RobustFit:
-        return _fit_chunk(chunk, support_fraction, estimator, majority)
+        return _fit_chunk(chunk, support_fraction, estimator, min_dimension, majority)
 
     fields = _fit_groups(dense, counted, chunk_size, fit_dense)
     fit = RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in fields))
@@ -223,6 +235,7 @@ def _fit_chunk(
     patches: Tensor,
     support_fraction: float,
     estimator: Estimator,
+    min_dimension: int,
     majority: Callable[[int], int] | None,
 ) -> RobustFit:
     """Fit finite patches ``(B, n, P)``."""
@@ -250,24 +263,24 @@ def _fit_chunk(
             on_plane = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
             is_exact = on_plane.sum(dim=0) >= enough
             store_exact(rows[is_exact], on_plane[:, is_exact])
-    exact = torch.nonzero(dimension == size - 1).squeeze(1)
+    exact = torch.nonzero((dimension < size) & (dimension >= min_dimension)).squeeze(1)
     if len(exact):
         store_exact(exact, members[:, exact])
-    lower = torch.nonzero(dimension < size - 1).squeeze(1)
+    lower = torch.nonzero(dimension < min_dimension).squeeze(1)
     if len(lower):
         outside = ~members[:, lower].t()
         fit = _fit_groups(
             patches[lower],
             outside,
             PATCHES_IN_CACHE,
-            lambda chunk: _fit_chunk(chunk, support_fraction, estimator, majority),
+            lambda chunk: _fit_chunk(chunk, support_fraction, estimator, min_dimension, majority),
         )
         _store(out, lower, fit)
         lower = lower[~fit.valid]
         lanes, every = lanes_of(lower), members[:, lower] | True
-        plane = refine_flat(lanes, every, tolerance[lower], size - 1).all(dim=0)
-        line = refine_flat(lanes, every, tolerance[lower], size - 2).all(dim=0)
-        rows = lower[plane & ~line]
+        flat = refine_flat(lanes, every, tolerance[lower], size - 1).all(dim=0)
+        small = refine_flat(lanes, every, tolerance[lower], min_dimension - 1).all(dim=0)
+        rows = lower[flat & ~small]
         store_exact(rows, members[:, rows] | True)
     return out
 
@@ -294,7 +307,7 @@ def _general_fit(estimate: Estimate, frame: _Frame) -> RobustFit:
 
 
 def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustFit:
-    """The fit of lanes whose ``members (K, M)`` lie on a plane; these are the inliers."""
+    """The fit of lanes whose ``members (K, M)`` lie on a flat; these are the inliers."""
     dtype = columns[0].dtype
     weights = members.double()
     count = sum_points(weights)
