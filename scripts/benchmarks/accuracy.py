@@ -7,8 +7,9 @@ is none), and folders of rooms as scanners and reconstructions give them, ``NAME
 region growing), ``cgalrg`` (CGAL's region growing and Efficient RANSAC) and ``gocopp``; PYTHON has
 Open3D. A program that is missing is left out. CGAL runs with PCA normals and with those of
 ``consensus``. Open3D finds boxes: a point goes to the nearest within 5 cm. ``depth`` sees a frame
-as an image, all others as a cloud. Settings of a folder's rooms are chosen on one folder, and another is held out. The first table has means over the
-clouds of a kind. Published figures stand below the tables, and are of other data.
+as an image, all others as a cloud. Settings of a folder's rooms are chosen on one folder, and
+another is held out. The first table has means over the clouds of a kind. Published figures stand
+below the tables, and are of other data.
 
     python scripts/bench.py accuracy --programs FOLDER --open3d-python PYTHON --synpeb FILE.pcd
         --parts office_parts.pcd --rooms CHOSEN HELD_OUT --out accuracy.json
