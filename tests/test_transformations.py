@@ -247,7 +247,7 @@ def regions_of(points):
     return grow_regions(points, points, points[:, 0], neighbors, "classic")
 
 
-CAMERA = torch.eye(3)
+CAMERA = torch.tensor([[30.0, 0, 1], [0, 30, 19.5], [0, 0, 1]])
 NORMALS, PLANES = EstimateNormals(method="pca", k=8), SegmentPlanes("classic")
 MIDDLES = {
     "estimate_normals": lambda points: estimate_normals(points, method="pca", k=8).normals,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.datasets.captures_tree import FRAMES, write_3rscan, write_depth, write_replica
+from tests.datasets.captures_tree import FRAMES, write_3rscan, write_depth
 from torchrg.batch.run import list_jobs, make_plan
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import RGBDSource
@@ -298,12 +298,3 @@ def test_exports_of_sens_files_may_be_png(tmp_path):
     assert find_layout(root) == "3rscan"
     names = [frame.name.rpartition("/")[2] for frame in RGBDFrames.from_folder(root).frames]
     assert names == ["frame-000000", "frame-000001"]
-
-
-def test_a_trajectory_of_another_recording_is_refused(tmp_path):
-    track = write_replica(tmp_path) / "room0" / "traj.txt"
-    track.write_text(track.read_text().splitlines()[0])
-    with pytest.raises(
-        FormatError, match=r"traj.txt: .* got 1 rows and depth000001.png; take both"
-    ):
-        RGBDFrames.from_folder(tmp_path)

@@ -42,6 +42,8 @@ MAX_PIXELS = 1 << 26
 made of them on the way to metres takes 1.5 GB. A library that has less ends the process."""
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
 """Median depths in meters beyond which the depth scale is doubted. Depth cameras see 0.1 to 20."""
+_SAMPLED = 20_000
+"""Pixels that the median is taken of."""
 _MOST_SECONDS = 0.02
 """Most seconds between an image and a pose that belong together."""
 
@@ -83,8 +85,9 @@ def read_depth(
         bad = ~(np.isfinite(depth) & (depth > 0))
     if no_depth is not None:
         bad |= stored == no_depth
-    # Every 16th pixel tells the scale, and takes no time.
-    seen = depth[~bad][::16] / depth_scale
+    seen = depth[~bad]
+    # A sample tells the scale, and takes no time.
+    seen = seen[:: len(seen) // _SAMPLED + 1] / depth_scale
     median = float(np.median(seen)) if len(seen) else _MIN_MEDIAN_DEPTH
     if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:
         warnings.warn(

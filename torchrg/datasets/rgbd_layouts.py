@@ -295,12 +295,8 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
     for name, image in _depth_images(folder, "results/depth*"):
         color = _color_image(folder / "results" / f"frame{name}")
-        if not (name.isdecimal() and int(name) < len(poses)):
-            raise FormatError(
-                f"{track}: expected a row for each depth image, got {len(poses):,} rows and "
-                f"{image.name}; take both of one recording."
-            )
-        pose = known_pose(poses[int(name)])
+        has_row = name.isdecimal() and int(name) < len(poses)
+        pose = known_pose(poses[int(name)]) if has_row else None
         yield ListedFrame(name, image, color, pose, (calibration, track), camera, scale)
 
 
