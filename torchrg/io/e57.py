@@ -115,8 +115,7 @@ def read_e57(path: Path, size: int) -> Cloud:
             points, fields = _read_points(path, pye57, file, header)
             # pye57 moves the bounds of a scan that has a pose, which is not the standard.
             bounds = () if scan.is_moved else _numbers(header.node, "cartesianBounds", _BOUNDS)
-            finite = points[np.isfinite(points).all(axis=1)]
-            if bounds and len(finite):
+            if bounds and len(finite := points[np.isfinite(points).all(axis=1)]):
                 box = np.reshape(bounds, (2, 3))
                 num_outside += distance_outside(*bounding_box(finite), box) > 0
             blocks.append(_to_world(points, fields, scan))
