@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from torchrg.neighbors import search_knn
     from torchrg.normals import estimate_normals
     from torchrg.pipeline import make_superpoints, segment_mesh, segment_planes
-    from torchrg.regions import align_axes, grow_regions
+    from torchrg.regions import align_axes, grow_regions, select_planes
     from torchrg.result import read_result
     from torchrg.structures import UNLABELED, Cloud, Plane
 else:
@@ -54,7 +54,7 @@ else:
         "neighbors": ("search_knn",),
         "normals": ("estimate_normals",),
         "pipeline": ("make_superpoints", "segment_mesh", "segment_planes"),
-        "regions": ("align_axes", "grow_regions"),
+        "regions": ("align_axes", "grow_regions", "select_planes"),
         "result": ("read_result",),
         "structures": ("UNLABELED", "Cloud", "Plane"),
     }
@@ -95,5 +95,5 @@ __all__ = [
     "UNLABELED", "Cloud", "Plane", "TorchrgError", "align_axes", "datasets", "depth",
     "estimate_normals", "grow_regions", "load_config", "make_superpoints", "metrics", "nn",
     "normals", "read_cloud", "read_result", "robust", "scenes", "search_knn", "segment_mesh",
-    "segment_planes", "transforms", "write_cloud",
+    "segment_planes", "select_planes", "transforms", "write_cloud",
 ]  # fmt: skip

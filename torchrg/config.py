@@ -16,7 +16,7 @@ import torch
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError
-from torchrg.structures import FARTHEST, Sampling
+from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
 Settings = TypeVar("Settings")
 NormalMethod = Literal[
@@ -29,6 +29,8 @@ Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """Axis of the coordinates that points up."""
 NO_FLAG = {"is_flag": False}
 """Metadata of a setting that files and Python change, and no flag of the command line."""
+SHORT_FLAG = {"has_part": False}
+"""Metadata of a setting whose flag has its name alone, without that of its part."""
 
 
 @dataclass(frozen=True)
@@ -254,13 +256,35 @@ class PlanesConfig:
 
     up: Up | None = None
     """Axis that points up. With it, the table names the class of each plane: floor, ceiling, wall
-    or another. None: no classes."""
+    or another. None: no classes, or z where kinds needs them."""
     outline: bool = False
     """Whether the outline of each plane is traced; this needs shapely."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SelectionConfig:
+    """Which planes a result keeps, and how it numbers them; see :func:`torchrg.select_planes`."""
+
+    min_area: float = field(default=0.0, metadata=SHORT_FLAG)
+    """Minimum area of a plane, in squares of the unit of the cloud. Points of smaller planes get no
+    label. 0 keeps all planes."""
+    kinds: tuple[PlaneKind, ...] | None = field(default=None, metadata=SHORT_FLAG)
+    """Classes of planes to keep, with commas between them. Points of other planes get no label.
+    None: all classes."""
+    sort: Literal["points", "area"] = field(default="points", metadata=SHORT_FLAG)
+    """Order of the planes: descending number of points, or descending area. Labels follow it."""
+
+    def __post_init__(self) -> None:
+        check_values(self)
+        _require(self, "min_area", ">= 0", self.min_area >= 0)
+        kinds: Any = self.kinds
+        is_list = isinstance(kinds, tuple) and len(kinds) > 0 and set(kinds) <= set(PLANE_KINDS)
+        words = f"to be some of {', '.join(PLANE_KINDS)}, or none"
+        _require(self, "kinds", words, kinds is None or is_list)
+
+
 @dataclass(frozen=True)
-class PipelineConfig:
+class PipelineConfig(SelectionConfig):
     """Everything that decides the result of :func:`torchrg.segment_planes`, and its memory.
 
     The defaults are those of :func:`load_config`.
@@ -277,8 +301,19 @@ class PipelineConfig:
     """Contents of the table of planes."""
 
     def __post_init__(self) -> None:
-        check_values(self)
+        super().__post_init__()
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
+
+    def of_all_planes(self) -> "PipelineConfig":
+        """Return the settings that keep all planes, and name the classes that ``kinds`` needs.
+
+        Example:
+            >>> load_config(kinds="wall").of_all_planes().planes.up
+            'z'
+        """
+        up = "z" if self.planes.up is None and self.kinds is not None else self.planes.up
+        planes = dataclasses.replace(self.planes, up=up)
+        return dataclasses.replace(self, min_area=0.0, kinds=None, sort="points", planes=planes)
 
     def at_angle(self, angle_deg: float) -> "PipelineConfig":
         """Return the settings with another angle: the one threshold that the paper tunes.
@@ -397,7 +432,7 @@ def _ascends(*numbers: float) -> bool:
 
 
 @dataclass(frozen=True)
-class DepthConfig:
+class DepthConfig(SelectionConfig):
     """How planes are found in depth images; see :func:`torchrg.depth.segment_depth`."""
 
     noise: tuple[float, float] | None = None
@@ -414,14 +449,20 @@ class DepthConfig:
     min_size: int = 100
     """Regions of fewer pixels are not labelled."""
 
+    up: Up | None = field(default=None, metadata=SHORT_FLAG)
+    """Axis that points up, -y for a camera that stands level. With it, the table names the class of
+    each plane; kinds needs it. None: no classes."""
+
     def __post_init__(self) -> None:
-        check_values(self)
+        super().__post_init__()
         parts: tuple[float, ...] = (1.0, 0.0) if self.noise is None else self.noise
         is_noise = len(parts) == 2 and min(parts) >= 0 and max(parts) > 0
         _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
         _require(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
         _require(self, "max_step", ">= 0", self.max_step >= 0)
+        needs_up = self.kinds is not None and self.up is None
+        _require(self, "up", "with kinds, as -y for a level camera", not needs_up)
         _require(self, "min_size", ">= 1", self.min_size >= 1)
 
 
@@ -619,6 +660,8 @@ def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
                 return value
         elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
             return float(value) if abs(value) <= FARTHEST else value  # It is refused by its range.
+        elif typing.get_origin(choice) is tuple and isinstance(value, str) and _is_words(choice):
+            return _checked(tuple(value.replace(" ", "").split(",")), choice, where)
         elif typing.get_origin(choice) is tuple and not isinstance(value, str | Mapping | None):
             kind, *others = typing.get_args(choice)
             parts = tuple(value) if isinstance(value, Iterable) else (value,)
@@ -628,6 +671,11 @@ def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
             return value
     allowed = [_spelled(choice) for choice in choices]
     raise ConfigError(f"{where}: expected {' or '.join(allowed)}, got {value!r}.")
+
+
+def _is_words(choice: Any) -> bool:  # noqa: ANN401
+    """Return whether a tuple is one of words, which are written with commas between them."""
+    return typing.get_origin(typing.get_args(choice)[0]) is Literal
 
 
 def _spelled(choice: Any) -> str:  # noqa: ANN401
@@ -691,7 +739,13 @@ def _refuse(config: object, name: str, value: object) -> NoReturn:
     )
 
 
-_KINDS: list[Any] = [*_SECTIONS.values(), PipelineConfig, SuperpointsConfig, DepthConfig]
+_KINDS: list[Any] = [
+    *_SECTIONS.values(),
+    PipelineConfig,
+    SelectionConfig,
+    SuperpointsConfig,
+    DepthConfig,
+]
 for _kind in _KINDS:
     _kind.__setattr__ = _refuse
 # So that torch.load(weights_only=True) reads checkpoints that hold settings.

@@ -37,6 +37,7 @@ from torchrg.normals import ESTIMATORS
 from torchrg.precision import warn_of_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
 from torchrg.regions.growth import needs_sampling, number_by_count
+from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.superpoints import merge_copies
 from torchrg.structures import UNLABELED, Neighbors, Rows, Segmentation, Superpoints
 
@@ -142,7 +143,11 @@ def segment_planes(
             on_stage(stage)
 
     objects = None if objects is None else objects.long().to(points.device)
-    seg = _segment(points, settings, voxel, objects, begin)
+    if settings.min_area > 0 or settings.kinds is not None or settings.sort != "points":
+        seg = _segment(points, settings.of_all_planes(), voxel, objects, begin)
+        seg = keep_planes(seg, choose_planes(seg.planes, settings))
+    else:
+        seg = _segment(points, settings, voxel, objects, begin)
     return seg if keep_neighbors else seg._replace(neighbors=None)
 
 

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, SupportsIndex
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, get_args
 
 import numpy as np
 import torch
@@ -272,7 +272,9 @@ class NormalFit(NamedTuple):
         return NormalFit(normals, curvature, valid, residual_rms, sharp)
 
 
-PLANE_KINDS = ("other", "floor", "ceiling", "wall", "horizontal", "vertical", "oblique")
+PlaneKind = Literal["other", "floor", "ceiling", "wall", "horizontal", "vertical", "oblique"]
+"""Class of a plane."""
+PLANE_KINDS: tuple[PlaneKind, ...] = get_args(PlaneKind)
 """Classes of planes; see :func:`torchrg.regions.classes.classify_planes`. Curved planes are
 "other", "horizontal" and "vertical" ones neither floor nor ceiling nor wall."""
 

@@ -42,6 +42,7 @@ from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_f
 from torchrg.neighbors import restore_points, sample_voxels
 from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
 from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.result import PLANES_FILE, describe_planes, write_table
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
 
@@ -337,13 +338,18 @@ def segment_cloud(
     check_viewpoint(cloud, orient, "use --orient interior")
     points, superpoints = cloud.points, None
     is_kept = partition is not None
+    # Superpoints keep to the borders of all planes.
+    config = settings.of_all_planes() if is_kept else settings
     seg = segment_planes(
-        points, settings, voxel=voxel, within=within, keep_neighbors=is_kept, on_stage=begin
+        points, config, voxel=voxel, within=within, keep_neighbors=is_kept, on_stage=begin
     )
     if partition is not None:
         begin("superpoints")
         colors = cloud.fields.get("color")
         superpoints = make_superpoints(points, seg, partition, colors=colors, voxel=voxel)
+        rows = choose_planes(seg.planes, settings)
+        plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
+        seg, superpoints = keep_planes(seg, rows), superpoints._replace(plane=plane)
     begin("orientation")
     return _oriented(cloud, seg, orient, voxel), superpoints
 

@@ -116,9 +116,16 @@ def parse(
     try:
         return typing.cast(Command, _build(kind, default, _read(flags, arguments, prog)))
     except ConfigError as error:
-        # The one setting that stands in no section.
-        text = str(error).replace("PipelineConfig: expected chunk_size", "expected --chunk-size")
+        text = _named_as_flags(str(error), flags)
         raise ConfigError(f"{text} See {prog} --help.") from None
+
+
+def _named_as_flags(message: str, flags: Sequence[Flag]) -> str:
+    """Return a message on a setting that names its flag, where that has no part."""
+    named = re.fullmatch(r"\w+Config: expected (\w+) (.*)", message, re.DOTALL)
+    name = f"--{named[1].replace('_', '-')}" if named else ""
+    is_flag = any(flag.name == name for flag in flags)
+    return f"expected {name} {named[2]}" if named and is_flag else message
 
 
 class _Parser(argparse.ArgumentParser):
@@ -139,7 +146,7 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[st
     """Return the values that are given, by path."""
     parser = _Parser(prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
     for flag in flags:
-        nargs = "*" if any(typing.get_origin(kind) is tuple for kind in _kinds(flag.hint)) else None
+        nargs = "*" if any(map(_is_list, _kinds(flag.hint))) else None
         if flag.is_positional:
             parser.add_argument(flag.path, nargs=nargs, metavar=flag.name)
             continue
@@ -152,7 +159,7 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[st
             if const is not None:
                 takes = {"action": "store_const", "const": const}
             parser.add_argument(*spellings, dest=flag.path, **takes)
-    namespace, left = parser.parse_known_args(arguments)
+    namespace, left = parser.parse_known_args(_joined(flags, arguments))
     if left:
         names = [flag.name for flag in flags] if left[0].startswith("--") else []
         near = difflib.get_close_matches(left[0], names, n=1)
@@ -162,6 +169,27 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[st
         raise ConfigError(f"Unrecognized options: {', '.join(left)}.{question}")
     values = vars(namespace)
     return {flag.path: _value_of(flag, values[flag.path]) for flag in flags if flag.path in values}
+
+
+def _joined(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:
+    """Return arguments in which a value that begins as a flag does is part of its flag.
+
+    Example:
+        >>> up = Flag("up", "--up", "--up {z,-z}", "", "", Literal["z", "-z"], False)
+        >>> _joined([up], ["--up", "-z", "--up", "z"])
+        ['--up=-z', '--up', 'z']
+    """
+    choices = {
+        flag.name: {word for kind in _kinds(flag.hint) for word in typing.get_args(kind)}
+        for flag in flags
+    }
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and argument.startswith("-") and argument in choices.get(joined[-1], ()):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def _switches(name: str) -> tuple[str, str]:
@@ -182,6 +210,17 @@ def _kinds(hint: object) -> list[Any]:
     return [kind for kind in kinds if kind is not NoneType] if is_union else [hint]
 
 
+def _is_list(kind: object) -> bool:
+    """Return whether a value is several arguments; words are one, with commas between them."""
+    return typing.get_origin(kind) is tuple and not _choices(kind)
+
+
+def _choices(kind: object) -> tuple[str, ...]:
+    """Return the words that the items of a tuple are chosen from; none of other types."""
+    items = typing.get_args(kind)[:1] if typing.get_origin(kind) is tuple else ()
+    return typing.get_args(items[0]) if items and typing.get_origin(items[0]) is Literal else ()
+
+
 def _value_of(flag: Flag, typed: bool | str | list[str]) -> object:
     """Return the value that is written for a flag."""
     if isinstance(typed, bool):
@@ -190,6 +229,12 @@ def _value_of(flag: Flag, typed: bool | str | list[str]) -> object:
     if words == [_NONE] and NoneType in typing.get_args(flag.hint):
         return None
     kind, *others = _kinds(flag.hint)
+    if words_of_items := _choices(kind):
+        chosen = tuple(words[0].replace(" ", "").split(","))
+        if not set(chosen) <= set(words_of_items):
+            some = ", ".join(words_of_items)
+            raise ConfigError(f"expected {flag.name} to be some of {some}, got {words[0]!r}.")
+        return chosen
     parts = typing.get_args(kind)
     if typing.get_origin(kind) is Literal:
         choices = [choice for literal in (kind, *others) for choice in typing.get_args(literal)]
@@ -288,6 +333,9 @@ def list_flags(
         if typing.get_origin(hint) is typing.Annotated:
             hint, argument = typing.get_args(hint)
         value, own = _default_of(field, default), f"{path}{field.name}"
+        front, subject = prefix, part
+        if not field.metadata.get("has_part", True):
+            front, subject = "--", ""
         if dataclasses.is_dataclass(hint):
             inner = (prefix, part)
             if not argument.is_inline:
@@ -296,18 +344,18 @@ def list_flags(
             continue
         text = plain(argument.text or texts.get(field.name, ""))
         if "Default:" not in text:
-            text = f"{text} {_said(value, is_setting=prefix != '--')}".strip()
-        name = f"{prefix}{field.name}".replace("_", "-")
+            text = f"{text} {_said(value, is_setting=front != '--')}".strip()
+        name = f"{front}{field.name}".replace("_", "-")
         if argument.is_positional:
             name = argument.metavar or field.name.upper()
             spelling = name + "..." * (typing.get_origin(hint) is tuple)
         elif hint is bool:
             # Only settings may be on from the start, and are turned off.
-            spelling = ", ".join(_switches(name)) if value or part else name
+            spelling = ", ".join(_switches(name)) if value or subject else name
         else:
             spelling = f"{name} {argument.metavar or _words(hint)}"
         needed = argument.is_positional or value is dataclasses.MISSING
-        yield Flag(own, name, spelling, text, part, hint, needed)
+        yield Flag(own, name, spelling, text, subject, hint, needed)
 
 
 def plain(text: str) -> str:
@@ -361,6 +409,8 @@ def _words(hint: object) -> str:
     if typing.get_origin(hint) is Literal:
         return "{" + ",".join(map(str, choices)) + "}"
     if typing.get_origin(hint) is tuple:
+        if words := _choices(hint):
+            return f"{{{','.join(words)}}},..."
         return f"{_words(choices[0])}..." if ... in choices else " ".join(map(_words, choices))
     return " or ".join(map(_words, choices)) if choices else _WORDS[typing.cast(type, hint)]
 

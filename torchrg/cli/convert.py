@@ -167,7 +167,7 @@ class FolderArguments(CloudArguments):
 class S3DISArguments(CloudArguments):
     """Convert S3DIS as it is released into Pointcept's layout, with normals and planes.
 
-    Few points of a region are wanted? --growing.min-size 200 leaves a third of the regions.
+    To keep only large planes, pass --min-area 0.5.
 
     Examples:
         torchrg convert s3dis Stanford3dDataset_v1.2 s3dis --dry-run

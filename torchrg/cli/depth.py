@@ -173,7 +173,7 @@ def _label(
     seg = orient_image(seg, points, arguments.orient)
     num_planes = len(seg.planes)
     if num_planes == 0:
-        warn(f"{source}: no plane found: no region is large enough.")
+        warn(f"{source}: no plane found: {flags.reason_for_no_plane(arguments.depth)}.")
     if picture is not None:
         apart = -(-max(points.shape) // _COLORED_FROM)
         few = torch.full_like(points, torch.nan)

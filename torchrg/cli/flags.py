@@ -19,6 +19,7 @@ from torchrg.config import (
     DEFAULT_PRESET,
     WHITENESS,
     PipelineConfig,
+    SelectionConfig,
     SuperpointsConfig,
     Up,
     load_config,
@@ -180,6 +181,17 @@ def choice_of(sampling: Sampling, settings: Mapping[str, Any]) -> str:
         for name, value in settings.items()
     )
     return f"{kind} (whiteness {sampling.whiteness:g}): {chosen}"
+
+
+def reason_for_no_plane(settings: SelectionConfig) -> str:
+    """Return why a result has no plane.
+
+    Example:
+        >>> reason_for_no_plane(SelectionConfig(min_area=9.0))
+        'no plane passes --min-area and --kinds'
+    """
+    is_chosen = settings.min_area > 0 or settings.kinds is not None
+    return "no plane passes --min-area and --kinds" if is_chosen else "no region is large enough"
 
 
 SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]

@@ -246,7 +246,8 @@ def _segment(
         settings = arguments.settings.resolved.measured(seg.sampling)["settings"]
         say(f"{source}: {flags.choice_of(seg.sampling, settings)}")
     place = f"{target}{left_out(target, cloud.fields)}"
-    _report(source, seg, cloud, place, time.perf_counter() - begin)
+    reason = flags.reason_for_no_plane(arguments.settings.resolved)
+    _report(source, seg, cloud, place, reason, time.perf_counter() - begin)
 
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
@@ -336,13 +337,14 @@ def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
         draw_planes(picture, result)
 
 
-def _report(source: str, seg: Segmentation, cloud: Cloud, target: str, seconds: float) -> None:
-    """Print the line about a result, after a warning if there is no plane in it."""
+def _report(
+    source: str, seg: Segmentation, cloud: Cloud, target: str, reason: str, seconds: float
+) -> None:
+    """Print the line about a result, after a warning with a reason if there is no plane in it."""
     if len(seg.planes) == 0:
         finite = cloud.coordinates[cloud.finite]
         is_place = (finite == finite[0]).all()
-        reason = "all points are equal" if is_place else "no region is large enough"
-        warn(f"{source}: no plane found: {reason}.")
+        warn(f"{source}: no plane found: {'all points are equal' if is_place else reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes)
     share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
     say(

@@ -1,6 +1,7 @@
 """From one depth image to planes."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,8 +15,11 @@ from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import fit_pixels
 from torchrg.depth.pixels import Pixels, describe_pixels
 from torchrg.depth.windows import Image
+from torchrg.linalg import unit_direction
 from torchrg.linalg.moments import Segments, kth_smallest
+from torchrg.regions.classes import classify_planes
 from torchrg.regions.fit import fit_planes
+from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.table import measure_planes
 from torchrg.structures import Segmentation
 
@@ -83,7 +87,8 @@ def segment_depth(
     check_floating("segment_depth", depth=depth)
     check_view("segment_depth", intrinsics, (depth.shape[1], depth.shape[0]))
     settings = settings_of("segment_depth", DepthConfig, config, changes)
-    return _segment(depth, intrinsics, settings, pose)
+    seg = _segment(depth, intrinsics, settings, pose)
+    return keep_planes(seg, choose_planes(seg.planes, settings))
 
 
 def _segment(
@@ -128,6 +133,9 @@ def _segment(
     segments = Segments(labels)
     fit = fit_planes(segments, points, plane_normals, shared=True)
     table = measure_planes(segments, points, fit._replace(curved=curved))
+    if config.up is not None:
+        up = unit_direction("segment_depth", config.up)
+        table = replace(table, kind=classify_planes(table, points, labels, up))
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),

@@ -29,9 +29,10 @@ def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
         length, name = (-1.0 if up.startswith("-") else 1.0), up.removeprefix("-")
         numbers = [length * (name == axis) + 0.0 for axis in "xyz"]
     try:
-        direction = torch.tensor([float(number) for number in numbers], dtype=torch.float64)
+        values = [float(number) for number in numbers]
     except (TypeError, ValueError, OverflowError):
-        direction = torch.empty(0)
+        values = []
+    direction = torch.tensor(values, dtype=torch.float64, device="cpu")
     if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
         raise ConfigError(
             f"{caller}: expected up to be a direction, as three numbers that are not all zero or "
