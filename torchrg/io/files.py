@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 
-from torchrg.errors import FormatError
+from torchrg.errors import OUT_OF_MEMORY, FormatError, is_out_of_memory
 
 DAMAGES = (
     ValueError,
@@ -279,6 +279,8 @@ def refusing(message: str, *errors: type[BaseException], repair: str = "") -> It
     except FormatError:
         raise
     except errors as error:
+        if is_out_of_memory(error):
+            raise FormatError(f"{message}{OUT_OF_MEMORY}") from error
         raise FormatError(f"{message}{first_line(error)}{repair}.") from error
 
 
