@@ -479,6 +479,21 @@ def test_copc_is_read_and_written_as_what_laspy_can(tmp_path, monkeypatch, kind)
     np.testing.assert_array_equal(read_cloud(tmp_path / f"b{kind}").coordinates, cloud.coordinates)
 
 
+def test_layers_are_checked_where_lazrs_reads_them(tmp_path, monkeypatch):
+    path = tmp_path / "a.copc.laz"
+    write_copc(path, monkeypatch)
+    with laspy.open(path) as reader:
+        start = reader.header.offset_to_point_data
+    data = bytearray(path.read_bytes())
+    (table,) = struct.unpack_from("<q", data, start)
+    # Bytes that shift a chunk make other sizes of its layers, of gigabytes.
+    data[start + 60 : start + 60] = b"\xff" * 8
+    struct.pack_into("<q", data, start, table + 8)
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=r"byte \d+: expected [\d,]+ bytes for the layers of a c"):
+        read_cloud(path)
+
+
 def test_panic_of_the_decoder_is_a_format_error(scanned, monkeypatch):
     class PanicException(BaseException):
         pass
