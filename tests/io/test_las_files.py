@@ -479,6 +479,21 @@ def test_copc_is_read_and_written_as_what_laspy_can(tmp_path, monkeypatch, kind)
     np.testing.assert_array_equal(read_cloud(tmp_path / f"b{kind}").coordinates, cloud.coordinates)
 
 
+def test_layers_are_checked_where_lazrs_reads_them(tmp_path, monkeypatch):
+    path = tmp_path / "a.copc.laz"
+    write_copc(path, monkeypatch)
+    with laspy.open(path) as reader:
+        first = reader.header.offset_to_point_data + 8
+        sizes = first + reader.header.point_format.size + 4
+    data = bytearray(path.read_bytes())
+    (layer,) = struct.unpack_from("<I", data, sizes)
+    # The next chunk is then read one byte too early, where its layers seem to be of gigabytes.
+    struct.pack_into("<I", data, sizes, layer - 1)
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=r"byte \d+: expected [\d,]+ bytes for the layers of a c"):
+        read_cloud(path)
+
+
 def test_panic_of_the_decoder_is_a_format_error(scanned, monkeypatch):
     class PanicException(BaseException):
         pass

@@ -462,8 +462,10 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
         num_points += int.from_bytes(stream.read(4), "little")
         sizes = np.frombuffer(stream.read(4 * num_layers), "<u4")
         total = int(sizes.sum(dtype=np.uint64))
-        check_promise(path, place, total, "the layers of a chunk", available=num_bytes)
-        start += num_bytes
+        # lazrs goes on where the layers end, wherever the table says that the next chunk begins.
+        used = place + sizes.nbytes - start
+        check_promise(path, place, total, "the layers of a chunk", available=num_bytes - used)
+        start += used + total
     if num_points != header.point_count:
         raise FormatError(
             f"{path}: expected {header.point_count:,} points, as its header says, got "
