@@ -6,7 +6,9 @@ extensions lose their prefix. Of what a file holds beside points, names and pose
 coordinate system are read.
 """
 
+import contextlib
 import math
+import struct
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -14,6 +16,7 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +44,16 @@ _MAX_DEVIATION, _MAX_ROTATION = 0.01, 2.0
 that is not an error. Programs round quaternions."""
 _PAGE_BYTES = 1024
 """The standard's page, the last four bytes of which are the CRC-32C of the others."""
+_CONTENT_BYTES = 1020
+"""Bytes of a page before its checksum."""
+_XML_ENTRY = struct.Struct("<24xQQ")
+"""Place, counted with checksums, and length of the XML, in the header of a file."""
+_MAX_DEPTH, _MAX_CHILDREN = 100, 1_000
+"""Most levels of the XML and children of a structure: libe57's time grows with their squares."""
+_MAX_RATIO = 1_000
+"""Most bytes of memory for a byte of a file. Values that are all equal take no bits of it."""
+_VALUE_BYTES = 8
+"""Bytes of a value in memory, at most."""
 _BYTES_PER_POINT = 12
 """Bytes of a point to guess their number by the size of a file: three coordinates of 32 bits."""
 _Block = dict[str, Values]
@@ -94,6 +107,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     """
     pye57 = require("pye57", extra="e57", purpose="read E57 files")
     _check_pages(path)
+    _check_tree(path, size)
     message = f"{path}: expected an E57 file, got: "
     errors = (pye57.libe57.E57Exception, *DAMAGES)
     with (
@@ -107,8 +121,10 @@ def read_e57(path: Path, size: int) -> Cloud:
             )
         counts = [header.point_count for header in headers]
         content = f"{sum(counts):,} points"
+        num_values = sum(header.point_count * len(header.point_fields) for header in headers)
         # Coordinates that differ at all take a bit.
-        check_promise(path, 0, sum(counts) // 8, content, available=size, at_least=True)
+        least = max(sum(counts) // 8, _VALUE_BYTES * num_values // _MAX_RATIO)
+        check_promise(path, 0, least, content, available=size, at_least=True)
         scans = tuple(_scan_of(path, header) for header in headers)
         blocks, num_outside = list[_Block](), 0
         for header, scan in zip(headers, scans, strict=True):
@@ -243,11 +259,40 @@ def _check_pages(path: Path) -> None:
     with path.open("rb") as stream:
         for start in range(0, size if size % _PAGE_BYTES == 0 else 0, _PAGE_BYTES):
             page = stream.read(_PAGE_BYTES)
-            if crc32c.value(page[:-4]) != int.from_bytes(page[-4:], "big"):
+            content, checksum = page[:_CONTENT_BYTES], page[_CONTENT_BYTES:]
+            if crc32c.value(content) != int.from_bytes(checksum, "big"):
                 raise FormatError(
                     f"{path}: byte {start}: expected a page that agrees with its checksum, got "
                     "another; the file is damaged, copy or write it again."
                 )
+
+
+def _check_tree(path: Path, size: int) -> None:
+    """Check that libe57 reads the XML in time; what else is wrong with it libe57 says."""
+    with path.open("rb") as stream:
+        head = stream.read(_XML_ENTRY.size)
+        if len(head) < _XML_ENTRY.size or not max(_XML_ENTRY.unpack(head)) <= size:
+            return
+        start, length = _XML_ENTRY.unpack(head)
+        stream.seek(start - start % _PAGE_BYTES)
+        num_pages = -(-(start % _PAGE_BYTES + length) // _CONTENT_BYTES)
+        pages = [stream.read(_PAGE_BYTES)[:_CONTENT_BYTES] for _ in range(num_pages)]
+    open_nodes: list[tuple[str | None, int]] = []
+
+    def begin(name: str, attributes: dict[str, str]) -> None:
+        kind, count = open_nodes.pop() if open_nodes else (None, 0)
+        open_nodes.extend([(kind, count + 1), (attributes.get("type"), 0)])
+        if len(open_nodes) > _MAX_DEPTH or (kind != "Vector" and count >= _MAX_CHILDREN):
+            raise FormatError(
+                f"{path}: expected XML of at most {_MAX_DEPTH} levels and {_MAX_CHILDREN:,} fields "
+                f"of a structure, got more at {name}; write the file again."
+            )
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda name: open_nodes.pop()
+    with contextlib.suppress(expat.ExpatError):
+        parser.Parse(b"".join(pages)[start % _PAGE_BYTES :][:length], True)
 
 
 def _scan_of(path: Path, header: Any) -> ScanPose:  # noqa: ANN401

@@ -16,7 +16,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
-from torchrg.errors import FormatError
+from torchrg.errors import OUT_OF_MEMORY, FormatError, is_out_of_memory
 
 DAMAGES = (
     ValueError,
@@ -311,6 +311,8 @@ def refusing(message: str, *errors: type[BaseException], repair: str = "") -> It
     except FormatError:
         raise
     except errors as error:
+        if is_out_of_memory(error):
+            raise FormatError(f"{message}{OUT_OF_MEMORY}") from error
         raise FormatError(f"{message}{first_line(error)}{repair}.") from error
 
 

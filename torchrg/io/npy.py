@@ -58,6 +58,10 @@ _NOT_PER_POINT = {
 """Arrays of a result that are not about its points, of however many rows."""
 _LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
+_MAX_ARRAYS = 10_000
+"""Most arrays of an archive: to look at each takes a fifth of a millisecond."""
+_MAX_CHECKED = 1 << 30
+"""Most bytes of arrays that are left out and yet read, so that damage in them is told: seconds."""
 _BYTES_AT_ONCE = 1 << 20
 """Bytes that are unpacked together, which bounds the memory."""
 _LONGEST_HEADER = 1 << 16
@@ -104,14 +108,17 @@ def write_npy(path: Path, cloud: Cloud) -> None:
 
 def read_npz(path: Path, size: int) -> Cloud:
     """Read a ``.npz`` file."""
-    # What is left out is read, too, so that damage in it is told.
     with _open_archive(path) as archive:
         layouts = _check_members(path, archive, size)
         coordinates, num_points = _find_coordinates(path, layouts)
-        arrays = {name: _read_member(path, archive, name) for name in layouts}
-    arrays = {name: values for name, values in arrays.items() if name not in _NOT_PER_POINT}
-    others = [name for name, values in arrays.items() if values.shape[:1] != (num_points,)]
-    columns = {name: values for name, values in arrays.items() if name not in others}
+        own = [name for name in layouts if name not in _NOT_PER_POINT]
+        others = [name for name in own if layouts[name][0][:1] != (num_points,)]
+        columns = {name: _read_member(path, archive, name) for name in own if name not in others}
+        left = [archive.getinfo(f"{name}.npy") for name in layouts if name not in columns]
+        if sum(member.file_size for member in left) <= _MAX_CHECKED:
+            for member in left:
+                with _open_member(path, archive, member) as stream:
+                    _read_on(stream)
     notes = (f"{', '.join(others)} left out: not of {num_points:,} rows",) if others else ()
     if coordinates is not None and (names := layouts[coordinates][1].names) is not None:
         # pyntcloud writes records, whose fields are columns.
@@ -263,8 +270,16 @@ def _open_member(
 
 def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, _Layout]:
     """Return shape and type of the arrays of an archive, of which all bytes can be there."""
-    layouts = {}
-    for member in archive.infolist():
+    layouts, members = {}, archive.infolist()
+    if len(members) > _MAX_ARRAYS:
+        raise FormatError(
+            f"{path}: expected at most {_MAX_ARRAYS:,} arrays, got {len(members):,}; leave out "
+            "what is not about points."
+        )
+    # Arrays that share bytes of a small file expand to any size.
+    packed = sum(member.compress_size for member in members)
+    check_promise(path, 0, packed, f"{len(members):,} arrays", available=size)
+    for member in members:
         if not member.filename.endswith(".npy"):
             continue
         if member.compress_type not in _LARGEST_RATIO:
@@ -282,12 +297,17 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
-    """Read one array of an archive, and on to its end, where its checksum is compared."""
+    """Read one array of an archive, and all of its bytes."""
     with _open_member(path, archive, archive.getinfo(f"{name}.npy")) as stream:
         values: Values = npy_format.read_array(stream, allow_pickle=False)
-        while stream.read(_BYTES_AT_ONCE):
-            pass
+        _read_on(stream)
         return values
+
+
+def _read_on(stream: IO[bytes]) -> None:
+    """Read to the end of an array, where its checksum is compared, without keeping it."""
+    while stream.read(_BYTES_AT_ONCE):
+        pass
 
 
 def _check_npy(path: Path, size: int) -> _Layout:
