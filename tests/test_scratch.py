@@ -2,6 +2,8 @@
 
 import dataclasses
 import errno
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -159,3 +161,23 @@ def test_a_killed_process_leaves_nothing(tmp_path):
     command = [sys.executable, "-c", KILLED, str(tmp_path), "planes"]
     assert subprocess.run(command, check=False).returncode == -9
     assert not list(tmp_path.iterdir())
+
+
+def end_after_work():
+    """Take an array from the disk in a forked process, which ends, or hangs and is ended."""
+    signal.alarm(10)
+    found = scratch.empty((3, 5), np.int32)
+    scratch.release()
+    os._exit(found.shape != (3, 5))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+def test_a_forked_process_waits_for_no_thread_that_it_does_not_have(tmp_path, small):
+    with scratch.on_disk(tmp_path):
+        lock = scratch._lock
+        with lock:  # As the thread that releases pages has it now and then.
+            process = os.fork()
+            if process == 0:
+                end_after_work()
+        assert os.waitpid(process, 0)[1] == 0

@@ -1,7 +1,10 @@
 """Calls leave torch's threads as they found them, and none of torch's own threads is ever used."""
 
+import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from threading import Event, Thread
 
@@ -87,3 +90,39 @@ def make_threads(set_threads):
             thread.join()
 
     return start
+
+
+def results_of(number):
+    """Bytes of what kernels of clouds, superpoints and images find, of one of two rooms."""
+    points = torchrg.scenes.make_room(num_points=2_000, noise=0.003, seed=number % 2).points
+    seg = torchrg.segment_planes(points)
+    parts = torchrg.make_superpoints(points, seg, counts=40).labels
+    normals = torchrg.estimate_normals(points[:300], method="paper", k=30).normals
+    depth = torch.full((30, 40), 2.0, dtype=torch.float64)
+    depth[:, 20 * (number % 2) :] = 2.5
+    camera = torch.tensor([[30.0, 0, 19.5], [0, 30, 14.5], [0, 0, 1]])
+    image = torchrg.depth.segment_depth(depth, camera)
+    found = seg.labels, seg.normals, parts, normals, image.labels, image.normals
+    return b"".join(values.numpy().tobytes() for values in found)
+
+
+@pytest.fixture(scope="module")
+def expected_results():
+    return [results_of(number) for number in range(2)]
+
+
+def test_threads_that_segment_at_once_find_what_one_finds(expected_results, set_threads):
+    set_threads(2)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(results_of, range(4)))
+    assert found == expected_results * 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+def test_processes_that_are_forked_find_what_their_parent_finds(expected_results, set_threads):
+    set_threads(2)
+    torch.rand(1_000_000).sin()  # Starts a team of threads, which a forked process does not have.
+    with get_context("fork").Pool(2) as pool:
+        found = pool.map_async(results_of, range(2)).get(timeout=120)
+    assert found == expected_results

@@ -40,6 +40,16 @@ _maps: "weakref.WeakSet[mmap.mmap]" = weakref.WeakSet()
 _lock = threading.Lock()
 
 
+def _renew_lock() -> None:
+    """Give a forked process a lock of its own; a thread that it lacks may hold the other."""
+    global _lock
+    _lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_lock)
+
+
 @contextmanager
 def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep large arrays on the disk of a folder: results are the same, and memory is bounded.

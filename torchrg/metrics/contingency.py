@@ -99,7 +99,7 @@ def count_overlaps(
         _, rows, sizes = torch.unique(labels, return_inverse=True, return_counts=True)
         labels = labels.masked_fill((sizes < min_size)[rows], UNLABELED)
     if ignore is not None:
-        scored = truth != ignore
+        scored = have_other_label(truth, ignore)
         labels, truth = labels[scored], truth[scored]
     region_labels, regions = number_labels(labels)
     face_labels, faces = number_labels(truth)
@@ -137,6 +137,18 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
     check_one_device(caller, **tensors)
     return [tensor.long() for tensor in tensors.values()]
+
+
+def have_other_label(truth: Tensor, ignore: int | None) -> Tensor:
+    """Return which points do not have the ignored label; no point has one beyond int64.
+
+    Example:
+        >>> have_other_label(torch.tensor([0, 1]), 1), have_other_label(torch.tensor([0]), 10**23)
+        (tensor([ True, False]), tensor([True]))
+    """
+    if ignore is None or not -(2**63) <= ignore < 2**63:
+        return torch.ones_like(truth, dtype=torch.bool)
+    return truth != ignore
 
 
 def check_one_device(caller: str, **arguments: Tensor) -> None:

@@ -9,7 +9,12 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import check_labels, contingency_table, share
+from torchrg.metrics.contingency import (
+    check_labels,
+    contingency_table,
+    have_other_label,
+    share,
+)
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.structures import UNLABELED
 
@@ -99,7 +104,7 @@ def score_partition(
         points = as_tensor("score_partition", "points", points)
         check_shapes("score_partition", points=(points, "N 3"), truth=(truth, "N"))
         check_floating("score_partition", points=points)
-    scored = truth != UNLABELED if ignore is None else (truth != UNLABELED) & (truth != ignore)
+    scored = (truth != UNLABELED) & have_other_label(truth, ignore)
     has_one = superpoints != UNLABELED
     count = len(torch.unique(superpoints[has_one]))
     num_right, miou = _score_oracle(superpoints[scored], truth[scored])
