@@ -2,7 +2,7 @@
 
     python scripts/bench.py peers --programs DIR --sizes 1000000 --out peers.json
     python scripts/bench.py accuracy --programs DIR --open3d-python PYTHON --synpeb FILE
-        --parts FILE --rooms FOLDER --out accuracy.json
+        --rooms FOLDER --only consensus depth PCL Open3D --out accuracy.json
     python scripts/bench.py superpoints --parts FILE --peer cutpursuit.py --out superpoints.json
     python scripts/readme_tables.py peers.json accuracy.json superpoints.json
 
@@ -40,17 +40,10 @@ KINDS = {
     "rgbd_like": "rooms, fused depth frames",
     "s3dis_like": "rooms, points of a mesh, as S3DIS",
     "scannet_like": "rooms, vertices of a mesh, as ScanNet",
-    "office_parts": "parts of a real office",
     "4 frames, exact": "single depth frames, exact",
     "4 frames, kinect": "single depth frames of a Kinect",
 }
 """Rows of the table of quality: the start of the name of their clouds, past any folder."""
-PEERS = {
-    "PCL": ("PCL",),
-    "Open3D": ("Open3D",),
-    "CGAL": ("CGAL growing, pca", "CGAL RANSAC, pca"),
-}
-"""Columns of the table of quality, and the runs of which the better one of each is shown."""
 IMAGES = "4 frames"
 """Clouds that torchrg sees as images."""
 FEW = 300
@@ -94,16 +87,14 @@ def _time(by: Figures, name: str) -> float:
 
 
 def _shares(results: Figures, kind: str) -> list[float]:
-    """Return the mean fractions of surfaces that each program detects in clouds of a kind."""
+    """Return the mean shares of the faces that torchrg, PCL and Open3D find in clouds of a kind."""
     clouds = [by for name, by in results.items() if name.split("/")[-1].startswith(kind)]
     ours = "depth" if kind.startswith(IMAGES) else "consensus"
-
-    def detected(name: str) -> float:
-        return fmean(median(run["recall_iou50"] for run in by[name]) for by in clouds)
-
-    if not clouds:
-        return []
-    return [detected(ours), *(max(map(detected, names)) for names in PEERS.values())]
+    return [
+        fmean(median(run["recall_iou50"] for run in by[name]) for by in clouds)
+        for name in (ours, "PCL", "Open3D")
+        if clouds
+    ]
 
 
 def to_section(figures: Figures) -> str:
@@ -118,7 +109,7 @@ def to_section(figures: Figures) -> str:
         for title, shares in figures["quality"].items()
     ]
     quality += [
-        [title, f"{ours:.2f}", *("" for _ in PEERS), f"{peer:.2f}"]
+        [title, f"{ours:.2f}", "", "", f"{peer:.2f}"]
         for title, (ours, peer) in figures["superpoints"].items()
     ]
     return "\n\n".join(
@@ -128,7 +119,7 @@ def to_section(figures: Figures) -> str:
             markdown(["work", "torchrg", "PCL", "Open3D", "PCL, sorted", "Open3D, sorted"], times),
             "Share of true faces found at an IoU of 0.5 (`bench.py accuracy`), or of points in a "
             f"superpoint of their own object, of {FEW}:",
-            markdown(["data", "torchrg", *PEERS, "cut pursuit"], quality),
+            markdown(["data", "torchrg", "PCL", "Open3D", "cut pursuit"], quality),
         ]
     )
 
