@@ -483,12 +483,12 @@ def test_layers_are_checked_where_lazrs_reads_them(tmp_path, monkeypatch):
     path = tmp_path / "a.copc.laz"
     write_copc(path, monkeypatch)
     with laspy.open(path) as reader:
-        start = reader.header.offset_to_point_data
+        first = reader.header.offset_to_point_data + 8
+        sizes = first + reader.header.point_format.size + 4
     data = bytearray(path.read_bytes())
-    (table,) = struct.unpack_from("<q", data, start)
-    # Bytes that shift a chunk make other sizes of its layers, of gigabytes.
-    data[start + 60 : start + 60] = b"\xff" * 8
-    struct.pack_into("<q", data, start, table + 8)
+    (layer,) = struct.unpack_from("<I", data, sizes)
+    # The next chunk is then read one byte too early, where its layers seem to be of gigabytes.
+    struct.pack_into("<I", data, sizes, layer - 1)
     path.write_bytes(data)
     with pytest.raises(FormatError, match=r"byte \d+: expected [\d,]+ bytes for the layers of a c"):
         read_cloud(path)
