@@ -10,6 +10,8 @@ from torchrg.structures import FARTHEST
 
 LARGEST_INTEGER = 2**31 - 1
 """Largest integer that stands for a coordinate, in steps of a scale from an offset."""
+_MIN_REACH = 2.0**-126
+"""Least extent of all integers, the smallest normal number of float32, in which points are kept."""
 _MAX_OUTSIDE = 0.01
 """Largest distance of points from the box in a header, as a fraction of their extent, without a
 note. Programs round the box."""
@@ -25,7 +27,7 @@ def check_grid(path: Path, what: str, scales: ArrayLike, offsets: ArrayLike) -> 
         torchrg.errors.FormatError: a.las: expected a scale and offset of x, y, z that ...
     """
     scale, offset = np.abs(np.array([scales, offsets], np.float64))
-    min_reach = np.maximum(np.spacing(offset), np.finfo(np.float32).tiny)
+    min_reach = np.maximum(np.spacing(offset), _MIN_REACH)
     is_grid = (scale * LARGEST_INTEGER >= min_reach) & (scale <= FARTHEST) & (offset <= FARTHEST)
     if not is_grid.all():
         shown = ", ".join(map(str, np.ravel(scales))), ", ".join(map(str, np.ravel(offsets)))
