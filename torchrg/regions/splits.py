@@ -420,7 +420,7 @@ def _measure_residuals(
     """
     segments, narrow = Segments(region), region.to(torch.int32)
     (along,) = segments.along(cloud.points, planes.center, planes.normal[:, None])
-    residual, average = torch.zeros(2, len(region), device=region.device)
+    residual, average = torch.zeros(2, len(region), dtype=torch.float32, device=region.device)
     residual[segments.rows] = along.float()
 
     def work(block: slice) -> None:
