@@ -35,8 +35,7 @@ from torchrg.datasets.pointcept import write_arrays, write_pointcept_scene
 from torchrg.errors import FormatError
 from torchrg.io.fields import are_whole
 from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_folder
-from torchrg.neighbors import restore_points, sample_voxels
-from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
+from torchrg.normals.orient import Orientation, front_of, orient_normals
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.result import PLANES_FILE, describe_planes, write_table
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
@@ -303,7 +302,7 @@ def segment_cloud(
     cloud: Cloud,
     settings: PipelineConfig,
     *,
-    orient: CloudOrientation = "auto",
+    orient: Orientation = "auto",
     partition: SuperpointsConfig | None = None,
     voxel: float | None = None,
     within: NDArray[np.integer] | None = None,
@@ -318,8 +317,7 @@ def segment_cloud(
     Raises:
         ConfigError: If normals shall look at scanners, and the cloud does not know of any.
     """
-    check_viewpoint(cloud, orient, "use --orient interior")
-    points, superpoints = cloud.points, None
+    points, front, superpoints = cloud.points, front_of(cloud, orient), None
     is_kept = partition is not None
     seg = segment_planes(
         points, settings, voxel=voxel, within=within, keep_neighbors=is_kept, on_stage=begin
@@ -329,7 +327,8 @@ def segment_cloud(
         colors = cloud.fields.get("color")
         superpoints = make_superpoints(points, seg, partition, colors=colors, voxel=voxel)
     begin("orientation")
-    return _oriented(cloud, seg, orient, voxel), superpoints
+    turned = orient_normals(points, seg.normals, towards=orient, front=front)
+    return seg._replace(normals=turned), superpoints
 
 
 def find_objects(
@@ -361,21 +360,6 @@ def find_objects(
             f"points, got {values.dtype} of shape {values.shape}; number the objects."
         )
     return values.reshape(len(values), -1)[:, 0].astype(np.int64)
-
-
-def _oriented(
-    cloud: Cloud, seg: Segmentation, orient: CloudOrientation, voxel: float | None
-) -> Segmentation:
-    """Return a segmentation whose normals point to their side; with voxels, to that of these."""
-    if voxel is None:
-        return seg._replace(normals=orient_cloud(cloud, seg.normals, orient))
-    rows, inverse = sample_voxels(cloud.points, voxel)
-    front = None if cloud.front is None else cloud.front[rows]
-    few = replace(
-        cloud, coordinates=cloud.coordinates[rows], fields={}, grid_shape=None, front=front
-    )
-    turned = orient_cloud(few, seg.normals[rows], orient)
-    return seg._replace(normals=restore_points(turned, inverse))
 
 
 def check_stems(layout: str, places: Mapping[str, str]) -> None:
