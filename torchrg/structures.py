@@ -51,7 +51,7 @@ class Cloud:
         front: Direction from each point to where its surface was seen from, of any length, zero
             where unknown, shape ``(N, 3)``, float32; None where the file does not say. By the faces
             of a mesh, or by where the scanners stood. It is not written with the cloud;
-            :func:`torchrg.normals.orient_cloud` turns normals by it.
+            :func:`torchrg.normals.orient_normals` turns normals by it.
 
     Raises:
         ShapeError: If ``coordinates`` is no NumPy array, or ``front`` has another shape.

@@ -118,7 +118,7 @@ def test_bad_points_stay_in_place(tmp_path, normals):
         (["--normals.k", "2"], "expected k >= 3, got 2"),
         (
             ["--orient", "viewpoint"],
-            "by viewpoint, got none; pass --viewpoint X Y Z, or --orient interior",
+            "or a viewpoint, to orient normals by viewpoint, got none; use interior",
         ),
         (["--viewpoint", "0", "0", "0"], "--viewpoint X Y Z together with --orient viewpoint"),
         (["--threads", "0"], "expected --threads from 1 to 1,024, got 0"),

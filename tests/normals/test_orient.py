@@ -9,8 +9,9 @@ import torch
 from tests.made import make_shape
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
-from torchrg.normals import estimate_normals, orient, orient_normals
-from torchrg.normals.orient import propagate_signs, vote_free_side
+from torchrg.normals import estimate_normals, orient_normals
+from torchrg.normals.faces import find_faces
+from torchrg.normals.free_space import cell_width, vote_free_side
 
 
 def shuffled_signs(normals):
@@ -118,10 +119,15 @@ def test_open_surface_is_consistent(rng):
 
 def test_patches_end_at_edges(rng):
     points, inwards = box_room((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), rng)
-    _, patches, _ = propagate_signs(points, inwards, search_knn(points, 12), within_patches=True)
-    sizes = patches.bincount()
+    near = search_knn(points, 20).indices
+    none = torch.full((len(points),), -1)
+    numbers, signs = find_faces(points, inwards, near, none, torch.zeros(0, 3), 0.01)
+    sizes = numbers.bincount()
     assert sizes.sort(descending=True).values[:6].sum() > 0.98 * len(points)
     assert sizes.max() <= 1500
+    for face in sizes.argsort(descending=True)[:6]:
+        normals = (inwards * signs[:, None])[numbers == face]
+        assert torch.equal(normals, normals[:1].expand_as(normals))
 
 
 def test_rooms_are_seen_from_inside(scanned):
@@ -173,23 +179,6 @@ def test_few_points_that_noise_has_tilted_follow_the_floor_they_are_part_of(rng)
     normals = torch.cat([inwards, torch.tensor([0.0, 0, 1]).expand(400, 3)])
     oriented = orient_normals(torch.cat([points, shelf]), shuffled_signs(normals))
     assert torch.equal(oriented[few], inwards[few])
-
-
-def test_points_between_those_over_which_signs_spread_follow_them(scanned, monkeypatch):
-    scene, normals = scanned
-    whole = orient_normals(scene.points, normals)
-    monkeypatch.setattr(orient, "_MOST_SPREADING", 15_000)
-    half = orient_normals(scene.points, normals)
-    assert share_right(half, scene.normals) > share_right(whole, scene.normals) - 0.01
-    order = torch.randperm(len(normals), generator=torch.Generator().manual_seed(3))
-    assert torch.equal(orient_normals(scene.points[order], -normals[order]), half[order])
-
-
-def test_points_that_follow_look_to_their_own_side_of_a_plate(rng, monkeypatch):
-    scene = make_shape("thin_plate", 30_000, 0.0)
-    monkeypatch.setattr(orient, "_MOST_SPREADING", 15_000)
-    oriented = orient_normals(scene.points, shuffled_signs(scene.normals), towards="consistent")
-    assert share_right(oriented, scene.normals) > 0.999
 
 
 @pytest.mark.parametrize("towards", ["consistent", "interior"])
@@ -271,9 +260,11 @@ def test_neighbors_may_be_given(rng):
 
 def test_wrong_arguments_are_refused():
     points = torch.rand(4, 3)
-    with pytest.raises(ConfigError, match=r"towards to be one of viewpoint, .*, got 'up'"):
-        orient_normals(points, points, towards="up")
-    with pytest.raises(ConfigError, match="expected a viewpoint with towards='viewpoint'"):
+    with pytest.raises(ConfigError, match=r"towards to be one of auto, .*, got 'inwards'"):
+        orient_normals(points, points, towards="inwards")
+    with pytest.raises(
+        ConfigError, match=r"expected poses of scanners, .*, or a viewpoint, .* got"
+    ):
         orient_normals(points, points, towards="viewpoint")
     with pytest.raises(ConfigError, match=r"expected no viewpoint with towards='\+z'"):
         orient_normals(points, points, towards="+z", viewpoint=torch.zeros(3))
@@ -301,8 +292,8 @@ def test_single_wrong_normals_take_the_side_of_those_around_them(spoiled):
     right = (oriented * inwards).sum(dim=1) > 0
     assert right[::10].double().mean() > 0.995
     # On their own they would be right less often.
-    near = search_knn(points, 20)
-    alone = vote_free_side(points, normals, near) > 0
+    near, rows = search_knn(points, 20).indices, torch.arange(len(points))
+    alone = vote_free_side(points, normals, near, rows, cell_width(points, near)) > 0
     assert alone[::10].double().mean() < right[::10].double().mean()
 
 

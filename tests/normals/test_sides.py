@@ -96,5 +96,5 @@ def test_a_viewpoint_that_is_not_known_is_refused_with_the_repair(scanned):
     # A front by poses is one of scanners.
     posed = replace(cloud, header={"scans": ()})
     assert torch.equal(orient_cloud(posed, normals, "viewpoint"), orient_cloud(cloud, normals))
-    with pytest.raises(ConfigError, match="expected towards to be one of viewpoint"):
+    with pytest.raises(ConfigError, match="expected orient to be one of auto"):
         orient_cloud(cloud, normals, "inwards")

@@ -107,7 +107,7 @@ def test_it_survives_pickling_and_shows_its_settings(rooms):
     again = pickle.loads(pickle.dumps(step))
     assert torch.equal(again(sample)["normal"], step(sample)["normal"])
     assert repr(step) == "OrientNormals(towards='viewpoint', viewpoint=(1.0, 2.0, 0.5))"
-    assert repr(OrientNormals("up")) == "OrientNormals(towards='+z')"
+    assert repr(OrientNormals("up")) == "OrientNormals(towards='up')"
 
 
 def test_empty_clouds_and_points_without_place_pass():
@@ -121,7 +121,7 @@ def test_empty_clouds_and_points_without_place_pass():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: OrientNormals("inwards"), "towards to be one of viewpoint, .*up, got 'inwards'"),
+        (lambda: OrientNormals("inwards"), "towards to be one of auto, .*none, got 'inwards'"),
         (lambda: OrientNormals("up", (0, 0, 1)), "three numbers as viewpoint, with .* with 'up'"),
         (lambda: OrientNormals("viewpoint", (0, 1)), r"three numbers .*got \(0, 1\) with 'viewp"),
         (

@@ -39,8 +39,7 @@ from torchrg.errors import FormatError
 from torchrg.io.colors import narrow_colors
 from torchrg.io.fields import are_whole
 from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_folder
-from torchrg.neighbors import restore_points, sample_voxels
-from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
+from torchrg.normals.orient import Orientation, front_of, orient_normals
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.result import PLANES_FILE, describe_planes, write_table
@@ -320,7 +319,7 @@ def segment_cloud(
     cloud: Cloud,
     settings: PipelineConfig,
     *,
-    orient: CloudOrientation = "auto",
+    orient: Orientation = "auto",
     partition: SuperpointsConfig | None = None,
     voxel: float | None = None,
     within: NDArray[np.integer] | None = None,
@@ -335,8 +334,7 @@ def segment_cloud(
     Raises:
         ConfigError: If normals shall look at scanners, and the cloud does not know of any.
     """
-    check_viewpoint(cloud, orient, "use --orient interior")
-    points, superpoints = cloud.points, None
+    points, front, superpoints = cloud.points, front_of(cloud, orient), None
     is_kept = partition is not None
     # Superpoints keep to the borders of all planes.
     config = settings.of_all_planes() if is_kept else settings
@@ -351,7 +349,8 @@ def segment_cloud(
         plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
         seg, superpoints = keep_planes(seg, rows), superpoints._replace(plane=plane)
     begin("orientation")
-    return _oriented(cloud, seg, orient, voxel), superpoints
+    turned = orient_normals(points, seg.normals, towards=orient, front=front)
+    return seg._replace(normals=turned), superpoints
 
 
 def find_objects(
@@ -383,22 +382,6 @@ def find_objects(
             f"points, got {values.dtype} of shape {values.shape}; number the objects."
         )
     return values.reshape(len(values), -1)[:, 0].astype(np.int64)
-
-
-def _oriented(
-    cloud: Cloud, seg: Segmentation, orient: CloudOrientation, voxel: float | None
-) -> Segmentation:
-    """Return a segmentation whose normals point to their side; with voxels, to that of these."""
-    if voxel is None:
-        return seg._replace(normals=orient_cloud(cloud, seg.normals, orient))
-    rows, inverse = sample_voxels(cloud.points, voxel)
-    kept = rows.numpy()  # NumPy takes a tensor of one element for a number.
-    front = None if cloud.front is None else cloud.front[kept]
-    few = replace(
-        cloud, coordinates=cloud.coordinates[kept], fields={}, grid_shape=None, front=front
-    )
-    turned = orient_cloud(few, seg.normals[rows], orient)
-    return seg._replace(normals=restore_points(turned, inverse))
 
 
 def check_stems(layout: str, places: Mapping[str, str]) -> None:

@@ -55,7 +55,7 @@ from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_colum
 from torchrg.io.colors import read_colors
 from torchrg.io.fields import Values
 from torchrg.io.npy import map_folder
-from torchrg.normals.sides import CloudOrientation, orient_cloud
+from torchrg.normals.orient import Orientation, orient_normals
 from torchrg.structures import Cloud, Segmentation
 
 _COPIED = tuple(name for name in GIVEN_ARRAYS if name != "normal")
@@ -75,7 +75,7 @@ class CloudSource(Source):
         layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
         partition: How superpoints are made.
         level: Which of their levels is written.
-        orient: To which side normals point; see :func:`torchrg.normals.orient_cloud`.
+        orient: To which side normals point; see :func:`torchrg.normals.orient_normals`.
         within: Array of objects that planes are kept within; see
             :func:`torchrg.batch.scans.find_objects`. Default: planes go across.
     """
@@ -86,7 +86,7 @@ class CloudSource(Source):
     layout: str = "pointcept"
     partition: SuperpointsConfig = field(default_factory=SuperpointsConfig)
     level: int = 0
-    orient: CloudOrientation = "auto"
+    orient: Orientation = "auto"
     within: str | None = None
     bytes_per_point: ClassVar[int] = 104
     """Space of a point in the largest of the layouts."""
@@ -372,7 +372,7 @@ class RGBDSource(Source):
     layout: str
     intrinsics: Pinhole | None = None
     depth_scale: float | None = None
-    orient: CloudOrientation = "auto"
+    orient: Orientation = "auto"
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
     def describe(self) -> Record:
@@ -432,7 +432,7 @@ class RGBDSource(Source):
         )
 
 
-def orient_image(seg: Segmentation, points: Tensor, orient: CloudOrientation) -> Segmentation:
+def orient_image(seg: Segmentation, points: Tensor, orient: Orientation) -> Segmentation:
     """Return the segmentation of an image of points ``(H, W, 3)`` with its normals turned.
 
     They look at the camera already, which every value but :data:`TURNING` leaves.
@@ -440,7 +440,7 @@ def orient_image(seg: Segmentation, points: Tensor, orient: CloudOrientation) ->
     if orient not in TURNING:
         return seg
     cloud = Cloud(points.reshape(-1, 3).numpy())
-    normals = orient_cloud(cloud, seg.normals.view(-1, 3), orient)
+    normals = orient_normals(cloud.points, seg.normals.view(-1, 3), towards=orient)
     return seg._replace(normals=normals.view_as(seg.normals))
 
 

@@ -29,7 +29,7 @@ from torchrg.io.fields import put_results
 from torchrg.io.npy import KEPT_FIELDS
 from torchrg.neighbors import distinct_points, search_knn
 from torchrg.normals import estimate_normals
-from torchrg.normals.sides import CloudOrientation, check_viewpoint, orient_cloud
+from torchrg.normals.orient import Orientation, front_of, orient_cloud
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
 """Fields of each point that are written."""
@@ -51,7 +51,7 @@ class Arguments:
     out: flags.OutFlag
     method: NormalMethod | None = None
     """Estimator of the normals, a short form of --normals.method."""
-    orient: CloudOrientation = "none"
+    orient: Orientation = "none"
     """How the sign of each normal is chosen: towards the viewpoint or along an axis (up is +z), so
     that neighbours agree (consistent), into the free space of rooms (interior), or as torchrg
     segment does it (auto): to the front of the faces of a mesh, to the scanner where the file names
@@ -93,7 +93,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     if cloud.precision_note:
         warn(f"{source}: {cloud.precision_note}.")
     if arguments.viewpoint is None:
-        check_viewpoint(cloud, arguments.orient, "pass --viewpoint X Y Z, or --orient interior")
+        front_of(cloud, arguments.orient)  # Before the work.
     check_output(target, cloud)
     with stage_bar(source.name, ("normals", "orientation")) as advance:
         advance("normals")

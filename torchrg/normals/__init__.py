@@ -15,8 +15,7 @@ name                  what it is                                     what for
 ``consensus``         ``pca``, then planes that neighbours agree on  the default: edges, noise
 ====================  =============================================  =============================
 
-Signs are arbitrary until :func:`orient_normals` chooses them, or :func:`orient_cloud`, which knows
-what the file of a cloud says about its sides. The ``fit_*`` functions take patches
+Signs are arbitrary until :func:`orient_normals` chooses them. The ``fit_*`` functions take patches
 of shape ``(*, K, 3)`` and are what the estimators are made of.
 """
 
@@ -36,10 +35,9 @@ from torchrg.neighbors import check_neighbors, distinct_points, search_knn
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
-from torchrg.normals.orient import orient_normals
+from torchrg.normals.orient import orient_cloud, orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
 from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
-from torchrg.normals.sides import orient_cloud
 from torchrg.precision import warn_of_steps
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
 from torchrg.structures import Neighbors, NormalFit

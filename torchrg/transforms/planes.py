@@ -7,11 +7,12 @@ count once and get one result, as in :func:`torchrg.segment_planes`.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchrg._checks import check_choices
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import (
     AnyConfig,
@@ -85,7 +86,7 @@ class OrientNormals(CloudTransform):
     or ``(N, 3)``. Changes ``normal``. Each cloud of a batch is oriented on its own.
 
     Args:
-        towards: What normals are turned to; ``"up"`` is ``"+z"``.
+        towards: What normals are turned to.
         viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
 
     Raises:
@@ -100,24 +101,20 @@ class OrientNormals(CloudTransform):
 
     def __init__(
         self,
-        towards: Orientation | Literal["up"] = "interior",
+        towards: Orientation = "interior",
         viewpoint: Sequence[float] | None = None,
         *,
         keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keep_neighbors=keep_neighbors, keys=keys)
-        sides = (*get_args(Orientation), "up")
-        if towards not in sides:
-            raise ConfigError(
-                f"OrientNormals: expected towards to be one of {', '.join(sides)}, got {towards!r}."
-            )
+        check_choices("OrientNormals", towards=(towards, Orientation))
         if viewpoint is not None and (towards != "viewpoint" or len(viewpoint) != 3):
             raise ConfigError(
                 "OrientNormals: expected three numbers as viewpoint, with towards='viewpoint', got "
                 f"{viewpoint!r} with {towards!r}."
             )
-        self.towards: Orientation = "+z" if towards == "up" else towards
+        self.towards: Orientation = towards
         self.viewpoint = None if viewpoint is None else tuple(map(float, viewpoint))
         looks = towards == "viewpoint" and viewpoint is None
         self.reads = ("coord", "normal", *["viewpoint"] * looks)

@@ -1,0 +1,188 @@
+"""Faces: the double cover, sides of plates, thick planes, and free paths against a dense grid."""
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg import scratch
+from torchrg.neighbors import finite_rows, search_knn
+from torchrg.normals import orient_normals
+from torchrg.normals.faces import _find_components, find_faces, find_surfaces
+from torchrg.normals.free_space import _free_paths
+from torchrg.normals.orient import turn_faces
+from torchrg.scenes import make_room
+
+
+def draw(rng, count, low, high, axis=2, side=1.0):
+    """Draw points of an axis-aligned rectangle, in canonical order later, and their normals."""
+    low, high = torch.tensor(low), torch.tensor(high)
+    points = low + torch.rand(count, 3, generator=rng) * (high - low)
+    return points, side * torch.eye(3)[axis].expand(count, 3)
+
+
+def sorted_cloud(parts, noise=0.0, rng=None):
+    """Join parts of points and normals in canonical order; return the part of each point, too."""
+    points, normals = (torch.cat(column) for column in zip(*parts, strict=True))
+    part = torch.repeat_interleave(torch.tensor([len(part[0]) for part in parts]))
+    if noise:
+        points = points + noise * normals * torch.randn(len(points), 1, generator=rng)
+    rows = finite_rows(points)
+    return points[rows], normals[rows], part[rows]
+
+
+def test_a_component_holds_one_copy_of_each_node_and_a_mixed_one_falls_apart():
+    # A chain that turns once, and a triangle that turns once, as a Moebius strip does.
+    starts, ends = np.array([0, 1, 3, 4, 5]), np.array([1, 2, 4, 5, 3])
+    turned = np.array([True, False, False, False, True])
+    numbers, signs = _find_components(6, starts, ends, turned)
+    assert numbers.tolist() == [0, 0, 0, 1, 2, 3]
+    assert signs[:3].tolist() == [1, -1, -1]
+
+
+def test_nothing_to_link_is_no_trouble():
+    none = np.zeros(0, dtype=np.int64)
+    numbers, signs = _find_components(3, none, none, none.astype(bool))
+    assert numbers.tolist() == [0, 1, 2]
+    assert signs.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("labeled", [True, False])
+def test_both_sides_of_a_plate_are_faces(rng, labeled):
+    # Farther apart than a neighbor is high: sides are told apart by heights alone.
+    top = draw(rng, 300, (0.0, 0, 0.04), (1.5, 1, 0.04))
+    bottom = draw(rng, 260, (0.0, 0, 0), (1.5, 1, 0), side=1.0)
+    stray = draw(rng, 20, (0.0, 0, -0.2), (1.5, 1, -0.1))
+    points, normals, part = sorted_cloud([top, bottom, stray], 0.003, rng)
+    near = search_knn(points, 20).indices
+    labels = torch.full((len(points),), 0 if labeled else -1)
+    axes = torch.tensor([[0.0, 0, 1]])[: int(labeled)]
+    faces, signs = find_faces(points, normals, near, labels, axes, 0.07)
+    for side in (0, 1):
+        assert (faces[part == side] == faces[part == side].mode().values).double().mean() > 0.99
+    assert faces[part == 0].mode().values != faces[part == 1].mode().values
+    assert (signs == signs[0]).all()
+
+
+@pytest.mark.parametrize(("kind", "sides"), [("noise", 1), ("slab", 2), ("plate", 2)])
+def test_noise_is_one_face(rng, kind, sides):
+    points, normals = draw(rng, 4000, (0.0, 0, 0), (4.0, 3, 0))
+    heights = {
+        "noise": torch.randn(4000, generator=rng),
+        "slab": 4 * torch.rand(4000, generator=rng) - 2,
+        "plate": torch.randn(4000, generator=rng).sign() + 0.3 * torch.randn(4000, generator=rng),
+    }
+    points[:, 2] = 0.02 * heights[kind]
+    rows = finite_rows(points)
+    points, normals = points[rows], normals[rows]
+    near, labels = search_knn(points, 20).indices, torch.zeros(4000, dtype=torch.int64)
+    faces, _ = find_faces(points, normals, near, labels, normals[:1], 0.1)
+    assert len(faces.unique()) == sides
+
+
+def test_a_region_of_two_walls_is_no_face(rng):
+    # Growth joined both sides of a wall, farther apart than points are.
+    walls = [draw(rng, 2000, (x, 0.0, 0), (x, 4, 2.5), axis=0) for x in (0.0, 0.4)]
+    points, normals, part = sorted_cloud(walls, 0.002, rng)
+    near = search_knn(points, 20).indices
+    labels = torch.zeros(len(points), dtype=torch.int64)
+    tilted = torch.nn.functional.normalize(torch.tensor([[1.0, 0.1, 0.05]]), dim=1)
+    faces, _ = find_faces(points, normals, near, labels, tilted, 0.05)
+    majority = [faces[part == wall].mode().values for wall in (0, 1)]
+    assert majority[0] != majority[1]
+    for wall in (0, 1):
+        assert (faces[part == wall] == majority[wall]).double().mean() > 0.99
+
+
+def test_patches_that_noise_cuts_from_one_wall_join(rng):
+    points, normals = draw(rng, 6000, (0.0, 0, 0), (4.0, 3, 0))
+    normals = normals + 0.25 * torch.randn(6000, 3, generator=rng)
+    normals = torch.nn.functional.normalize(normals, dim=1)
+    rows = finite_rows(points)
+    points, normals = points[rows], normals[rows]
+    near, none = search_knn(points, 20).indices, torch.full((6000,), -1)
+    faces, signs = find_faces(points, normals, near, none, torch.zeros(0, 3), 0.05)
+    sizes = faces.bincount()
+    assert sizes[sizes > 0].min() >= 10
+    assert (sizes > 0).sum() < 60
+    for face in faces.unique():
+        assert ((normals[:, 2] * signs)[faces == face] > 0).double().mean() in (0.0, 1.0)
+
+
+def test_surfaces_are_connected_over_edges(rng):
+    cube = [
+        draw(rng, 400, *((*[0.0] * a, s, *[0.0] * (2 - a)), (*[1.0] * a, s, *[1.0] * (2 - a))), a)
+        for a in range(3)
+        for s in (0.0, 1.0)
+    ]
+    points, normals, _ = sorted_cloud([*cube, draw(rng, 400, (5.0, 0, 0), (6.0, 1, 0))])
+    surfaces, signs = find_surfaces(points, normals, search_knn(points, 12).indices)
+    assert surfaces.bincount().tolist() == [2400, 400]
+    outwards = ((points - 0.5) * normals).sum(dim=1)[surfaces == 0] * signs[surfaces == 0]
+    assert (outwards > 0).double().mean() in (0.0, 1.0)
+
+
+def walked_path(occupied, cell, steps):
+    """Walk over empty cells to the next one with points or out of the grid."""
+    at, count = np.array(cell) + steps, 0
+    while ((at >= 0) & (at < occupied.shape)).all():
+        if occupied[tuple(at)]:
+            return count, 1.0
+        at, count = at + steps, count + 1
+    return count, 0.5
+
+
+def test_free_paths_are_those_of_a_walk_through_a_dense_grid():
+    rng = np.random.default_rng(2)
+    occupied = rng.random((7, 5, 9)) < 0.15
+    at = np.stack(np.nonzero(occupied))
+    at = at - at.min(axis=1, keepdims=True)
+    occupied = np.zeros(at.max(axis=1) + 1, dtype=bool)
+    occupied[tuple(at)] = True
+    for steps in product((-1, 0, 1), repeat=3):
+        if steps <= (0, 0, 0):
+            continue
+        stride = math.sqrt(sum(map(abs, steps)))
+        for found, sign in zip(_free_paths(at, steps, stride), (1, -1), strict=True):
+            for cell, worth in zip(at.T, found, strict=True):
+                count, weight = walked_path(occupied, cell, sign * np.array(steps))
+                expected = weight * count * stride / (count * stride + 8)
+                assert worth == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def furnished():
+    room = make_room(12_000, 0.003, 4)
+    rows = finite_rows(room.points)
+    return room.points[rows].float(), room.normals[rows].float()
+
+
+def test_a_stray_point_far_off_changes_little(furnished):
+    points, normals = furnished
+    whole = orient_normals(points, normals)
+    far = torch.tensor([[3e4, -2e4, 1e4]])
+    strayed = orient_normals(torch.cat([points, far]), torch.cat([normals, normals[:1]]))
+    assert strayed.isfinite().all()
+    assert ((strayed[:-1] * whole).sum(dim=1) > 0).double().mean() > 0.9
+
+
+@pytest.mark.parametrize("side", ["interior", "consistent"])
+def test_threads_and_disks_and_longer_lists_change_nothing(furnished, tmp_path, monkeypatch, side):
+    points, normals = furnished
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            results.append(orient_normals(points, normals, towards=side))
+    finally:
+        torch.set_num_threads(before)
+    monkeypatch.setattr(scratch, "_LEAST_BYTES", 0)
+    with scratch.on_disk(tmp_path):
+        results.append(orient_normals(points, normals, towards=side))
+        longer = search_knn(points, 50)
+        results.append(orient_normals(points, normals, towards=side, neighbors=longer))
+    results.append(turn_faces(points, -normals, side, search_knn(points, 5)))
+    assert all(torch.equal(result, results[0]) for result in results)

@@ -1,0 +1,143 @@
+"""The side of a surface that has more free space in front of it."""
+
+import math
+from functools import reduce
+from itertools import product
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrg._parallel import ROWS_AT_ONCE, map_tasks
+from torchrg.linalg.moments import dot, kth_smallest
+
+_SPACINGS_PER_CELL = 1.5
+_SPACING_QUANTILE = 0.9
+"""Quantile of the spacing of the points that gives the side of a cell, so that sparse walls are
+closed."""
+
+_MAX_CELLS = 2**19
+"""Cells along an axis. The number of a line and the place on it then fit an int64."""
+
+_NUM_OBSTACLES = 12
+"""Nearest neighbors that can be an obstacle."""
+
+_PARALLEL, _ABOVE = 0.99, 0.5
+"""Cosine, of 8 degrees, between normals that are parallel, and sine, of 30 degrees, of the angle at
+which a neighbor with such a normal lies on another face. On one smooth surface it rises by no more
+than half of the angle between the normals."""
+
+_OPEN_WEIGHT = 0.5
+"""Weight of a free path that leaves the box around the cloud."""
+
+_HALF_WORTH = 8
+"""Free cells at which a path gets half of the largest weight. A gap so weighs less than a room, and
+a hall no more than a room."""
+
+_HALF_DIRECTIONS = [steps for steps in product((-1, 0, 1), repeat=3) if steps > (0, 0, 0)]
+"""Thirteen directions to cells around one; the opposite directions lead to the other thirteen."""
+
+
+def vote_free_side(
+    points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, width: float
+) -> Tensor:
+    """Return how much more free space lies in front of some points than behind them.
+
+    1. The points mark the cells of a grid.
+    2. From each point, in each of the 26 directions to neighboring cells, the free path is measured
+       to the next marked cell. A path that leaves the box of the cloud counts half.
+    3. If a neighbor with a parallel normal lies above the surface by more than 30 degrees, paths to
+       the front end there, and paths to the back likewise: faces of thin plates are closer than
+       cells.
+    4. The vote is the sum of ``sign(n . d) (n . d)^2 f(path)`` over the directions ``d``, where
+       ``f`` rises from 0 to 1 and is half at 8 cells.
+
+    Points ``(N, 3)`` are in canonical order, ``near`` ``(N, K)`` are rows of their neighbors, and
+    ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive where the normal points to the freer side.
+    """
+    low = points.amin(dim=0)
+    x, y, z = ((points - low) / width).long().unbind(dim=1)
+    codes = (x * _MAX_CELLS + y) * _MAX_CELLS + z
+    cells = np.sort(torch.unique_consecutive(codes).numpy())
+    cells = cells[np.append(True, cells[1:] != cells[:-1])]
+    x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
+    at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell])
+    cell = np.searchsorted(cells, codes[rows].numpy())
+    own = normals[rows]
+    front, back = _find_obstacles(points, normals, near, rows, width)
+
+    def vote(steps: tuple[int, ...]) -> Tensor:
+        stride = math.sqrt(sum(step * step for step in steps))
+        cosine = dot(own, own.new_tensor(steps)) / stride
+        ahead, behind = (
+            torch.from_numpy(worth[cell]).to(own) for worth in _free_paths(at, steps, stride)
+        )
+        is_front = cosine > 0
+        ahead = torch.minimum(ahead, torch.where(is_front, front, back))
+        behind = torch.minimum(behind, torch.where(is_front, back, front))
+        return cosine * cosine.abs() * (ahead - behind)
+
+    return reduce(torch.add, map_tasks(vote, _HALF_DIRECTIONS, points.device))
+
+
+def cell_width(points: Tensor, near: Tensor) -> float:
+    """Return the side of cells, by the spacing of the points; any where that is zero."""
+    rank = (near.shape[1] - 1) // 2
+    if rank == 0:
+        return 1.0
+    rows = torch.arange(0, len(points), max(len(points) // ROWS_AT_ONCE, 1))
+    arms = points[near[rows, rank]] - points[rows]
+    # A disk of that radius holds ``rank`` points, one for each square of the spacing.
+    spacing = dot(arms, arms).sqrt() * math.sqrt(math.pi / rank)
+    at = math.ceil(_SPACING_QUANTILE * len(rows)) - 1
+    width = _SPACINGS_PER_CELL * float(kth_smallest(spacing, at))
+    extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
+    return max(width, 2 * extent / _MAX_CELLS) or 1.0
+
+
+def _find_obstacles(
+    points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, width: float
+) -> list[Tensor]:
+    """Return the worth of paths to the nearest faces ahead and behind on which neighbors lie."""
+    ends, own = near[rows, :_NUM_OBSTACLES], normals[rows, None]
+    arms = points[ends] - points[rows, None]
+    height = dot(arms, own)
+    is_face = dot(normals[ends], own).abs() > _PARALLEL
+    is_face &= height * height > _ABOVE * _ABOVE * dot(arms, arms)
+    nearest = (
+        torch.where(is_face & (above > 0), above, torch.inf).amin(dim=1)
+        for above in (height, -height)
+    )
+    return [1 / (1 + _HALF_WORTH * width / path) for path in nearest]
+
+
+def _free_paths(
+    at: NDArray[np.int64], steps: tuple[int, ...], stride: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the worth of the free paths from cells ``(3, C)`` in a direction, and opposite to it.
+
+    Each is ``(C,)``. Gaps between the cells of a line are paths, without a grid of empty cells.
+    """
+    sides = at.max(axis=1) + 1
+    a = next(axis for axis in range(3) if steps[axis])
+    b, c = (axis for axis in range(3) if axis != a)
+    first, second = (at[axis] - steps[axis] * at[a] + sides[a] for axis in (b, c))
+    order = np.argsort((first * (sides[c] + 2 * sides[a]) + second) * sides[a] + at[a])
+    first, second, along = first[order], second[order], at[a][order]
+    is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
+    gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)
+
+    def worth(gap: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
+        free = np.empty(len(order), np.int64)
+        free[order] = gap
+        to_ends = [
+            sides[axis] - 1 - at[axis] if steps[axis] * sign > 0 else at[axis]
+            for axis in range(3)
+            if steps[axis]
+        ]
+        path = stride * np.where(free < 0, np.minimum.reduce(to_ends), free).astype(np.float32)
+        weight = np.where(free < 0, np.float32(_OPEN_WEIGHT), np.float32(1))
+        return weight * (path / (path + np.float32(_HALF_WORTH)))
+
+    return worth(np.append(gaps, -1), 1), worth(np.insert(gaps, 0, -1), -1)
