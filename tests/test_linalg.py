@@ -19,7 +19,13 @@ from torchrg.linalg import (
     unsigned_angle_deg,
 )
 from torchrg.linalg.eigen import principal_frame
-from torchrg.linalg.moments import fit_planes_to_each, fit_weighted_planes, residuals, split_columns
+from torchrg.linalg.moments import (
+    Segments,
+    fit_planes_to_each,
+    fit_weighted_planes,
+    residuals,
+    split_columns,
+)
 
 PACKAGE = Path(__file__).parents[1] / "torchrg"
 # The largest number that a file can hold.
@@ -222,3 +228,19 @@ def test_tolerances_stand_here_alone():
         if "finfo" in path.read_text() and path.parent.name != "linalg"
     }
     assert asking <= MAY_ASK_FOR_PRECISION
+
+
+@pytest.mark.parametrize("size", [3, 200])
+def test_quantiles_of_small_and_large_regions_are_those_of_sorted_values(size: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.randint(-1, 40, (40 * size,), generator=generator)
+    labels[:40] = torch.arange(40)
+    values = torch.rand(len(labels), generator=generator)
+    segments = Segments(labels)
+    for fraction in (0.0, 0.33, 0.5, 1.0):
+        found = segments.quantile(segments.take(values), fraction)
+        expected = []
+        for label in range(40):
+            ascending = values[labels == label].sort().values
+            expected.append(ascending[int(fraction * (len(ascending) - 1))])
+        assert torch.equal(found, torch.stack(expected))

@@ -21,6 +21,10 @@ from torchrg.linalg.eigen import smallest_eigenvector3
 _LEAST_POINTS = 2**16
 """Points that are worth a thread's start."""
 
+_SORTED_SIZE = 50
+"""Mean number of points of a region below which one sort of all values is faster than a search for
+the quantile of each region."""
+
 
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
@@ -270,6 +274,12 @@ class Segments:
 
     def quantile(self, values: Tensor, fraction: float) -> Tensor:
         """Return the lower quantile of each region's values, one of them."""
+        are_small = len(values) < _SORTED_SIZE * len(self.counts) and bool(self.counts.all())
+        if are_small and values.device.type == "cpu":
+            order = np.lexsort((values.numpy(), self.labels.numpy()))
+            first = self.counts.cumsum(0) - self.counts
+            rank = (fraction * (self.counts - 1).double()).long()
+            return values[torch.from_numpy(order)[first + rank]]
         parts = torch.split(values, self.counts.tolist())
         found = [kth_smallest(region, int(fraction * (len(region) - 1))) for region in parts]
         return torch.stack(found) if parts else values

@@ -264,13 +264,18 @@ def merge_facets(
 
 
 class _Moments(NamedTuple):
-    """Moments of regions, the distance that counts as on their planes, and noise they lend."""
+    """Moments of regions, the distance that counts as on their planes, and noise they lend.
+
+    ``normal`` ``(M, 3)`` is the axis of the least variance ``(M,)``.
+    """
 
     weight: Tensor
     mean: Tensor
     covariance: Tensor
     scale: Tensor
     noise: Tensor
+    least: Tensor
+    normal: Tensor
 
     def at(self, rows: Tensor | slice) -> "_Moments":
         """Return those of some of the regions."""
@@ -280,12 +285,15 @@ class _Moments(NamedTuple):
 def _moments_of(planes: RegionPlanes) -> _Moments:
     normal = planes.normal
     variance = (normal[:, None] @ planes.covariance @ normal[:, :, None])[:, 0, 0]
+    values, axes = eigh3_of_few(planes.covariance)
     return _Moments(
         planes.num_points.double(),
         planes.center - planes.center[:1],
         planes.covariance,
         torch.where(planes.curved, 0.0, torch.maximum(variance.clamp(min=0).sqrt(), planes.floor)),
         planes.noise,
+        values[:, 0],
+        axes[:, :, 0],
     )
 
 
@@ -297,7 +305,7 @@ def misfit_of_pairs(planes: RegionPlanes, pairs: Tensor) -> Tensor:
     thickness = planes.thickness[pairs].amax(dim=1)
     moments = _moments_of(planes)
     first, second = (moments.at(side)._replace(scale=thickness) for side in pairs.unbind(dim=1))
-    return _misfit(first, second)
+    return _misfit(first, second, _joined(first, second))
 
 
 def _merge(
@@ -317,9 +325,10 @@ def _merge(
     def offer(pairs: Tensor) -> None:
         first, second = pairs.unbind(dim=1)
         sides = groups.at(first), groups.at(second)
-        misfits = _misfit(*sides)
+        both = _joined(*sides)
+        misfits = _misfit(*sides, both)
         if max_tilt is not None:
-            misfits = torch.where(_are_turned(*sides, max_tilt), torch.inf, misfits)
+            misfits = torch.where(_are_turned(*sides, both, max_tilt), torch.inf, misfits)
         for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
             if misfit <= tolerance:
                 heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
@@ -366,14 +375,13 @@ def _joined(a: _Moments, b: _Moments) -> _Moments:
         covariance = covariance + share[:, :, None] * spread
     noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
     scale = (share_a[:, 0] * a.scale.square() + share_b[:, 0] * b.scale.square()).sqrt()
-    return _Moments(weight, mean, covariance, scale, noise)
+    values, axes = eigh3_of_few(covariance)
+    return _Moments(weight, mean, covariance, scale, noise, values[:, 0], axes[:, :, 0])
 
 
-def _misfit(a: _Moments, b: _Moments) -> Tensor:
-    """Return how far from the joint plane the worse of two regions is, in its own scales."""
-    both = _joined(a, b)
-    normal = eigh3_of_few(both.covariance)[1][:, :, 0]
-    misfits = []
+def _misfit(a: _Moments, b: _Moments, both: _Moments) -> Tensor:
+    """Return the RMS distance to the joint plane of the worse of two regions, by its scale."""
+    misfits, normal = [], both.normal
     for side, other in ((a, b), (b, a)):
         variance = (normal[:, None] @ side.covariance @ normal[:, :, None])[:, 0, 0]
         shift = ((side.mean - both.mean) * normal).sum(dim=1)
@@ -383,15 +391,14 @@ def _misfit(a: _Moments, b: _Moments) -> Tensor:
     return torch.maximum(*misfits)
 
 
-def _are_turned(a: _Moments, b: _Moments, max_tilt: float) -> Tensor:
+def _are_turned(a: _Moments, b: _Moments, both: _Moments, max_tilt: float) -> Tensor:
     """Return whether the joint plane is turned too far against that of either."""
-    joint = eigh3_of_few(_joined(a, b).covariance)[1][:, :, 0]
+    joint = both.normal
     turned = torch.zeros(len(joint), dtype=torch.bool)
     for side in (a, b):
-        values, vectors = eigh3_of_few(side.covariance)
         variance = (joint[:, None] @ side.covariance @ joint[:, :, None])[:, 0, 0]
-        turned |= unsigned_angle_deg(vectors[:, :, 0], joint) > _FACET_TURN_DEG
-        turned |= variance - values[:, 0] > max_tilt**2
+        turned |= unsigned_angle_deg(side.normal, joint) > _FACET_TURN_DEG
+        turned |= variance - side.least > max_tilt**2
     return turned
 
 

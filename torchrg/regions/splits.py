@@ -365,7 +365,9 @@ def split_levels(
         none.
     """
     searched = labels
-    for _ in range(_MAX_LEVELS):
+    for search in range(_MAX_LEVELS):
+        if search:
+            planes = fit_regions(cloud, searched, config)
         large = (planes.num_points >= _MIN_POINTS * int(config.min_size)) & ~planes.curved
         if not bool(large.any()):
             break
@@ -380,7 +382,6 @@ def split_levels(
         rows = places_of(torch.isin(region, owner))
         searched = torch.full_like(labels, UNLABELED)
         searched[rows] = torch.unique(labels[rows], return_inverse=True)[1]
-        planes = fit_regions(cloud, searched, config)
     return labels
 
 
