@@ -2,18 +2,20 @@
 
     python scripts/bench.py peers --programs DIR --sizes 1000000 --out peers.json
     python scripts/bench.py accuracy --programs DIR --open3d-python PYTHON --synpeb FILE
-        --rooms FOLDER --only consensus depth PCL Open3D --out accuracy.json
+        --parts FILE --rooms FOLDER --out accuracy.json
     python scripts/bench.py superpoints --parts FILE --peer cutpursuit.py --out superpoints.json
-    python scripts/readme_tables.py peers.json accuracy.json superpoints.json
+    python scripts/readme_tables.py --peers peers.json --accuracy accuracy.json
+        --superpoints superpoints.json
 
-The figures are kept in ``figures.json`` beside this file. Times are medians of those of one round,
-as multiples of torchrg's. Of planes the share of the true faces is shown that are found at an IoU
-of 0.5, as a mean over the clouds of a kind; of some 300 superpoints the share of the points that
-are in one of their own object. Without files the tables are made of the figures that are kept.
+``figures.json`` in the same folder keeps the figures; a file that is not given keeps its part.
+Times are medians over the rounds, as multiples of torchrg's. A row on planes shows the fraction of
+the ground-truth planes detected at an IoU of 0.5, as a mean over the clouds of a kind; for CGAL it
+is the better one of region growing and RANSAC with PCA normals. A row on superpoints shows the
+fraction of points whose superpoint matches their object, for about 300 superpoints.
 """
 
+import argparse
 import json
-import sys
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -40,10 +42,17 @@ KINDS = {
     "rgbd_like": "rooms, fused depth frames",
     "s3dis_like": "rooms, points of a mesh, as S3DIS",
     "scannet_like": "rooms, vertices of a mesh, as ScanNet",
+    "office_parts": "a real office, its labeled parts",
     "4 frames, exact": "single depth frames, exact",
     "4 frames, kinect": "single depth frames of a Kinect",
 }
 """Rows of the table of quality: the start of the name of their clouds, past any folder."""
+PEERS = {
+    "PCL": ("PCL",),
+    "Open3D": ("Open3D",),
+    "CGAL": ("CGAL growing, pca", "CGAL RANSAC, pca"),
+}
+"""Columns of the table of quality: the contenders of which the better one is shown."""
 IMAGES = "4 frames"
 """Clouds that torchrg sees as images."""
 FEW = 300
@@ -56,27 +65,34 @@ ORDERS = ("random", "sorted")
 Figures = dict[str, Any]
 
 
-def take_figures(peers: Figures, accuracy: Figures, superpoints: Figures) -> Figures:
-    """Return what the tables show, of the files of the three benchmarks."""
+def times_of(peers: Figures) -> Figures:
+    """Return what the table of times shows, from the file of its benchmark."""
     rooms = {cloud.split()[-1]: by for cloud, by in peers["results"].items()}
-    times = {
-        work: [_time(rooms[order], name) for order in ORDERS for name in names]
-        for work, names in WORK.items()
-    }
-    quality = {title: _shares(accuracy["results"], kind) for kind, title in KINDS.items()}
-    partitions = {
-        f"superpoints: {cloud}".replace("_", " "): [
-            at_count(by[name][0]["levels"], FEW, "asa") for name in (OURS, PEER)
-        ]
-        for cloud, by in superpoints["results"].items()
-        if cloud in PARTITIONED
-    }
-    made_with = {name: peers["made_with"][name] for name in ("commit", "processor", "cores")}
     return {
-        "made_with": made_with,
-        "times": times,
-        "quality": {title: shares for title, shares in quality.items() if shares},
-        "superpoints": partitions,
+        "made_with": {name: peers["made_with"][name] for name in ("commit", "processor", "cores")},
+        "times": {
+            work: [_time(rooms[order], name) for order in ORDERS for name in names]
+            for work, names in WORK.items()
+        },
+    }
+
+
+def quality_of(accuracy: Figures) -> Figures:
+    """Return the fractions of detected planes, from the file of their benchmark."""
+    quality = {title: _fractions(accuracy["results"], kind) for kind, title in KINDS.items()}
+    return {"quality": {title: fractions for title, fractions in quality.items() if fractions}}
+
+
+def partitions_of(superpoints: Figures) -> Figures:
+    """Return the fractions of points in the right superpoint, from the file of their benchmark."""
+    return {
+        "superpoints": {
+            f"superpoints: {cloud}".replace("_", " "): [
+                at_count(by[name][0]["levels"], FEW, "asa") for name in (OURS, PEER)
+            ]
+            for cloud, by in superpoints["results"].items()
+            if cloud in PARTITIONED
+        }
     }
 
 
@@ -86,15 +102,16 @@ def _time(by: Figures, name: str) -> float:
     return median(run["seconds"][stage] if stage else run["total"] for run in by[contender])
 
 
-def _shares(results: Figures, kind: str) -> list[float]:
-    """Return the mean shares of the faces that torchrg, PCL and Open3D find in clouds of a kind."""
+def _fractions(results: Figures, kind: str) -> list[float]:
+    """Return the mean fractions of the planes that torchrg and its peers detect in a kind."""
     clouds = [by for name, by in results.items() if name.split("/")[-1].startswith(kind)]
     ours = "depth" if kind.startswith(IMAGES) else "consensus"
-    return [
-        fmean(median(run["recall_iou50"] for run in by[name]) for by in clouds)
-        for name in (ours, "PCL", "Open3D")
-        if clouds
-    ]
+    columns = [(ours,), *PEERS.values()] if clouds else []
+
+    def mean(name: str) -> float:
+        return fmean(median(run["recall_iou50"] for run in by[name]) for by in clouds)
+
+    return [max(map(mean, names)) for names in columns]
 
 
 def to_section(figures: Figures) -> str:
@@ -109,7 +126,7 @@ def to_section(figures: Figures) -> str:
         for title, shares in figures["quality"].items()
     ]
     quality += [
-        [title, f"{ours:.2f}", "", "", f"{peer:.2f}"]
+        [title, f"{ours:.2f}", *[""] * len(PEERS), f"{peer:.2f}"]
         for title, (ours, peer) in figures["superpoints"].items()
     ]
     return "\n\n".join(
@@ -117,9 +134,9 @@ def to_section(figures: Figures) -> str:
             "Time for the normals and planes of a million points, as a multiple of torchrg's, on "
             f"{made['processor']} (`bench.py peers`, {made['commit']}):",
             markdown(["work", "torchrg", "PCL", "Open3D", "PCL, sorted", "Open3D, sorted"], times),
-            "Share of true faces found at an IoU of 0.5 (`bench.py accuracy`), or of points in a "
-            f"superpoint of their own object, of {FEW}:",
-            markdown(["data", "torchrg", "PCL", "Open3D", "cut pursuit"], quality),
+            "Fraction of ground-truth planes detected at an IoU of 0.5 (`bench.py accuracy`), or "
+            f"of points whose superpoint matches their object, of {FEW} superpoints:",
+            markdown(["data", "torchrg", *PEERS, "cut pursuit"], quality),
         ]
     )
 
@@ -134,11 +151,16 @@ def insert(readme: str, figures: Figures) -> str:
 
 
 def main() -> None:
-    """Put the figures of files, or those that are kept, into the README."""
-    if files := sys.argv[1:]:
-        figures = take_figures(*(json.loads(Path(file).read_text()) for file in files))
-        FIGURES.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    """Put the figures of the files given, and those kept, into the README."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    tables = {"peers": times_of, "accuracy": quality_of, "superpoints": partitions_of}
+    for name in tables:
+        parser.add_argument(f"--{name}", type=Path)
     figures = json.loads(FIGURES.read_text(encoding="utf-8"))
+    for name, path in vars(parser.parse_args()).items():
+        if path is not None:
+            figures |= tables[name](json.loads(path.read_text(encoding="utf-8")))
+    FIGURES.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     README.write_text(insert(README.read_text(encoding="utf-8"), figures), encoding="utf-8")
 
 

@@ -118,15 +118,15 @@ def test_figures_are_medians_means_and_what_lies_between_two_partitions():
     shares = {"consensus": [{"recall_iou50": 0.8}], "PCL": [{"recall_iou50": 0.5}]}
     other = {"consensus": [{"recall_iou50": 0.6}], "PCL": [{"recall_iou50": 0.1}]}
     for clouds in (shares, other):
-        clouds["Open3D"] = clouds["PCL"]
+        clouds["Open3D"] = clouds["CGAL growing, pca"] = clouds["PCL"]
+        clouds["CGAL RANSAC, pca"] = [{"recall_iou50": 0.2}]
     accuracy = {"results": {"room, 1 mm": shares, "rooms/room_2": other}}
     levels = [{"count": 100, "asa": 0.5}, {"count": 900, "asa": 0.7}]
     parts = {"torchrg": [{"levels": levels}], "cut pursuit": [{"levels": levels}]}
-    figures = readme_tables.take_figures(
-        peers, accuracy, {"results": {"office_parts": parts, "another": parts}}
-    )
+    figures = readme_tables.times_of(peers) | readme_tables.quality_of(accuracy)
+    figures |= readme_tables.partitions_of({"results": {"office_parts": parts, "another": parts}})
     section = readme_tables.to_section(figures)
     assert "| planes by `paper` | 1 | 3.0 | 1.0 | 3.0 | 1.0 |" in section
     assert "| normals by `pca` | 1 | 2.0 | 1.0 | 2.0 | 1.0 |" in section
-    assert "| made rooms, seven noises and densities | 0.70 | 0.30 | 0.30 |  |" in section
-    assert "| superpoints: office parts | 0.60 |  |  | 0.60 |" in section
+    assert "| made rooms, seven noises and densities | 0.70 | 0.30 | 0.30 | 0.30 |  |" in section
+    assert "| superpoints: office parts | 0.60 |  |  |  | 0.60 |" in section

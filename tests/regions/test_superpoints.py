@@ -45,8 +45,22 @@ def crumpled(rng, count=120, *, crumple=1.0):
     return points, normals, planes
 
 
+def literal_leaning(normals, planes):
+    """Normals are halfway to the mean direction of their plane, if the normals of this agree."""
+    leaning = normals.copy()
+    for plane in {int(label) for label in planes if label >= 0}:
+        members = [i for i in range(len(planes)) if planes[i] == plane]
+        values, axes = np.linalg.eigh(sum(np.outer(normals[i], normals[i]) for i in members))
+        if values[-1] / len(members) >= np.cos(np.deg2rad(20)) ** 2:
+            for i in members:
+                both = normals[i] + np.sign(normals[i] @ axes[:, -1]) * axes[:, -1]
+                leaning[i] = both / np.linalg.norm(both)
+    return leaning
+
+
 def literal_merging(points, normals, planes, config):
     """Points, or whole planes, merge, those first that are best partners, all from the points."""
+    normals = literal_leaning(normals, planes)
     reach, near = cKDTree(points).query(points, k=9)
     near = near[:, 1:]
     contacts = [(i, int(j)) for i in range(len(points)) for j in near[i]]
