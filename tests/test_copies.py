@@ -11,7 +11,7 @@ from torchrg import make_superpoints, segment_planes
 from torchrg.config import preset_names
 from torchrg.datasets import collate_offset
 from torchrg.metrics import score_labels, score_partition
-from torchrg.normals import ESTIMATORS, estimate_normals, orient_cloud, orient_normals
+from torchrg.normals import ESTIMATORS, estimate_normals, orient_normals
 from torchrg.regions import summarize_planes
 from torchrg.result import Result
 from torchrg.structures import PLANE_COLUMNS, UNLABELED, Cloud
@@ -204,14 +204,14 @@ def test_superpoints_do_not_depend_on_the_order_of_copies_of_other_colors(points
     assert torch.equal(other.levels[0], one.levels[0][order])
 
 
-@pytest.mark.parametrize("towards", ["interior", "consistent"])
-def test_copies_look_to_one_side(points, rows, towards):
+@pytest.mark.parametrize("orient", ["interior", "consistent"])
+def test_copies_look_to_one_side(points, rows, orient):
     normals = estimate_normals(points, method="pca").normals
-    expected = orient_normals(points, normals, towards=towards)
+    expected = orient_normals(points, normals, orient=orient)
     signs = torch.ones(len(rows), 1)
     signs[1::3] = -1
     of_copies = torch.cat([torch.zeros(3, 3), normals[rows] * signs])
-    turned = orient_normals(copied(points, rows), of_copies, towards=towards)
+    turned = orient_normals(copied(points, rows), of_copies, orient=orient)
     assert torch.equal(turned[3:], expected[rows])
 
 
@@ -223,7 +223,7 @@ def test_fronts_of_copies_count_once(points):
     front[lost] = 0
     rows = torch.cat([ROWS, lost.repeat(3)])
     single, cloud = (
-        orient_cloud(Cloud(points[some].numpy(), front=front[some].numpy()), normals[some])
+        orient_normals(Cloud(points[some].numpy(), front=front[some].numpy()), normals[some])
         for some in (ROWS, rows)
     )
     assert torch.equal(cloud, single[rows])

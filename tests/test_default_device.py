@@ -61,7 +61,7 @@ EVERYTHING |= {
     "align_axes": lambda: torchrg.align_axes(walls()),
     "align_axes, up": lambda: torchrg.align_axes(walls(), up=(0.1, 0, 1)),
     "orient_normals": lambda: [
-        torchrg.normals.orient_normals(POINTS, plain()[0].normals, towards=way, viewpoint=place)
+        torchrg.normals.orient_normals(POINTS, plain()[0].normals, orient=way, viewpoint=place)
         for way, place in (("consistent", None), ("interior", None), ("viewpoint", VIEWPOINT))
     ],
     "find_sharp_points": lambda: find_sharp_points(

@@ -99,7 +99,7 @@ def test_gradients_reach_a_sample_and_survive_orientation():
     points = bracket(0, 40).requires_grad_()
     sample = EstimateNormals(method="pca", k=10)({"coord": points})
     turned = orient_normals(
-        points, sample["normal"], towards="viewpoint", viewpoint=torch.ones(3).double()
+        points, sample["normal"], orient="viewpoint", viewpoint=torch.ones(3).double()
     )
     (turned[:, 2] ** 2).sum().backward()
     assert points.grad.isfinite().all()

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import torchrg
+from torchrg.robust import fit_detmcd
 
 ALL_WORK = """
 import os, time, torch, torchrg
@@ -126,3 +127,12 @@ def test_processes_that_are_forked_find_what_their_parent_finds(expected_results
     with get_context("fork").Pool(2) as pool:
         found = pool.map_async(results_of, range(2)).get(timeout=120)
     assert found == expected_results
+
+
+def test_inference_mode_holds_in_all_threads(set_threads):
+    set_threads(2)
+    patches = torch.rand(3000, 12, 3, generator=torch.Generator().manual_seed(0))
+    expected = fit_detmcd(patches)
+    with torch.inference_mode():
+        fit = fit_detmcd(patches)
+    assert torch.equal(fit.location, expected.location)

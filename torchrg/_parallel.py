@@ -8,6 +8,7 @@ a core, that takes ten times as long and more.
 import ctypes
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -159,7 +160,7 @@ def map_tasks(
                     pass
 
         # This thread works too: until others run, and instead of them where no core is free.
-        settings = torch.is_grad_enabled(), copy_context()
+        settings = torch.is_grad_enabled(), torch.is_inference_mode_enabled(), copy_context()
         with ThreadPoolExecutor(
             num_threads - 1, initializer=_begin_thread, initargs=settings
         ) as pool:
@@ -215,7 +216,10 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _begin_thread(grad_enabled: bool, context: Context) -> None:
+_OF_THREAD = threading.local()
+
+
+def _begin_thread(grad_enabled: bool, inference: bool, context: Context) -> None:
     """Let a thread work alone on each operation, with the settings of the one that started it."""
     for variable, value in context.items():
         variable.set(value)
@@ -224,6 +228,10 @@ def _begin_thread(grad_enabled: bool, context: Context) -> None:
     torch.get_num_threads()
     _set_own_threads([1] * (1 + len(_openmp_libraries())))
     torch.set_grad_enabled(grad_enabled)
+    if inference:
+        # The mode lasts as long as its guard, and this as long as the thread.
+        _OF_THREAD.inference = torch.inference_mode()
+        _OF_THREAD.inference.__enter__()
 
 
 def _set_own_threads(numbers: Sequence[int]) -> list[int]:

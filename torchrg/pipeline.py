@@ -1,10 +1,11 @@
 """From points to planes, and to superpoints: each in one function."""
 
+import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,16 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import scratch
-from torchrg._checks import (
-    as_tensor,
-    check_floating,
-    check_points,
-    check_shapes,
-    of_clouds,
-)
+from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, of_clouds
 from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
+from torchrg.io import read_cloud
 from torchrg.io.colors import read_colors
 from torchrg.neighbors import (
     DistinctPoints,
@@ -34,12 +30,13 @@ from torchrg.neighbors import (
 )
 from torchrg.neighbors.knn import keep_within
 from torchrg.normals import ESTIMATORS
+from torchrg.normals.orient import Orientation, Points, choose_side, find_directions, turn_faces
 from torchrg.precision import warn_of_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
 from torchrg.regions.growth import needs_sampling, number_by_count
 from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.superpoints import merge_copies
-from torchrg.structures import UNLABELED, Neighbors, Rows, Segmentation, Superpoints
+from torchrg.structures import UNLABELED, Cloud, Neighbors, Rows, Segmentation, Superpoints
 
 BYTES_PER_POINT = 1_100
 """Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
@@ -55,9 +52,12 @@ shall be about as many superpoints as it makes segments of meshed depth frames."
 @of_clouds
 @sequential_operations()
 def segment_planes(
-    points: Tensor | NDArray[np.floating],
+    points: Points | Cloud | str | os.PathLike[str],
     config: AnyConfig | None = None,
     *,
+    orient: Orientation = "auto",
+    viewpoint: Points | Sequence[float] | None = None,
+    front: Points | None = None,
     voxel: float | None = None,
     within: Tensor | NDArray[np.integer] | None = None,
     keep_neighbors: bool = False,
@@ -81,11 +81,20 @@ def segment_planes(
         points. ``min_size`` and the table count copies once, except the table's ``count``. Labels
         are numbered by ``count``.
 
+        Normals point to one side, and every command and transform chooses the same one. This takes
+        a tenth of the time; ``orient="none"`` saves it.
+
     Args:
-        points: Points, shape ``(N, 3)``, float32 or float64. Clouds far from the origin should be
-            float64, or moved to it first, as :func:`torchrg.read_cloud` does.
+        points: Points, shape ``(N, 3)``, float32 or float64; a cloud, whose ``points`` are taken;
+            or the path of a file. Tensors far from the origin should be float64, or moved to it
+            first, as :func:`torchrg.read_cloud` does.
         config: Settings, a dictionary of them, or the name of a preset or a file. Default: that of
             :func:`torchrg.load_config`.
+        orient: Side to which normals point, as in :func:`torchrg.normals.orient_normals`. Default:
+            to the front of the surface where the cloud knows it, else into the free space of rooms.
+        viewpoint: Where the scanner stood, for ``orient="viewpoint"``; see there.
+        front: Direction from each point to where its surface was seen from, shape ``(N, 3)``; see
+            there. Default: that of the cloud.
         voxel: Side of voxels, in the unit of the cloud: one point of each is segmented, and every
             point has the result of its voxel. Sizes of regions are counted in voxels then; planes
             are described from all points and numbered by their number, and which of them meet is
@@ -123,8 +132,11 @@ def segment_planes(
         >>> halves.count.tolist(), halves.object.tolist()
         ([200, 200], [5, 6])
     """
-    points = as_tensor("segment_planes", "points", points).detach()
-    check_points("segment_planes", points)
+    if isinstance(points, str | os.PathLike):
+        points = read_cloud(points)
+    points, directions = find_directions(
+        "segment_planes", points, orient, viewpoint=viewpoint, front=front
+    )
     warn_of_steps("segment_planes", points)
     objects = None if within is None else as_tensor("segment_planes", "within", within)
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
@@ -143,17 +155,26 @@ def segment_planes(
             on_stage(stage)
 
     objects = None if objects is None else objects.long().to(points.device)
+    side = _Side(orient, directions)
     if settings.min_area > 0 or settings.kinds is not None or settings.sort != "points":
-        seg = _segment(points, settings.of_all_planes(), voxel, objects, begin)
+        seg = _segment(points, settings.of_all_planes(), side, voxel, objects, begin)
         seg = keep_planes(seg, choose_planes(seg.planes, settings))
     else:
-        seg = _segment(points, settings, voxel, objects, begin)
+        seg = _segment(points, settings, side, voxel, objects, begin)
     return seg if keep_neighbors else seg._replace(neighbors=None)
+
+
+class _Side(NamedTuple):
+    """The side that normals point to, and the directions to it ``(N, 3)``, if there are any."""
+
+    orient: Orientation
+    front: Tensor | None
 
 
 def _segment(
     points: Tensor,
     config: PipelineConfig,
+    side: _Side,
     voxel: float | None,
     objects: Tensor | None,
     begin: Callable[[str], None],
@@ -219,6 +240,7 @@ def _segment(
     normals, curvature, sharp, valid = (
         restore_points(values, inverse) for values in (fit.normals, fit.curvature, sharp, fit.valid)
     )
+    axes = planes.normal
     if voxel is not None:
         rows: Rows = distinct.rows if objects is None else slice(None)
         cloud = points[rows], normals[rows], of_points[rows]
@@ -229,6 +251,17 @@ def _segment(
         of_plane = objects.new_zeros(len(planes))
         of_plane[of_points[of_points >= 0]] = objects[of_points >= 0]
         planes = replace(planes, object=of_plane)
+
+    begin("orientation")
+    if isinstance(parts, Tensor):
+        none = torch.full((len(places),), UNLABELED, device=labels.device)
+        labels = none.scatter_reduce(0, parts, labels, "amax")
+
+    def turn(side: Orientation) -> Tensor:
+        turned = turn_faces(places, fit.normals, side, neighbors, labels, axes)
+        return restore_points(turned, inverse)
+
+    normals = choose_side(points, normals, side.orient, side.front, turn)
     begin("done")
     searched = neighbors if voxel is None else None
     return Segmentation(

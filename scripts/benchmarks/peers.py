@@ -203,7 +203,7 @@ def prepare(work: str, file: str) -> Callable[[], Figures]:
         def run(points: np.ndarray) -> None:
             if kind == "preset":
                 cloud = torch.from_numpy(points)
-                torchrg.segment_planes(cloud, config, on_stage=note)
+                torchrg.segment_planes(cloud, config, orient="none", on_stage=note)
             else:
                 note("normals")
                 torchrg.estimate_normals(torch.from_numpy(points), method="pca", k=K)

@@ -127,5 +127,5 @@ def prepare(name: str, size: int) -> Callable[[], None]:
         return lambda: segment() and None
     config = torchrg.load_config(name)
     points: torch.Tensor = torchrg.scenes.make_room(size, noise=NOISE, seed=SEED).points
-    torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config)
-    return lambda: torchrg.segment_planes(points, config) and None
+    torchrg.segment_planes(points[:: max(size // WARM_UP, 1)], config, orient="none")
+    return lambda: torchrg.segment_planes(points, config, orient="none") and None

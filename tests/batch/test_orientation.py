@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import Delaunay
+from torch.utils.data import DataLoader
 
 from tests.datasets.scannet_tree import write_mesh, write_scan
 from torchrg.batch.records import reason_to_convert
@@ -16,10 +17,13 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import FolderSource, RGBDSource, ScanNetSource
 from torchrg.config import DepthConfig, load_config
+from torchrg.datasets import FolderOfClouds, collate_offset
 from torchrg.depth.camera import Pinhole
 from torchrg.io import read_cloud, write_cloud
+from torchrg.pipeline import segment_planes
 from torchrg.render import write_png
 from torchrg.structures import Cloud
+from torchrg.transforms import SegmentPlanes
 
 CLASSIC = load_config("classic")
 CAMERA = ("--intrinsics", "50,50,19.5,14.5", "--depth-scale", "1000")
@@ -91,6 +95,44 @@ def convert(source, out):
 
 def folder_source(tmp_path, orient="auto"):
     return FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out", orient=orient)
+
+
+@pytest.mark.parametrize("preset", ["classic", "consensus"])
+@pytest.mark.parametrize(("name", "side"), [("points", 1), ("outwards", -1)])
+def test_all_doors_give_one_answer(room, mesh, files, tmp_path, run, preset, name, side):
+    if name == "points":
+        scene = room(noise=0.002, seed=2, num_points=20_000)
+        points, truth = scene.points.float().numpy(), scene.normals.numpy()
+    else:
+        points, truth, faces = mesh
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "in" / f"{name}.ply"
+    write_cloud(path, Cloud(points))
+    if name != "points":
+        write_mesh(path, points, faces=faces[:, ::-1])
+    expected = segment_planes(path, preset)
+    assert share(expected.normals.numpy(), side * truth) >= 0.97
+    cloud = read_cloud(path)
+    seg = segment_planes(cloud, preset)
+    assert torch.equal(seg.labels, expected.labels)
+    assert torch.equal(seg.normals, expected.normals)
+    data = FolderOfClouds(tmp_path / "in", transform=SegmentPlanes(preset))
+    (batch,) = DataLoader(data, collate_fn=collate_offset)
+    assert torch.equal(batch["plane"], expected.labels)
+    assert torch.equal(batch["normal"], expected.normals)
+    assert run("segment", path, "--out", tmp_path / "a.npz", "--preset", preset).code == 0
+    with np.load(tmp_path / "a.npz") as result:
+        assert np.array_equal(result["labels"], expected.labels)
+        assert np.array_equal(result["normals"], expected.normals)
+    source = FolderSource(tmp_path / "in", load_config(preset), tmp_path / "out")
+    (normals,) = convert(source, tmp_path / "out").values()
+    assert np.array_equal(normals, expected.normals)
+    assert np.array_equal(np.load(tmp_path / "out" / name / "plane.npy"), expected.labels)
+    settings = load_config(preset).normals
+    flags = ("--method", settings.method, "--normals.k", settings.k)
+    assert run("normals", path, "--out", tmp_path / "b.npz", *flags).code == 0
+    with np.load(tmp_path / "b.npz") as result:
+        assert share(result["normals"], side * truth) >= 0.97
 
 
 def test_normals_point_into_rooms_to_the_front_of_faces_and_to_scanners(mesh, files, tmp_path):

@@ -33,13 +33,13 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
         "layout": "images",
         "intrinsics": camera,
         "depth_scale": 9.0,
+        "orient": "auto",
     }
     turned = RGBDSource(tmp_path, settings, "images", camera, 9.0, orient="up")
     assert turned.describe()["orient"] == "up"
     options = {"kind": "s3dis", "class_order": "spt", "superpoint": True, "orient": "auto"}
     assert S3DISSource(tmp_path, CLASSIC, (5,), "spt", superpoint=True).describe() == options
-    options = {"kind": "folder", "superpoint": False}
-    # As results were described when normals had the signs that they have with none.
+    options = {"kind": "folder", "superpoint": False, "orient": "none"}
     assert FolderSource(tmp_path, CLASSIC, tmp_path, orient="none").describe() == options
     options |= {"orient": "auto"}
     assert FolderSource(tmp_path, CLASSIC, tmp_path).describe() == options

@@ -28,7 +28,6 @@ from torchrg.datasets.layouts import LAYOUTS
 from torchrg.datasets.scannet import NYU_IDS
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.normals import orient_normals
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
@@ -65,7 +64,7 @@ class Room:
         seg = segment_planes(self.coord, CLASSIC)
         parts = make_superpoints(self.coord, seg, PARTITION, colors=self.color)
         self.plane = seg.labels.numpy()
-        self.normal = orient_normals(self.coord, seg.normals).numpy()
+        self.normal = seg.normals.numpy()
         self.superpoint = parts.levels[0].numpy()
 
 

@@ -49,7 +49,7 @@ def test_vertices_are_points_and_have_the_classes_of_their_objects(tree, scans):
     assert sample["instance"].tolist() == [1, 1, 0, 0, -1, -1, 2, 2]
     assert np.allclose(sample["axis_align_matrix"], ALIGNMENT)
     assert sample["segment"].dtype == sample["instance"].dtype
-    assert set(data[2]) == {"coord", "color", "name"}
+    assert set(data[2]) == {"coord", "color", "front", "name"}
     assert [ScanNet(tree, split)[0]["name"] for split in ("train", "val", "test")] == [
         names[1], names[0], names[2],
     ]  # fmt: skip

@@ -176,13 +176,13 @@ def test_threads_and_disks_and_longer_lists_change_nothing(furnished, tmp_path, 
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            results.append(orient_normals(points, normals, towards=side))
+            results.append(orient_normals(points, normals, orient=side))
     finally:
         torch.set_num_threads(before)
     monkeypatch.setattr(scratch, "_LEAST_BYTES", 0)
     with scratch.on_disk(tmp_path):
-        results.append(orient_normals(points, normals, towards=side))
+        results.append(orient_normals(points, normals, orient=side))
         longer = search_knn(points, 50)
-        results.append(orient_normals(points, normals, towards=side, neighbors=longer))
+        results.append(orient_normals(points, normals, orient=side, neighbors=longer))
     results.append(turn_faces(points, -normals, side, search_knn(points, 5)))
     assert all(torch.equal(result, results[0]) for result in results)

@@ -1,4 +1,4 @@
-"""Signs of normals: towards a place, along an axis, consistent on solids, into rooms."""
+"""Signs of normals: orient a place, along an axis, consistent on solids, into rooms."""
 
 import math
 
@@ -47,21 +47,21 @@ def box_room(size, at, rng, count=1500, faces=range(6)):
 def test_normals_look_at_the_viewpoint(rng):
     points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng)
     oriented = orient_normals(
-        points, shuffled_signs(inwards), towards="viewpoint", viewpoint=torch.tensor([1.0, 2, 1])
+        points, shuffled_signs(inwards), orient="viewpoint", viewpoint=torch.tensor([1.0, 2, 1])
     )
     assert torch.equal(oriented, inwards)
 
 
 def test_each_point_may_have_its_own_viewpoint(rng):
     points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng)
-    oriented = orient_normals(points, inwards, towards="viewpoint", viewpoint=points - inwards)
+    oriented = orient_normals(points, inwards, orient="viewpoint", viewpoint=points - inwards)
     assert torch.equal(oriented, -inwards)
 
 
 @pytest.mark.parametrize("axis", ["+x", "-x", "+y", "-y", "+z", "-z"])
 def test_normals_lie_along_the_axis(rng, axis):
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=rng), dim=1)
-    oriented = orient_normals(torch.rand(50, 3, generator=rng), normals, towards=axis)
+    oriented = orient_normals(torch.rand(50, 3, generator=rng), normals, orient=axis)
     component = oriented[:, "xyz".index(axis[1])]
     assert ((component > 0) if axis[0] == "+" else (component < 0)).all()
     assert torch.equal(oriented.abs(), normals.abs())
@@ -70,7 +70,7 @@ def test_normals_lie_along_the_axis(rng, axis):
 def test_right_angles_have_one_answer():
     across = torch.tensor([[-1.0, 0, 0], [0, -1, 0], [0.6, -0.8, 0]])
     for normals in (across, -across):
-        oriented = orient_normals(torch.zeros(3, 3), normals, towards="+z")
+        oriented = orient_normals(torch.zeros(3, 3), normals, orient="+z")
         assert torch.equal(oriented, torch.tensor([[1.0, 0, 0], [0, 1, 0], [-0.6, 0.8, 0]]))
 
 
@@ -88,14 +88,14 @@ def test_right_angles_have_one_answer():
 )
 def test_consistent_is_outwards_on_solids(name, num_points):
     scene = make_shape(name, num_points, 0.0)
-    oriented = orient_normals(scene.points, shuffled_signs(scene.normals), towards="consistent")
+    oriented = orient_normals(scene.points, shuffled_signs(scene.normals), orient="consistent")
     assert share_right(oriented, scene.normals) > 0.999
 
 
 def test_consistent_bears_noise_and_smoothed_edges():
     scene = make_shape("bracket", 5000, 0.004)
     fit = estimate_normals(scene.points, method="pca", k=20)
-    oriented = orient_normals(scene.points, shuffled_signs(fit.normals), towards="consistent")
+    oriented = orient_normals(scene.points, shuffled_signs(fit.normals), orient="consistent")
     assert share_right(oriented, scene.normals) > 0.995
 
 
@@ -103,7 +103,7 @@ def test_components_are_turned_each_for_itself():
     scene = make_shape("sphere", 1000)
     points = torch.cat([scene.points, scene.points + 10, scene.points - 10])
     normals = scene.normals.repeat(3, 1)
-    oriented = orient_normals(points, shuffled_signs(normals), towards="consistent")
+    oriented = orient_normals(points, shuffled_signs(normals), orient="consistent")
     assert torch.equal(oriented, normals)
 
 
@@ -112,7 +112,7 @@ def test_open_surface_is_consistent(rng):
     for bend, up in ((0.0, True), (0.3, False), (-0.3, True)):
         points[:, 2] = bend * points[:, 0] ** 2
         fit = estimate_normals(points, method="pca", k=12)
-        oriented = orient_normals(points, shuffled_signs(fit.normals), towards="consistent")
+        oriented = orient_normals(points, shuffled_signs(fit.normals), orient="consistent")
         # Flat: upwards; bent: to the convex side.
         assert ((oriented[:, 2] > 0) == up).all()
 
@@ -181,18 +181,18 @@ def test_few_points_that_noise_has_tilted_follow_the_floor_they_are_part_of(rng)
     assert torch.equal(oriented[few], inwards[few])
 
 
-@pytest.mark.parametrize("towards", ["consistent", "interior"])
+@pytest.mark.parametrize("orient", ["consistent", "interior"])
 @pytest.mark.parametrize("rounded", [False, True], ids=["generic", "ties"])
-def test_neither_signs_nor_order_matter(scanned, towards, rounded):
+def test_neither_signs_nor_order_matter(scanned, orient, rounded):
     scene, normals = scanned
     points, normals = scene.points[:6000], normals[:6000]
     if rounded:
         # Equal distances everywhere, and normals that agree with nothing.
         points, first = np.unique((points / 0.2).round().numpy(), axis=0, return_index=True)
         points, normals = torch.from_numpy(points), normals[first]
-    first = orient_normals(points, normals, towards=towards)
+    first = orient_normals(points, normals, orient=orient)
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
-    again = orient_normals(points[order], -normals[order], towards=towards)
+    again = orient_normals(points[order], -normals[order], orient=orient)
     assert torch.equal(again, first[order])
 
 
@@ -212,36 +212,36 @@ def test_tilted_plane_looks_up_whatever_rounding_says(rng):
         across = torch.linalg.svd(normal[None]).Vh[1:]
         points = torch.rand(200, 2, generator=rng) @ across
         oriented = orient_normals(
-            points, shuffled_signs(normal.expand(200, 3)), towards="consistent"
+            points, shuffled_signs(normal.expand(200, 3)), orient="consistent"
         )
         assert torch.equal(oriented, (normal * normal[2].sign()).expand(200, 3))
 
 
-@pytest.mark.parametrize("towards", ["consistent", "interior"])
+@pytest.mark.parametrize("orient", ["consistent", "interior"])
 @pytest.mark.parametrize("unit", [1e-4, 1e3])
-def test_unit_and_origin_do_not_matter(rng, towards, unit):
+def test_unit_and_origin_do_not_matter(rng, orient, unit):
     points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=500)
-    first = orient_normals(points, shuffled_signs(inwards), towards=towards)
+    first = orient_normals(points, shuffled_signs(inwards), orient=orient)
     moved = points.double() * unit + 5e6
-    again = orient_normals(moved, shuffled_signs(inwards), towards=towards)
+    again = orient_normals(moved, shuffled_signs(inwards), orient=orient)
     assert (again != first).any(dim=1).sum() <= 3
 
 
-@pytest.mark.parametrize("towards", ["+z", "consistent", "interior"])
+@pytest.mark.parametrize("orient", ["+z", "consistent", "interior"])
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
-def test_few_points_and_missing_normals_are_no_trouble(towards, count):
+def test_few_points_and_missing_normals_are_no_trouble(orient, count):
     points, normals = torch.rand(count, 3), torch.zeros(count, 3)
-    assert torch.equal(orient_normals(points, normals, towards=towards), normals)
+    assert torch.equal(orient_normals(points, normals, orient=orient), normals)
     normals = torch.eye(3)[:1].expand(count, 3)
-    assert torch.equal(orient_normals(points, normals, towards=towards).abs(), normals)
+    assert torch.equal(orient_normals(points, normals, orient=orient).abs(), normals)
 
 
-@pytest.mark.parametrize("towards", ["consistent", "interior"])
-def test_duplicates_and_bad_points_are_no_trouble(rng, towards):
+@pytest.mark.parametrize("orient", ["consistent", "interior"])
+def test_duplicates_and_bad_points_are_no_trouble(rng, orient):
     points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=200)
     points = torch.cat([points, points[:300], torch.full((2, 3), torch.nan)])
     normals = torch.cat([inwards, inwards[:300], torch.zeros(2, 3)])
-    oriented = orient_normals(points, normals, towards=towards)
+    oriented = orient_normals(points, normals, orient=orient)
     assert oriented.isfinite().all()
     assert torch.equal(oriented.abs(), normals.abs())
     same_place = torch.full((30, 3), 0.5)
@@ -250,26 +250,26 @@ def test_duplicates_and_bad_points_are_no_trouble(rng, towards):
 
 def test_neighbors_may_be_given(rng):
     points, inwards = box_room((4.0, 3.0, 2.5), (0.0, 0.0, 0.0), rng, count=500)
-    for towards in ("consistent", "interior"):
+    for orient in ("consistent", "interior"):
         oriented = orient_normals(
-            points, shuffled_signs(inwards), towards=towards, neighbors=search_knn(points, 20)
+            points, shuffled_signs(inwards), orient=orient, neighbors=search_knn(points, 20)
         )
-        expected = inwards if towards == "interior" else -inwards
+        expected = inwards if orient == "interior" else -inwards
         assert share_right(oriented, expected) > 0.999
 
 
 def test_wrong_arguments_are_refused():
     points = torch.rand(4, 3)
-    with pytest.raises(ConfigError, match=r"towards to be one of auto, .*, got 'inwards'"):
-        orient_normals(points, points, towards="inwards")
+    with pytest.raises(ConfigError, match=r"orient to be one of auto, .*, got 'inwards'"):
+        orient_normals(points, points, orient="inwards")
     with pytest.raises(
         ConfigError, match=r"expected poses of scanners, .*, or a viewpoint, .* got"
     ):
-        orient_normals(points, points, towards="viewpoint")
-    with pytest.raises(ConfigError, match=r"expected no viewpoint with towards='\+z'"):
-        orient_normals(points, points, towards="+z", viewpoint=torch.zeros(3))
+        orient_normals(points, points, orient="viewpoint")
+    with pytest.raises(ConfigError, match=r"expected no viewpoint with orient='\+z'"):
+        orient_normals(points, points, orient="+z", viewpoint=torch.zeros(3))
     with pytest.raises(ShapeError, match="expected viewpoint of shape"):
-        orient_normals(points, points, towards="viewpoint", viewpoint=torch.zeros(2, 3))
+        orient_normals(points, points, orient="viewpoint", viewpoint=torch.zeros(2, 3))
     with pytest.raises(ShapeError, match="expected normals of shape"):
         orient_normals(points, points[:3])
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError
-from torchrg.normals import estimate_normals, orient_cloud, orient_normals
+from torchrg.normals import estimate_normals, orient_normals
 from torchrg.structures import Cloud
 
 
@@ -27,29 +27,30 @@ def agrees(normals, truth):
 def test_normals_look_to_the_front_whatever_signs_they_had(scanned):
     cloud, normals, scene = scanned
     for signs in (1, -1):
-        turned = orient_cloud(cloud, signs * normals)
+        turned = orient_normals(cloud, signs * normals)
         assert agrees(turned, -scene.normals)[normals.any(dim=1)].all()
         assert torch.equal(turned.abs(), normals.abs())
     assert torch.equal(
-        orient_cloud(cloud, normals, "interior"), orient_normals(cloud.points, normals)
+        orient_normals(cloud, normals, orient="interior"), orient_normals(cloud.points, normals)
     )
 
 
 def test_without_a_front_rooms_are_seen_from_inside(scanned):
     cloud, normals, scene = scanned
-    turned = orient_cloud(replace(cloud, front=None), normals)
+    turned = orient_normals(replace(cloud, front=None), normals)
     assert torch.equal(turned, orient_normals(cloud.points, normals))
     assert agrees(turned, scene.normals).double().mean() > 0.9
 
 
 def test_up_and_none_and_a_viewpoint_are_what_they_say(scanned):
     cloud, normals, _ = scanned
-    assert orient_cloud(cloud, normals, "none") is normals
+    assert orient_normals(cloud, normals, orient="none") is normals
     assert torch.equal(
-        orient_cloud(cloud, normals, "up"), orient_normals(cloud.points, normals, towards="+z")
+        orient_normals(cloud, normals, orient="up"),
+        orient_normals(cloud.points, normals, orient="+z"),
     )
     place = cloud.coordinates.mean(axis=0)
-    turned = orient_cloud(cloud, normals, "viewpoint", viewpoint=place)
+    turned = orient_normals(cloud, normals, orient="viewpoint", viewpoint=place)
     arms = torch.from_numpy(place - cloud.coordinates)
     assert ((turned.double() * arms).sum(dim=1) > -1e-4).all()
 
@@ -59,20 +60,20 @@ def test_few_points_without_a_front_follow_the_nearest_that_have_one(scanned):
     front = cloud.front.copy()
     lost = torch.randperm(len(front), generator=torch.Generator().manual_seed(1))[:50]
     front[lost] = 0
-    turned = orient_cloud(replace(cloud, front=front), normals)
+    turned = orient_normals(replace(cloud, front=front), normals)
     # To the front, which is the outside, and not into the room.
     assert agrees(turned[lost], -scene.normals[lost]).double().mean() > 0.85
     order = torch.randperm(len(front), generator=torch.Generator().manual_seed(2))
     moved = Cloud(cloud.coordinates[order], front=front[order])
-    assert torch.equal(orient_cloud(moved, -normals[order]), turned[order])
+    assert torch.equal(orient_normals(moved, -normals[order]), turned[order])
 
 
 def test_many_points_without_a_front_look_into_the_room(scanned):
     cloud, normals, _ = scanned
     front = cloud.front.copy()
     front[200:] = 0
-    turned = orient_cloud(replace(cloud, front=front), normals)
-    assert torch.equal(turned[:200], orient_cloud(cloud, normals)[:200])
+    turned = orient_normals(replace(cloud, front=front), normals)
+    assert torch.equal(turned[:200], orient_normals(cloud, normals)[:200])
     assert torch.equal(turned[200:], orient_normals(cloud.points, normals)[200:])
 
 
@@ -82,7 +83,7 @@ def test_points_without_normals_or_place_need_no_front(scanned):
     places = cloud.coordinates.copy()
     front[:3000], normals[:2000], places[2000:3000] = 0, 0, np.nan
     cloud = Cloud(places, front=front)
-    turned = orient_cloud(cloud, normals)
+    turned = orient_normals(cloud, normals)
     assert not turned[:2000].any()
     assert agrees(turned[3000:], -scene.normals[3000:]).all()
 
@@ -92,9 +93,11 @@ def test_a_viewpoint_that_is_not_known_is_refused_with_the_repair(scanned):
     named = replace(cloud, source="a.ply")
     message = r"^a\.ply: expected poses of scanners, .* got none; use interior\.$"
     with pytest.raises(ConfigError, match=message):
-        orient_cloud(named, normals, "viewpoint")
+        orient_normals(named, normals, orient="viewpoint")
     # A front by poses is one of scanners.
     posed = replace(cloud, header={"scans": ()})
-    assert torch.equal(orient_cloud(posed, normals, "viewpoint"), orient_cloud(cloud, normals))
+    assert torch.equal(
+        orient_normals(posed, normals, orient="viewpoint"), orient_normals(cloud, normals)
+    )
     with pytest.raises(ConfigError, match="expected orient to be one of auto"):
-        orient_cloud(cloud, normals, "inwards")
+        orient_normals(cloud, normals, orient="inwards")

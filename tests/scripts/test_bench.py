@@ -183,7 +183,7 @@ def test_libraries_are_timed_by_stage(tmp_path):
     assert len(points) == 1500
     file = str(tmp_path / "cloud.npy")
     stages = peers.prepare("preset classic", file)()["stages"]
-    assert list(stages) == ["neighbors", "normals", "regions", "planes"]
+    assert list(stages) == ["neighbors", "normals", "regions", "planes", "orientation"]
     assert list(peers.prepare("normals", file)()["stages"]) == ["normals"]
 
 

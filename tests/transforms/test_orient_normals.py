@@ -31,17 +31,19 @@ def batch(rooms):
 
 
 def test_planes_and_then_sides_are_the_two_functions(rooms):
-    points, normals = rooms[0]
-    found = nn.Sequential(SegmentPlanes("classic"), OrientNormals())({"coord": points})
-    assert torch.equal(found["normal"], orient_normals(points, normals))
-    assert not torch.equal(found["normal"], normals)
-    assert torch.equal(found["plane"], segment_planes(points, "classic").labels)
+    points, _ = rooms[0]
+    bare = segment_planes(points, "classic", orient="none")
+    steps = nn.Sequential(SegmentPlanes("classic", orient="none"), OrientNormals())
+    found = steps({"coord": points})
+    assert torch.equal(found["normal"], orient_normals(points, bare.normals))
+    assert not torch.equal(found["normal"], bare.normals)
+    assert torch.equal(found["plane"], bare.labels)
 
 
 @pytest.mark.parametrize("towards", ["interior", "consistent", "-x", "up"])
 def test_each_cloud_of_a_batch_is_oriented_on_its_own(rooms, batch, towards):
     way = {"up": "+z"}.get(towards, towards)
-    expected = torch.cat([orient_normals(*room, towards=way) for room in rooms])
+    expected = torch.cat([orient_normals(*room, orient=way) for room in rooms])
     given = batch["normal"].clone()
     found = OrientNormals(towards)(batch)
     assert torch.equal(found["normal"], expected)
@@ -56,7 +58,7 @@ def test_viewpoints_are_of_all_clouds_of_each_or_of_each_point(rooms, batch):
 
     def looking(places):
         pairs = zip(rooms, places, strict=True)
-        each = [orient_normals(*r, towards="viewpoint", viewpoint=place) for r, place in pairs]
+        each = [orient_normals(*r, orient="viewpoint", viewpoint=place) for r, place in pairs]
         return torch.cat(each)
 
     transform, one = OrientNormals("viewpoint"), looking(places[:1].expand(3, 3))
@@ -106,8 +108,8 @@ def test_it_survives_pickling_and_shows_its_settings(rooms):
     step = OrientNormals("viewpoint", (1, 2, 0.5))
     again = pickle.loads(pickle.dumps(step))
     assert torch.equal(again(sample)["normal"], step(sample)["normal"])
-    assert repr(step) == "OrientNormals(towards='viewpoint', viewpoint=(1.0, 2.0, 0.5))"
-    assert repr(OrientNormals("up")) == "OrientNormals(towards='up')"
+    assert repr(step) == "OrientNormals(orient='viewpoint', viewpoint=(1.0, 2.0, 0.5))"
+    assert repr(OrientNormals("up")) == "OrientNormals(orient='up')"
 
 
 def test_empty_clouds_and_points_without_place_pass():
@@ -121,7 +123,7 @@ def test_empty_clouds_and_points_without_place_pass():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: OrientNormals("inwards"), "towards to be one of auto, .*none, got 'inwards'"),
+        (lambda: OrientNormals("inwards"), "orient to be one of auto, .*none, got 'inwards'"),
         (lambda: OrientNormals("up", (0, 0, 1)), "three numbers as viewpoint, with .* with 'up'"),
         (lambda: OrientNormals("viewpoint", (0, 1)), r"three numbers .*got \(0, 1\) with 'viewp"),
         (

@@ -39,7 +39,7 @@ from torchrg.errors import FormatError
 from torchrg.io.colors import narrow_colors
 from torchrg.io.fields import are_whole
 from torchrg.io.files import check_place, marked_parts, remove_leftovers, sync_folder
-from torchrg.normals.orient import Orientation, front_of, orient_normals
+from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.result import PLANES_FILE, describe_planes, write_table
@@ -320,37 +320,39 @@ def segment_cloud(
     settings: PipelineConfig,
     *,
     orient: Orientation = "auto",
+    viewpoint: Sequence[float] | None = None,
     partition: SuperpointsConfig | None = None,
     voxel: float | None = None,
     within: NDArray[np.integer] | None = None,
     begin: Begin = lambda stage: None,
 ) -> tuple[Segmentation, Superpoints | None]:
-    """Return the planes of a cloud, its normals turned to a side, and its superpoints.
+    """Return the planes of a cloud, and with a ``partition`` its superpoints.
 
-    There are superpoints with a ``partition``; with a ``voxel`` one point of each is segmented;
-    with objects ``(N,)`` planes are ``within`` them. ``begin`` is called with the name of each
-    stage when it starts.
+    See :func:`torchrg.segment_planes` for the arguments; it calls ``begin`` as ``on_stage``.
 
     Raises:
-        ConfigError: If normals shall look at scanners, and the cloud does not know of any.
+        ConfigError: If normals shall point to scanners, and the cloud does not name any.
     """
-    points, front, superpoints = cloud.points, front_of(cloud, orient), None
     is_kept = partition is not None
-    # Superpoints keep to the borders of all planes.
-    config = settings.of_all_planes() if is_kept else settings
     seg = segment_planes(
-        points, config, voxel=voxel, within=within, keep_neighbors=is_kept, on_stage=begin
+        cloud,
+        # Superpoints keep to the borders of all planes.
+        settings.of_all_planes() if is_kept else settings,
+        orient=orient,
+        viewpoint=viewpoint,
+        voxel=voxel,
+        within=within,
+        keep_neighbors=is_kept,
+        on_stage=begin,
     )
-    if partition is not None:
-        begin("superpoints")
-        colors = cloud.fields.get("color")
-        superpoints = make_superpoints(points, seg, partition, colors=colors, voxel=voxel)
-        rows = choose_planes(seg.planes, settings)
-        plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
-        seg, superpoints = keep_planes(seg, rows), superpoints._replace(plane=plane)
-    begin("orientation")
-    turned = orient_normals(points, seg.normals, towards=orient, front=front)
-    return seg._replace(normals=turned), superpoints
+    if partition is None:
+        return seg, None
+    begin("superpoints")
+    colors = cloud.fields.get("color")
+    superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
+    rows = choose_planes(seg.planes, settings)
+    plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
+    return keep_planes(seg, rows), superpoints._replace(plane=plane)
 
 
 def find_objects(

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import torch
-from torch import Tensor
 
 from torchrg._optional import require
 from torchrg.batch.records import Record
@@ -55,13 +54,11 @@ from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_colum
 from torchrg.io.colors import read_colors
 from torchrg.io.fields import Values
 from torchrg.io.npy import map_folder
-from torchrg.normals.orient import Orientation, orient_normals
-from torchrg.structures import Cloud, Segmentation
+from torchrg.normals.orient import Orientation
+from torchrg.structures import Cloud
 
 _COPIED = tuple(name for name in GIVEN_ARRAYS if name != "normal")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
-TURNING = ("interior", "up")
-"""Sides that normals of an image are turned to; without them, they look at the camera."""
 
 
 @dataclass(frozen=True)
@@ -133,9 +130,7 @@ class CloudSource(Source):
 
     def describe(self) -> Record:
         """Return the kind of the source, and the settings that differ from their defaults."""
-        changed: Record = {"kind": self.kind, "superpoint": self.superpoint}
-        if self.orient != "none":
-            changed["orient"] = self.orient
+        changed: Record = {"kind": self.kind, "superpoint": self.superpoint, "orient": self.orient}
         if self.layout != "pointcept":
             changed |= {"layout": self.layout, "version": layouts.VERSION}
         if (self.partition, self.level) != (SuperpointsConfig(), 0):
@@ -364,8 +359,7 @@ class RGBDSource(Source):
         layout: The shape of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
         intrinsics: The camera. Default: that of a camera file, or the layout's.
         depth_scale: Stored value of one metre. Default: that of a camera file, or the layout's.
-        orient: To which side normals point: to the camera, unless it says ``"interior"`` or
-            ``"up"``.
+        orient: Side to which normals point; see :func:`torchrg.depth.segment_depth`.
     """
 
     settings: DepthConfig
@@ -382,7 +376,7 @@ class RGBDSource(Source):
             "layout": self.layout,
             "intrinsics": self.intrinsics,
             "depth_scale": self.depth_scale,
-            **({"orient": self.orient} if self.orient in TURNING else {}),
+            "orient": self.orient,
         }
 
     def list_scans(self) -> list[Scan]:
@@ -409,9 +403,10 @@ class RGBDSource(Source):
                 f"{frame.depth}: expected pixels with depth, got none; take this frame out."
             )
         begin("planes")
-        seg = segment_depth(depth, frame.intrinsics, self.settings, pose=frame.pose)
+        seg = segment_depth(
+            depth, frame.intrinsics, self.settings, pose=frame.pose, orient=self.orient
+        )
         points = points_of_image(depth, frame.intrinsics, frame.pose)
-        seg = orient_image(seg, points, self.orient)
         coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
         files = tuple(write_results(folder, coord, seg))
@@ -430,18 +425,6 @@ class RGBDSource(Source):
                 "depth_scale": frame.depth_scale,
             },
         )
-
-
-def orient_image(seg: Segmentation, points: Tensor, orient: Orientation) -> Segmentation:
-    """Return the segmentation of an image of points ``(H, W, 3)`` with its normals turned.
-
-    They look at the camera already, which every value but :data:`TURNING` leaves.
-    """
-    if orient not in TURNING:
-        return seg
-    cloud = Cloud(points.reshape(-1, 3).numpy())
-    normals = orient_normals(cloud.points, seg.normals.view(-1, 3), towards=orient)
-    return seg._replace(normals=normals.view_as(seg.normals))
 
 
 def _plain(frame: RGBDFrame) -> Record:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchrg.batch.memory import available_memory
 from torchrg.batch.records import describe_run
-from torchrg.batch.sources import orient_image
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn, warnings_as_lines
@@ -168,9 +167,8 @@ def _label(
     with warnings.catch_warnings():
         # The camera was checked against the size of the image, or found from the points.
         warnings.simplefilter("ignore", DepthWarning)
-        seg = segment_depth(depth, camera, arguments.depth, pose=pose)
+        seg = segment_depth(depth, camera, arguments.depth, pose=pose, orient=arguments.orient)
     points = cloud.points.view(*depth.shape, 3)
-    seg = orient_image(seg, points, arguments.orient)
     num_planes = len(seg.planes)
     if num_planes == 0:
         warn(f"{source}: no plane found: {flags.reason_for_no_plane(arguments.depth)}.")

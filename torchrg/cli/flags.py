@@ -29,6 +29,7 @@ from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.fields import COLUMNS_RULE
+from torchrg.normals import Orientation
 from torchrg.structures import FARTHEST, Sampling
 
 _MOST_THREADS = 1024
@@ -61,14 +62,20 @@ ThreadsFlag = Annotated[
     int | None,
     Argument(text="Number of threads. Default: as torch decides, usually one for each core."),
 ]
-_Side = Literal["auto", "interior", "viewpoint", "up", "none"]
 OrientFlag = Annotated[
-    _Side,
+    Orientation,
     Argument(
-        text="To which side normals point: to the front of the faces where the file is a mesh, "
-        "else to the scanner where it names its places, as E57 does, else into the free space of "
-        "rooms (auto); always into rooms (interior), to the scanner (viewpoint) or along +z (up); "
-        "or to that side where the first of z, y, x that is not zero is positive (none).",
+        text="Side to which normals point. auto: the front of the faces of a mesh, else the "
+        "scanner if the file names its place, as E57 does, else interior. interior: the free space "
+        "of rooms. viewpoint: the scanner. consistent: as their neighbors. up, +x ... -z: along an "
+        "axis. none: as estimated, which is fastest.",
+    ),
+]
+ViewpointFlag = Annotated[
+    tuple[float, float, float] | None,
+    Argument(
+        text="Place of the scanner in the coordinates of the input, for --orient viewpoint. "
+        "Default: the places that the file names.",
     ),
 ]
 IntrinsicsFlag = Annotated[
@@ -86,11 +93,11 @@ DepthScaleFlag = Annotated[
     Argument(text="Stored value of one metre: 1000 for millimetres. Default: that of the folder."),
 ]
 ImageOrientFlag = Annotated[
-    _Side,
+    Orientation,
     Argument(
-        text="To which side normals point: to the camera (auto, viewpoint, none), into the free "
-        "space of rooms (interior), or along +z (up), which is the optical axis where no pose of "
-        "the camera is known.",
+        text="Side to which normals point. auto, viewpoint, none: the camera. interior: the free "
+        "space of rooms. consistent: as their neighbors. up, +x ... -z: along an axis, in camera "
+        "coordinates if the pose is unknown.",
     ),
 ]
 TableFlag = Annotated[
@@ -211,6 +218,14 @@ def split_columns(columns: str | None) -> tuple[str, ...] | None:
 def columns_of(path: str | os.PathLike[str], columns: str | None) -> tuple[str, ...] | None:
     """Return the names that ``--columns`` gives a file; None for one that names its own."""
     return split_columns(columns) if takes_columns(path) else None
+
+
+def check_viewpoint(viewpoint: tuple[float, float, float] | None, orient: str) -> None:
+    """Refuse a viewpoint that normals do not point to."""
+    if viewpoint is not None and orient != "viewpoint":
+        raise ConfigError(
+            f"expected --viewpoint X Y Z with --orient viewpoint, got --orient {orient}; add it."
+        )
 
 
 def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) -> None:

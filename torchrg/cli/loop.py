@@ -24,7 +24,7 @@ tqdm.set_lock(RLock())
 
 DRAWINGS = (".png", ".html")
 """Suffixes of pictures and pages."""
-STAGES = ("neighbors", "normals", "regions", "planes")
+STAGES = ("neighbors", "normals", "regions", "planes", "orientation")
 """Stages of the segmentation of a cloud, which progress bars show."""
 
 

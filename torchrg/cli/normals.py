@@ -5,7 +5,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from torchrg.batch.records import describe_run
@@ -28,8 +27,8 @@ from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.fields import put_results
 from torchrg.io.npy import KEPT_FIELDS
 from torchrg.neighbors import distinct_points, search_knn
-from torchrg.normals import estimate_normals
-from torchrg.normals.orient import Orientation, front_of, orient_cloud
+from torchrg.normals import estimate_normals, orient_normals
+from torchrg.normals.orient import find_directions
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
 """Fields of each point that are written."""
@@ -41,7 +40,7 @@ class Arguments:
 
     Examples:
         torchrg normals scan.pcd --out normals.ply
-        torchrg normals scan.ply --out normals.ply --orient interior
+        torchrg normals scan.ply --out normals.ply --orient none
         torchrg normals scan.ply --out normals.npz --method pca --normals.k 30
         torchrg normals scan.e57 --out normals.laz --orient viewpoint
         torchrg normals scan.ply --out normals.ply --orient viewpoint --viewpoint 0 0 1.6
@@ -51,14 +50,8 @@ class Arguments:
     out: flags.OutFlag
     method: NormalMethod | None = None
     """Estimator of the normals, a short form of --normals.method."""
-    orient: Orientation = "none"
-    """How the sign of each normal is chosen: towards the viewpoint or along an axis (up is +z), so
-    that neighbours agree (consistent), into the free space of rooms (interior), or as torchrg
-    segment does it (auto): to the front of the faces of a mesh, to the scanner where the file names
-    its places, else into rooms."""
-    viewpoint: tuple[float, float, float] | None = None
-    """Place of the scanner in the coordinates of the input, for --orient viewpoint. Default: those
-    that an E57 file names."""
+    orient: flags.OrientFlag = "auto"
+    viewpoint: flags.ViewpointFlag = None
     normals: NormalsConfig = dataclasses.field(default_factory=lambda: load_config().normals)
     """How normals and curvature are estimated."""
     chunk_size: int = PipelineConfig.chunk_size
@@ -73,8 +66,7 @@ def run(argv: list[str]) -> int:
     arguments = parse(Arguments, argv, prog="torchrg normals")
     if arguments.chunk_size < 1:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
-    if arguments.viewpoint is not None and arguments.orient != "viewpoint":
-        raise ConfigError("expected --viewpoint X Y Z together with --orient viewpoint.")
+    flags.check_viewpoint(arguments.viewpoint, arguments.orient)
     flags.use_threads(arguments.threads)
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
@@ -92,8 +84,8 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     check_finite(cloud)
     if cloud.precision_note:
         warn(f"{source}: {cloud.precision_note}.")
-    if arguments.viewpoint is None:
-        front_of(cloud, arguments.orient)  # Before the work.
+    # Before the work.
+    find_directions("normals", cloud, arguments.orient, viewpoint=arguments.viewpoint)
     check_output(target, cloud)
     with stage_bar(source.name, ("normals", "orientation")) as advance:
         advance("normals")
@@ -103,8 +95,9 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
             distinct.points, settings, neighbors=near, chunk_size=arguments.chunk_size
         ).each(distinct.restore)
         advance("orientation")
-        scanner = None if arguments.viewpoint is None else np.array(arguments.viewpoint)
-        turned = orient_cloud(cloud, fit.normals, arguments.orient, viewpoint=scanner)
+        turned = orient_normals(
+            cloud, fit.normals, orient=arguments.orient, viewpoint=arguments.viewpoint
+        )
     for note in note_on_copies(distinct.num_copies, len(cloud)):
         say(f"{source}: {note}")
     provenance = describe_run(source, arguments.normals)

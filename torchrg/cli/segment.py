@@ -108,6 +108,7 @@ class Arguments:
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
     orient: flags.OrientFlag = "auto"
+    viewpoint: flags.ViewpointFlag = None
     within: flags.WithinFlag = None
     merge: bool = False
     """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
@@ -143,6 +144,7 @@ def run(argv: list[str]) -> int:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
     flags.check_columns(arguments.columns, arguments.inputs)
+    flags.check_viewpoint(arguments.viewpoint, arguments.orient)
     firsts = tuple(sources[0] for sources in clouds if sources)
     suffix = ".npz" if arguments.layout is None else ""
     outputs = output_paths(firsts, arguments.out, suffix=suffix)
@@ -216,12 +218,13 @@ def _segment(
     where = _arrays_of(arguments, source, target, len(cloud), limit)
     objects = find_objects(cloud.fields, arguments.within, cloud)
     _check_points(arguments, source, cloud, target)
-    stages = (*STAGES, *["superpoints"] * arguments.superpoints, "orientation")
+    stages = (*STAGES, *["superpoints"] * arguments.superpoints)
     with stage_bar(sources[0].name, stages) as advance, where:
         seg, superpoints = segment_cloud(
             cloud,
             arguments.settings.resolved,
             orient=arguments.orient,
+            viewpoint=arguments.viewpoint,
             partition=arguments.partition if arguments.superpoints else None,
             voxel=arguments.voxel,
             within=objects,
@@ -300,7 +303,8 @@ def _describe(arguments: Arguments, sources: tuple[Path, ...], seg: Segmentation
     """Return the provenance of a cloud of one file or of several."""
     settings = arguments.settings.resolved
     provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
-    options = {name: getattr(arguments, name) for name in ("columns", "voxel", "within")}
+    names = ("columns", "viewpoint", "voxel", "within")
+    options = {name: getattr(arguments, name) for name in names}
     provenance |= {name: value for name, value in options.items() if value is not None}
     if measured := settings.measured(seg.sampling):
         provenance["measured"] = measured

@@ -69,7 +69,8 @@ class FolderOfClouds(SceneDataset):
     Links are followed and each file is read once; see :func:`files_below`.
 
     A sample has ``coord`` ``(N, 3)`` float32 about ``origin`` ``(1, 3)`` float64, the fields of the
-    file (``normal``, ``color``, ``labels``, ``intensity``, ...), and ``name``, the path below
+    file (``normal``, ``color``, ``labels``, ``intensity``, ...), ``front`` where the file says to
+    which side surfaces look (see :attr:`torchrg.Cloud.front`), and ``name``, the path below
     ``root`` without the suffix. A folder with ``coord.npy`` is one cloud, as Pointcept keeps them;
     see :func:`torchrg.datasets.read_pointcept_scene`.
 
@@ -138,6 +139,8 @@ class FolderOfClouds(SceneDataset):
             for field, values in cloud.fields.items()
             if values.dtype.kind in "fiub"
         }
+        if cloud.front is not None:
+            fields["front"] = torch.from_numpy(cloud.front)
         origin = torch.from_numpy(cloud.origin).reshape(1, 3)
         return {**fields, "coord": cloud.points, "origin": origin, "name": name}
 

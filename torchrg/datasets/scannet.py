@@ -139,8 +139,7 @@ class ScanNet(SceneDataset):
         """Return the sample of a scan."""
         name, mesh, _ = self.scenes[index]
         arrays = read_scannet_scan(mesh, self.root)
-        for key in ("category", "front"):
-            arrays.pop(key, None)
+        arrays.pop("category", None)
         if "segment20" in arrays:
             arrays["segment"] = arrays.pop("segment20")
         sample: SampleDict = {key: torch.from_numpy(values) for key, values in arrays.items()}

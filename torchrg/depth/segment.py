@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
+from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes, of_clouds
 from torchrg._parallel import places_of, sequential_operations
 from torchrg.config import DepthConfig, settings_of
 from torchrg.depth.camera import check_view, has_depth, read_intrinsics
@@ -17,6 +17,7 @@ from torchrg.depth.pixels import Pixels, describe_pixels
 from torchrg.depth.windows import Image
 from torchrg.linalg import unit_direction
 from torchrg.linalg.moments import Segments, kth_smallest
+from torchrg.normals import Orientation, orient_normals
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.fit import fit_planes
 from torchrg.regions.selection import choose_planes, keep_planes
@@ -33,6 +34,7 @@ def segment_depth(
     config: DepthConfig | Mapping[str, Any] | None = None,
     *,
     pose: Tensor | None = None,
+    orient: Orientation = "auto",
     **changes: Any,  # noqa: ANN401
 ) -> Segmentation:
     """Segment a depth image into planes.
@@ -43,8 +45,7 @@ def segment_depth(
 
     Convention:
         Pixels without depth (0, negative, not finite, beyond ``max_depth``) belong to nothing, and
-        no neighbourhood crosses a step of the depth. The unit of the depth does not matter. Normals
-        point towards the camera.
+        no neighbourhood crosses a step of the depth. The unit of the depth does not matter.
 
     Args:
         depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
@@ -53,6 +54,8 @@ def segment_depth(
         config: Settings, or a dictionary of them. Default: :class:`DepthConfig`.
         pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
             the world. Default: they are in camera coordinates.
+        orient: Side to which normals point: to the camera for "auto", "viewpoint" and "none", else
+            as in :func:`torchrg.normals.orient_normals`.
         **changes: Single settings, as in ``max_depth=4.0``.
 
     Returns:
@@ -86,17 +89,22 @@ def segment_depth(
     )
     check_floating("segment_depth", depth=depth)
     check_view("segment_depth", intrinsics, (depth.shape[1], depth.shape[0]))
+    check_choices("segment_depth", orient=(orient, Orientation))
     settings = settings_of("segment_depth", DepthConfig, config, changes)
-    seg = _segment(depth, intrinsics, settings, pose)
+    seg = _segment(depth, intrinsics, settings, pose, orient)
     return keep_planes(seg, choose_planes(seg.planes, settings))
 
 
 def _segment(
-    depth: Tensor, intrinsics: Tensor, config: DepthConfig, pose: Tensor | None
+    depth: Tensor,
+    intrinsics: Tensor,
+    config: DepthConfig,
+    pose: Tensor | None,
+    orient: Orientation,
 ) -> Segmentation:
     """Do what :func:`segment_depth` says."""
     if depth.numel() == 0:
-        pixel = _segment(depth.new_zeros(1, 1), intrinsics, config, pose)
+        pixel = _segment(depth.new_zeros(1, 1), intrinsics, config, pose, orient)
         labels, normals, curvature, sharp, valid = (
             image.new_zeros(*depth.shape, *image.shape[2:]) for image in pixel[:5]
         )
@@ -136,6 +144,9 @@ def _segment(
     if config.up is not None:
         up = unit_direction("segment_depth", config.up)
         table = replace(table, kind=classify_planes(table, points, labels, up))
+    if orient not in ("auto", "viewpoint", "none"):
+        places = torch.where(seen.view(-1, 1), points, torch.nan).float()
+        normals = orient_normals(places, normals, orient=orient)
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),

@@ -35,7 +35,7 @@ from torchrg.neighbors import check_neighbors, distinct_points, search_knn
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
-from torchrg.normals.orient import orient_cloud, orient_normals
+from torchrg.normals.orient import Orientation, orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
 from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
 from torchrg.precision import warn_of_steps
@@ -45,6 +45,7 @@ from torchrg.structures import Neighbors, NormalFit
 __all__ = [
     "ESTIMATORS",
     "JetFit",
+    "Orientation",
     "estimate_normals",
     "find_sharp_points",
     "fit_jet",
@@ -52,7 +53,6 @@ __all__ = [
     "fit_normals_jet",
     "fit_normals_pca",
     "fit_normals_robust",
-    "orient_cloud",
     "orient_normals",
 ]
 

@@ -1,6 +1,6 @@
 """Signs of normals: into rooms, to the front of a mesh, to a scanner, along an axis, or alike."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -8,7 +8,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes, of_clouds
+from torchrg._checks import (
+    as_tensor,
+    check_choices,
+    check_floating,
+    check_points,
+    check_shapes,
+    of_clouds,
+)
 from torchrg._parallel import places_of, sequential_operations
 from torchrg.errors import ConfigError
 from torchrg.neighbors import check_neighbors, distinct_points, distinct_rows, search_knn
@@ -20,6 +27,9 @@ Orientation = Literal[
     "auto", "interior", "viewpoint", "consistent", "up", "+x", "-x", "+y", "-y", "+z", "-z", "none"
 ]
 """Sides to which normals can point; see :func:`orient_normals`."""
+
+Points = Tensor | NDArray[np.floating]
+"""Rows of three numbers, as a tensor or an array."""
 
 NUM_NEIGHBORS = 20
 """Nearest points that orientation uses, the point itself included."""
@@ -48,17 +58,18 @@ _AS_NEAR = 1 + 1e-6
 @of_clouds
 @sequential_operations()
 def orient_normals(
-    points: Tensor | NDArray[np.floating],
-    normals: Tensor | NDArray[np.floating],
+    points: Points | Cloud,
+    normals: Points,
     *,
-    towards: Orientation = "auto",
-    viewpoint: Tensor | NDArray[np.floating] | None = None,
-    front: Tensor | NDArray[np.floating] | None = None,
+    orient: Orientation = "auto",
+    viewpoint: Points | Sequence[float] | None = None,
+    front: Points | None = None,
     neighbors: Neighbors | None = None,
 ) -> Tensor:
     """Choose the sign of each normal.
 
-    - ``"auto"``: to the front of the surface where it is known, else as ``"interior"``.
+    - ``"auto"``: to the front of the surface where it is known, as by the faces of a mesh or the
+      places of scanners, else as ``"interior"``.
     - ``"interior"``: into the free space of rooms: floors up, ceilings down, walls into their own
       room, furniture away from its inside. Points of each face vote by the free paths in front of
       them and behind. Several rooms, storeys and missing ceilings are no obstacle; a wall between
@@ -77,46 +88,41 @@ def orient_normals(
         positive.
 
     Args:
-        points: Points, shape ``(N, 3)``.
+        points: Points, shape ``(N, 3)``, or a cloud.
         normals: Unit normals, shape ``(N, 3)``; zero where there is none.
-        towards: See above.
-        viewpoint: Where the scanner stood, shape ``(3,)``, or ``(N, 3)`` for several scans.
+        orient: See above.
+        viewpoint: Where the scanner stood, shape ``(3,)``, or ``(N, 3)`` for several scans, in the
+            coordinates of the points or of the cloud. Only with ``orient="viewpoint"``.
         front: Direction from each point to where its surface was seen from, shape ``(N, 3)``, as
             :attr:`torchrg.Cloud.front`. A point whose front is zero follows the nearest others; if
-            these are more than one in a hundred, they are turned as by ``"interior"``.
+            these are more than one in a hundred, they are turned as by ``"interior"``. Default:
+            that of the cloud.
         neighbors: Neighbors of all points, all of them finite, for faces. Default: searched.
 
     Returns:
         The normals, some of them reversed. Rows of points that are not finite stay as they are.
 
     Raises:
-        ConfigError: If ``towards`` is unknown, or ``viewpoint`` is missing or not wanted.
+        ConfigError: If ``orient`` is unknown, or ``viewpoint`` is missing or not wanted.
         ShapeError: If a shape or dtype is not as above.
 
     Example:
+        >>> cloud = Cloud(np.eye(3), front=np.array([[0, 0, -1]] * 3, np.float32))
+        >>> orient_normals(cloud, torch.tensor([[0.0, 0.0, 1.0]] * 3))[0] + 0
+        tensor([ 0.,  0., -1.])
         >>> floor = torch.cartesian_prod(torch.arange(5.0), torch.arange(5.0), torch.zeros(1))
         >>> down = torch.tensor([0.0, 0, -1]).expand(25, 3)
-        >>> orient_normals(floor, down, towards="up")[0] + 0
+        >>> orient_normals(floor, down, orient="up")[0] + 0
         tensor([0., 0., 1.])
     """
-    cloud = as_tensor("orient_normals", "points", points).detach()
+    cloud, directions = find_directions(
+        "orient_normals", points, orient, viewpoint=viewpoint, front=front
+    )
     vectors = as_tensor("orient_normals", "normals", normals)
     check_shapes("orient_normals", points=(cloud, "N 3"), normals=(vectors, "N 3"))
-    check_floating("orient_normals", points=cloud)
     check_floating("orient_normals", normals=vectors)
     if neighbors is not None:
         check_neighbors("orient_normals", neighbors, cloud)
-    if viewpoint is not None:
-        if towards != "viewpoint":
-            raise ConfigError(
-                f"orient_normals: expected no viewpoint with towards={towards!r}; pass "
-                "towards='viewpoint' to look at one."
-            )
-        place = as_tensor("orient_normals", "viewpoint", viewpoint).to(cloud)
-        pattern = "3" if place.ndim == 1 else "N 3"
-        check_shapes("orient_normals", points=(cloud, "N 3"), viewpoint=(place, pattern))
-        front = place - cloud
-    directions = check_orientation("orient_normals", towards, cloud, front, name="towards")
 
     def turn(side: Orientation) -> Tensor:
         if neighbors is not None:
@@ -129,64 +135,52 @@ def orient_normals(
         # Copies of a point look to the side of the one that stands for them.
         return turn_towards(upright, upright.detach().index_copy(0, usable, turned))
 
-    return choose_side(cloud, vectors, towards, directions, turn)
+    return choose_side(cloud, vectors, orient, directions, turn)
 
 
-def orient_cloud(
-    cloud: Cloud,
-    normals: Tensor,
-    towards: Orientation = "auto",
-    *,
-    viewpoint: NDArray[np.floating] | None = None,
-) -> Tensor:
-    """Choose the sign of each normal of a cloud by its front; see :func:`orient_normals`.
-
-    The viewpoint ``(3,)`` is in the coordinates of the cloud. Default: that of its scanners.
-
-    Example:
-        >>> cloud = Cloud(np.eye(3), front=np.array([[0, 0, -1]] * 3, np.float32))
-        >>> orient_cloud(cloud, torch.tensor([[0.0, 0.0, 1.0]] * 3))[0] + 0
-        tensor([ 0.,  0., -1.])
-    """
-    if viewpoint is not None:
-        place = viewpoint - cloud.origin
-        return orient_normals(cloud.points, normals, towards=towards, viewpoint=place)
-    front = front_of(cloud, towards)
-    return orient_normals(cloud.points, normals, towards=towards, front=front)
-
-
-def front_of(cloud: Cloud, orient: Orientation) -> NDArray[np.float32] | None:
-    """Return the front of a cloud that an orientation uses: by "viewpoint" that to its scanners.
-
-    Raises:
-        ConfigError: If the orientation is unknown, or the cloud has no scanners to look at.
-    """
-    is_used = orient != "viewpoint" or "scans" in cloud.header
-    front = cloud.front if is_used else None
-    check_orientation(cloud.source or "Cloud", orient, cloud.points, front)
-    return front
-
-
-def check_orientation(
+def find_directions(
     caller: str,
-    orient: str,
-    points: Tensor,
-    front: Tensor | NDArray[np.floating] | None,
+    points: Points | Cloud,
+    orient: Orientation,
     *,
-    name: str = "orient",
-) -> Tensor | None:
-    """Return the front as a tensor, or raise an error about the orientation or the front."""
-    check_choices(caller, **{name: (orient, Orientation)})
-    if front is None:
+    viewpoint: Points | Sequence[float] | None = None,
+    front: Points | None = None,
+) -> tuple[Tensor, Tensor | None]:
+    """Return points ``(N, 3)`` and the directions from them that an orientation needs, or None.
+
+    See :func:`orient_normals` for the arguments and the errors.
+    """
+    check_choices(caller, orient=(orient, Orientation))
+    origin = torch.zeros(3, dtype=torch.float64)
+    if isinstance(points, Cloud):
+        caller, origin = points.source or caller, torch.from_numpy(points.origin)
+        if viewpoint is None and front is None and (orient == "auto" or "scans" in points.header):
+            front = points.front
+        points = points.points
+    places = as_tensor(caller, "points", points).detach()
+    check_points(caller, places)
+    if viewpoint is not None:
         if orient != "viewpoint":
-            return None
+            raise ConfigError(
+                f"{caller}: expected no viewpoint with orient={orient!r}, got one; pass "
+                "orient='viewpoint' to look at it."
+            )
+        is_array = isinstance(viewpoint, Tensor | np.ndarray)
+        place = as_tensor(caller, "viewpoint", viewpoint if is_array else np.array(viewpoint))
+        check_shapes(
+            caller, points=(places, "N 3"), viewpoint=(place, "3" if place.ndim == 1 else "N 3")
+        )
+        return places, (place - origin.to(place.device)).to(places) - places
+    if front is not None:
+        directions = as_tensor(caller, "front", front).to(places)
+        check_shapes(caller, points=(places, "N 3"), front=(directions, "N 3"))
+        return places, directions
+    if orient == "viewpoint":
         raise ConfigError(
             f"{caller}: expected poses of scanners, as an E57 file may have, or a viewpoint, to "
             "orient normals by viewpoint, got none; use interior."
         )
-    directions = as_tensor(caller, "front", front).to(points)
-    check_shapes(caller, points=(points, "N 3"), front=(directions, "N 3"))
-    return directions
+    return places, None
 
 
 def choose_side(

@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, of_clouds
+from torchrg._checks import as_tensor, check_choices, of_clouds
 from torchrg.config import settings_of
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
 from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import restore_points, sample_voxels
+from torchrg.normals import Orientation
 from torchrg.structures import UNLABELED
 from torchrg.transforms.rows import Entries, SampleDict, check_sample
 from torchrg.transforms.sample import SampleTransform
@@ -136,7 +137,7 @@ class SegmentDepth(DepthTransform):
     coordinates. Adds images, with ``B`` in front for a batch:
 
     * ``plane`` ``(H, W)``, int64: 0 to M-1 by descending size in each image, -1 for none;
-    * ``normal`` ``(H, W, 3)``: unit normals towards the camera, 0 where there is no depth;
+    * ``normal`` ``(H, W, 3)``: unit normals, 0 where there is no depth;
     * ``curvature`` ``(H, W)``;
 
     and with ``planes=True`` also ``planes``, the table of planes
@@ -144,6 +145,7 @@ class SegmentDepth(DepthTransform):
 
     Args:
         config: Settings, or a dictionary of them.
+        orient: Side to which normals point, by default the camera.
         planes: Whether to add the table.
         **changes: Single settings, as in ``max_depth=4.0``.
 
@@ -159,19 +161,21 @@ class SegmentDepth(DepthTransform):
         self,
         config: DepthConfig | Mapping[str, Any] | None = None,
         *,
+        orient: Orientation = "auto",
         planes: bool = False,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(keys=keys)
+        check_choices("SegmentDepth", orient=(orient, Orientation))
         self.config = settings_of("SegmentDepth", DepthConfig, config, changes)
-        self.planes = planes
+        self.orient, self.planes = orient, planes
 
     @of_clouds
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)
-        segment = partial(segment_depth, config=self.config)
+        segment = partial(segment_depth, config=self.config, orient=self.orient)
         segmentations = [
             segment(image, camera, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))

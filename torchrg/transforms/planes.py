@@ -26,7 +26,14 @@ from torchrg.errors import ConfigError
 from torchrg.io.colors import find_white
 from torchrg.neighbors import distinct_points
 from torchrg.normals import estimate_normals, orient_normals
-from torchrg.normals.orient import NUM_NEIGHBORS, Orientation, turn_towards
+from torchrg.normals.orient import (
+    NUM_NEIGHBORS,
+    Orientation,
+    choose_side,
+    find_directions,
+    turn_faces,
+    turn_towards,
+)
 from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.regions.growth import number_by_count
@@ -35,13 +42,81 @@ from torchrg.transforms.rows import Sample, rows_of_clouds
 from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
 
 
-class EstimateNormals(CloudTransform):
+class OrientedTransform(CloudTransform):
+    """Base of the transforms that choose the sign of normals.
+
+    Reads ``coord`` and, where a sample has it, ``front`` ``(N, 3)``, the direction from each point
+    to where its surface was seen from. ``orient="viewpoint"`` reads ``viewpoint`` unless one is
+    given: where the scanner stood, of shape ``(3,)``, ``(B, 3)`` for the clouds of a batch, or
+    ``(N, 3)``.
+
+    Args:
+        orient: Side to which normals point; see :func:`torchrg.normals.orient_normals`.
+        viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
+
+    Raises:
+        ConfigError: If ``orient`` is unknown, or does not go with ``viewpoint``.
+    """
+
+    reads_if_there: tuple[str, ...] = ("front",)
+
+    def __init__(
+        self,
+        *,
+        orient: Orientation = "auto",
+        viewpoint: Sequence[float] | None = None,
+        keep_neighbors: bool = False,
+        keys: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
+        caller = type(self).__name__
+        check_choices(caller, orient=(orient, Orientation))
+        if viewpoint is not None and (orient != "viewpoint" or len(viewpoint) != 3):
+            raise ConfigError(
+                f"{caller}: expected three numbers as viewpoint, with orient='viewpoint', got "
+                f"{viewpoint!r} with {orient!r}."
+            )
+        self.orient: Orientation = orient
+        self.viewpoint = None if viewpoint is None else tuple(map(float, viewpoint))
+        if orient == "viewpoint":
+            self.reads_if_there = ()
+            if viewpoint is None:
+                self.reads = (*self.reads, "viewpoint")
+
+    def read(self, sample: Sample, name: str) -> Tensor:
+        """Return an entry of a sample; of a viewpoint a row for each point."""
+        values = super().read(sample, name)
+        if name != "viewpoint":
+            return values
+        parts = rows_of_clouds(sample, len(super().read(sample, "coord")))
+        places = values[None] if values.ndim == 1 else values
+        if len(places) not in (1, len(parts)):
+            return places
+        of_clouds = places.expand(len(parts), -1)
+        counts = [rows.stop - rows.start for rows in parts]
+        return of_clouds.repeat_interleave(torch.tensor(counts, device=places.device), dim=0)
+
+    def side(self, cloud: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Return the arguments of a function that says to which side normals point."""
+        viewpoint = self.viewpoint if self.viewpoint is not None else cloud.get("viewpoint")
+        return {"orient": self.orient, "viewpoint": viewpoint, "front": cloud.get("front")}
+
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        place = "" if self.viewpoint is None else f", viewpoint={self.viewpoint}"
+        settings = super().extra_repr()
+        return f"orient={self.orient!r}{place}" + f",\n{settings}" * bool(settings)
+
+
+class EstimateNormals(OrientedTransform):
     """Add unit normals and curvature; see :func:`torchrg.estimate_normals`.
 
     Reads ``coord`` ``(N, 3)``; adds ``normal`` ``(N, 3)``, ``curvature`` and ``residual`` ``(N,)``.
 
     Args:
         config: Settings of the estimator.
+        orient: Side to which normals point, as in :class:`SegmentPlanes`.
+        viewpoint: Where the scanner stood, for ``orient="viewpoint"``.
         residual: Whether to add ``residual`` ``(N,)``, the root mean square distance of the
             neighbours to the plane, which ``GrowRegions`` reads where ``plane_reach`` is on.
         chunk_size: Points handled at a time; bounds memory, changes no result.
@@ -57,13 +132,17 @@ class EstimateNormals(CloudTransform):
         self,
         config: NormalsConfig | AnyConfig | None = None,
         *,
+        orient: Orientation = "auto",
+        viewpoint: Sequence[float] | None = None,
         residual: bool = True,
         chunk_size: int = CHUNK_SIZE,
         keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
+        super().__init__(
+            orient=orient, viewpoint=viewpoint, keep_neighbors=keep_neighbors, keys=keys
+        )
         self.config = settings_of("EstimateNormals", NormalsConfig, config, changes)
         self.residual, self.chunk_size = residual, chunk_size
 
@@ -71,87 +150,69 @@ class EstimateNormals(CloudTransform):
         """Return normals and curvature of a cloud."""
         distinct = distinct_points(cloud["coord"])
         neighbors = search(distinct.points, self.config.k)
-        fit = estimate_normals(
+        found = estimate_normals(
             distinct.points, self.config, neighbors=neighbors, chunk_size=self.chunk_size
-        ).each(distinct.restore)
-        added = {"normal": fit.normals, "curvature": fit.curvature}
+        )
+        points, front = find_directions(type(self).__name__, cloud["coord"], **self.side(cloud))
+
+        def turn(side: Orientation) -> Tensor:
+            return distinct.restore(turn_faces(distinct.points, found.normals, side, neighbors))
+
+        fit = found.each(distinct.restore)
+        normals = choose_side(points, fit.normals, self.orient, front, turn)
+        added = {"normal": normals, "curvature": fit.curvature}
         return {**added, "residual": fit.residual_rms} if self.residual else added
 
 
-class OrientNormals(CloudTransform):
+class OrientNormals(OrientedTransform):
     """Choose the sign of the normals that a sample has; see :func:`torchrg.normals.orient_normals`.
 
-    Reads ``coord``, ``normal`` ``(N, 3)`` and, to look at a viewpoint that is not given here,
-    ``viewpoint``: where the scanner stood, of shape ``(3,)``, ``(B, 3)`` for the clouds of a batch,
-    or ``(N, 3)``. Changes ``normal``. Each cloud of a batch is oriented on its own.
+    Reads ``coord``, ``normal`` ``(N, 3)`` and what :class:`OrientedTransform` reads; changes
+    ``normal``. Each cloud of a batch is oriented on its own. :class:`SegmentPlanes` and
+    :class:`EstimateNormals` orient the normals that they add.
 
     Args:
-        towards: What normals are turned to.
+        orient: Side to which normals point.
         viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
 
     Raises:
-        ConfigError: If ``towards`` is unknown, or does not go with ``viewpoint``.
+        ConfigError: If ``orient`` is unknown, or does not go with ``viewpoint``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
-        >>> steps = torch.nn.Sequential(SegmentPlanes(), OrientNormals("viewpoint", (4, 4, -1)))
-        >>> steps({"coord": floor})["normal"][0] + 0
+        >>> sample = {"coord": floor, "normal": torch.tensor([[0.0, 0, 1]]).expand(64, 3)}
+        >>> OrientNormals("viewpoint", (4, 4, -1))(sample)["normal"][0] + 0
         tensor([ 0.,  0., -1.])
     """
 
+    reads = ("coord", "normal")
+
     def __init__(
         self,
-        towards: Orientation = "interior",
+        orient: Orientation = "auto",
         viewpoint: Sequence[float] | None = None,
         *,
         keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
     ) -> None:
-        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
-        check_choices("OrientNormals", towards=(towards, Orientation))
-        if viewpoint is not None and (towards != "viewpoint" or len(viewpoint) != 3):
-            raise ConfigError(
-                "OrientNormals: expected three numbers as viewpoint, with towards='viewpoint', got "
-                f"{viewpoint!r} with {towards!r}."
-            )
-        self.towards: Orientation = towards
-        self.viewpoint = None if viewpoint is None else tuple(map(float, viewpoint))
-        looks = towards == "viewpoint" and viewpoint is None
-        self.reads = ("coord", "normal", *["viewpoint"] * looks)
-
-    def read(self, sample: Sample, name: str) -> Tensor:
-        """Return an entry of a sample; of a viewpoint a row for each point."""
-        values = super().read(sample, name)
-        if name != "viewpoint":
-            return values
-        parts = rows_of_clouds(sample, len(super().read(sample, "coord")))
-        places = values[None] if values.ndim == 1 else values
-        if len(places) not in (1, len(parts)):
-            return places
-        of_clouds = places.expand(len(parts), -1)
-        counts = [rows.stop - rows.start for rows in parts]
-        return of_clouds.repeat_interleave(torch.tensor(counts, device=places.device), dim=0)
+        super().__init__(
+            orient=orient, viewpoint=viewpoint, keep_neighbors=keep_neighbors, keys=keys
+        )
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the normals of a cloud, turned."""
-        points, normals, viewpoint = cloud["coord"], cloud["normal"], cloud.get("viewpoint")
-        if self.viewpoint is not None:
-            viewpoint = points.new_tensor(self.viewpoint)
+        points, normals = cloud["coord"], cloud["normal"]
         is_all = bool((normals != 0).any(dim=1).all() & points.isfinite().all())
-        if search.known and is_all and self.towards in ("interior", "consistent"):
+        side = self.side(cloud)
+        by_faces = self.orient == "auto" and side["front"] is None
+        if search.known and is_all and (by_faces or self.orient in ("interior", "consistent")):
             distinct = distinct_points(points, normals.unbind(dim=1))
             near = search(distinct.points, NUM_NEIGHBORS)
             turned = orient_normals(
-                distinct.points, normals[distinct.rows], towards=self.towards, neighbors=near
+                distinct.points, normals[distinct.rows], orient=self.orient, neighbors=near
             )
             return {"normal": turn_towards(normals, distinct.restore(turned))}
-        turned = orient_normals(points, normals, towards=self.towards, viewpoint=viewpoint)
-        return {"normal": turned}
-
-    def extra_repr(self) -> str:
-        """Return the settings."""
-        place = "" if self.viewpoint is None else f", viewpoint={self.viewpoint}"
-        return f"towards={self.towards!r}{place}"
+        return {"normal": orient_normals(points, normals, **side)}
 
 
 class GrowRegions(CloudTransform):
@@ -213,11 +274,18 @@ class GrowRegions(CloudTransform):
         return f"k={self.k},\n{super().extra_repr()}"
 
 
-class SegmentPlanes(CloudTransform):
+class SegmentPlanes(OrientedTransform):
     """Add plane labels, normals and curvature; see :func:`torchrg.segment_planes`.
 
-    Reads ``coord`` ``(N, 3)``; adds ``plane`` ``(N,)``, int64, -1 for none, ``normal`` ``(N, 3)``
-    and ``curvature`` ``(N,)``.
+    Reads ``coord`` ``(N, 3)`` and what :class:`OrientedTransform` reads; adds ``plane`` ``(N,)``,
+    int64, -1 for none, ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
+
+    Args:
+        config: Settings. Default: those of the preset ``consensus``.
+        orient: Side to which normals point. Default: to the front of the surface where the sample
+            has ``front``, else into the free space of rooms.
+        viewpoint: Where the scanner stood, for ``orient="viewpoint"``. Default: as the sample says.
+        **changes: Single settings, as in ``**{"normals.k": 30}``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -229,16 +297,22 @@ class SegmentPlanes(CloudTransform):
         self,
         config: AnyConfig | None = None,
         *,
+        orient: Orientation = "auto",
+        viewpoint: Sequence[float] | None = None,
         keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(keep_neighbors=keep_neighbors, keys=keys)
+        super().__init__(
+            orient=orient, viewpoint=viewpoint, keep_neighbors=keep_neighbors, keys=keys
+        )
         self.config = settings_of("SegmentPlanes", PipelineConfig, config, changes)
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return plane labels, normals and curvature of a cloud."""
-        seg = segment_planes(cloud["coord"], self.config, keep_neighbors=self.keep_neighbors)
+        seg = segment_planes(
+            cloud["coord"], self.config, keep_neighbors=self.keep_neighbors, **self.side(cloud)
+        )
         if seg.neighbors is not None:
             search.remember(distinct_points(cloud["coord"]).points, seg.neighbors)
         return {"plane": seg.labels, "normal": seg.normals, "curvature": seg.curvature}
@@ -301,7 +375,7 @@ class MakeSuperpoints(CloudTransform):
 class AlignAxes(SampleTransform):
     """Set each cloud upright, its walls along x and y; see :func:`torchrg.align_axes`.
 
-    Reads ``coord`` ``(N, 3)``; changes it and ``normal`` ``(N, 3)``, if it is there, and adds
+    Reads ``coord`` ``(N, 3)``; changes it and ``normal`` and ``front``, if they are there, and adds
     ``axis_align_matrix`` ``(B, 4, 4)``, float64, the motion of each cloud.
 
     Args:
@@ -337,12 +411,15 @@ class AlignAxes(SampleTransform):
         coord = self.read(sample, "coord")
         parts = rows_of_clouds(sample, len(coord))
         motions = [
-            align_axes(segment_planes(coord[rows], self.config), up=self.up).to(coord.device)
+            align_axes(segment_planes(coord[rows], self.config, orient="none"), up=self.up).to(
+                coord.device
+            )
             for rows in parts
         ]
         moved = {"coord": _moved(coord, parts, motions, shifted=True)}
-        if self.key(sample, "normal") in sample:
-            moved["normal"] = _moved(self.read(sample, "normal"), parts, motions, shifted=False)
+        for name in ("normal", "front"):
+            if self.key(sample, name) in sample:
+                moved[name] = _moved(self.read(sample, name), parts, motions, shifted=False)
         changes = {self.key(sample, name): values for name, values in moved.items()}
         return self.changed(
             sample, changes | {self.key(sample, "axis_align_matrix"): torch.stack(motions)}

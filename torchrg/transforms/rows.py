@@ -31,7 +31,7 @@ OUR_KEYS = ("plane", "curvature", "residual")
 _USUAL_KEYS = {
     *POINTCEPT_KEYS,
     *OUR_KEYS,
-    *("grid_coord", "displacement", "index", "intensity", "labels"),
+    *("grid_coord", "displacement", "index", "intensity", "labels", "front"),
     *("pos", "x", "y", "rgb", "norm", "batch", "plane_index", "superpoint_index"),
 }
 """Entries that have a row for each point where they are as long as the cloud; PyG's come last."""

@@ -37,7 +37,7 @@ from torchrg.transforms.rows import (
 
 KEYS = (
     "coord", "normal", "curvature", "residual", "plane", "inverse", "origin", "color", "superpoint",
-    "viewpoint", "neighbors",
+    "viewpoint", "front", "neighbors",
 )  # fmt: skip
 """Names of the entries of a sample (Pointcept's, and ours)."""
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
@@ -221,6 +221,7 @@ class CloudTransform(SampleTransform):
     """
 
     reads: tuple[str, ...] = ("coord",)
+    reads_if_there: tuple[str, ...] = ()
 
     def __init__(
         self, *, keep_neighbors: bool = False, keys: Mapping[str, str] | None = None
@@ -234,9 +235,11 @@ class CloudTransform(SampleTransform):
 
     def transform(self, sample: Sample) -> Sample:
         """Return a new sample with the new entries."""
-        values = {name: self.read(sample, name) for name in self.reads}
+        entries = entries_of(sample)
+        there = [name for name in self.reads_if_there if self.key(sample, name) in entries]
+        values = {name: self.read(sample, name) for name in (*self.reads, *there)}
         key = self.key(sample, "neighbors")
-        carried = entries_of(sample).get(key)
+        carried = entries.get(key)
         search = NeighborSearch(carried.known if isinstance(carried, NeighborSearch) else ())
         parts = [
             self.add({name: value[rows] for name, value in values.items()}, search)
