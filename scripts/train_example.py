@@ -29,7 +29,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
 from tests.made import CurvedLayout
 from torchrg import segment_planes
 from torchrg.neighbors import restore_points, sample_voxels, search_knn
-from torchrg.normals import orient_normals
 from torchrg.scenes import Scene, make_room
 
 CLASSES = {
@@ -138,13 +137,12 @@ def classes_of(room: Scene) -> Tensor:
 def prepare(room: Scene) -> Sample:
     """Run torchrg on the scan, then reduce it to voxels."""
     seg = segment_planes(room.points)
-    normals = orient_normals(room.points, seg.normals)
     voxels = sample_voxels(room.points, VOXELS[0])
     rows, truth = voxels.rows, classes_of(room)
     plane, own = seg.labels[rows], len(seg.planes) + torch.arange(len(rows))
     return Sample(
         make_levels(room.points[rows]),
-        normals[rows],
+        seg.normals[rows],
         seg.curvature[rows],
         torch.where(plane >= 0, plane, own).unique(return_inverse=True)[1],
         truth[rows],

@@ -72,7 +72,7 @@ class CloudSource(Source):
         layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
         partition: How superpoints are made.
         level: Which of their levels is written.
-        orient: To which side normals point; see :func:`torchrg.normals.orient_normals`.
+        orient: Side to which normals point; see :func:`torchrg.normals.orient_normals`.
         within: Array of objects that planes are kept within; see
             :func:`torchrg.batch.scans.find_objects`. Default: planes go across.
     """
