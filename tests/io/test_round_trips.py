@@ -210,7 +210,7 @@ def test_kinds_adjacency_and_outlines_are_written(tmp_path, make_cloud, make_seg
         adjacency=adjacency,
         outline=((rings[0], rings[1]), (), (rings[2],)),
     )
-    write_cloud(tmp_path / "a.npz", cloud, seg._replace(planes=table))
+    write_cloud(tmp_path / "a.npz", cloud, replace(seg, planes=table))
     with np.load(tmp_path / "a.npz", allow_pickle=False) as result:
         arrays = dict(result)
     assert arrays["plane_kind"].tolist() == ["floor", "wall", "other"]

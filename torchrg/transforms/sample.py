@@ -7,7 +7,6 @@ treat each cloud by itself.
 
 import copy
 import importlib
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -45,8 +44,6 @@ PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
 in their name PyG counts on when it batches, as it does ``edge_index``: ``inverse_index`` names rows
 of the batch, and planes and superpoints of several clouds stay apart with ``keys={"plane":
 "plane_index", "superpoint": "superpoint_index"}``."""
-_LINE = 90
-"""Characters of a line of settings."""
 _MADE_BY_BATCHING = ("batch", "ptr", "num_nodes")
 """Entries that PyG makes when it joins clouds."""
 _NEVER_A_ROW = torch.iinfo(torch.int64).min
@@ -83,8 +80,7 @@ class SampleTransform(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        words = "" if self.config is None else repr(self.config)
-        return textwrap.fill(words, _LINE, break_long_words=False, break_on_hyphens=False)
+        return "" if self.config is None else repr(self.config)
 
     @of_clouds
     def forward(self, sample: Sample) -> Sample:
