@@ -36,8 +36,8 @@ class Cloud:
     """A cloud as it was read: its coordinates untouched, and points fit for float32 arithmetic.
 
     Args:
-        coordinates: The input's own coordinates, shape ``(N, 3)``, float32 or float64. Non-finite
-            rows are kept.
+        coordinates: The input's own coordinates, shape ``(N, 3)``, float32 or float64, an array or
+            a tensor, which becomes an array. Non-finite rows are kept.
         fields: Further values of each point by name, each of shape ``(N, ...)``: for example
             ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8 or uint16).
         grid_shape: ``(height, width)`` of an organised cloud (row-major), otherwise None.
@@ -54,7 +54,7 @@ class Cloud:
             :func:`torchrg.normals.orient_normals` turns normals by it.
 
     Raises:
-        ShapeError: If ``coordinates`` is no NumPy array, or ``front`` has another shape.
+        ShapeError: If ``coordinates`` is neither array nor tensor, or ``front`` has another shape.
 
     Warns:
         PrecisionWarning: Where :attr:`points` is taken and :attr:`precision_note` is not empty.
@@ -74,14 +74,16 @@ class Cloud:
     front: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        coordinates: object = self.coordinates
-        if not isinstance(coordinates, np.ndarray):
-            repair = (
-                "its numpy() is one" if isinstance(coordinates, Tensor) else "numpy.array makes one"
-            )
+        values: dict[str, Any] = {
+            "coordinates": _as_array(self.coordinates),
+            "fields": {name: _as_array(field) for name, field in self.fields.items()},
+            "front": _as_array(self.front),
+        }
+        vars(self).update(values)
+        if not isinstance(values["coordinates"], np.ndarray):
             raise ShapeError(
-                "Cloud: expected coordinates to be a NumPy array, got "
-                f"{type(coordinates).__name__}; {repair}."
+                "Cloud: expected coordinates to be a tensor or a NumPy array, got "
+                f"{type(self.coordinates).__name__}; numpy.array makes one."
             )
         if self.front is not None and self.front.shape != (len(self), 3):
             raise ShapeError(
@@ -165,6 +167,11 @@ class Cloud:
         if coordinates.dtype == np.float32 and not origin.any():
             return torch.from_numpy(np.ascontiguousarray(coordinates))
         return torch.from_numpy((coordinates - origin).astype(np.float32))
+
+
+def _as_array(values: Any) -> Any:  # noqa: ANN401
+    """Return a tensor as an array, and anything else as it is."""
+    return values.numpy(force=True) if isinstance(values, Tensor) else values
 
 
 def bounding_box(

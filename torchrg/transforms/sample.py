@@ -54,9 +54,9 @@ has added the rows of the clouds before."""
 class SampleTransform(nn.Module):
     """Base of the transforms: reads and writes samples of every kind, never changes one.
 
-    Results are NumPy arrays where the coordinates are. Such samples leave with a list of the
-    entries that have a row for each point, ``index_valid_keys``, so that Pointcept's transforms
-    take points out of ours too. A PyG ``Batch`` leaves as one that can be taken apart again.
+    Results are NumPy arrays where the coordinates are. New entries join the list of those that have
+    a row for each point, Pointcept's ``index_valid_keys``, where there is one. A PyG ``Batch``
+    leaves as one that can be taken apart again.
 
     Args:
         keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
@@ -142,8 +142,7 @@ class SampleTransform(nn.Module):
         }
         changed = {**sample, **new}
         coord = self.key(sample, "coord")
-        # Pointcept's transforms would else begin a list in which ours are not.
-        if LISTED in sample or (is_numpy and coord == "coord"):
+        if LISTED in sample:
             num_points, whole = len(changed[coord]), self._whole_keys(sample)
             others = recognized_keys(changed, num_points, whole=whole)
             changed |= with_listed(changed, [*OUR_KEYS, *per_point, *others])
