@@ -26,8 +26,7 @@ def flags_of(kind: type) -> list[Flag]:
     """Return the arguments of a command; the defaults of settings are those of the preset."""
     start = None
     if "settings" in {field.name for field in dataclasses.fields(kind)}:
-        up = kind.up if issubclass(kind, convert.CloudArguments) else None
-        start = {"settings": PlaneSettings.asked_for([], up)}
+        start = {"settings": PlaneSettings.asked_for([])}
     return list(list_flags(kind, start))
 
 

@@ -255,9 +255,9 @@ def _ramp(value: float, low: float, high: float) -> float:
 class PlanesConfig:
     """What the table of planes says beyond the planes themselves."""
 
-    up: Up | None = None
-    """Axis that points up. With it, the table names the class of each plane: floor, ceiling, wall
-    or another. None: no classes, or z where kinds needs them."""
+    up: Up | None = field(default=None, metadata=SHORT_FLAG)
+    """Axis that points up, z in all commands. With it, the table names the class of each plane:
+    floor, ceiling, wall or another. None: no classes, or z where kinds needs them."""
     outline: bool = False
     """Whether the outline of each plane is traced; this needs shapely."""
 
@@ -584,7 +584,7 @@ def _preset_file(name: object, *, expected: str) -> Path:
     if name in _MEASURED_NOW:
         raise ConfigError(
             f"{expected} {', '.join(preset_names())}, got {name!r}; leave it out: the default "
-            "measures what that preset set. planes.up tells which axis points up."
+            "measures what that preset set. up tells which axis points up."
         )
     if name not in preset_names():
         raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}.")

@@ -88,7 +88,7 @@ def test_several_inputs_go_to_a_directory(turned, tmp_path, align):
     ("flags", "words"),
     [
         (["--matrix", "m.csv"], "expected --matrix to end in .npy or .txt"),
-        (["--up", "0", "0", "0"], "expected up to be a direction"),
+        (["--up", "w"], "up"),
         (["--up", "1"], "up"),
     ],
 )

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from torchrg.cli import flags
+from torchrg.config import load_config
 from torchrg.io import read_cloud, write_cloud
+from torchrg.pipeline import segment_planes
 from torchrg.result import read_result
-from torchrg.structures import Cloud
+from torchrg.structures import PLANE_KINDS, Cloud
 
 UTM = np.array([651_234.125, 5_412_345.5, 417.75])
 CLASSIC = ("--preset", "classic")
@@ -68,7 +70,7 @@ def test_outlines_and_roles_need_no_flag_and_a_flag_wins(scans, tmp_path, run, m
     pytest.importorskip("shapely", reason="needs the extra outline")
     assert run("segment", *places, tmp_path / "1.csv").code == 0
     assert all(row["outline"].startswith("POLYGON Z ((6") for row in rows_of(tmp_path / "1.csv"))
-    assert run("segment", *places, tmp_path / "2.csv", "--planes.up=-z").code == 0
+    assert run("segment", *places, tmp_path / "2.csv", "--up=-z").code == 0
     first, second = ([row["kind"] for row in rows_of(tmp_path / f"{i}.csv")] for i in (1, 2))
     swapped = {"floor": "ceiling", "ceiling": "floor"}
     assert [swapped.get(kind, kind) for kind in first] == second
@@ -94,6 +96,19 @@ def test_json_is_the_planes_json_of_convert(scans, tmp_path, run):
     assert json.loads(table.read_text()) == written
     rows = rows_of(out / "room" / "planes.csv")
     assert [float(row["offset"]) for row in rows] == [row["offset"] for row in written["planes"]]
+
+
+@pytest.mark.parametrize("flags", [(), ("--preset", "classic")])
+def test_up_is_z_in_every_command_without_a_flag(scans, tmp_path, run, flags):
+    source, out = scans[0] / "room.npz", tmp_path / "out"
+    assert run("segment", source, *flags, "--out", tmp_path / "o.npz").code == 0
+    assert run("align", source, *flags, "--segment", "--out", tmp_path / "a.npz").code == 0
+    assert run("convert", "folder", scans[0], out, *flags).code == 0
+    config = load_config(flags[1] if flags else "consensus", **{"planes.up": "z"})
+    kinds = segment_planes(read_cloud(source), config).planes.kind
+    assert PLANE_KINDS.index("floor") in kinds.tolist()
+    for path in (tmp_path / "o.npz", tmp_path / "a.npz", out / "room"):
+        assert torch.equal(read_result(path).planes.kind, kinds)
 
 
 def test_convert_keeps_its_tables_and_never_replaces_those_of_others(scans, tmp_path, run):

@@ -304,7 +304,7 @@ def test_clouds_without_walls_or_without_points():
 
 def test_a_real_room_has_a_ceiling_a_floor_and_nine_walls(scan, run, tmp_path):
     path = tmp_path / "planes.npz"
-    run("segment", scan("room_scan1.pcd"), "--out", path, "--planes.up", "z")
+    run("segment", scan("room_scan1.pcd"), "--out", path, "--up", "z")
     planes = read_result(path).planes
     kinds = [plane.kind for plane in planes]
     assert kinds[int(planes.area.argmax())] == "ceiling"

@@ -19,7 +19,6 @@ from torchrg.cli.loop import STAGES, check_apart, note_input, output_paths, run_
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place
-from torchrg.linalg import unit_direction
 from torchrg.pipeline import segment_planes
 from torchrg.regions.axes import align_axes, move_cloud, move_planes
 from torchrg.structures import Segmentation
@@ -30,11 +29,12 @@ class Arguments:
     """Set scans upright, with walls along x and y, the lowest floor at z = 0, the middle at 0, 0.
 
     The planes of the scan say where floors and walls are; settings are those of torchrg segment.
+    The axis of --up points up to within 30 degrees.
 
     Examples:
         torchrg align scan.ply --out upright.ply
         torchrg align scan.ply --out upright.npz --segment --matrix motion.npy
-        torchrg align scan.ply --out upright.ply --up 0 -1 0
+        torchrg align scan.ply --out upright.ply --up -y
     """
 
     inputs: flags.CloudsFlag
@@ -44,8 +44,6 @@ class Arguments:
     line axisAlignment of ScanNet."""
     segment: bool = False
     """Write labels, normals, curvature and the table of planes too, as torchrg segment does."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points up in the input, to within 30 degrees."""
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
     settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
@@ -55,7 +53,6 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, align each input and write it."""
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg align", default=start)
-    unit_direction("align", arguments.up)
     flags.use_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
@@ -90,7 +87,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     try:
         with warnings_as_lines():
-            motion = align_axes(seg, up=arguments.up)
+            motion = align_axes(seg, up=settings.planes.up or "z")
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
     # The motion of the coordinates in the file; points are about their origin.

@@ -31,7 +31,7 @@ Command = TypeVar("Command")
 
 OFTEN = (
     *("--normals.method", "--normals.k"),
-    *("--growing.max-angle-deg", "--growing.min-size", "--growing.max-distance", "--planes.up"),
+    *("--growing.max-angle-deg", "--growing.min-size", "--growing.max-distance", "--up"),
     *("--depth.noise", "--depth.max-depth", "--depth.min-size"),
 )
 """Settings of parts that are often changed; the others come after everything else."""

@@ -45,7 +45,7 @@ from torchrg.cli.ending import (
 )
 from torchrg.cli.loop import Progress, tell_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
-from torchrg.config import DepthConfig, SuperpointsConfig, Up
+from torchrg.config import DepthConfig, SuperpointsConfig
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
@@ -127,8 +127,6 @@ class CloudArguments(Arguments):
     objects there. S3DIS has neither scannet nor spformer, ScanNet++ no other with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
-    up: ClassVar[Up | None] = None
-    """Axis that points up in all scans of the data set."""
 
     @property
     def output(self) -> dict[str, Any]:
@@ -179,7 +177,6 @@ class S3DISArguments(CloudArguments):
     """Numbers of the areas. Default: those that are there."""
     class_order: Literal["pointcept", "spt"] = "pointcept"
     """Meaning of the numbers in segment.npy. Other layouts have the order pointcept."""
-    up: ClassVar[Up | None] = "z"
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the rooms of the areas."""
@@ -200,8 +197,6 @@ class ScanNetArguments(CloudArguments):
         torchrg convert scannet scannet out --workers 4 --superpoints
         torchrg convert scannet scannet out --layout mmdet3d
     """
-
-    up: ClassVar[Up | None] = "z"
 
     def source(self, root: Path, out: Path) -> Source:
         """Return the scans."""
@@ -270,7 +265,7 @@ def run(argv: list[str]) -> int:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     chosen, start = KINDS[kind], {}
     if issubclass(chosen, CloudArguments):
-        start["settings"] = flags.PlaneSettings.asked_for(rest, chosen.up)
+        start["settings"] = flags.PlaneSettings.asked_for(rest)
     arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()

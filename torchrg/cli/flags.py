@@ -21,7 +21,6 @@ from torchrg.config import (
     PipelineConfig,
     SelectionConfig,
     SuperpointsConfig,
-    Up,
     load_config,
 )
 from torchrg.datasets.camera_files import SUFFIXES, read_camera
@@ -140,11 +139,11 @@ class PlaneSettings:
     )
 
     @classmethod
-    def asked_for(cls, argv: list[str], up: Up | None = None) -> "PlaneSettings":
+    def asked_for(cls, argv: list[str]) -> "PlaneSettings":
         """Return the settings of the preset or the file in the arguments: defaults of the flags.
 
-        ``up`` is the axis that points up in a data set, where they name neither. A table of planes
-        has classes and outlines as far as they can be known.
+        The axis z points up unless the file names another. A table of planes has outlines as far as
+        they can be known.
 
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
@@ -156,12 +155,11 @@ class PlaneSettings:
             name = name.replace("_", "-")
             if name in values:
                 values[name] = value if equals else following
-        named = values["--config"] or values["--preset"]
-        resolved = load_config(named or DEFAULT_PRESET)
-        planes = resolved.planes if named else dataclasses.replace(resolved.planes, up=up)
+        resolved = load_config(values["--config"] or values["--preset"] or DEFAULT_PRESET)
+        planes = dataclasses.replace(resolved.planes, up=resolved.planes.up or "z")
         if any(argument.partition("=")[0] == "--table" for argument in argv):
             outline = planes.outline or find_spec("shapely") is not None
-            planes = dataclasses.replace(planes, up=planes.up or "z", outline=outline)
+            planes = dataclasses.replace(planes, outline=outline)
         resolved = dataclasses.replace(resolved, planes=planes)
         try:
             angle = float(values["--angle-deg"])

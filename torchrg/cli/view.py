@@ -13,6 +13,7 @@ from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
 from torchrg.cli.loop import check_beside, is_page
+from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.io.colors import narrow_colors
 from torchrg.render import (
@@ -32,7 +33,6 @@ from torchrg.structures import Cloud
 
 ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
 PageColorBy = Literal[ColorBy, "error", "normal-error"]
-Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Direction = tuple[float, float, float]
 
 
@@ -63,7 +63,7 @@ class Arguments:
     """Where the picture is taken from: from outside without ceiling and near walls (cutaway), from
     above without ceiling (above), from outside with everything (outside), or from the origin along
     z as a depth camera sees it (sensor)."""
-    up: Axis | None = None
+    up: Up | None = None
     """Axis that points up. Default: z; -y with --view sensor."""
     azimuth_deg: float | None = None
     """Angle about the up axis from which to look, in degrees. Default: the one that shows most."""
@@ -182,7 +182,7 @@ def _colors(
     return torch.from_numpy(narrow_colors(cloud.fields["color"]))
 
 
-def _direction(axis: Axis) -> Direction:
+def _direction(axis: Up) -> Direction:
     """Return an axis as a vector."""
     sign = -1.0 if axis.startswith("-") else 1.0
     x, y, z = (sign * (letter == axis[-1]) for letter in "xyz")

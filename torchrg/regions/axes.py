@@ -25,7 +25,7 @@ _LEAST_SHARE = 0.02
 
 
 @made_on_cpu()
-def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> Tensor:
+def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -> Tensor:
     r"""Return the motion that sets a room upright, with walls along x and y and the floor at 0.
 
     Up is the unit vector :math:`u` that minimises, over planes of area :math:`a` and unit normal
@@ -44,7 +44,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] = (0.0, 0.0, 1
 
     Args:
         seg: A segmentation, or its plane table.
-        up: Where up is, to within 30 degrees, in the coordinates of the points.
+        up: Upward direction to within 30 degrees, as three numbers or as the name of an axis.
 
     Returns:
         A rigid motion, shape ``(4, 4)``, float64: ``points @ motion[:3, :3].T + motion[:3, 3]``.
