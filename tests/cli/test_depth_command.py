@@ -1,7 +1,6 @@
 """``torchrg depth``: planes of depth images and of organised clouds."""
 
 import json
-import shutil
 import struct
 
 import kornia_rs
@@ -20,6 +19,7 @@ from torchrg.depth.camera import Pinhole, depth_to_points, make_intrinsics
 from torchrg.errors import DepthWarning, FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.render import write_png
+from torchrg.result import RECORD
 from torchrg.structures import Cloud
 
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads", "1"]
@@ -128,9 +128,9 @@ def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_pa
     assert damaged.count("2.png") == 1
     assert sums == "torchrg: 1 of 3 inputs failed, the others are written."
     assert told.out.count(" 2 planes, ") == 2
-    assert sorted(contents(out)) == [
-        f"{name}{end}" for name in (1, 3) for end in (".json", ".png", "_planes.png")
-    ]
+    assert sorted(path.name for path in out.iterdir()) == ["1", "3"]
+    assert contents(out / "1") == contents(out / "3")
+    assert len(contents(out / "1")) == 5
 
 
 def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
@@ -139,9 +139,32 @@ def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
     frame.rename(folder / frame.name)
     assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels").code == 0
     assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels.png").code == 0
-    results = contents(tmp_path / "labels")
-    assert sorted(results) == ["frame.json", "frame.png", "frame_planes.png"]
-    assert results["frame.png"] == (tmp_path / "labels.png").read_bytes()
+    labels = kornia_rs.io.read_image_png_u16(str(tmp_path / "labels.png"), "mono")[..., 0]
+    np.testing.assert_array_equal(np.load(tmp_path / "labels/frame/plane.npy") + 1, labels)
+
+
+def test_images_in_a_directory_write_what_convert_writes(tmp_path, frame, depth, run):
+    folder, out = tmp_path / "images", tmp_path / "out"
+    folder.mkdir()
+    frame.rename(folder / "0.png")
+    write_png(folder / "1.png", (depth.flip(1) * 1200).round().int())
+    assert run("depth", *sorted(folder.iterdir()), *CAMERA, "--out", out).code == 0
+    assert run("convert", "rgbd", folder, tmp_path / "all", *CAMERA[:4], "--workers", "1").code == 0
+    for name in ("0", "1"):
+        written, expected = contents(out / name), contents(tmp_path / "all" / name)
+        assert written == {key: expected[key] for key in expected if key != RECORD}
+    table = (folder / "0.png", *CAMERA, "--out", tmp_path / "labels.png", "--table")
+    assert run("depth", *table, tmp_path / "labels.csv").code == 0
+    assert (tmp_path / "labels.json").is_file()
+    before = contents(out / "0")
+    tables = ("--out", out, "--table", tmp_path / "tables", "--picture", tmp_path / "pictures")
+    assert run("depth", *sorted(folder.iterdir()), *CAMERA, *tables).code == 0
+    assert contents(out / "0") == before
+    written = contents(tmp_path / "tables")
+    assert written.keys() == {"0.csv", "1.csv"}
+    assert written["0.csv"] == (tmp_path / "labels.csv").read_bytes()
+    picture = contents(tmp_path / "pictures")["0.png"]
+    assert picture == (tmp_path / "labels_planes.png").read_bytes()
 
 
 def test_a_folder_of_several_is_refused_with_the_command_for_it(tmp_path, frame, run):
@@ -186,12 +209,10 @@ def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, run):
     other.write_bytes(frame.read_bytes())
     before = contents(tmp_path)
     for inputs, out, message in (
-        ([frame, other], tmp_path, "expected a place of its own for each result"),
-        ([frame], frame, "frame.png: expected a place of its own"),
-        ([frame, other], tmp_path / "out", "frame_planes.png: expected a place of its own"),
+        ([frame], frame, "frame.png: expected a place of its own for each result"),
+        ([other], frame, "frame_planes.png: expected a place of its own for each result"),
     ):
         assert message in run("depth", *inputs, *CAMERA, "--out", out).error
-        shutil.rmtree(tmp_path / "out", ignore_errors=True)
     assert contents(tmp_path) == before
 
 

@@ -77,7 +77,8 @@ def place(tmp_path):
     for name in ("kept.npz", "kept.png", "kept.html", "kept.csv"):
         (tmp_path / "open" / name).write_bytes(b"kept")
         (tmp_path / "open" / name).chmod(0o444)
-    for name in ("room2.npz", "room2.png", "2.png", "1_planes.png", "report.json"):
+    for name in ("room2.npz", "room2.png", "2/planes.json", "report.json"):
+        (tmp_path / "partly" / name).parent.mkdir(exist_ok=True)
         (tmp_path / "partly" / name).write_bytes(b"kept")
         (tmp_path / "partly" / name).chmod(0o444)
     (tmp_path / "indexed" / "index.html").write_bytes(b"kept")
@@ -112,8 +113,8 @@ FOLDERS = [
     ("segment room1.npz room2.npz --out open --picture {}", "partly/room2.png"),
     ("segment room1.npz room2.npz --out open --pages --picture {}", "indexed/index.html"),
     ("normals room1.npz room2.npz --out {}", "partly/room2.npz"),
-    ("depth 1.png 2.png --out {}", "partly/2.png"),
-    ("depth 1.png --out {}", "partly/1_planes.png"),
+    ("depth 1.png 2.png --out {}", "partly/2/planes.json"),
+    ("depth 2.png --out {}", "partly/2/planes.json"),
     ("convert folder scans {}", "partly/report.json"),
     ("convert folder scans open --pages {}", "indexed/index.html"),
 ]
@@ -147,7 +148,7 @@ def test_a_directory_with_a_file_that_cannot_be_written_is_told_too(place, there
 @pytest.mark.parametrize("command", [command for command, _ in FOLDERS])
 def test_a_directory_that_takes_no_files_is_told_before_the_work(place, there, command):
     for target, message in (("shut/out", "is read-only"), ("shut/new", "cannot be made")):
-        if target == "shut/new" and command.startswith("depth 1.png --out"):
+        if target == "shut/new" and command.startswith("depth 2.png --out"):
             continue  # One image goes to a file.
         code, _, err = there(*words_of(command.format(target)))
         assert (code, err.count("\n")) == (2, 1), err

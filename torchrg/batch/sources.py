@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from torchrg._optional import require
 from torchrg.batch.records import Record
@@ -55,7 +56,7 @@ from torchrg.io.colors import read_colors
 from torchrg.io.fields import Values
 from torchrg.io.npy import map_folder
 from torchrg.normals.orient import Orientation
-from torchrg.structures import Cloud
+from torchrg.structures import Cloud, Segmentation
 
 _COPIED = tuple(name for name in GIVEN_ARRAYS if name != "normal")
 """Arrays of a folder in Pointcept's layout that go along with its results."""
@@ -407,9 +408,8 @@ class RGBDSource(Source):
             depth, frame.intrinsics, self.settings, pose=frame.pose, orient=self.orient
         )
         points = points_of_image(depth, frame.intrinsics, frame.pose)
-        coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
         begin("write")
-        files = tuple(write_results(folder, coord, seg))
+        files = tuple(write_frame(folder, depth, points, seg))
         num_planes = len(seg.planes)
         notes += [] if num_planes else ["no plane found"]
         return TaskReport(
@@ -425,6 +425,15 @@ class RGBDSource(Source):
                 "depth_scale": frame.depth_scale,
             },
         )
+
+
+def write_frame(folder: Path, depth: Tensor, points: Tensor, seg: Segmentation) -> list[str]:
+    """Write a frame ``(H, W)`` and its points ``(H, W, 3)``; see :func:`write_results`.
+
+    Pixels without depth have zeros.
+    """
+    coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
+    return write_results(folder, coord, seg)
 
 
 def _plain(frame: RGBDFrame) -> Record:

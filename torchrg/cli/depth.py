@@ -1,16 +1,20 @@
 """``torchrg depth``: planes of depth images and of organised clouds, found in the image."""
 
+import itertools
 import time
 import warnings
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg.batch.memory import available_memory
 from torchrg.batch.records import describe_run
+from torchrg.batch.sources import write_frame
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import say, warn, warnings_as_lines
@@ -26,11 +30,11 @@ from torchrg.datasets.rgbd_files import (
 from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
 from torchrg.depth.camera import Pinhole, find_misfit, numbers_of, points_of_image
 from torchrg.errors import ConfigError, DepthWarning, FormatError
-from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
+from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place, make_folder
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import color_planes, write_png
-from torchrg.result import write_table
+from torchrg.result import PLANES_FILE, write_table
 from torchrg.structures import Cloud
 
 _COLORED_FROM = 200
@@ -50,13 +54,15 @@ class Arguments:
     """Label the planes of depth images, or of organised clouds taken as such.
 
     Labels are written as a 16-bit PNG (0 is no plane, the first plane is 1) with a coloured picture
-    and a table of the planes, .json, beside it, or as a cloud, all in camera coordinates. For
-    folders and sequences of depth images there is torchrg convert rgbd.
+    and a table of the planes, .json, beside it, or as a cloud. Into a directory each image writes a
+    folder with the files of torchrg convert rgbd, which is for sequences and other folders. All
+    results are in camera coordinates.
 
     Examples:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
         torchrg depth frame.png --intrinsics camera.json --depth-scale 1000 --out labels.png
         torchrg depth kinect.pcd --out planes.ply
+        torchrg depth *.png --intrinsics camera.json --depth-scale 1000 --out results
     """
 
     inputs: Annotated[tuple[Path, ...], Argument("IMAGE", is_positional=True)]
@@ -64,7 +70,8 @@ class Arguments:
     (.pcd)."""
     out: Path
     """File to write, .png for labels or a cloud by its suffix; for several inputs a directory, and
-    for a folder, unless it has such a suffix."""
+    for a folder, unless it has such a suffix. A directory gets a folder for each image, with coord,
+    normal, curvature and plane as .npy, and planes.json."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
     picture: Path | None = None
@@ -90,18 +97,27 @@ def run(argv: list[str]) -> int:
     ]
     if any(path.is_dir() for path in arguments.inputs) and not arguments.out.suffix:
         make_folder(arguments.out)
-    targets = output_paths(inputs, arguments.out, suffix=".png")
+    is_folder = arguments.out.is_dir() or (
+        len(inputs) > 1 and arguments.out.suffix.lower() not in (".png", *FORMATS)
+    )
+    targets = output_paths(inputs, arguments.out, suffix="" if is_folder else ".png")
     pictures = paths_beside(targets, arguments.picture, suffixes=(".png",))
-    if arguments.picture is None:
-        pictures = [t.with_name(f"{t.stem}_planes.png") if _is_png(t) else None for t in targets]
-    tables = paths_beside(targets, arguments.table, suffixes=TABLE_SUFFIXES)
-    if arguments.table is None:
-        tables = [target.with_suffix(".json") if _is_png(target) else None for target in targets]
-    beside = [path for path in (*pictures, *tables) if path is not None]
+    asked = paths_beside(targets, arguments.table, suffixes=TABLE_SUFFIXES)
+    tables = [set() if path is None else {path} for path in asked]
+    if not is_folder and _is_png(targets[0]):
+        if arguments.picture is None:
+            pictures = [targets[0].with_name(f"{targets[0].stem}_planes.png")]
+        tables[0].add(targets[0].with_suffix(".json"))
+    beside = [
+        path for path in (*pictures, *itertools.chain(*map(sorted, tables))) if path is not None
+    ]
     check_apart([*targets, *beside], [*inputs, Path(arguments.intrinsics or "")])
     for path in beside:
         check_place(path)
-    return run_each(_label, arguments, inputs, sources, targets, pictures, tables)
+    for path in targets if is_folder else []:
+        check_place(path / PLANES_FILE if path.is_dir() else path)
+    folders = [is_folder] * len(inputs)
+    return run_each(_label, arguments, inputs, sources, targets, folders, pictures, tables)
 
 
 def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGBDFrame | None:
@@ -145,8 +161,9 @@ def _label(
     source: Path,
     given: RGBDFrame | Pinhole | None,
     target: Path,
+    is_folder: bool,
     picture: Path | None,
-    table: Path | None,
+    tables: Collection[Path],
 ) -> None:
     """Label an image, or a cloud with its camera, write the result, and print a line about it."""
     begin = time.perf_counter()
@@ -158,12 +175,14 @@ def _label(
             cloud, depth, camera = _read_image(given)
     else:
         cloud, depth, camera = _read_cloud(source, given)
-    if not _is_png(target):
+    is_image = _is_png(target)
+    if not is_folder and not is_image:
         check_output(target, cloud)
-    note_input(f"{source}", cloud, target, () if _is_png(target) else RESULT_FIELDS)
-    # Results are about the cloud's origin.
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = -torch.from_numpy(cloud.origin)
+    note_input(f"{source}", cloud, target, () if is_folder or is_image else RESULT_FIELDS)
+    origin, pose = np.zeros(3), None
+    if not is_folder:  # Results are about the cloud's origin.
+        origin, pose = cloud.origin, torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = -torch.from_numpy(origin)
     with warnings.catch_warnings():
         # The camera was checked against the size of the image, or found from the points.
         warnings.simplefilter("ignore", DepthWarning)
@@ -177,7 +196,9 @@ def _label(
         few = torch.full_like(points, torch.nan)
         few[::apart, ::apart] = points[::apart, ::apart]
         write_png(picture, color_planes(seg.labels, few) * (depth > 0)[..., None])
-    if _is_png(target):
+    if is_folder:
+        write_frame(target, depth, torch.from_numpy(cloud.coordinates).view(*points.shape), seg)
+    elif is_image:
         write_png(target, seg.labels + 1)
     else:
         provenance = describe_run(source, arguments.depth) | {
@@ -189,8 +210,8 @@ def _label(
         images = {name: values for name, values in vars(seg).items() if name not in _NO_IMAGES}
         rows = replace(seg, **{name: image.flatten(0, 1) for name, image in images.items()})
         write_cloud(target, cloud, rows, provenance=provenance)
-    if table is not None:
-        write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))
+    for table in tables:
+        write_table(table, describe_planes(seg.planes, origin=origin.tolist()))
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
     share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
     say(
