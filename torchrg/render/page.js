@@ -431,7 +431,8 @@ function showScale() {
 
 // ---- Picking ---------------------------------------------------------------------------------
 
-const number = (value, digits = 4) => Number(value.toPrecision(digits)).toLocaleString("en", { maximumSignificantDigits: digits });
+const number = (value, digits = 4) => (value !== 0 && Math.abs(value) < 1e-4 ? value.toExponential(1)
+  : Number(value.toPrecision(digits)).toLocaleString("en", { maximumSignificantDigits: digits }));
 // Places of a point to a ten-thousandth of the cloud or better.
 const decimals = Math.max(0, 4 - Math.floor(Math.log10(page.frame.scale * 10)));
 const place = (value) => (Math.round(value * 10 ** decimals) / 10 ** decimals + 0)
