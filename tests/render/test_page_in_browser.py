@@ -209,6 +209,8 @@ def test_a_click_picks_and_the_panel_tells(tab, room):
     assert f"{plane['count']:,}" in text
     assert all(word in text for word in ("equation", "area", "rms", "meets"))
     assert "°" in text
+    boxes = "(terms) => terms.filter((term) => term.scrollWidth > term.clientWidth).length"
+    assert tab.page.locator("#picked dt").evaluate_all(boxes) == 0  # No term covers its value.
 
 
 def test_hiding_a_plane_and_cutting_change_the_picture(tab, room):

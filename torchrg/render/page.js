@@ -506,7 +506,9 @@ function describePicked() {
     add("rms", `${number(plane.rms, 3)} ${page.unit}`);
     add("points", plane.count.toLocaleString("en"));
     for (const [name, value] of Object.entries(plane)) {
-      if (!SAID.includes(name)) add(name, typeof value === "number" ? number(value) : `${value}`);
+      if (SAID.includes(name)) continue;
+      const text = typeof value === "number" ? number(value) : `${value}`;
+      add(name.replace(/_deg$/, "").replaceAll("_", " "), name.endsWith("_deg") ? `${text}°` : text);
     }
     const met = plane.meets.slice().sort((first, second) => second[2] - first[2]).slice(0, 12).map(([other, angle]) =>
       element("button", `${cloud.planes[other].name}: ${angle}°`, {
