@@ -62,7 +62,7 @@ class Arguments:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
         torchrg depth frame.png --intrinsics camera.json --depth-scale 1000 --out labels.png
         torchrg depth kinect.pcd --out planes.ply
-        torchrg depth *.png --intrinsics camera.json --depth-scale 1000 --out results
+        torchrg depth *.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out results
     """
 
     inputs: Annotated[tuple[Path, ...], Argument("IMAGE", is_positional=True)]
