@@ -256,8 +256,8 @@ class PlanesConfig:
     """What the table of planes says beyond the planes themselves."""
 
     up: Up | None = field(default=None, metadata=SHORT_FLAG)
-    """Axis that points up, z in all commands. With it, the table names the class of each plane:
-    floor, ceiling, wall or another. None: no classes, or z where kinds needs them."""
+    """Axis that points up. With it, the table names the class of each plane: floor, ceiling, wall
+    or another. Commands on clouds use z. None: no classes, or z where kinds needs them."""
     outline: bool = False
     """Whether the outline of each plane is traced; this needs shapely."""
 
