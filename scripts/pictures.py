@@ -5,6 +5,7 @@
 ``rooms.png`` and ``page.png`` beside this file are written again; the latter needs Chromium and
 playwright, and stays as it is where they are missing. The frame, of a desk at the Technical
 University of Munich, is in the folder ch7 of https://github.com/gaoxiang12/slambook2; where it is
+from dataclasses import replace
 from and its licence are in ``LICENSE.rooms`` beside this file.
 """
 
@@ -50,11 +51,12 @@ def draw_frame(path: Path, color: Path, depth: Path) -> None:
     intrinsics = make_intrinsics(*CAMERA)
     points = depth_to_points(image[None], intrinsics[None])[0].flatten(0, 1)
     found = segment_depth(image, intrinsics)
-    seg = found._replace(
+    seg = dataclasses.replace(
+        found,
         **{
             name: getattr(found, name).flatten(0, 1)
             for name in ("labels", "normals", "curvature", "sharp", "valid")
-        }
+        },
     )
     own = torch.from_numpy(np.array(Image.open(color).convert("RGB"))).flatten(0, 1)
     config = SuperpointsConfig(counts=(NUM_PARTS,))

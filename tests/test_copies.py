@@ -1,5 +1,7 @@
 """Points with equal coordinates: all that is estimated is that of the distinct points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -197,7 +199,7 @@ def test_superpoints_do_not_depend_on_the_order_of_copies_of_other_colors(points
     cloud, order = points.repeat(2, 1), torch.randperm(2 * COUNT, generator=rng)
     # Labels of copies differ too, as where objects share positions.
     seg = segment_planes(cloud, within=torch.arange(2).repeat_interleave(COUNT))
-    moved = seg._replace(labels=seg.labels[order], normals=seg.normals[order], points=None)
+    moved = replace(seg, labels=seg.labels[order], normals=seg.normals[order], points=None)
     one = make_superpoints(cloud, seg, colors=colors, voxel=voxel)
     other = make_superpoints(cloud[order], moved, colors=colors[order], voxel=voxel)
     assert torch.equal(other.labels, one.labels[order])

@@ -266,10 +266,10 @@ def test_labels_from_elsewhere_get_one_table(monkeypatch, cloud, seg):
 
 
 def test_neighbors_of_the_segmentation_are_not_searched_again(monkeypatch, cloud, seg):
-    bare = seg._replace(planes=replace(seg.planes, adjacency=None))
+    bare = replace(seg, planes=replace(seg.planes, adjacency=None))
     searched = Result.of(cloud, bare).planes
     rows = finite_rows(cloud.points)
-    known = bare._replace(neighbors=torchrg.search_knn(cloud.points[rows], 50, canonical=True))
+    known = replace(bare, neighbors=torchrg.search_knn(cloud.points[rows], 50, canonical=True))
     monkeypatch.setattr("torchrg.result.search_knn", None)
     result = Result.of(cloud, known)
     assert_same_table(result.planes, searched)

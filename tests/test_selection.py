@@ -115,14 +115,14 @@ def test_no_plane_may_be_left(whole):
 
 
 def test_classes_are_those_of_the_table_or_of_the_direction(points, whole, chosen):
-    without = whole._replace(planes=replace(whole.planes, kind=None))
+    without = replace(whole, planes=replace(whole.planes, kind=None))
     assert is_equal(torchrg.select_planes(without, **ASKED), chosen)
     assert is_equal(torchrg.select_planes(without, **ASKED, up=(0, 0, 2)), chosen)
     turned = torchrg.select_planes(whole, kinds="floor", up="-z")
     ceiling = torchrg.select_planes(whole, kinds="ceiling")
     assert torch.equal(turned.labels, ceiling.labels)
     with pytest.raises(ConfigError, match="pass up to segment_depth"):
-        torchrg.select_planes(without._replace(points=None), kinds="wall")
+        torchrg.select_planes(replace(without, points=None), kinds="wall")
 
 
 def test_segment_planes_and_its_transform_select_alike(points, chosen):

@@ -73,6 +73,9 @@ else:
             module = None
         if module is None:
             repair = "; seg.show() shows a result" if name == "show" else ""
+            near = [word for word in __all__ if word.startswith(f"{name}_")]
+            if near:
+                repair = f". Did you mean {near[0]!r}?"
             raise AttributeError(f"module 'torchrg' has no attribute {name!r}{repair}")
         globals()[name] = getattr(module, name) if name in _MODULES else module
         return globals()[name]

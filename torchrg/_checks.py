@@ -98,9 +98,9 @@ def check_points(caller: str, points: Tensor) -> None:
             "of an image to torchrg.transforms.SegmentDepth, or points.reshape(-1, 3)."
         )
     if points.ndim == 2 and points.shape[1] > 3:
+        repair = "points.T" if len(points) == 3 else "points[:, :3]"
         raise ShapeError(
-            f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass "
-            "points[:, :3]."
+            f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass {repair}."
         )
     check_shapes(caller, points=(points, "N 3"))
     check_floating(caller, points=points)

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -85,7 +86,7 @@ def segment_cloud(
     superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
     rows = choose_planes(seg.planes, settings)
     plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
-    return keep_planes(seg, rows), superpoints._replace(plane=plane)
+    return keep_planes(seg, rows), replace(superpoints, plane=plane)
 
 
 def check_finite(cloud: Cloud) -> tuple[str, ...]:

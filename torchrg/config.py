@@ -7,8 +7,9 @@ import math
 import numbers
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar
 
@@ -739,6 +740,37 @@ def _refuse(config: object, name: str, value: object) -> NoReturn:
     )
 
 
+def _flat_values(config: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401
+    """Yield the settings of a configuration by their dotted names."""
+    for name, value in vars(config).items():
+        if dataclasses.is_dataclass(value):
+            yield from ((f"{name}.{inner}", own) for inner, own in _flat_values(value))
+        else:
+            yield name, value
+
+
+@cache
+def _values_of_presets() -> dict[str, dict[str, Any]]:
+    """Return the settings of each preset by their dotted names, the default first."""
+    names = sorted(preset_names(), key=lambda name: name != DEFAULT_PRESET)
+    return {name: dict(_flat_values(load_config(name))) for name in names}
+
+
+def _show(config: Any) -> str:  # noqa: ANN401
+    """Return a call that makes the settings, with those that differ from the defaults."""
+    kind, values = type(config), dict(_flat_values(config))
+    if kind is not PipelineConfig:
+        usual = dict(_flat_values(kind()))
+        changed = [f"{name}={value!r}" for name, value in values.items() if value != usual[name]]
+        return f"{kind.__name__}({', '.join(changed)})"
+    others = {
+        name: {key: value for key, value in values.items() if value != preset[key]}
+        for name, preset in _values_of_presets().items()
+    }
+    preset, differing = min(others.items(), key=lambda item: len(item[1]))
+    return f"load_config({preset!r}{f', **{differing}' if differing else ''})"
+
+
 _KINDS: list[Any] = [
     *_SECTIONS.values(),
     PipelineConfig,
@@ -748,5 +780,6 @@ _KINDS: list[Any] = [
 ]
 for _kind in _KINDS:
     _kind.__setattr__ = _refuse
+    _kind.__repr__ = _show
 # So that torch.load(weights_only=True) reads checkpoints that hold settings.
 torch.serialization.add_safe_globals(_KINDS)

@@ -161,7 +161,7 @@ def segment_planes(
         seg = keep_planes(seg, choose_planes(seg.planes, settings))
     else:
         seg = _segment(points, settings, side, voxel, objects, begin)
-    return seg if keep_neighbors else seg._replace(neighbors=None)
+    return seg if keep_neighbors else replace(seg, neighbors=None)
 
 
 class _Side(NamedTuple):

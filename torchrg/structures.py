@@ -36,8 +36,8 @@ class Cloud:
     """A cloud as it was read: its coordinates untouched, and points fit for float32 arithmetic.
 
     Args:
-        coordinates: The input's own coordinates, shape ``(N, 3)``, float32 or float64. Non-finite
-            rows are kept.
+        coordinates: The input's own coordinates, shape ``(N, 3)``, float32 or float64, an array or
+            a tensor, which becomes an array. Non-finite rows are kept.
         fields: Further values of each point by name, each of shape ``(N, ...)``: for example
             ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8 or uint16).
         grid_shape: ``(height, width)`` of an organised cloud (row-major), otherwise None.
@@ -55,7 +55,7 @@ class Cloud:
         repairs: What reading put right, a line each.
 
     Raises:
-        ShapeError: If ``coordinates`` is no NumPy array, or ``front`` has another shape.
+        ShapeError: If ``coordinates`` is neither array nor tensor, or ``front`` has another shape.
 
     Warns:
         PrecisionWarning: Where :attr:`points` is taken and :attr:`precision_note` is not empty.
@@ -76,14 +76,16 @@ class Cloud:
     repairs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        coordinates: object = self.coordinates
-        if not isinstance(coordinates, np.ndarray):
-            repair = (
-                "its numpy() is one" if isinstance(coordinates, Tensor) else "numpy.array makes one"
-            )
+        values: dict[str, Any] = {
+            "coordinates": _as_array(self.coordinates),
+            "fields": {name: _as_array(field) for name, field in self.fields.items()},
+            "front": _as_array(self.front),
+        }
+        vars(self).update(values)
+        if not isinstance(values["coordinates"], np.ndarray):
             raise ShapeError(
-                "Cloud: expected coordinates to be a NumPy array, got "
-                f"{type(coordinates).__name__}; {repair}."
+                "Cloud: expected coordinates to be a tensor or a NumPy array, got "
+                f"{type(self.coordinates).__name__}; numpy.array makes one."
             )
         if self.front is not None and self.front.shape != (len(self), 3):
             raise ShapeError(
@@ -92,6 +94,14 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.coordinates)
+
+    def __repr__(self) -> str:
+        parts = [
+            f"{len(self):,} points",
+            *sorted(self.fields),
+            *["front"] * (self.front is not None),
+        ]
+        return f"Cloud({', '.join(parts)})"
 
     if not TYPE_CHECKING:
 
@@ -159,6 +169,11 @@ class Cloud:
         if coordinates.dtype == np.float32 and not origin.any():
             return torch.from_numpy(np.ascontiguousarray(coordinates))
         return torch.from_numpy((coordinates - origin).astype(np.float32))
+
+
+def _as_array(values: Any) -> Any:  # noqa: ANN401
+    """Return a tensor as an array, and anything else as it is."""
+    return values.numpy(force=True) if isinstance(values, Tensor) else values
 
 
 def bounding_box(
@@ -324,6 +339,14 @@ class Plane:
     outline: tuple[Tensor, ...] | None = None
     object: int | None = None
 
+    def __repr__(self) -> str:
+        normal = ", ".join(f"{value + 0:.3f}" for value in self.normal.tolist())
+        kind = "" if self.kind is None else f"{self.kind}, "
+        return (
+            f"Plane({self.id}, {kind}{self.count:,} points, area {self.area:.4g}, "
+            f"normal ({normal}), offset {self.offset:.4g})"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Planes:
@@ -384,6 +407,12 @@ class Planes:
     def __len__(self) -> int:
         return len(self.normal)
 
+    def __repr__(self) -> str:
+        counts = [] if self.kind is None else torch.bincount(self.kind).tolist()
+        named = sorted((-count, kind) for count, kind in zip(counts, PLANE_KINDS, strict=False))
+        classes = ", ".join(f"{-count:,} {kind}" for count, kind in named if count)
+        return f"Planes({len(self):,} planes{': ' * bool(classes)}{classes})"
+
     def __iter__(self) -> Iterator[Plane]:
         return map(self.__getitem__, range(len(self)))
 
@@ -418,6 +447,13 @@ class Planes:
         return _display.call("as_frame", self)
 
 
+def _count_points(labels: Tensor) -> str:
+    """Return the number of points, or the size of an image, in words."""
+    if labels.ndim == 2:
+        return f"{labels.shape[0]:,} x {labels.shape[1]:,} pixels"
+    return f"{len(labels):,} points"
+
+
 def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401
     """Return tensors, and tuples and tables of them, on a device; anything else as it is."""
     if isinstance(value, Tensor | Planes):
@@ -443,13 +479,14 @@ PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
 """Columns that every plane table has, in files too: kind of numbers, and shape of a row."""
 
 
-class Segmentation(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Segmentation:
     """What :func:`torchrg.segment_planes` returns: labels, normals, and the plane table.
 
     Attributes:
         labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or
             :data:`UNLABELED`.
-        normals: Unit normals of arbitrary sign, shape ``(N, 3)``; zero where not ``valid``.
+        normals: Unit normals, shape ``(N, 3)``; zero where not ``valid``.
         curvature: Surface variation in [0, 1/3], shape ``(N,)``; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(N,)``, bool.
         valid: Points that are finite and have a normal, shape ``(N,)``, bool.
@@ -474,9 +511,16 @@ class Segmentation(NamedTuple):
     sampling: Sampling | None = None
     num_copies: int = 0
 
+    def __repr__(self) -> str:
+        labeled = 100 * torch.count_nonzero(self.labels >= 0).item() / max(self.labels.numel(), 1)
+        return (
+            f"Segmentation({_count_points(self.labels)}, {len(self.planes):,} planes, "
+            f"{labeled:.1f} % labeled)"
+        )
+
     def to(self, device: torch.device | str) -> "Segmentation":
         """Return the segmentation on a device."""
-        return Segmentation(*(moved(item, device) for item in self))
+        return replace(self, **{name: moved(value, device) for name, value in vars(self).items()})
 
     def cpu(self) -> "Segmentation":
         """Return the segmentation on the CPU."""
@@ -503,7 +547,8 @@ class Segmentation(NamedTuple):
         return text
 
 
-class Superpoints(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Superpoints:
     """What :func:`torchrg.make_superpoints` returns: a partition of all points, and coarser ones.
 
     Attributes:
@@ -518,6 +563,13 @@ class Superpoints(NamedTuple):
     labels: Tensor
     plane: Tensor
     levels: tuple[Tensor, ...]
+
+    def __repr__(self) -> str:
+        counts = ", ".join(
+            f"{int(level.max()) + 1 if len(level) else 0:,}"
+            for level in (self.labels, *self.levels)
+        )
+        return f"Superpoints({_count_points(self.labels)}, {counts} superpoints)"
 
     def by_level(self) -> dict[str, NDArray[np.int32]]:
         """Return all partitions by the names that they have in files.

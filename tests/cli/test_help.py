@@ -112,18 +112,19 @@ def test_fields_become_what_is_written(line, changes):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("", "Missing from f: FILE, --out. See f --help."),
+        ("", "missing required FILE and --out."),
+        ("a", "missing required --out for a."),
         ("a --out", "expected a value for --out. See"),
         ("a --out b --part.size wide", "expected a number for --part.size, got 'wide'. See"),
         ("a --out b --place 1 2", "expected 3 values for --place, got 2. See"),
         ("a --out b --part.counts 1 x", "expected a whole number for --part.counts, got 'x'. See"),
         ("a --out b --kind none", "expected --kind to be one of one, other, got 'none'. See"),
         ("a --out b --part.is-on=yes", "expected no value for --part.is-on. See"),
-        ("a b --out b", "Unrecognized options: b. See"),
-        (
-            "a --out b --par.size 2",
-            "Unrecognized options: --par.size, 2. Did you mean --part",
-        ),
+        ("a b --out b", "unrecognized argument b. See"),
+        ("a --out b --par.size 2", "unrecognized option --par.size. Did you mean --part.size? See"),
+        ("a --output b --size 2", "unrecognized option --size. Did you mean --part.size? See"),
+        ("a -o b --is_on", "unrecognized option --is-on. Did you mean --part.is-on? See"),
+        ("a --out b --kind one two", "expected one value for --kind, got one two; separate"),
     ],
 )
 def test_what_is_written_wrongly_is_one_line(line, message):

@@ -145,7 +145,7 @@ def test_a_folder_of_pointcept_is_completed_and_not_changed(foreign):
 
 def test_what_torchrg_wrote_is_replaced(sample, seg, tmp_path):
     write_pointcept_scene(tmp_path, sample, seg, superpoint=seg.labels)
-    flipped = seg._replace(normals=-seg.normals, labels=seg.labels.clone().fill_(-1))
+    flipped = replace(seg, normals=-seg.normals, labels=seg.labels.clone().fill_(-1))
     moved = {**sample, "coord": sample["coord"] + 1}
     write_pointcept_scene(tmp_path, moved, flipped)
     assert np.array_equal(np.load(tmp_path / "normal.npy"), flipped.normals)

@@ -149,7 +149,8 @@ def test_modules_can_be_pickled(frames):
         again = pickle.loads(pickle.dumps(module))
         for key, value in module(sample).items():
             assert torch.equal(again(sample)[key], value)
-    assert "min_size=100" in repr(SegmentDepth())
+    shown = "SegmentDepth(DepthConfig(min_size=7), orient='up')"
+    assert repr(SegmentDepth(min_size=7, orient="up")) == shown
 
 
 def test_wrong_samples_are_refused(frames):

@@ -210,7 +210,7 @@ def test_kinds_adjacency_and_outlines_are_written(tmp_path, make_cloud, make_seg
         adjacency=adjacency,
         outline=((rings[0], rings[1]), (), (rings[2],)),
     )
-    write_cloud(tmp_path / "a.npz", cloud, seg._replace(planes=table))
+    write_cloud(tmp_path / "a.npz", cloud, replace(seg, planes=table))
     with np.load(tmp_path / "a.npz", allow_pickle=False) as result:
         arrays = dict(result)
     assert arrays["plane_kind"].tolist() == ["floor", "wall", "other"]
@@ -387,12 +387,19 @@ def test_files_pass_between_formats(tmp_path, make_cloud):
         np.testing.assert_array_equal(previous.fields[name].astype(values.dtype), values)
 
 
-def test_points_alone_are_refused_with_the_repair(tmp_path):
-    with pytest.raises(FormatError, match=r"got ndarray; Cloud\(coordinates\) makes one"):
-        write_cloud(tmp_path / "points.ply", np.eye(3))
+@pytest.mark.parametrize("given", [torch.eye(3), np.eye(3, dtype=np.float32)])
+def test_points_alone_are_a_cloud(given, tmp_path):
+    write_cloud(tmp_path / "points.ply", given)
+    assert np.array_equal(read_cloud(tmp_path / "points.ply").coordinates, np.eye(3))
+    with pytest.raises(ShapeError, match=r"write_cloud: expected cloud of shape \(N, 3\)"):
+        write_cloud(tmp_path / "points.ply", given[:, :2])
 
 
-@pytest.mark.parametrize("given", [torch.eye(3), [[0.0, 0.0, 1.0]]])
-def test_coordinates_that_are_no_array_are_refused_with_the_repair(given):
-    with pytest.raises(ShapeError, match=r"got (Tensor; its numpy\(\)|list; numpy\.array makes)"):
-        Cloud(given)
+def test_a_cloud_takes_tensors():
+    front = torch.ones(3, 3)
+    cloud = Cloud(torch.eye(3), {"labels": torch.arange(3)}, front=front)
+    values = cloud.coordinates, cloud.fields["labels"], cloud.front
+    assert all(isinstance(value, np.ndarray) for value in values)
+    assert torch.equal(cloud.points, torch.eye(3))
+    with pytest.raises(ShapeError, match=r"got list; numpy\.array makes"):
+        Cloud([[0.0, 0.0, 1.0]])

@@ -322,7 +322,13 @@ def test_a_table_is_gone_through_plane_by_plane():
 def test_a_segmentation_goes_to_a_device_whole():
     seg = segment_planes(make_room(2000, seed=0).points, "classic", keep_neighbors=True)
     away = seg.to("meta")
-    tensors = [*away[:5], away.points, away.neighbors.indices, *columns_of(away.planes)]
+    tensors = [
+        away.labels,
+        away.normals,
+        away.points,
+        away.neighbors.indices,
+        *columns_of(away.planes),
+    ]
     assert {part.device.type for part in (*tensors, *away.planes.adjacency)} == {"meta"}
     back = seg.cpu()
     assert torch.equal(back.labels, seg.labels)

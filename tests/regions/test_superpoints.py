@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -414,12 +415,12 @@ def test_a_superpoint_is_on_the_plane_of_more_than_half_of_its_points():
 def test_neighbors_that_are_known_are_not_searched_again(monkeypatch):
     points = make_room(num_points=3000, noise=0.003, seed=2).points
     seg = segment_planes(points, "classic", keep_neighbors=True)
-    expected = make_superpoints(points, seg._replace(neighbors=None))
+    expected = make_superpoints(points, replace(seg, neighbors=None))
     twice = torch.cat([points, points[:7]])
     found_twice = make_superpoints(twice, segment_planes(twice, "classic", keep_neighbors=True))
     assert torch.equal(found_twice.labels[3000:], found_twice.labels[:7])
     other = make_superpoints(
-        points.flip(0), seg._replace(labels=seg.labels.flip(0), normals=seg.normals.flip(0))
+        points.flip(0), replace(seg, labels=seg.labels.flip(0), normals=seg.normals.flip(0))
     )
     assert torch.equal(other.labels.flip(0), expected.labels)
     monkeypatch.setattr("torchrg.regions.superpoints.search_knn", None)

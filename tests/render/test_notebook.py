@@ -1,6 +1,7 @@
 """How a segmentation shows itself in a notebook."""
 
 import re
+from dataclasses import replace
 
 import pytest
 import torch
@@ -26,11 +27,11 @@ def test_a_notebook_shows_a_picture_and_the_largest_planes(seg):
 
 
 def test_without_points_there_is_the_table_alone(seg):
-    text = seg._replace(points=None)._repr_html_()
+    text = replace(seg, points=None)._repr_html_()
     assert "<img" not in text
     assert "<table>" in text
-    with pytest.raises(ConfigError, match=re.escape("use seg._replace(points=points)")):
-        seg._replace(points=None).show()
+    with pytest.raises(ConfigError, match=re.escape("use dataclasses.replace(seg, points=points)")):
+        replace(seg, points=None).show()
 
 
 def test_a_cloud_without_planes_shows_itself():

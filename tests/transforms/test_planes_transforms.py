@@ -152,14 +152,21 @@ def test_wrong_settings_are_refused_at_once_and_in_one_line(make, message):
     assert "\n" not in str(info.value)
 
 
-def test_settings_are_shown_on_lines_that_can_be_read():
-    for module in (SegmentPlanes(), EstimateNormals(), GrowRegions(k=9), MakeSuperpoints()):
-        lines = repr(module).splitlines()
-        assert all(len(line) <= 100 for line in lines)
-        assert len(lines) > 1
-    assert "max_angle_deg=7.0" in repr(GrowRegions(max_angle_deg=7.0))
-    assert "method='consensus', k=50" in repr(SegmentPlanes())
-    assert repr(GrowRegions(k=9)).splitlines()[1].strip() == "k=9,"
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        (SegmentPlanes(), "SegmentPlanes(load_config('consensus'), orient='auto')"),
+        (
+            SegmentPlanes("paper", orient="none", **{"normals.k": 30}),
+            "SegmentPlanes(load_config('paper', **{'normals.k': 30}), orient='none')",
+        ),
+        (EstimateNormals(k=9), "EstimateNormals(NormalsConfig(k=9), orient='auto')"),
+        (GrowRegions(max_angle_deg=7.0), "GrowRegions(GrowingConfig(max_angle_deg=7.0), k=50)"),
+        (MakeSuperpoints(), "MakeSuperpoints(SuperpointsConfig())"),
+    ],
+)
+def test_transforms_are_shown_in_one_line(module, line):
+    assert repr(module) == line
 
 
 def test_superpoints_are_those_of_the_function(coord):

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +116,7 @@ def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Seg
     about = motion.clone()
     about[:3, 3] -= torch.from_numpy(origin)
     normals = (seg.normals.double() @ motion[:3, :3].T).to(seg.normals.dtype)
-    return seg._replace(normals=normals, planes=move_planes(seg.planes, about), points=None)
+    return replace(seg, normals=normals, planes=move_planes(seg.planes, about), points=None)
 
 
 def _write_matrix(path: Path, matrix: NDArray[np.float64]) -> None:

@@ -12,6 +12,7 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import itertools
 import os
 import re
 import shutil
@@ -38,8 +39,8 @@ RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
 """Flags that decide where and how fast a command runs, never what it finds."""
-ALSO = {"--superpoints": ("--superpoint",)}
-"""Other spellings of flags, which are taken and not shown."""
+ALSO = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
+"""Other spellings of flags, which are accepted and not shown."""
 NEEDED = "needed"
 """Title of the arguments that a command does not run without."""
 _RUNNING = "how it runs, without effect on what is found"
@@ -114,7 +115,9 @@ def parse(
         print(format_help(kind, flags, prog=prog))
         raise SystemExit(0)
     try:
-        return typing.cast(Command, _build(kind, default, _read(flags, arguments, prog)))
+        example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
+        values = _read(flags, arguments, prog, example)
+        return typing.cast(Command, _build(kind, default, values))
     except ConfigError as error:
         text = _named_as_flags(str(error), flags)
         raise ConfigError(f"{text} See {prog} --help.") from None
@@ -136,39 +139,67 @@ class _Parser(argparse.ArgumentParser):
         for pattern, text in (
             (r"argument (--[^:/]*).*: expected .*", r"expected a value for \1"),
             (r"argument (--[^:/]*).*: ignored explicit .*", r"expected no value for \1"),
-            (r"the following arguments are required: ", f"Missing from {self.prog}: "),
         ):
             message = re.sub(pattern, text, message)
         raise ConfigError(f"{message}.")
 
 
-def _read(flags: Sequence[Flag], arguments: Sequence[str], prog: str) -> dict[str, object]:
+def _read(
+    flags: Sequence[Flag], arguments: Sequence[str], prog: str, example: str
+) -> dict[str, object]:
     """Return the values that are given, by path."""
     parser = _Parser(prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
     for flag in flags:
         nargs = "*" if any(map(_is_list, _kinds(flag.hint))) else None
         if flag.is_positional:
-            parser.add_argument(flag.path, nargs=nargs, metavar=flag.name)
+            parser.add_argument(flag.path, nargs=nargs or "?", metavar=flag.name)
             continue
         switches = zip(_switches(flag.name), (True, False), strict=True)
         for name, const in switches if flag.hint is bool else [(flag.name, None)]:
             # Fields are written with underscores too.
             underscored = f"--{name[2:].replace('-', '_')}"
             spellings = dict.fromkeys((name, underscored, *ALSO.get(name, ())))
-            takes: dict[str, Any] = {"nargs": nargs, "required": flag.is_needed}
+            takes: dict[str, Any] = {"nargs": nargs}
             if const is not None:
                 takes = {"action": "store_const", "const": const}
             parser.add_argument(*spellings, dest=flag.path, **takes)
     namespace, left = parser.parse_known_args(_joined(flags, arguments))
     if left:
-        names = [flag.name for flag in flags] if left[0].startswith("--") else []
-        near = difflib.get_close_matches(left[0], names, n=1)
-        if os.path.lexists(left[0]):  # A file whose name begins as a flag does.
-            near = [f"./{left[0]}"]
-        question = f" Did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"Unrecognized options: {', '.join(left)}.{question}")
+        raise ConfigError(_describe_unknown(left[0], flags, arguments))
     values = vars(namespace)
+    missing = [
+        flag.name for flag in flags if flag.is_needed and values.get(flag.path) in (None, [])
+    ]
+    if missing:
+        inputs = [values[flag.path] for flag in flags if flag.is_positional and flag.path in values]
+        words = " ".join(" ".join(words) if isinstance(words, list) else words for words in inputs)
+        given = f" for {words}" if words else ""
+        raise ConfigError(f"missing required {' and '.join(missing)}{given}.{example}")
     return {flag.path: _value_of(flag, values[flag.path]) for flag in flags if flag.path in values}
+
+
+def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]) -> str:
+    """Return a message on an argument that is neither a flag nor a value, with a repair."""
+    if os.path.lexists(word):  # A file whose name begins as a flag does.
+        return f"unrecognized option {word}. Did you mean ./{word}?"
+    if not word.startswith("-"):
+        start = list(arguments).index(word)
+        before = [place for place in range(start) if arguments[place].startswith("-")]
+        if not before:
+            return f"unrecognized argument {word}."
+        words = [*itertools.takewhile(lambda x: x[:1] != "-", arguments[before[-1] + 1 :])]
+        flag = arguments[before[-1]].partition("=")[0]
+        return (
+            f"expected one value for {flag}, got {' '.join(words)}; separate values with commas: "
+            f"{flag} {','.join(words)}."
+        )
+    asked = word.partition("=")[0].replace("_", "-")
+    names = {flag.name: flag.name for flag in flags if not flag.is_positional}
+    # The name of a setting without its part comes first.
+    tails = {f"--{name.lstrip('-').rpartition('.')[2]}": name for name in reversed(names)}
+    near = difflib.get_close_matches(asked, [*tails, *names], n=1)
+    name = tails.get(asked) or (near and (names.get(near[0]) or tails[near[0]]))
+    return f"unrecognized option {asked}.{f' Did you mean {name}?' if name else ''}"
 
 
 def _joined(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:

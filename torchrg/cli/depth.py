@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -186,8 +186,8 @@ def _label(
             "depth_scale": scale,
             "orient": arguments.orient,
         }
-        images = {name: values for name, values in seg._asdict().items() if name not in _NO_IMAGES}
-        rows = seg._replace(**{name: image.flatten(0, 1) for name, image in images.items()})
+        images = {name: values for name, values in vars(seg).items() if name not in _NO_IMAGES}
+        rows = replace(seg, **{name: image.flatten(0, 1) for name, image in images.items()})
         write_cloud(target, cloud, rows, provenance=provenance)
     if table is not None:
         write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))

@@ -105,10 +105,12 @@ def _segment(
     """Do what :func:`segment_depth` says."""
     if depth.numel() == 0:
         pixel = _segment(depth.new_zeros(1, 1), intrinsics, config, pose, orient)
-        labels, normals, curvature, sharp, valid = (
-            image.new_zeros(*depth.shape, *image.shape[2:]) for image in pixel[:5]
-        )
-        return Segmentation(labels, normals, curvature, sharp, valid, pixel.planes)
+        images: dict[str, Any] = {
+            name: image.new_zeros(*depth.shape, *image.shape[2:])
+            for name, image in vars(pixel).items()
+            if isinstance(image, Tensor)
+        }
+        return replace(pixel, **images)
     if config.max_depth is not None:
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = has_depth(depth)

@@ -7,7 +7,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
 
+from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import FormatError
 from torchrg.io.columns import check_length
 from torchrg.io.e57 import count_e57, read_e57
@@ -154,7 +157,7 @@ def takes_columns(path: str | os.PathLike[str]) -> bool:
 
 def write_cloud(
     path: str | os.PathLike[str],
-    cloud: Cloud,
+    cloud: Cloud | Tensor | NDArray[np.floating],
     segmentation: Segmentation | None = None,
     *,
     superpoints: Superpoints | None = None,
@@ -181,7 +184,7 @@ def write_cloud(
     Args:
         path: The file; an older one is replaced. Its suffix is ``.vg`` or one of :data:`FORMATS`
             but ``.e57``, ``.pts`` and ``.csv``.
-        cloud: The cloud.
+        cloud: The cloud, or its points, shape ``(N, 3)``.
         segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
         superpoints: What :func:`torchrg.make_superpoints` said about them.
         provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
@@ -199,12 +202,10 @@ def write_cloud(
         [0, 0, -1]
     """
     target = Path(path)
-    value: object = cloud
-    if not isinstance(value, Cloud):
-        raise FormatError(
-            f"{target}: expected a Cloud, got {type(value).__name__}; "
-            "Cloud(coordinates) makes one of a NumPy array."
-        )
+    if not isinstance(cloud, Cloud):
+        points = as_tensor("write_cloud", "cloud", cloud)
+        check_shapes("write_cloud", cloud=(points, "N 3"))
+        cloud = Cloud(points.numpy(force=True))
     check_output(target, cloud)
     for name, values in cloud.fields.items():
         check_length(target, name, values, len(cloud))

@@ -68,7 +68,7 @@ def select_planes(
                 "pass up to segment_depth."
             )
         kind = classify_planes(seg.planes, seg.points, seg.labels, direction)
-        seg = seg._replace(planes=replace(seg.planes, kind=kind))
+        seg = replace(seg, planes=replace(seg.planes, kind=kind))
     return keep_planes(seg, choose_planes(seg.planes, settings))
 
 
@@ -99,7 +99,7 @@ def keep_planes(seg: Segmentation, rows: Tensor) -> Segmentation:
     if planes.adjacency is not None:
         columns["adjacency"] = _kept_pairs(planes.adjacency, rows, len(planes))
     labels = renumber_planes(seg.labels, rows, len(planes))
-    return seg._replace(labels=labels, planes=replace(planes, **columns))
+    return replace(seg, labels=labels, planes=replace(planes, **columns))
 
 
 def renumber_planes(labels: Tensor, rows: Tensor, num_planes: int) -> Tensor:

@@ -31,7 +31,7 @@ def _result_of(segmentation: Segmentation) -> Result:
     if segmentation.points is None:
         raise ConfigError(
             "Segmentation: expected its points to show them, got none; "
-            "use seg._replace(points=points)."
+            "use dataclasses.replace(seg, points=points)."
         )
     points = segmentation.points.numpy(force=True).reshape(-1, 3)
     return Result.of(Cloud(points, source="segmentation"), segmentation)

@@ -171,6 +171,10 @@ class SegmentDepth(DepthTransform):
         self.config = settings_of("SegmentDepth", DepthConfig, config, changes)
         self.orient, self.planes = orient, planes
 
+    def extra_repr(self) -> str:
+        """Return the settings."""
+        return f"{super().extra_repr()}, orient={self.orient!r}"
+
     @of_clouds
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""

@@ -103,9 +103,9 @@ class OrientedTransform(CloudTransform):
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        place = "" if self.viewpoint is None else f", viewpoint={self.viewpoint}"
-        settings = super().extra_repr()
-        return f"orient={self.orient!r}{place}" + f",\n{settings}" * bool(settings)
+        own = {"orient": self.orient, "viewpoint": self.viewpoint}
+        shown = [f"{name}={value!r}" for name, value in own.items() if value is not None]
+        return ", ".join([*filter(None, [super().extra_repr()]), *shown])
 
 
 class EstimateNormals(OrientedTransform):
@@ -271,7 +271,7 @@ class GrowRegions(CloudTransform):
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        return f"k={self.k},\n{super().extra_repr()}"
+        return f"{super().extra_repr()}, k={self.k}"
 
 
 class SegmentPlanes(OrientedTransform):

@@ -23,7 +23,14 @@ import numpy as np
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
 from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints, OrientNormals
-from torchrg.transforms.rows import OUR_KEYS, Entries, Sample, SampleDict, with_listed
+from torchrg.transforms.rows import (
+    OUR_KEYS,
+    Entries,
+    Sample,
+    SampleDict,
+    recognized_keys,
+    with_listed,
+)
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
 _FEATURES = ("curvature", "residual")
@@ -98,8 +105,9 @@ _OWN: dict[str, Callable[..., SampleDict]] = {}
 
 
 def index_operator(data_dict: SampleDict, index: object, duplicate: bool = False) -> SampleDict:
-    """Take points out as Pointcept does, and out of our entries too."""
-    data_dict.update(with_listed(data_dict, [*OUR_KEYS, *_LABELS]))
+    """Take points out as Pointcept does, and out of all entries with a row for each point."""
+    others = recognized_keys(data_dict, len(data_dict["coord"]))
+    data_dict.update(with_listed(data_dict, [*OUR_KEYS, *_LABELS, *others]))
     return _OWN["index_operator"](data_dict, index, duplicate)
 
 

@@ -7,7 +7,6 @@ treat each cloud by itself.
 
 import copy
 import importlib
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -45,8 +44,6 @@ PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
 in their name PyG counts on when it batches, as it does ``edge_index``: ``inverse_index`` names rows
 of the batch, and planes and superpoints of several clouds stay apart with ``keys={"plane":
 "plane_index", "superpoint": "superpoint_index"}``."""
-_LINE = 90
-"""Characters of a line of settings."""
 _MADE_BY_BATCHING = ("batch", "ptr", "num_nodes")
 """Entries that PyG makes when it joins clouds."""
 _NEVER_A_ROW = torch.iinfo(torch.int64).min
@@ -57,9 +54,9 @@ has added the rows of the clouds before."""
 class SampleTransform(nn.Module):
     """Base of the transforms: reads and writes samples of every kind, never changes one.
 
-    Results are NumPy arrays where the coordinates are. Such samples leave with a list of the
-    entries that have a row for each point, ``index_valid_keys``, so that Pointcept's transforms
-    take points out of ours too. A PyG ``Batch`` leaves as one that can be taken apart again.
+    Results are NumPy arrays where the coordinates are. New entries join the list of those that have
+    a row for each point, Pointcept's ``index_valid_keys``, where there is one. A PyG ``Batch``
+    leaves as one that can be taken apart again.
 
     Args:
         keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
@@ -83,8 +80,7 @@ class SampleTransform(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the settings."""
-        words = "" if self.config is None else repr(self.config)
-        return textwrap.fill(words, _LINE, break_long_words=False, break_on_hyphens=False)
+        return "" if self.config is None else repr(self.config)
 
     @of_clouds
     def forward(self, sample: Sample) -> Sample:
@@ -146,8 +142,7 @@ class SampleTransform(nn.Module):
         }
         changed = {**sample, **new}
         coord = self.key(sample, "coord")
-        # Pointcept's transforms would else begin a list in which ours are not.
-        if LISTED in sample or (is_numpy and coord == "coord"):
+        if LISTED in sample:
             num_points, whole = len(changed[coord]), self._whole_keys(sample)
             others = recognized_keys(changed, num_points, whole=whole)
             changed |= with_listed(changed, [*OUR_KEYS, *per_point, *others])
