@@ -24,9 +24,9 @@ finally:
 """
 
 
-def help_of(prog, capsys):
+def help_of(prog, capsys, flag="--help-all"):
     with pytest.raises(SystemExit, match="0"):
-        main([*prog.split()[1:], "--help"])
+        main([*prog.split()[1:], flag])
     return capsys.readouterr().out
 
 
@@ -142,6 +142,18 @@ def test_examples_are_understood(prog, capsys):
         assert line.startswith(f"{prog} ")
         arguments = shlex.split(line)[len(prog.split()) :]
         parse(kind, flags.spell_counts(arguments), prog=prog)
+
+
+@pytest.mark.parametrize("prog", KINDS)
+def test_short_help_fits_a_screen_and_names_the_rest(prog, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    text, flags = help_of(prog, capsys, "--help"), list(list_flags(KINDS[prog]))
+    assert len(text.splitlines()) <= 60
+    shown = [flag for flag in flags if f"\n  {flag.spelling}" in text]
+    assert all(flag in shown for flag in flags if flag.is_needed)
+    more = f"{prog} --help-all explains these and {len(flags) - len(shown)} more."
+    assert (more in text) == (len(shown) < len(flags))
+    assert text.rstrip().endswith(example_lines(KINDS[prog])[-1])
 
 
 def test_what_is_needed_has_names(capsys):

@@ -262,7 +262,7 @@ def test_view_writes_a_page(tmp_path, run):
     what = described(Page(out.read_text(), ()))
     assert len(what["clouds"]) == 2
     assert what["unit"] == "m"
-    assert described(page_of_room())["unit"] == "units"
+    assert described(page_of_room())["unit"] == "m"
 
 
 @pytest.mark.parametrize(

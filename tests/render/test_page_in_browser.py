@@ -141,7 +141,7 @@ def test_the_scale_bar_is_as_long_as_it_says(tab, room):
     distance = (eye - np.array(tab.run("torchrg.state.camera.target"))) @ toward
     width = tab.run("scale.lastChild.getBoundingClientRect().width")
     assert width == pytest.approx(float(digits) / per_page * focal / distance, rel=0.03)
-    assert unit == "units"
+    assert unit == "m"
 
 
 def test_points_are_drawn_in_both_halves(tab):
@@ -209,6 +209,8 @@ def test_a_click_picks_and_the_panel_tells(tab, room):
     assert f"{plane['count']:,}" in text
     assert all(word in text for word in ("equation", "area", "rms", "meets"))
     assert "°" in text
+    boxes = "(terms) => terms.filter((term) => term.scrollWidth > term.clientWidth).length"
+    assert tab.page.locator("#picked dt").evaluate_all(boxes) == 0  # No term covers its value.
 
 
 def test_hiding_a_plane_and_cutting_change_the_picture(tab, room):
@@ -368,3 +370,64 @@ def test_the_table_of_the_chosen_cloud_is_saved_as_csv(tab, room):
         assert [int(row["count"]) for row in rows] == counts.tolist()
         assert {row["kind"] for row in rows} > {"wall"}
     assert tab.said == []
+
+
+def names_of_rows(tab):
+    rows = "[...document.querySelectorAll('#planes tr[data-plane]')]"
+    return tab.run(f"{rows}.map((row) => Number(row.dataset.plane))")
+
+
+def test_the_table_is_sorted_by_its_columns(tab):
+    planes = tab.run("torchrg.page.clouds[0].planes.map((p) => [p.area, p.count, p.kind])")
+    areas, counts, _ = (np.array(column) for column in zip(*planes, strict=True))
+    tab.run("cloud.value = 0; cloud.onchange()")
+    head = tab.page.locator("#planes th button")
+    assert [text.split()[0] for text in head.all_inner_texts()] == [
+        *("plane", "class", "area", "points"),
+    ]
+    head.nth(2).click()
+    assert (np.diff(areas[names_of_rows(tab)]) <= 0).all()
+    assert tab.run("document.querySelector('th[aria-sort]').innerText") == "area (m²) ↓"
+    tab.page.locator("#planes th button").nth(2).click()
+    assert (np.diff(areas[names_of_rows(tab)]) >= 0).all()
+    tab.page.locator("#planes th button").nth(0).click()
+    assert names_of_rows(tab) == sorted(names_of_rows(tab))
+    tab.page.locator("#planes th button").nth(3).click()
+    assert (np.diff(counts[names_of_rows(tab)]) <= 0).all()
+    assert tab.said == []
+
+
+def test_a_minimum_area_hides_small_planes_and_leaves_them_out_of_the_csv(tab):
+    areas = np.array(tab.run("torchrg.page.clouds[0].planes.map((p) => p.area)"))
+    tab.run("cloud.value = 0; cloud.onchange()")
+    before = drawn(tab.picture()).sum()
+    tab.page.locator("#minarea").fill("4")
+    large = np.flatnonzero(areas >= 4)
+    assert 0 < len(large) < len(areas)
+    assert sorted(names_of_rows(tab)) == large.tolist()
+    assert drawn(tab.picture()).sum() < before
+    with tab.page.expect_download() as started:
+        tab.run("csv.click()")
+    with started.value.path().open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(large)
+    assert min(float(row["area"]) for row in rows) >= 4
+    tab.run("showall.click()")
+    assert len(names_of_rows(tab)) == len(areas)
+    assert tab.page.locator("#minarea").input_value() == ""
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_targets_are_large_and_nothing_overflows(tab, width):
+    size = tab.page.viewport_size
+    tab.page.set_viewport_size({"width": width, "height": 900})
+    tab.run("cloud.value = 0; cloud.onchange()")
+    small = tab.run(
+        "[...document.querySelectorAll('aside button, aside input, aside select')]"
+        ".filter((e) => e.offsetParent && Math.min(e.offsetHeight, e.offsetWidth) < 24"
+        " && e.type !== 'range').map((e) => e.outerHTML.slice(0, 60))"
+    )
+    assert small == []
+    assert tab.run("document.documentElement.scrollWidth <= innerWidth")
+    assert tab.run("planes.scrollWidth <= planes.clientWidth")
+    tab.page.set_viewport_size(size)

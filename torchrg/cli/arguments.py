@@ -34,18 +34,28 @@ OFTEN = (
     *("--growing.max-angle-deg", "--growing.min-size", "--growing.max-distance", "--planes.up"),
     *("--depth.noise", "--depth.max-depth", "--depth.min-size"),
 )
-"""Settings of parts that are often changed; the others come after everything else."""
+"""Settings of parts that are often changed; ``--help-all`` has the others."""
+ADVANCED = (
+    *("--pages", "--level", "--layout", "--columns", "--viewpoint", "--within", "--merge"),
+    *("--config", "--angle-deg", "--sort", "--chunk-size", "--engine", "--ray-address"),
+    *("--growing.max-distance", "--ignore", "--boundary-distance", "--azimuth-deg"),
+)
+"""Flags of commands that ``--help`` leaves to ``--help-all``."""
 RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
 """Flags that decide where and how fast a command runs, never what it finds."""
 ALSO = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
 """Other spellings of flags, which are accepted and not shown."""
-NEEDED = "needed"
+NEEDED = "required"
 """Title of the arguments that a command does not run without."""
-_RUNNING = "how it runs, without effect on what is found"
+_RUNNING = "performance (does not change the result)"
 _EXAMPLES = "\n\nExamples:\n"
 _WIDEST = 100
+_COLUMN = 28
+"""Column of the terminal at which the texts of short help begin."""
+_SHORT = 40
+"""Characters of a default that short help names."""
 _WORDS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 _NUMBERS = {int: "a whole number", float: "a number"}
 _NONE = "None"
@@ -98,7 +108,7 @@ def parse(
     prog: str,
     default: Mapping[str, object] | None = None,
 ) -> Command:
-    """Parse arguments into a dataclass; ``--help`` prints and exits.
+    """Parse arguments into a dataclass; ``--help`` and ``--help-all`` print and exit.
 
     ``default`` has values of fields in place of those of the dataclass; ``prog`` is the command.
 
@@ -111,8 +121,8 @@ def parse(
         0.01
     """
     flags = list(list_flags(kind, default))
-    if not {"-h", "--help"}.isdisjoint(arguments):
-        print(format_help(kind, flags, prog=prog))
+    if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
+        print(format_help(kind, flags, prog=prog, whole="--help-all" in arguments))
         raise SystemExit(0)
     try:
         example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
@@ -296,21 +306,45 @@ def _build(kind: Any, default: Any, typed: Mapping[str, object], prefix: str = "
     return kind(**values)
 
 
-def format_help(kind: type, flags: Sequence[Flag], *, prog: str) -> str:
-    """Return what a command that is parsed into a dataclass says about itself.
+def format_help(kind: type, flags: Sequence[Flag], *, prog: str, whole: bool = True) -> str:
+    """Return the help of a command that is parsed into a dataclass, whole or on one screen.
 
     The docstring of the class is the description; the lines of its section "Examples" come last.
+    On one screen, each common option has its first sentence.
     """
-    groups = group_flags(flags)
+    common = [flag for flag in flags if whole or _is_common(flag)]
+    groups = group_flags(common)
     needed = (flag.spelling for flag in groups.get(NEEDED, ()))
     usage = " ".join(["usage:", prog, *needed, "[options]"])
-    blocks = [usage, *(_wrap(paragraph) for paragraph in describe(kind).split("\n\n"))]
+    paragraphs = describe(kind).split("\n\n")
+    blocks = [usage, *map(_wrap, paragraphs if whole else paragraphs[:1])]
     for title, members in groups.items():
-        entries = [f"  {f.spelling}\n{_wrap(f.text, indent=6)}" for f in members]
+        entries = [_whole_entry(flag) if whole else _short_entry(flag) for flag in members]
         blocks.append("\n".join([f"{title}:", *entries]))
+    if len(common) < len(flags):
+        blocks.append(f"{prog} --help-all explains these and {len(flags) - len(common)} more.")
     if examples := example_lines(kind):
         blocks.append("\n".join(["examples:", *(f"  {line}" for line in examples)]))
     return "\n\n".join(blocks)
+
+
+def _is_common(flag: Flag) -> bool:
+    """Return whether most users need a flag."""
+    return flag.is_needed or (flag.name not in ADVANCED and (not flag.part or flag.name in OFTEN))
+
+
+def _whole_entry(flag: Flag) -> str:
+    """Return the lines on a flag: how it is written, and all of its text."""
+    return f"  {flag.spelling}\n{_wrap(flag.text, indent=6)}"
+
+
+def _short_entry(flag: Flag) -> str:
+    """Return the lines on a flag: how it is written, its first sentence and its default."""
+    sentences = re.split(r"(?<=[.]) (?=[A-Z])", flag.text)
+    default = [s for s in sentences[1:] if s.startswith("Default:") and len(s) < _SHORT]
+    text = _wrap(" ".join([sentences[0], *default]), indent=_COLUMN)
+    head = f"  {flag.spelling}"
+    return f"{head:<{_COLUMN}}{text.lstrip()}" if len(head) < _COLUMN - 1 else f"{head}\n{text}"
 
 
 def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
@@ -324,7 +358,7 @@ def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
         elif not flag.part or flag.name in OFTEN:
             group = "options"
         else:
-            group = f"seldom needed: {flag.part}"
+            group = f"advanced: {flag.part}"
         groups.setdefault(group, []).append(flag)
     # What has no flag comes first, in the order in which it is written.
     groups[NEEDED].sort(key=lambda flag: not flag.is_positional)

@@ -9,6 +9,8 @@ from torchrg.cli.ending import printable
 
 _SECONDS_PER_SCAN = 0.03
 """Time of one core of an AMD EPYC for a scan of 40 points: hashes, and files that are flushed."""
+_SHORT = 100
+"""Seconds or minutes from which on a duration is in the next unit."""
 MOST_ROWS = 300
 """Most scans of a batch that is printed scan by scan."""
 
@@ -39,12 +41,12 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
             break
         memory, at_once = memory + needed, at_once + 1
     num_points = sum(job.scan.num_points for job in jobs)
-    hours = (seconds * num_points / 1e6 + _SECONDS_PER_SCAN * len(jobs)) / 3600
+    total = seconds * num_points / 1e6 + _SECONDS_PER_SCAN * len(jobs)
     return (
         f"disk: about {plan.num_bytes / 1e9:,.3f} GB of "
         f"{free / 1e9:,.1f} that are free\n"
         f"memory: about {memory / 1e9:,.1f} GB for {at_once} at a time, within {limit / 1e9:,.1f}\n"
-        f"time: about {hours / at_once:,.2f} hours, at {seconds:g} s of a core for a million "
+        f"time: about {_format_time(total / at_once)}, at {seconds:g} s of a core for a million "
         f"{of_what}"
     )
 
@@ -57,7 +59,7 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     """
     stages = list(report.stage_seconds)
     shown = report.scans if len(report.scans) <= MOST_ROWS else report.with_status("failed")
-    head = ["scan", "status", "points", "planes", *stages, "GB"]
+    head = ["scan", "status", "points", "planes", *(f"{stage} (s)" for stage in stages), "GB"]
     rows = [_row(scan, stages) for scan in shown]
     totals = report.with_status("converted")
     peak = max((scan.peak_memory for scan in totals), default=0) / 1e9
@@ -79,6 +81,19 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
         f"{report.num_points / seconds:,.0f} points, {len(totals) / seconds:,.2f} {unit}s a second"
     )
     return "\n".join([format_table(head, rows), *notes, speed])
+
+
+def _format_time(seconds: float) -> str:
+    """Return a duration in the unit that suits it.
+
+    Example:
+        >>> _format_time(8), _format_time(500), _format_time(9000)
+        ('8 s', '8 min', '2.5 h')
+    """
+    if seconds < _SHORT:
+        return f"{math.ceil(seconds)} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < _SHORT else f"{minutes / 60:,.1f} h"
 
 
 def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:

@@ -16,6 +16,8 @@ from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.metrics import (
+    METRICS,
+    Index,
     differing_rows,
     match_points,
     score_labels,
@@ -97,7 +99,7 @@ def run(argv: list[str]) -> int:
     for part, values in scores.items():
         print(part)
         for name, value in values.items():
-            print(f"  {name:<22}{_spelled(value)}")
+            print(f"  {name:<22}{_format(value, METRICS.get(part, {}).get(name))}")
     return 0
 
 
@@ -231,6 +233,13 @@ def _mean(scans: Mapping[str, Scores]) -> Scores:
     return means
 
 
-def _spelled(value: float | None) -> str:
-    """Return a number with four places at most."""
-    return "none" if value is None else f"{value:.4f}".rstrip("0").rstrip(".")
+def _format(value: float | None, index: Index | None) -> str:
+    """Return a number with its unit; fractions are in percent, as precision and recall are."""
+    unit = "" if index is None else index.unit
+    if value is None:
+        return "none"
+    if unit == "fraction":
+        value, unit = 100 * value, "%"
+    if unit in ("", "count"):
+        return f"{value:.4f}".rstrip("0").rstrip(".")
+    return f"{value:.1f} {unit}" if unit == "%" else f"{value:.2f} {unit}"

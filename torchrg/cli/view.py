@@ -75,8 +75,9 @@ class Arguments:
     """Cloud of the same points with true labels or normals, to show errors on a page."""
     max_points: int = MAX_POINTS
     """Most points that a page shows. Of a larger cloud it shows a random sample, and says so."""
-    unit: str = "units"
-    """Name of the unit of the coordinates, such as m, for the scale bar of a page."""
+    unit: str | None = None
+    """Name of the unit of the coordinates, such as m, for lengths and areas on a page. Default: m
+    if the cloud is 2 to 6 units high, as rooms are in meters."""
     columns: ColumnsFlag = None
 
 

@@ -146,7 +146,7 @@ def _read_image(source: Path, kinds: str) -> Array:
     if source.suffix.lower() == ".png" and (count := num_pixels(source)) > MAX_PIXELS:
         raise FormatError(
             f"{source}: expected an image of at most {MAX_PIXELS:,} pixels, got {count:,} in its "
-            "header; the file is damaged, fetch it again, or make it smaller."
+            "header; the file may be corrupt, or make it smaller."
         )
     with refusing(f"{source}: expected a {kinds} image, got: ", Exception):
         # Without a mode, the library says how many bits and channels there are.
@@ -314,7 +314,9 @@ def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
     wrong = next((row for row in rows if len(row) != num_words), [])
     if wrong or not rows:
         got = repr(" ".join(wrong)[:60]) if wrong else "none"
-        raise FormatError(f"{path}: expected {what} in each row, got {got}; fetch the file again.")
+        raise FormatError(
+            f"{path}: expected {what} in each row, got {got}; the file may be corrupt."
+        )
     return rows
 
 

@@ -138,7 +138,9 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
     check_folder(root)
     if not folder.is_dir():
         inside = [path.parent for path in root.glob("*/Area_[1-6]")]
-        repair = f"pass {inside[0]}" if inside else "choose areas that are there, or fetch it again"
+        repair = (
+            f"pass {inside[0]}" if inside else "choose areas that are there, or download it again"
+        )
         raise FormatError(f"{root}: expected a folder {folder.name}, got none; {repair}.")
     entries = [path for path in listed(folder) if path.is_dir() and not path.name.startswith(".")]
     rooms = [path for path in entries if (path / ANNOTATIONS).is_dir()]
@@ -232,7 +234,9 @@ def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
     """
     folder = path / ANNOTATIONS
     if not folder.is_dir():
-        raise FormatError(f"{path}: expected a folder {ANNOTATIONS}, got none; fetch it again.")
+        raise FormatError(
+            f"{path}: expected a folder {ANNOTATIONS}, got none; the file may be corrupt."
+        )
     objects, notes = [], []
     for file in listed(folder):
         match = _OBJECT.fullmatch(file.stem)
@@ -246,7 +250,7 @@ def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
             objects.append((match[1], file))
     if not objects:
         raise FormatError(
-            f"{folder}: expected objects as CLASS_NUMBER.txt, got none; fetch it again."
+            f"{folder}: expected objects as CLASS_NUMBER.txt, got none; the file may be corrupt."
         )
     return objects, notes
 
@@ -334,5 +338,7 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np
             )
         rows.append(row)
     if not rows:
-        raise FormatError(f"{path}: expected at least one point, got none; fetch the file again.")
+        raise FormatError(
+            f"{path}: expected at least one point, got none; the file may be corrupt."
+        )
     return list(np.array(rows).T)

@@ -289,7 +289,7 @@ def _alignment(path: Path) -> Arrays:
         name, _, numbers = line.partition("=")
         if name.strip() == "axisAlignment":
             message = f"{path}: expected 16 finite numbers as axisAlignment, got: "
-            with refusing(message, *DAMAGES, repair="; fetch it again"):
+            with refusing(message, *DAMAGES, repair="; the file may be corrupt"):
                 matrix = np.array(numbers.split(), dtype=np.float64).reshape(4, 4)
                 if not np.isfinite(matrix).all():
                     raise ValueError(shortened(numbers.strip()))
@@ -323,14 +323,14 @@ def _labels(files: Mapping[str, Path], root: Path, count: int) -> Arrays:
         if labels is None or labels.shape != (count,):
             raise FormatError(
                 f"{files['categories']}: expected a label of each of {count:,} vertices, got "
-                f"{'none' if labels is None else f'{len(labels):,}'}; fetch it again."
+                f"{'none' if labels is None else f'{len(labels):,}'}; the file may be corrupt."
             )
         category = labels.astype(np.int64)
         wrong = np.flatnonzero((category < 0) | (category > _LARGEST_CLASS))
         if len(wrong):
             raise FormatError(
                 f"{files['categories']}: vertex {wrong[0]:,}: expected a label from 0 to "
-                f"{_LARGEST_CLASS:,}, got {category[wrong[0]]}; fetch it again."
+                f"{_LARGEST_CLASS:,}, got {category[wrong[0]]}; the file may be corrupt."
             )
         arrays["category"] = category
     if "category" in arrays:
@@ -382,7 +382,7 @@ def _groups(
     if len(segments) != count:
         raise FormatError(
             f"{path}: expected a segment of each of {count:,} vertices, got {len(segments):,}; "
-            "fetch it again."
+            "the file may be corrupt."
         )
     of_vertices = _whole(path, "segIndices", segments)
     known, path = np.unique(of_vertices), files["groups"]
@@ -396,8 +396,8 @@ def _groups(
         if not (isinstance(label, str) and isinstance(members, list) and len(numbers) == len(keys)):
             raise FormatError(
                 f"{path}: object {place}: expected a label, a number from 0 to {most:,} as "
-                f"{' and '.join(keys)}, and a list of segments, got {shortened(group)}; fetch it "
-                "again."
+                f"{' and '.join(keys)}, and a list of segments, got {shortened(group)}; the file "
+                "may be corrupt."
             )
         whole = _whole(path, f"segments of object {place}", members)
         absent = whole[~np.isin(whole, known)]
@@ -422,7 +422,7 @@ def _warn_of_first(path: Path, what: str, entries: Sequence[object]) -> None:
 def _read_list(path: Path, key: str) -> list[Any]:
     """Return the list that a file of JSON has under a key."""
     message = f"{path}: expected JSON with a list {key}, got: "
-    with refusing(message, *DAMAGES, repair="; fetch it again"):
+    with refusing(message, *DAMAGES, repair="; the file may be corrupt"):
         content = json.loads(read_text(path))
         if not isinstance(content, dict) or not isinstance(content.get(key), list):
             raise TypeError(shortened(content))
@@ -433,7 +433,7 @@ def _read_list(path: Path, key: str) -> list[Any]:
 def _whole(path: Path, what: str, values: Sequence[object]) -> NDArray[np.int64]:
     """Return whole numbers of 64 bits, and refuse all others; ``what`` they are is for messages."""
     message = f"{path}: expected {what} to be whole numbers, got: "
-    with refusing(message, *DAMAGES, repair="; fetch it again"):
+    with refusing(message, *DAMAGES, repair="; the file may be corrupt"):
         if not set(map(type, values)) <= {int}:
             place = next(i for i, value in enumerate(values) if type(value) is not int)
             raise TypeError(f"{shortened(values[place])} as number {place:,}")
@@ -443,7 +443,7 @@ def _whole(path: Path, what: str, values: Sequence[object]) -> NDArray[np.int64]
 def _read_rows(path: Path, columns: tuple[str, ...], delimiter: str) -> Iterator[dict[str, str]]:
     """Yield the rows of a table that has some columns."""
     message = f"{path}: expected a table with columns {', '.join(columns)}, got: "
-    with refusing(message, csv.Error, *DAMAGES, repair="; fetch it again"):
+    with refusing(message, csv.Error, *DAMAGES, repair="; the file may be corrupt"):
         rows = csv.DictReader(StringIO(read_text(path), newline=None), delimiter=delimiter)
         if missing := [name for name in columns if name not in (rows.fieldnames or ())]:
             raise LookupError(f"none called {missing[0]}")
@@ -477,7 +477,7 @@ def _class_number(path: Path | None, row: Mapping[str, str], name: str) -> int:
     if not (0 <= number <= _LARGEST_CLASS and number.is_integer()):
         raise FormatError(
             f"{path}: {shortened(row['raw_category'])}: expected {name} to be a whole number from "
-            f"0 to {_LARGEST_CLASS:,}, got {shortened(text)}; fetch it again."
+            f"0 to {_LARGEST_CLASS:,}, got {shortened(text)}; the file may be corrupt."
         )
     return int(number)
 

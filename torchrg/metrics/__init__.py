@@ -46,7 +46,7 @@ class Index(NamedTuple):
     """What a number means.
 
     Attributes:
-        unit: ``"%"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""`` for a share.
+        unit: ``"%"``, ``"fraction"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""``.
         higher_is_better: None where neither direction is better.
     """
 
@@ -57,11 +57,13 @@ class Index(NamedTuple):
 _LABELS = {
     Index("%", True): "precision recall f1",
     Index("count", None): "pairs regions faces points",
-    Index("", True): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 recall_iou80 "
+    Index(
+        "fraction", True
+    ): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 recall_iou80 "
     "share_labeled covering ari",
 }
 _SUPERPOINTS = {
-    Index("", True): "asa oracle_miou boundary_recall boundary_precision",
+    Index("fraction", True): "asa oracle_miou boundary_recall boundary_precision",
     Index("", None): "boundary_distance",
     Index("count", None): "count points_per_superpoint points",
 }
@@ -77,7 +79,7 @@ _CLUSTERS = {
 _NORMALS = {
     Index("deg^2", False): "msae",
     Index("deg", False): "rms mean median",
-    Index("", True): "under_5_deg under_10_deg under_20_deg",
+    Index("fraction", True): "under_5_deg under_10_deg under_20_deg",
     Index("count", None): "points",
     Index("count", False): "invalid",
 }

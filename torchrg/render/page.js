@@ -102,6 +102,7 @@ const page = JSON.parse($("description").textContent);
 const state = {
   mode: page.mode, cut: page.cut, outlines: false, normals: false, loose: true,
   top: 0, near: 0, size: 0, picked: null, share: 1, moving: false,
+  sort: { by: "points", down: true }, minArea: 0,
   camera: { target: [0, 0, 0], rotationOrbit: 0, rotationX: 30, zoom: 5 },
 };
 let drawing = null, CloudLayer = null; // deck.gl's Deck, and our kind of its layers.
@@ -430,7 +431,8 @@ function showScale() {
 
 // ---- Picking ---------------------------------------------------------------------------------
 
-const number = (value, digits = 4) => Number(value.toPrecision(digits)).toLocaleString("en", { maximumSignificantDigits: digits });
+const number = (value, digits = 4) => (value !== 0 && Math.abs(value) < 1e-4 ? value.toExponential(1)
+  : Number(value.toPrecision(digits)).toLocaleString("en", { maximumSignificantDigits: digits }));
 // Places of a point to a ten-thousandth of the cloud or better.
 const decimals = Math.max(0, 4 - Math.floor(Math.log10(page.frame.scale * 10)));
 const place = (value) => (Math.round(value * 10 ** decimals) / 10 ** decimals + 0)
@@ -484,7 +486,7 @@ function describePicked() {
   const box = $("picked");
   box.replaceChildren();
   if (!state.picked) {
-    box.append(element("p", "Click a point, or choose a plane below.", { className: "soft" }));
+    box.append(element("p", "Click a point, or select a plane below.", { className: "soft" }));
     return;
   }
   const { cloud: c, plane: own, point } = state.picked;
@@ -499,19 +501,21 @@ function describePicked() {
     const plane = cloud.planes[own];
     add("plane", `${plane.name}${plane.curved ? " (curved)" : ""}, ${page.kinds[plane.kind]}`);
     add("equation", equation(plane));
-    add("area", number(plane.area));
-    add("extent", plane.extent.map((side) => number(side)).join(" × "));
-    add("rms", number(plane.rms, 3));
+    add("area", `${number(plane.area)} ${page.unit}²`);
+    add("extent", `${plane.extent.map((side) => number(side)).join(" × ")} ${page.unit}`);
+    add("rms", `${number(plane.rms, 3)} ${page.unit}`);
     add("points", plane.count.toLocaleString("en"));
     for (const [name, value] of Object.entries(plane)) {
-      if (!SAID.includes(name)) add(name, typeof value === "number" ? number(value) : `${value}`);
+      if (SAID.includes(name)) continue;
+      const text = typeof value === "number" ? number(value) : `${value}`;
+      add(name.replace(/_deg$/, "").replaceAll("_", " "), name.endsWith("_deg") ? `${text}°` : text);
     }
     const met = plane.meets.slice().sort((first, second) => second[2] - first[2]).slice(0, 12).map(([other, angle]) =>
       element("button", `${cloud.planes[other].name}: ${angle}°`, {
         title: `plane ${cloud.planes[other].name}, at ${angle} degrees`,
         onclick: () => choose({ cloud: c, plane: other }) }));
     if (met.length) add("meets", ...met);
-  } else add("plane", "none");
+  } else add("plane", "unlabeled");
   if (point !== undefined) {
     add("at", inFile(at(cloud.positions, point)).map(place).join("  "));
     const normal = at(cloud.normals, point);
@@ -529,9 +533,9 @@ function describePicked() {
   if (own < 0) return;
   const row = element("div", null, { className: "row" });
   row.append(
-    element("button", cloud.hidden.has(own) ? "Show it" : "Hide it", { onclick: () => setHidden(c, [own], !cloud.hidden.has(own)) }),
-    element("button", "Only this one", { onclick: () => only(c, own) }),
-    element("button", "Look at it", { onclick: () => lookAt(c, own) }));
+    element("button", cloud.hidden.has(own) ? "Show" : "Hide", { onclick: () => setHidden(c, [own], !cloud.hidden.has(own)) }),
+    element("button", "Show only this", { onclick: () => only(c, own) }),
+    element("button", "Zoom to it", { onclick: () => lookAt(c, own) }));
   box.append(row);
 }
 
@@ -598,6 +602,38 @@ function listKinds(c, cloud) {
   }));
 }
 
+// The columns of the table by which planes are sorted, with their keys.
+const COLUMNS = {
+  plane: (plane) => Number(plane.name), class: (plane) => page.kinds[plane.kind],
+  area: (plane) => plane.area, points: (plane) => plane.count,
+};
+
+function sortBy(name) {
+  state.sort = { by: name, down: state.sort.by === name ? !state.sort.down : ["area", "points"].includes(name) };
+  listPlanes();
+}
+
+function sortedPlanes(cloud) {
+  const key = (own) => COLUMNS[state.sort.by](cloud.planes[own]), sign = state.sort.down ? -1 : 1;
+  return cloud.order.filter((own) => cloud.planes[own].area >= state.minArea)
+    .sort((a, b) => sign * (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : 0));
+}
+
+function limitArea(area) {
+  state.minArea = area;
+  page.clouds.forEach((cloud, c) => {
+    const isSmall = (own) => cloud.planes[own].area < area;
+    setHidden(c, cloud.order.filter((own) => !isSmall(own)), false);
+    setHidden(c, cloud.order.filter(isSmall), true);
+  });
+}
+
+// The lines of a table, its head and those of the planes that are shown.
+function shownTable(cloud) {
+  const lines = new TextDecoder().decode(cloud.values.table).split(/(?<=\n)/);
+  return lines.filter((_, i) => i === 0 || !cloud.hidden.has(i - 1)).join("");
+}
+
 function listPlanes() {
   const c = Number($("cloud").value), cloud = page.clouds[c];
   const focused = document.activeElement?.getAttribute?.("aria-label");
@@ -607,9 +643,15 @@ function listPlanes() {
     $("planes").replaceChildren(element("p", "This file has no plane labels.", { className: "soft" }));
     return;
   }
-  const table = element("table", null), head = element("tr", null);
-  head.append(...["plane", "kind", "area", "points", "shown"].map((name) => element("th", name, { scope: "col" })));
-  table.append(head, ...cloud.order.slice(0, MOST_ROWS).map((own) => {
+  const table = element("table", null), head = element("tr", null), listed = sortedPlanes(cloud);
+  head.append(...Object.keys(COLUMNS).map((name) => {
+    const cell = element("th", null, { scope: "col" }), isSorted = state.sort.by === name;
+    const title = name === "area" ? `area (${page.unit}²)` : name, arrow = state.sort.down ? " ↓" : " ↑";
+    cell.append(element("button", title + (isSorted ? arrow : ""), { onclick: () => sortBy(name) }));
+    if (isSorted) cell.setAttribute("aria-sort", state.sort.down ? "descending" : "ascending");
+    return cell;
+  }), element("th", "shown", { scope: "col" }));
+  table.append(head, ...listed.slice(0, MOST_ROWS).map((own) => {
     const plane = cloud.planes[own], row = element("tr", null);
     row.dataset.plane = own;
     const colors = cloud.values["plane colors"];
@@ -623,8 +665,8 @@ function listPlanes() {
     return row;
   }));
   $("planes").replaceChildren(table);
-  if (cloud.order.length > MOST_ROWS)
-    $("planes").append(element("p", `The largest ${MOST_ROWS} of ${cloud.order.length.toLocaleString("en")}.`, { className: "soft" }));
+  if (listed.length > MOST_ROWS)
+    $("planes").append(element("p", `The first ${MOST_ROWS} of ${listed.length.toLocaleString("en")}.`, { className: "soft" }));
   if (focused?.startsWith("show ")) document.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
   markRow();
 }
@@ -651,7 +693,7 @@ function setMode(mode) {
 function fillPanel() {
   for (const [mode, name] of page.modes) $("mode").append(element("option", name, { value: mode }));
   $("mode").disabled = !page.modes.length;
-  if (!page.modes.length) $("mode").append(element("option", "nothing: the file has points alone"));
+  if (!page.modes.length) $("mode").append(element("option", "nothing: the file has only points"));
   $("mode").value = page.mode;
   $("mode").onchange = (event) => setMode(event.target.value);
   for (const name of ["cut", "outlines", "normals", "loose"]) {
@@ -672,10 +714,11 @@ function fillPanel() {
   $("home").onclick = () => home(page.toward);
   $("above").onclick = () => home([0, 0, 1]);
   $("level").onclick = () => { state.camera.rotationX = 0; home(); };
-  $("showall").onclick = () => page.clouds.forEach((cloud, c) => setHidden(c, cloud.order, false));
+  $("showall").onclick = () => { $("minarea").value = ""; limitArea(0); };
+  $("minarea").oninput = (event) => limitArea(Number(event.target.value));
   $("csv").onclick = () => {
     const cloud = page.clouds[Number($("cloud").value)];
-    const href = URL.createObjectURL(new Blob([cloud.values.table], { type: "text/csv" }));
+    const href = URL.createObjectURL(new Blob([shownTable(cloud)], { type: "text/csv" }));
     element("a", null, { href, download: `${cloud.name}_planes.csv` }).click();
     setTimeout(() => URL.revokeObjectURL(href), STILL_MS);
   };

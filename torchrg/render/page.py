@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 
 MAX_POINTS = 1_000_000
 """Most points of a page by default: as many as a laptop turns fluently."""
+_ROOM_HEIGHTS = 2.0, 6.0
+"""Heights of rooms and halls in meters."""
 _STEPS = 65535
 """Steps of a position along the longest side of a cloud: two bytes a coordinate."""
 _ASSETS = Path(__file__).parent
@@ -89,7 +91,7 @@ def make_page(
     up: tuple[float, float, float] | None = None,
     azimuth_deg: float | None = None,
     max_points: int = MAX_POINTS,
-    unit: str = "units",
+    unit: str | None = None,
 ) -> Page:
     """Make a page that shows a result, or two of them with one camera.
 
@@ -110,7 +112,8 @@ def make_page(
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
         max_points: Most points of a cloud that are shown; of a larger one it is a random sample,
             and the page says so.
-        unit: Name of the unit of the coordinates, for the scale bar.
+        unit: Name of the unit of the coordinates, for lengths and areas. Default: "m" if the cloud
+            is as high as a room in meters, else "units".
 
     Returns:
         The page.
@@ -155,11 +158,18 @@ def make_page(
             "scale": frame.scale,
         },
         "kinds": PLANE_KINDS,
-        "unit": unit,
+        "unit": unit or _guess_unit(cloud, up),
         "clouds": scenes,
     }
     text = _fill_template(description, [_encode_library(library), *blobs], library)
     return Page(text, tuple(scene["shown"] for scene in scenes))
+
+
+def _guess_unit(cloud: Cloud, up: tuple[float, float, float]) -> str:
+    """Return the unit of a cloud, by its height."""
+    heights = cloud.coordinates[cloud.finite].astype(float) @ np.array(up) / np.linalg.norm(up)
+    height = np.ptp(heights) if len(heights) else 0.0
+    return "m" if _ROOM_HEIGHTS[0] <= height <= _ROOM_HEIGHTS[1] else "units"
 
 
 def _check_settings(
