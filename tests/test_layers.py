@@ -17,7 +17,7 @@ LAYERS = [
     {"normals", "regions", "metrics", "io", "scenes"},
     {"result"},
     {"pipeline"},
-    {"depth", "nn"},
+    {"clouds", "depth", "nn"},
     {"transforms"},
     {"datasets"},
     {"batch", "render"},

@@ -9,7 +9,8 @@ from scipy.spatial import KDTree
 
 from torchrg import Cloud, estimate_normals, load_config, read_cloud, segment_planes, write_cloud
 from torchrg.batch.scans import Job, convert_scan
-from torchrg.batch.sources import FolderSource
+from torchrg.batch.sources import CloudSource
+from torchrg.datasets import FolderOfClouds
 from torchrg.errors import PrecisionWarning
 from torchrg.precision import note_on_steps
 from torchrg.transforms import SegmentPlanes
@@ -174,7 +175,7 @@ def test_commands_say_it_once_a_file(places, tmp_path, run, command):
 def test_reports_of_convert_and_info_say_it_too(places, tmp_path, run):
     (tmp_path / "scans").mkdir()
     np.save(tmp_path / "scans" / "hall.npy", moved(places, UTM))
-    source = FolderSource(tmp_path / "scans", load_config("classic"), tmp_path / "out")
-    report = convert_scan(Job(source, source.list_scans()[0], tmp_path / "out"))
+    source = CloudSource(FolderOfClouds(tmp_path / "scans"), load_config("classic"))
+    report = convert_scan(Job(source, source.list_scans(tmp_path / "out")[0], tmp_path / "out"))
     assert [LINE in warning for warning in report.warnings] == [True]
     assert run("info", tmp_path / "scans" / "hall.npy").out.count(LINE) == 1

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import torchrg
-from torchrg.batch.scans import write_results
 from torchrg.cli import main
 from torchrg.config import PlanesConfig, load_config
 from torchrg.datasets import write_pointcept_scene
+from torchrg.datasets.pointcept import write_results
 from torchrg.errors import FormatError, ShapeError
 from torchrg.io import FORMATS
 from torchrg.neighbors import finite_rows

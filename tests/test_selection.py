@@ -153,8 +153,8 @@ def test_conversions_select_alike(points, chosen, tmp_path):
     flags = (str(tmp_path / "in"), str(tmp_path / "out"), *FLAGS)
     start = {"settings": PlaneSettings.asked_for(["--preset", "classic"])}
     arguments = parse(FolderArguments, flags, prog="torchrg convert folder", default=start)
-    source = arguments.source(tmp_path / "in", tmp_path / "out")
-    job = Job(source, source.list_scans()[0], tmp_path / "out")
+    source = arguments.source(tmp_path / "in")
+    job = Job(source, source.list_scans(tmp_path / "out")[0], tmp_path / "out")
     assert convert_scan(job).status == "converted"
     assert np.array_equal(np.load(job.folder / "plane.npy"), chosen.labels)
     described = json.loads((job.folder / "planes.json").read_text())["planes"]

@@ -52,6 +52,7 @@ class Cloud:
             where unknown, shape ``(N, 3)``, float32; None where the file does not say. By the faces
             of a mesh, or by where the scanners stood. It is not written with the cloud;
             :func:`torchrg.normals.orient_normals` turns normals by it.
+        repairs: What reading put right, a line each.
 
     Raises:
         ShapeError: If ``coordinates`` is neither array nor tensor, or ``front`` has another shape.
@@ -72,6 +73,7 @@ class Cloud:
     header: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     front: NDArray[np.float32] | None = None
+    repairs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         values: dict[str, Any] = {

@@ -5,10 +5,12 @@ import os
 import signal
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from torchrg.batch.scans import Job, Scan, Source
+from torchrg.batch.scans import Job, Source
 from torchrg.batch.task import TaskReport
 from torchrg.config import PipelineConfig
+from torchrg.datasets import SceneFiles
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 
@@ -17,19 +19,24 @@ from torchrg.io import atomic_path
 class FaultySource(Source):
     """Text files, named ``<points>_<anything>``; the text is a behaviour and becomes the result."""
 
+    root: Path
     settings: PipelineConfig = field(default_factory=PipelineConfig)
+    table: str | None = None
     bytes_per_point = 1
 
     def describe(self):
         return {"kind": "faulty"}
 
-    def list_scans(self):
+    def list_scans(self, out):
         paths = sorted(self.root.iterdir())
-        return [Scan(path.stem, (path,), int(path.stem.split("_")[0])) for path in paths]
+        return [
+            SceneFiles(path.stem, path, (path,), num_points=int(path.stem.split("_")[0]))
+            for path in paths
+        ]
 
     def convert(self, scan, folder, begin):
         begin("read")
-        behavior = scan.inputs[0].read_text()
+        behavior = scan.files[0].read_text()
         with (self.root.parent / "log").open("a") as log:
             log.write(f"{scan.name} {os.getpid()}\n")
         act(behavior, self.root.parent / f"{scan.name}.once")
@@ -78,4 +85,4 @@ def make_jobs(folder, behaviors):
     for name, behavior in behaviors.items():
         (folder / "in" / f"{name}.txt").write_text(behavior)
     source = FaultySource(folder / "in")
-    return [Job(source, scan, folder / "out") for scan in source.list_scans()]
+    return [Job(source, scan, folder / "out") for scan in source.list_scans(folder / "out")]

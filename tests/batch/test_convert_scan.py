@@ -10,8 +10,9 @@ import pytest
 from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource
+from torchrg.batch.sources import CloudSource
 from torchrg.config import load_config
+from torchrg.datasets import FolderOfClouds
 
 
 def test_the_record_tells_what_was_made_from_what(faults, tmp_path):
@@ -52,14 +53,14 @@ def test_what_goes_wrong_is_in_the_report(faults, tmp_path, behavior, reason, is
 
 def test_an_input_that_is_gone_is_named(faults, tmp_path):
     (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
-    job.scan.inputs[0].unlink()
-    assert convert_scan(job).reason == f"{job.scan.inputs[0]}: No such file or directory."
+    job.scan.files[0].unlink()
+    assert convert_scan(job).reason == f"{job.scan.files[0]}: No such file or directory."
 
 
 def test_a_failure_leaves_no_record_of_an_earlier_success(faults, tmp_path):
     (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
     convert_scan(job)
-    job.scan.inputs[0].write_text("corrupt")
+    job.scan.files[0].write_text("corrupt")
     assert convert_scan(job).status == "failed"
     assert reason_to_convert(job) == "new"
 
@@ -89,7 +90,7 @@ def job_of_a_room(room, tmp_path):
     def make(**settings):
         (tmp_path / "in").mkdir()
         np.save(tmp_path / "in" / "room.npy", room(500).points)
-        source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path / "out", **settings)
+        source = CloudSource(FolderOfClouds(tmp_path / "in"), load_config("classic"), **settings)
         return list_jobs(source, tmp_path / "out")[0]
 
     return make

@@ -32,7 +32,7 @@ def test_other_settings_are_noticed_but_not_those_that_change_no_result(job):
 
 
 def test_another_input_is_noticed_even_at_the_same_size_and_time(job):
-    path = job.scan.inputs[0]
+    path = job.scan.files[0]
     before = path.stat()
     path.write_text("PLAIN")
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))

@@ -14,9 +14,10 @@ import pytest
 from tests.datasets.s3dis_tree import write_clean_room
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource
+from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
 from torchrg.config import load_config
+from torchrg.datasets import FolderOfClouds
 from torchrg.scenes import make_room
 
 NAMES = ("hall", "lobby", "office", "store")
@@ -50,7 +51,7 @@ def undisturbed(rooms, tmp_path_factory):
 
 def convert_here(rooms, out):
     """Convert rooms in this process, and return the bytes of every result."""
-    for job in list_jobs(FolderSource(rooms, load_config("classic"), out), out):
+    for job in list_jobs(CloudSource(FolderOfClouds(rooms), load_config("classic")), out):
         assert convert_scan(job).status == "converted"
     assert len(results_of(out)) == 6 * len(NAMES)
     return results_of(out)

@@ -15,9 +15,9 @@ from tests.datasets.scannet_tree import write_mesh, write_scan
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource, RGBDSource, ScanNetSource
+from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import DepthConfig, load_config
-from torchrg.datasets import FolderOfClouds, collate_offset
+from torchrg.datasets import FolderOfClouds, ScanNet, collate_offset
 from torchrg.depth.camera import Pinhole
 from torchrg.io import read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
@@ -94,7 +94,7 @@ def convert(source, out):
 
 
 def folder_source(tmp_path, orient="auto"):
-    return FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out", orient=orient)
+    return CloudSource(FolderOfClouds(tmp_path / "in"), CLASSIC, orient=orient)
 
 
 @pytest.mark.parametrize("preset", ["classic", "consensus"])
@@ -124,7 +124,7 @@ def test_all_doors_give_one_answer(room, mesh, files, tmp_path, run, preset, nam
     with np.load(tmp_path / "a.npz") as result:
         assert np.array_equal(result["labels"], expected.labels)
         assert np.array_equal(result["normals"], expected.normals)
-    source = FolderSource(tmp_path / "in", load_config(preset), tmp_path / "out")
+    source = CloudSource(FolderOfClouds(tmp_path / "in"), load_config(preset))
     (normals,) = convert(source, tmp_path / "out").values()
     assert np.array_equal(normals, expected.normals)
     assert np.array_equal(np.load(tmp_path / "out" / name / "plane.npy"), expected.labels)
@@ -178,7 +178,7 @@ def test_meshes_of_scannet_say_which_side_is_seen(mesh, tmp_path):
     name = "scene0000_00/scene0000_00_vh_clean_2.ply"
     # A room from outside, which only its faces can tell.
     write_mesh(tmp_path / "in" / "scans" / name, points, color, faces=faces[:, ::-1])
-    found = convert(ScanNetSource(tmp_path / "in", CLASSIC), tmp_path / "out")
+    found = convert(CloudSource(ScanNet(tmp_path / "in"), CLASSIC), tmp_path / "out")
     assert share(found["scene0000_00"], -truth) > 0.95
     assert not [*tmp_path.rglob("front.npy")]
 

@@ -7,8 +7,9 @@ import pytest
 
 from torchrg.batch.run import list_jobs, lock_folder
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource, RGBDSource
+from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import load_config
+from torchrg.datasets import FolderOfClouds
 from torchrg.depth import DepthConfig
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, FormatError
@@ -95,10 +96,10 @@ def test_files_of_two_scans_in_one_folder_are_refused(root, tmp_path, names):
     save(root, *(f"{name}.npy" for name in names))
     for layout in FLAT:
         with pytest.raises(FormatError, match="expected files of its own for each scan") as error:
-            list_jobs(FolderSource(root, CLASSIC, tmp_path, layout=layout), tmp_path / "out")
+            list_jobs(CloudSource(FolderOfClouds(root), CLASSIC, layout=layout), tmp_path / "out")
         assert all(name in str(error.value) for name in (*names, layout))
     for layout in ("pointcept", "scannet"):
-        source = FolderSource(root, CLASSIC, tmp_path, layout=layout)
+        source = CloudSource(FolderOfClouds(root), CLASSIC, layout=layout)
         assert len(list_jobs(source, tmp_path / "out")) == 2
 
 
@@ -140,7 +141,7 @@ def test_a_scan_of_another_command_with_the_same_files_is_refused(root, tmp_path
     save(tmp_path / "second", "a_b/c.npy")
     reports, before = [], None
     for folder in (root, tmp_path / "second"):
-        source = FolderSource(folder, CLASSIC, tmp_path / "out", layout="npy")
+        source = CloudSource(FolderOfClouds(folder), CLASSIC, layout="npy")
         (job,) = list_jobs(source, tmp_path / "out")
         before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.npy")}
         reports.append(convert_scan(job))
@@ -153,9 +154,9 @@ def test_a_scan_of_another_command_with_the_same_files_is_refused(root, tmp_path
 @pytest.mark.parametrize("name", ["../x", "/x", "a/../../x"])
 def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
     (job,) = faults.make_jobs(tmp_path, {"1_a": "plain"})
-    scan = job.scan.__class__(name, job.scan.inputs, 1)
+    scan = job.scan._replace(name=name)
     source = job.source.__class__(job.source.root)
-    object.__setattr__(source, "list_scans", lambda: [scan])
+    object.__setattr__(source, "list_scans", lambda out: [scan])
     with pytest.raises(FormatError, match="expected names of scans below a folder"):
         list_jobs(source, tmp_path / "out")
 
@@ -191,13 +192,13 @@ def test_results_are_never_read_as_scans_through_a_link_or_from_above(root, tmp_
     save(tmp_path / "out", "hall/coord.npy")
     (root / "results").symlink_to(tmp_path / "out")
     with pytest.raises(ConfigError, match="so that no result is read as a scan"):
-        list_jobs(FolderSource(root, CLASSIC, tmp_path / "out"), tmp_path / "out")
+        list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path / "out")
     (root / "results").unlink()
     save(root, "in/hall.npy")
-    assert len(list_jobs(FolderSource(root, CLASSIC, tmp_path / "out"), tmp_path / "out")) == 2
+    assert len(list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path / "out")) == 2
     # The scan in/in/hall.npy would get the folder in/hall below the directory above.
     with pytest.raises(ConfigError, match="so that no result is read as a scan"):
-        list_jobs(FolderSource(root, CLASSIC, tmp_path), tmp_path)
+        list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path)
 
 
 def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, convert):
@@ -209,5 +210,5 @@ def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, convert):
     assert done.err.count("\n") == 1
     assert "1 scans to convert" in done.out
     with pytest.warns(UserWarning, match="passed over in/loop"):
-        jobs = list_jobs(FolderSource(root, CLASSIC, tmp_path / "out"), tmp_path / "out")
+        jobs = list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["in/a"]

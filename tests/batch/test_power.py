@@ -11,8 +11,9 @@ import pytest
 from tests.batch.power import Disk, PowerCutError
 from torchrg.batch.run import list_jobs, lock_folder, make_plan
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource
+from torchrg.batch.sources import CloudSource
 from torchrg.config import load_config
+from torchrg.datasets import FolderOfClouds
 from torchrg.scenes import make_room
 
 SYSTEM_CALLS = ("fsync", "unlink", "replace", "mkdir", "rmdir")
@@ -23,7 +24,7 @@ def convert(root):
     """Convert a folder of rooms, as the command does."""
     out = root / "out"
     out.mkdir(exist_ok=True)
-    jobs = list_jobs(FolderSource(root / "rooms", load_config("classic"), out), out)
+    jobs = list_jobs(CloudSource(FolderOfClouds(root / "rooms"), load_config("classic")), out)
     with lock_folder(out):
         for job in make_plan(jobs).to_convert:
             assert convert_scan(job).status == "converted"

@@ -13,8 +13,9 @@ import pytest
 from tests.batch.test_interruptions import results_of
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource
+from torchrg.batch.sources import CloudSource
 from torchrg.config import load_config
+from torchrg.datasets import FolderOfClouds
 from torchrg.errors import MissingDependencyError
 
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
@@ -39,7 +40,7 @@ def test_ray_gives_the_bytes_of_one_process(folder_of_clouds, tmp_path):
     options = ("--preset", "classic", "--engine", "ray", "--workers", "2")
     shown = run_python("-m", "torchrg", "convert", "folder", rooms, out, *options)
     assert "3 of 3 scans are complete" in shown
-    for job in list_jobs(FolderSource(rooms, load_config("classic"), here), here):
+    for job in list_jobs(CloudSource(FolderOfClouds(rooms), load_config("classic")), here):
         convert_scan(job)
     assert results_of(out) == results_of(here)
     assert json.loads((out / "report.json").read_text())["engine"] == "ray"

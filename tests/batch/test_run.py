@@ -6,9 +6,9 @@ import os
 import pytest
 
 from torchrg.batch.run import REPORT, make_plan, run_plan, write_report
-from torchrg.batch.scans import convert_scan, mark_of
+from torchrg.batch.scans import convert_scan
 from torchrg.cli.report import format_costs, format_report, format_table
-from torchrg.io.files import remove_leftovers
+from torchrg.io.files import mark_of, remove_leftovers
 
 
 def run(jobs, on_report=lambda report: None):

@@ -12,10 +12,12 @@ import torch
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, find_areas
+from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config
+from torchrg.datasets import S3DIS, FolderOfClouds
 from torchrg.datasets.rgbd_layouts import LAYOUTS
+from torchrg.datasets.s3dis import find_areas
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole
 from torchrg.io import Cloud, estimate_points, write_cloud
@@ -25,6 +27,7 @@ from torchrg.result import read_result
 CLASSIC = load_config("classic")
 
 
+@pytest.mark.filterwarnings("ignore:.*expected .* rooms")
 def test_the_command_knows_every_kind_and_layout(tmp_path):
     assert {*get_args(get_type_hints(RGBDArguments)["layout"])} == {"auto", *LAYOUTS}
     settings, camera = DepthConfig(), Pinhole(5.0, 5.0, 2.0, 1.0)
@@ -38,12 +41,15 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
     turned = RGBDSource(tmp_path, settings, "images", camera, 9.0, orient="up")
     assert turned.describe()["orient"] == "up"
     options = {"kind": "s3dis", "class_order": "spt", "superpoint": True, "orient": "auto"}
-    assert S3DISSource(tmp_path, CLASSIC, (5,), "spt", superpoint=True).describe() == options
+    write_room(tmp_path / "Area_5" / "a", {"floor_1": grid()})
+    np.save(tmp_path / "a.npy", grid())
+    rooms = S3DIS(tmp_path, (5,), class_order="spt")
+    assert CloudSource(rooms, CLASSIC, superpoint=True).describe() == options
     options = {"kind": "folder", "superpoint": False, "orient": "none"}
-    assert FolderSource(tmp_path, CLASSIC, tmp_path, orient="none").describe() == options
+    assert CloudSource(FolderOfClouds(tmp_path), CLASSIC, orient="none").describe() == options
     options |= {"orient": "auto"}
-    assert FolderSource(tmp_path, CLASSIC, tmp_path).describe() == options
-    named = FolderSource(tmp_path, CLASSIC, tmp_path, columns=("x", "y", "z"))
+    assert CloudSource(FolderOfClouds(tmp_path), CLASSIC).describe() == options
+    named = CloudSource(FolderOfClouds(tmp_path, columns=("x", "y", "z")), CLASSIC)
     assert named.describe() == options | {"columns": ["x", "y", "z"]}
 
 
@@ -85,8 +91,8 @@ def test_s3dis_becomes_pointcept_with_planes(tmp_path):
     wall.write_bytes(wall.read_bytes().replace(b"0.000 0.000 0.050 1", b"0.000 0.000 0.05\x10 1"))
     (room / "Annotations" / "wall_1 (1).txt").write_bytes(b"")
     assert find_areas(tmp_path / "in") == (2,)
-    source = S3DISSource(tmp_path / "in", CLASSIC, (2,), superpoint=True)
-    (scan,) = source.list_scans()
+    source = CloudSource(S3DIS(tmp_path / "in", (2,)), CLASSIC, superpoint=True)
+    (scan,) = source.list_scans(tmp_path / "out")
     assert abs(scan.num_points - len(points)) <= 0.02 * len(points)
     report = convert_all(source, tmp_path / "out")["Area_2/office_1"]
     assert report.repairs == (
@@ -114,7 +120,7 @@ def test_a_bad_line_fails_its_room_and_names_it(tmp_path):
     points = grid()
     write_room(tmp_path / "in" / "Area_1" / "a", {"floor_1": points})
     write_room(tmp_path / "in" / "Area_1" / "b", {"floor_1": points}, prefix="x")
-    jobs = list_jobs(S3DISSource(tmp_path / "in", CLASSIC, (1,)), tmp_path / "out")
+    jobs = list_jobs(CloudSource(S3DIS(tmp_path / "in", (1,)), CLASSIC), tmp_path / "out")
     good, bad = (convert_scan(job) for job in jobs)
     assert good.status == "converted"
     assert "floor_1.txt: line 1" in bad.reason
@@ -125,7 +131,7 @@ def test_far_clouds_keep_their_coordinates_and_planes_are_in_them(tmp_path):
     color = np.full((len(points), 3), 7, dtype=np.uint8)
     (tmp_path / "in").mkdir()
     write_cloud(tmp_path / "in" / "far.npz", Cloud(points, {"color": color}))
-    convert_all(FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out"), tmp_path / "out")
+    convert_all(CloudSource(FolderOfClouds(tmp_path / "in"), CLASSIC), tmp_path / "out")
     out = tmp_path / "out" / "far"
     coord, written = load(out, "coord", "color")
     assert coord.dtype == np.float64
@@ -151,7 +157,7 @@ def test_scenes_have_colors_of_8_bits_whatever_was_in_them(tmp_path, form, note)
     scene.mkdir(parents=True)
     np.save(scene / "coord.npy", points)
     np.save(scene / "color.npy", form(color))
-    source = FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out", superpoint=True)
+    source = CloudSource(FolderOfClouds(tmp_path / "in"), CLASSIC, superpoint=True)
     (report,) = convert_all(source, tmp_path / "out").values()
     assert report.warnings == ((note,) if note else ())
     written, found = load(tmp_path / "out" / "scene", "color", "superpoint")
@@ -167,7 +173,7 @@ def test_scenes_have_colors_of_8_bits_whatever_was_in_them(tmp_path, form, note)
 def test_a_short_write_of_an_array_is_a_full_disk(tmp_path):
     (tmp_path / "in").mkdir()
     np.save(tmp_path / "in" / "a.npy", grid())
-    (job,) = list_jobs(FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out"), tmp_path / "out")
+    (job,) = list_jobs(CloudSource(FolderOfClouds(tmp_path / "in"), CLASSIC), tmp_path / "out")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
@@ -189,7 +195,7 @@ def test_points_that_are_not_finite_stay_and_are_told(tmp_path):
     points[5] = np.nan
     (tmp_path / "in").mkdir()
     np.save(tmp_path / "in" / "holes.npy", points)
-    source = FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out")
+    source = CloudSource(FolderOfClouds(tmp_path / "in"), CLASSIC)
     report = convert_all(source, tmp_path / "out")["holes"]
     assert "1 of 780 points are not finite" in report.warnings[0]
     coord, plane = load(tmp_path / "out" / "holes", "coord", "plane")
@@ -207,7 +213,7 @@ def test_folders_of_pointcept_are_completed_in_place(tmp_path):
     np.save(scene / "coord.npy", points)
     np.save(scene / "normal.npy", np.ones_like(points))
     before = {path.name: path.read_bytes() for path in scene.iterdir()}
-    source = FolderSource(tmp_path, CLASSIC, tmp_path)
+    source = CloudSource(FolderOfClouds(tmp_path), CLASSIC)
     report = convert_all(source, tmp_path)["Area_1/hall"]
     assert report.num_points == len(points)
     assert all((scene / name).read_bytes() == content for name, content in before.items())
@@ -224,7 +230,7 @@ def test_folders_of_pointcept_go_elsewhere_with_their_labels(tmp_path):
     np.save(scene / "coord.npy", points)
     np.save(scene / "segment.npy", np.ones((len(points), 1), dtype=np.int16))
     np.save(scene / "normal.npy", np.ones_like(points))
-    convert_all(FolderSource(tmp_path / "in", CLASSIC, tmp_path / "out"), tmp_path / "out")
+    convert_all(CloudSource(FolderOfClouds(tmp_path / "in"), CLASSIC), tmp_path / "out")
     segment, normal = load(tmp_path / "out" / "hall", "segment", "normal")
     assert segment.tolist() == [[1]] * len(points)
     assert np.array_equal(normal, segment_planes(points, CLASSIC).normals)

@@ -15,9 +15,10 @@ from tests.datasets.scannet_tree import write_scan, write_tables
 from torchrg.batch.records import RECORD
 from torchrg.batch.run import DATA_SETS, LOCK, REPORT, list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import ScanNetSource
+from torchrg.batch.sources import CloudSource
 from torchrg.batch.stale import check_stale, find_stale, remove_stale
 from torchrg.config import load_config
+from torchrg.datasets import ScanNet
 from torchrg.datasets.layouts import LAYOUTS
 from torchrg.scenes import make_room
 
@@ -195,7 +196,7 @@ def test_a_removal_that_is_killed_at_any_moment_goes_on(
         record.unlink()
     start = shutil.copytree(out, out.with_name("start"))
     move(root)
-    jobs = list_jobs(ScanNetSource(root, load_config("classic"), layout="mask3d"), out)
+    jobs = list_jobs(CloudSource(ScanNet(root), load_config("classic"), layout="mask3d"), out)
 
     def remove():
         for result in find_stale(jobs):

@@ -13,7 +13,8 @@ from tests.datasets.scannet_tree import WORDS, write_scan, write_scan_plus, writ
 from torchrg import load_config
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import FolderSource, ScanNetSource
+from torchrg.batch.sources import CloudSource
+from torchrg.datasets import FolderOfClouds, ScanNet
 from torchrg.datasets.layouts import LAYOUTS, LayoutScan
 from torchrg.datasets.scannet import read_objects, read_scannet_scan
 from torchrg.errors import ConfigError, FormatError
@@ -77,6 +78,12 @@ def write(folder, files):
         path.write_bytes(content) if isinstance(content, bytes) else np.save(path, content)
 
 
+def given_of(mesh, root):
+    """What is known of a scan beside its points."""
+    cloud = read_scannet_scan(mesh, root)
+    return {**cloud.fields, **cloud.header}
+
+
 class Release:
     """A small scan whose segments and superpoints know nothing of each other."""
 
@@ -107,7 +114,7 @@ class Release:
             "normal": np.zeros_like(self.coord),
             "superpoint": self.superpoint,
             "plane": self.superpoint % 3 - 1,
-            "given": read_scannet_scan(self.mesh, root),
+            "given": given_of(self.mesh, root),
             "objects": read_objects(self.mesh, NUM_POINTS),
         }
         return LayoutScan(**(parts | changes))
@@ -186,7 +193,7 @@ def test_the_first_object_of_a_scan_has_a_box(release, root):
 
 
 def test_pointcepts_classes_of_scannet_become_categories_of_nyu40(release, root):
-    given = read_scannet_scan(release.mesh, root)
+    given = given_of(release.mesh, root)
     del given["category"]
     given["segment20"] = np.arange(NUM_POINTS) % 21 - 1
     files = LAYOUTS["mmdet3d"]["ScanNet"](release.scan(root, given=given))
@@ -198,7 +205,7 @@ def test_pointcepts_classes_of_scannet_become_categories_of_nyu40(release, root)
 def as_one_object(release, root, number, category=5):
     """The scan with one object of one class."""
     labels = {"instance": np.full(NUM_POINTS, number), "category": np.full(NUM_POINTS, category)}
-    return release.scan(root, given={**read_scannet_scan(release.mesh, root), **labels})
+    return release.scan(root, given={**given_of(release.mesh, root), **labels})
 
 
 def test_ground_truth_of_mask3d_tells_classes_and_objects(release, root):
@@ -236,7 +243,7 @@ def test_superpoints_of_scannet_plusplus_are_where_sai3d_reads_them(tmp_path):
     write_scan_plus(tmp_path / "in", "0a5c013435", coord, color, faces, objects)
     settings, out = load_config("classic"), tmp_path / "out"
     for layout in ("scannet", "npy"):
-        source = ScanNetSource(tmp_path / "in", settings, layout=layout)
+        source = CloudSource(ScanNet(tmp_path / "in"), settings, layout=layout)
         (job,) = list_jobs(source, out)
         assert convert_scan(job).status == "converted"
     path = out / "scans/0a5c013435/scans/mesh_aligned_0.05.0.010000.segs.json"
@@ -244,7 +251,7 @@ def test_superpoints_of_scannet_plusplus_are_where_sai3d_reads_them(tmp_path):
     assert segments == np.load(out / "superpoints" / "0a5c013435.npy").tolist()
     assert not [*out.rglob("*aggregation*")]
     for layout in ("mmdet3d", "spformer", "isbnet", "mask3d"):
-        source = ScanNetSource(tmp_path / "in", settings, layout=layout)
+        source = CloudSource(ScanNet(tmp_path / "in"), settings, layout=layout)
         with pytest.raises(ConfigError, match=r"pointcept, scannet, nag, npy for ScanNet\+\+, got"):
             list_jobs(source, tmp_path / "other")
 
@@ -255,12 +262,12 @@ def test_pointcepts_folders_of_unknown_classes_have_no_layout_with_classes(tmp_p
     np.save(folder / "coord.npy", np.zeros((5, 3), np.float32))
     np.save(folder / "segment.npy", np.zeros((5, 1), np.int16))
     for layout in LAYOUTS:
-        source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path, layout=layout)
+        source = CloudSource(FolderOfClouds(tmp_path / "in"), load_config("classic"), layout=layout)
         if layout in ("scannet", "nag", "npy"):
             assert len(list_jobs(source, tmp_path / "out")) == 1
             continue
         with pytest.raises(ConfigError, match="scannet, nag, npy for Area_1/office_1, got"):
             list_jobs(source, tmp_path / "out")
     np.save(folder / "segment20.npy", np.zeros(5, np.int64))
-    source = FolderSource(tmp_path / "in", load_config("classic"), tmp_path, layout="mask3d")
+    source = CloudSource(FolderOfClouds(tmp_path / "in"), load_config("classic"), layout="mask3d")
     assert len(list_jobs(source, tmp_path / "out")) == 1

@@ -20,10 +20,11 @@ from torchrg import load_config, make_superpoints, segment_planes
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import ScanNetSource
+from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
 from torchrg.cli.flags import Layout
 from torchrg.config import SuperpointsConfig
+from torchrg.datasets import ScanNet
 from torchrg.datasets.layouts import LAYOUTS
 from torchrg.datasets.scannet import NYU_IDS
 from torchrg.errors import ConfigError
@@ -80,7 +81,7 @@ def room(root):
 
 def convert(root, out, layout, only=None, **settings):
     """What the command does, in this process; return what was done to each scan."""
-    jobs = list_jobs(ScanNetSource(root, CLASSIC, layout=layout, **settings), out, only=only)
+    jobs = list_jobs(CloudSource(ScanNet(root), CLASSIC, layout=layout, **settings), out, only=only)
     return [convert_scan(job) for job in jobs if reason_to_convert(job)]
 
 

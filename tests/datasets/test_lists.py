@@ -14,8 +14,9 @@ from torchrg import load_config
 from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import ScanNetSource
+from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
+from torchrg.datasets import ScanNet
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.errors import FormatError
 from torchrg.scenes import make_room
@@ -51,7 +52,7 @@ def root(tmp_path_factory):
 
 def convert(root, out, layout, only=None):
     """What the command does with scans, without the lists at its end."""
-    source = ScanNetSource(root, CLASSIC, layout=layout)
+    source = CloudSource(ScanNet(root), CLASSIC, layout=layout)
     for job in list_jobs(source, out, only=only):
         if reason_to_convert(job):
             assert convert_scan(job).status == "converted"

@@ -321,7 +321,8 @@ def test_a_frame_that_is_missing_fails_alone(tum, tmp_path):
     long = "x" * 300
     (tum / "depth.txt").write_text(f"1.0 depth/1.0.png\n2.0 depth/2.0.png\n3.0 {long}.png\n")
     source = RGBDSource(tum, DepthConfig(noise=(0.001, 0.0)), "tum")
-    reports = [convert_scan(Job(source, scan, tmp_path / "out")) for scan in source.list_scans()]
+    out = tmp_path / "out"
+    reports = [convert_scan(Job(source, scan, out)) for scan in source.list_scans(out)]
     assert [report.status for report in reports] == ["failed", "converted", "failed"]
     assert reports[0].reason.startswith(f"{tum / 'depth' / '1.0.png'}: ")
     assert reports[2].reason.startswith(f"{tum / long}.png: ")

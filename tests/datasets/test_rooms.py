@@ -54,11 +54,11 @@ def test_a_room_with_every_defect_reads_exactly(room):
     parts = [np.vstack([rows["c"], list(BROKEN.values())]), *(rows[name] for name in "edbfa")]
     points = np.vstack(parts)
     counts = [len(part) for part in parts]
-    assert np.array_equal(found.coord, points[:, :3].astype(np.float32))
-    assert np.array_equal(found.color, points[:, 3:])
-    assert np.array_equal(found.segment, np.repeat([0, 8, 12, 2, 2, 2], counts))
-    assert np.array_equal(found.instance, np.repeat(range(6), counts))
-    assert (found.segment.dtype, found.instance.dtype) == (np.int16, np.int16)
+    assert np.array_equal(found.coordinates, points[:, :3].astype(np.float32))
+    assert np.array_equal(found.fields["color"], points[:, 3:])
+    assert np.array_equal(found.fields["segment"], np.repeat([0, 8, 12, 2, 2, 2], counts))
+    assert np.array_equal(found.fields["instance"], np.repeat(range(6), counts))
+    assert (found.fields["segment"].dtype, found.fields["instance"].dtype) == (np.int16, np.int16)
 
     assert [text.partition(" read as ")[0] for text in found.repairs] == [
         f"ceiling_1.txt: line {43 + i}, column {broken_column(line)}: {line!r}"
@@ -80,7 +80,9 @@ def test_a_room_with_every_defect_reads_exactly(room):
 def test_a_copy_without_its_original_is_an_object(room):
     rows = write_clean_room(room, 1, {"wall_3 (1)": 5, "wall_4": 6})
     found = read_room(room)
-    assert np.array_equal(found.coord, np.vstack(list(rows.values()))[:, :3].astype(np.float32))
+    assert np.array_equal(
+        found.coordinates, np.vstack(list(rows.values()))[:, :3].astype(np.float32)
+    )
     assert found.notes == ()
 
 
@@ -90,13 +92,13 @@ def test_two_objects_of_the_same_points_are_told(room):
     write_objects(room, {f"{name}.txt": text_of(part) for name, part in objects.items()})
     found = read_room(room)
     assert found.notes == ("table_1.txt has the points of chair_2.txt, too",)
-    assert len(found.coord) == 60
+    assert len(found) == 60
 
 
 def test_class_orders_name_the_same_objects(room):
     write_clean_room(room, 2, {f"{name}_1": 3 for name in CLASS_ORDERS["pointcept"]})
     names = {
-        order: [classes[i] for i in read_room(room, class_order=order).segment]
+        order: [classes[i] for i in read_room(room, class_order=order).fields["segment"]]
         for order, classes in CLASS_ORDERS.items()
     }
     assert names["pointcept"] == names["spt"] == sorted(names["spt"])
@@ -141,6 +143,7 @@ def test_all_objects_of_a_room_have_colors_of_one_range(room, scale):
     scaled = {name: table / [1, 1, 1, scale, scale, scale] for name, table in tables.items()}
     write_objects(room, {name: text_of(table, color="%.9f") for name, table in scaled.items()})
     found = read_room(room)
-    assert np.array_equal(found.color, np.vstack([rows, pure])[:, 3:])
-    assert found.color.dtype == np.uint8
+    color = found.fields["color"]
+    assert np.array_equal(color, np.vstack([rows, pure])[:, 3:])
+    assert color.dtype == np.uint8
     assert found.notes == ()

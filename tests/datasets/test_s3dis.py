@@ -46,7 +46,8 @@ def test_a_sample_is_the_room(root):
     dtypes = [torch.float32, torch.uint8, torch.int64, torch.int64]
     for i, name in enumerate(("coord", "color", "segment", "instance")):
         assert sample[name].dtype == dtypes[i]
-        assert np.array_equal(sample[name].numpy(), getattr(room, name))
+        expected = room.coordinates if name == "coord" else room.fields[name]
+        assert np.array_equal(sample[name].numpy(), expected)
     assert data.classes[sample["segment"][0]] == "floor"
 
 
@@ -57,7 +58,8 @@ def test_data_sets_survive_pickling(root):
 
 def test_notes_and_repairs_are_those_of_the_room(root):
     before = digest(root)
-    (repair,), (note,) = S3DIS(root, [3]).read_room(0)[4:]
+    room = S3DIS(root, [3]).read_cloud(0)
+    (repair,), (note,) = room.repairs, room.notes
     assert repair == r"floor_1.txt: line 11, column 11: b'1 2 3 4 5 \x16' read as b'1 2 3 4 5 6'"
     assert note == "x.md not read: not named CLASS_NUMBER.txt"
     assert digest(root) == before

@@ -15,8 +15,9 @@ from tests.datasets.s3dis_tree import write_clean_room
 from torchrg import load_config
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
-from torchrg.batch.sources import S3DISSource
+from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
+from torchrg.datasets import S3DIS
 from torchrg.io.files import make_mark
 
 CLASSIC = load_config("classic")
@@ -63,10 +64,10 @@ def converted(root, rooms, tmp_path_factory):
     folders = {}
     for layout in ("isbnet", "mmdet3d", "mask3d", "npy"):
         out = folders[layout] = tmp_path_factory.mktemp(layout)
-        source = S3DISSource(root, CLASSIC, (1, 5), layout=layout)
         with warnings.catch_warnings():
             # The areas have fewer rooms than the release.
             warnings.simplefilter("ignore")
+            source = CloudSource(S3DIS(root, (1, 5)), CLASSIC, layout=layout)
             reports = [convert_scan(job) for job in list_jobs(source, out)]
         assert [report.status for report in reports] == ["converted"] * 2, reports
         source.write_lists(out, make_mark())

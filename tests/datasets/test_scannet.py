@@ -8,7 +8,9 @@ import pytest
 
 from tests.datasets.scannet_tree import ALIGNMENT, write_scan, write_scan_plus, write_tables
 from torchrg import Cloud, load_config, write_cloud
-from torchrg.batch.sources import ScanNetSource
+from torchrg.batch.run import list_jobs
+from torchrg.batch.scans import convert_scan
+from torchrg.batch.sources import CloudSource
 from torchrg.datasets import ScanNet, read_scannet_scan
 from torchrg.datasets.scannet import IDS_200, NYU_IDS, _places
 from torchrg.errors import ConfigError, FormatError
@@ -98,7 +100,7 @@ def test_vertices_of_several_objects_have_the_smallest_first(scans, tmp_path):
     segment, instance = literal_labels(SEGMENTS, objects, {"wall": 0, "chair": 1, "table": 2})
     assert data[0]["segment"].tolist() == segment[:, 0].tolist()
     assert data[0]["instance"].tolist() == instance[:, 0].tolist()
-    arrays = read_scannet_scan(data.scenes[0].path, tmp_path)
+    arrays = read_scannet_scan(data.scenes[0].path, tmp_path).fields
     assert np.array_equal(arrays["segment"], segment)
     assert np.array_equal(arrays["instance"], instance)
     assert arrays["segment"].dtype == np.int16
@@ -253,9 +255,10 @@ def test_what_two_objects_claim_is_told_and_the_later_has_it(scans, tmp_path):
     with pytest.warns(UserWarning, match="segments are in two|objects have labels"):
         sample = ScanNet(tmp_path / "in")[0]
     assert sample["instance"].tolist() == [1, 1, 1, 1, 1, 1, 2, 2]
-    source = ScanNetSource(tmp_path / "in", load_config("classic"), layout="scannet")
-    notes = source.read(source.list_scans()[0]).notes
-    assert [note.partition("aggregation.json: ")[2] for note in notes] == [
+    source = CloudSource(ScanNet(tmp_path / "in"), load_config("classic"), layout="scannet")
+    (job,) = list_jobs(source, tmp_path / "out")
+    notes = [note.partition("aggregation.json: ")[2] for note in convert_scan(job).warnings]
+    assert [note for note in notes if note] == [
         "segments are in two objects, of which the later is taken: 7 and 1 more.",
         "objects have labels that scannetv2-labels.combined.tsv does not have: 'beanbag'.",
     ]

@@ -1,8 +1,8 @@
 """Whole data sets: many scans, on one machine or on a cluster, and a record of each.
 
-A source (:class:`~torchrg.batch.sources.FolderSource`, :class:`~torchrg.batch.sources.S3DISSource`,
-:class:`~torchrg.batch.sources.RGBDSource`, or a :class:`~torchrg.batch.sources.CloudSource` of your
-own) lists scans and reads one of them. :func:`~torchrg.batch.run.list_jobs` makes jobs of them,
+A source (:class:`~torchrg.batch.sources.CloudSource` of any :class:`~torchrg.datasets.SceneDataset`
+of clouds, or :class:`~torchrg.batch.sources.RGBDSource`) lists scans and converts one of them.
+:func:`~torchrg.batch.run.list_jobs` makes jobs of them,
 :func:`~torchrg.batch.run.make_plan` finds those that are not done,
 :func:`~torchrg.batch.stale.find_stale` finds results of scans that changed their name,
 :func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
@@ -13,14 +13,15 @@ Example:
     >>> from pathlib import Path
     >>> import numpy as np
     >>> from torchrg.batch.scans import convert_scan
-    >>> from torchrg.batch.sources import FolderSource
+    >>> from torchrg.batch.sources import CloudSource
     >>> from torchrg.batch.run import list_jobs
     >>> from torchrg.config import load_config
+    >>> from torchrg.datasets import FolderOfClouds
     >>> from torchrg.scenes import make_room
     >>> folder = Path(tempfile.mkdtemp())
     >>> (folder / "in").mkdir()
     >>> np.save(folder / "in" / "room.npy", make_room(2000).points)
-    >>> source = FolderSource(folder / "in", load_config("classic"), folder / "out")
+    >>> source = CloudSource(FolderOfClouds(folder / "in"), load_config("classic"))
     >>> [convert_scan(job).status for job in list_jobs(source, folder / "out")]
     ['converted']
     >>> sorted(path.name for path in (folder / "out" / "room").iterdir())

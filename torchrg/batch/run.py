@@ -14,12 +14,12 @@ from typing import NamedTuple
 import filelock
 
 from torchrg.batch.records import Record, describe_versions, read_record, reason_to_convert
-from torchrg.batch.scans import Job, Scan, Source, mark_of
+from torchrg.batch.scans import Job, Source
 from torchrg.batch.task import STATUSES, Reports, TaskReport
-from torchrg.datasets.folder import folded_name
+from torchrg.datasets.folder import SceneFiles
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import check_space, marked_parts
+from torchrg.io.files import check_space, folded_name, mark_of, marked_parts
 
 REPORT = "report.json"
 """Name of the report in the output directory."""
@@ -103,8 +103,8 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
         ConfigError: If no name matches the pattern, or results would go in among the scans.
         FormatError: If the source has no scans, or the results of one have no place of their own.
     """
-    is_among = source.root in out.parents or (source.root == out and not source.in_place)
-    scans = [] if is_among else source.list_scans()
+    is_among = source.root in out.parents
+    scans = [] if is_among else source.list_scans(out)
     if is_among or _is_among_scans(source, scans, out):
         raise ConfigError(
             f"{out}: expected a directory outside {source.root}, so that no result is read as a "
@@ -129,17 +129,17 @@ def match_jobs(jobs: Sequence[Job], only: str | None) -> list[Job]:
     return chosen
 
 
-def _is_among_scans(source: Source, scans: Sequence[Scan], out: Path) -> bool:
+def _is_among_scans(source: Source, scans: Sequence[SceneFiles], out: Path) -> bool:
     """Whether results would be read as scans the next time, also through links."""
     if source.root == out:
         return False
-    inputs = (Path(os.path.realpath(file)) for scan in scans for file in scan.inputs)
+    inputs = (Path(os.path.realpath(file)) for scan in scans for file in scan.files)
     return any((out / scan.name).is_relative_to(source.root) for scan in scans) or (
         not source.root.is_relative_to(out) and any(file.is_relative_to(out) for file in inputs)
     )
 
 
-def _check_names(root: Path, scans: Sequence[Scan]) -> None:
+def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
     """Refuse scans whose results would share a folder, or replace files of the batch."""
     batch_files = {folded_name(name): name for name in (REPORT, LOCK, DATA_SETS)}
     taken: dict[str, str] = {}

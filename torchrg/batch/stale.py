@@ -18,7 +18,7 @@ from torchrg.batch.records import (
     read_record,
 )
 from torchrg.batch.run import DATA_SETS, LOCK, REPORT
-from torchrg.batch.scans import Job, mark_of
+from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
 from torchrg.datasets.pointcept import written_files
 from torchrg.errors import FormatError
@@ -26,6 +26,7 @@ from torchrg.io import atomic_path
 from torchrg.io.files import (
     DAMAGES,
     find_leftovers,
+    mark_of,
     marked_parts,
     remove_leftovers,
     sync_folder,
@@ -84,13 +85,13 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
     out, source = jobs[0].out, jobs[0].source
     names, data_sets = {job.name for job in jobs}, _read_data_sets(out)
     inputs = {name: first for scans in data_sets for name, first in scans.items()}
-    folders = {str(path.parent) for job in jobs for path in job.scan.inputs}
+    folders = {str(path.parent) for job in jobs for path in job.scan.files}
     found = {*_find_records(out, folders)}
     earlier = [name for name in inputs.keys() | found if name not in names]
     if not earlier:
         return []
     kind = source.describe().get("kind")
-    scans = {os.path.realpath(job.scan.inputs[0]): job.name for job in jobs if job.scan.inputs}
+    scans = {os.path.realpath(job.scan.files[0]): job.name for job in jobs if job.scan.files}
     renamed: dict[str, str] = {}
     missing = []
     for name in earlier:
@@ -159,9 +160,7 @@ def note_data_set(jobs: Sequence[Job], removed: Sequence[StaleResult]) -> None:
     Earlier names stay on the list as long as there is a folder of results.
     """
     out, before = jobs[0].out, _read_data_sets(jobs[0].out)
-    scans = {
-        job.name: job.input_name(job.scan.inputs[0]) if job.scan.inputs else "" for job in jobs
-    }
+    scans = {job.name: job.input_name(job.scan.files[0]) if job.scan.files else "" for job in jobs}
     own = scans.keys() | {result.name for result in removed}
     others = [data_set for data_set in before if own.isdisjoint(data_set)]
     for data_set in before:

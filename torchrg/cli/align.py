@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.batch.records import describe_run
-from torchrg.batch.scans import check_finite
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn, warnings_as_lines
 from torchrg.cli.loop import STAGES, check_apart, note_input, output_paths, run_each, stage_bar
+from torchrg.clouds import check_finite
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_place

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tqdm import tqdm
 
+from torchrg._optional import require
 from torchrg._parallel import num_cores
 from torchrg.batch.local import run_local
 from torchrg.batch.memory import spare_memory
@@ -22,8 +23,8 @@ from torchrg.batch.run import (
     run_plan,
     write_report,
 )
-from torchrg.batch.scans import Job, Source, mark_of
-from torchrg.batch.sources import FolderSource, RGBDSource, S3DISSource, ScanNetSource, find_areas
+from torchrg.batch.scans import Job, Source
+from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.batch.stale import (
     StaleResult,
     check_stale,
@@ -46,10 +47,13 @@ from torchrg.cli.ending import (
 from torchrg.cli.loop import Progress, tell_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig
+from torchrg.datasets import S3DIS, FolderOfClouds, ScanNet
+from torchrg.datasets.folder import SceneDataset
 from torchrg.datasets.rgbd_layouts import find_layout
+from torchrg.datasets.s3dis import find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
-from torchrg.io.files import check_place, free_space, make_folder, remove_leftovers
+from torchrg.io.files import check_place, free_space, make_folder, mark_of, remove_leftovers
 from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, draw_entry, write_index
 from torchrg.render.page import check_library
@@ -98,8 +102,8 @@ class Arguments:
     segment`` of a made room of four million. ``classic`` takes six tenths of it, ``paper`` half as
     much again, and all take some three times as long without kernels."""
 
-    def source(self, root: Path, out: Path) -> Source:
-        """Return the data set, both paths absolute."""
+    def source(self, root: Path) -> Source:
+        """Return what is converted; the path is absolute."""
         raise NotImplementedError
 
 
@@ -128,11 +132,16 @@ class CloudArguments(Arguments):
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
-    @property
-    def output(self) -> dict[str, Any]:
-        """What is written of each cloud, as sources take it."""
-        names = ("layout", "partition", "level", "orient", "within")
-        return {"superpoint": self.superpoints, **{name: getattr(self, name) for name in names}}
+    def data(self, root: Path) -> SceneDataset:
+        """Return the data set."""
+        raise NotImplementedError
+
+    def source(self, root: Path) -> Source:
+        """Return the clouds of the data set, and what is written of each."""
+        names = ("layout", "partition", "level", "orient", "within", "table")
+        output: dict[str, Any] = {name: getattr(self, name) for name in names}
+        settings = self.settings.resolved
+        return CloudSource(self.data(root), settings, superpoint=self.superpoints, **output)
 
 
 @dataclass(frozen=True)
@@ -153,12 +162,12 @@ class FolderArguments(CloudArguments):
     """Suffixes of the files that are clouds, by default all that torchrg segment reads but .csv.
     Name fewer where two files differ in the suffix alone."""
 
-    def source(self, root: Path, out: Path) -> Source:
+    def data(self, root: Path) -> SceneDataset:
         """Return the folder."""
-        names, settings = flags.split_columns(self.columns), self.settings.resolved
-        return FolderSource(
-            root, settings, out, columns=names, suffixes=self.suffixes, **self.output
-        )
+        columns = flags.split_columns(self.columns)
+        data = FolderOfClouds(root, suffixes=self.suffixes, columns=columns)
+        flags.check_columns(self.columns, [s.path for s in data.scenes if not s.path.is_dir()])
+        return data
 
 
 @dataclass(frozen=True)
@@ -178,10 +187,10 @@ class S3DISArguments(CloudArguments):
     class_order: Literal["pointcept", "spt"] = "pointcept"
     """Meaning of the numbers in segment.npy. Other layouts have the order pointcept."""
 
-    def source(self, root: Path, out: Path) -> Source:
+    def data(self, root: Path) -> SceneDataset:
         """Return the rooms of the areas."""
-        areas = self.areas or find_areas(root)
-        return S3DISSource(root, self.settings.resolved, areas, self.class_order, **self.output)
+        require("pyarrow", extra="text", purpose="read S3DIS")
+        return S3DIS(root, self.areas or find_areas(root), class_order=self.class_order)
 
 
 @dataclass(frozen=True)
@@ -198,9 +207,9 @@ class ScanNetArguments(CloudArguments):
         torchrg convert scannet scannet out --layout mmdet3d
     """
 
-    def source(self, root: Path, out: Path) -> Source:
+    def data(self, root: Path) -> SceneDataset:
         """Return the scans."""
-        return ScanNetSource(root, self.settings.resolved, **self.output)
+        return ScanNet(root)
 
 
 @dataclass(frozen=True)
@@ -225,12 +234,12 @@ class RGBDArguments(Arguments):
     """As that of clouds, by the 0.12 s of a frame of 640 x 480 pixels (``scripts/bench.py
     steady``)."""
 
-    def source(self, root: Path, out: Path) -> Source:
+    def source(self, root: Path) -> Source:
         """Return the frames."""
         camera = flags.parse_intrinsics(self.intrinsics)
         layout = find_layout(root) if self.layout == "auto" else self.layout
         options = (layout, camera, self.depth_scale, self.orient)
-        return RGBDSource(root, self.depth, *options)
+        return RGBDSource(root, self.depth, *options, table=self.table)
 
 
 KINDS: dict[str, type[Arguments]] = {
@@ -270,8 +279,7 @@ def run(argv: list[str]) -> int:
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with warnings_as_lines():
-        source = dataclasses.replace(arguments.source(root, out), table=arguments.table)
-        scans = list_jobs(source, out)
+        scans = list_jobs(arguments.source(root), out)
     jobs = match_jobs(scans, arguments.only)
     if arguments.dry_run:
         plan, stale = _look_at(jobs, arguments), _find_stale(scans, arguments)

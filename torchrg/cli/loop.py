@@ -10,11 +10,10 @@ from tqdm import tqdm
 
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.cli.ending import SOME_FAILED, fail, printable, warn
-from torchrg.datasets.folder import folded_name
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import notes_on_results
-from torchrg.io.files import check_place, make_folder
+from torchrg.io.files import check_place, folded_name, make_folder
 from torchrg.io.npy import KEPT_FIELDS
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from torchrg.batch.records import describe_run
-from torchrg.batch.scans import check_finite, note_on_copies
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn
@@ -21,6 +20,7 @@ from torchrg.cli.loop import (
     run_each,
     stage_bar,
 )
+from torchrg.clouds import check_finite, note_on_copies
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud

@@ -15,17 +15,6 @@ from torchrg import scratch
 from torchrg.batch.memory import available_memory, memory_of_scan
 from torchrg.batch.records import Record, describe_run
 from torchrg.batch.run import REPORT, lock_folder
-from torchrg.batch.scans import (
-    Reading,
-    check_finite,
-    check_stems,
-    find_objects,
-    mark_of,
-    note_on_copies,
-    note_on_origin,
-    segment_cloud,
-    write_scan,
-)
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import say, warn
@@ -41,8 +30,10 @@ from torchrg.cli.loop import (
     run_each,
     stage_bar,
 )
+from torchrg.clouds import find_objects, note_on_copies, segment_cloud
 from torchrg.config import SuperpointsConfig
-from torchrg.datasets.layouts import check_layout
+from torchrg.datasets.folder import SceneFiles
+from torchrg.datasets.layouts import check_layout, check_stems, note_on_origin, write_scan
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
@@ -54,7 +45,7 @@ from torchrg.io import (
     read_cloud,
     write_cloud,
 )
-from torchrg.io.files import check_space
+from torchrg.io.files import check_space, mark_of
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes, write_index
@@ -132,7 +123,8 @@ def run(argv: list[str]) -> int:
             "segment: expected --superpoints with --partition flags, got none; add it."
         )
     flags.check_level(arguments.level, arguments.partition)
-    check_layout(arguments.layout or "pointcept", _DATASET, "clouds")
+    if arguments.layout is not None:
+        check_layout(arguments.layout, _DATASET, "clouds")
     if arguments.level and arguments.layout is None:
         raise ConfigError(
             "expected --layout with --level, as other files hold all levels, got none; leave "
@@ -212,11 +204,12 @@ def _segment(
     begin, source = time.perf_counter(), name_of(sources)
     limit = flags.bytes_of_limit(arguments.limit_memory, available_memory() // 2)
     _check_limit(source, sum(map(estimate_points, sources)), limit)  # Before it is read.
-    cloud = merge_clouds(
-        [read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources]
-    )
+    clouds = [
+        read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources
+    ]
+    cloud = merge_clouds(clouds) if len(clouds) > 1 else clouds[0]
     where = _arrays_of(arguments, source, target, len(cloud), limit)
-    objects = find_objects(cloud.fields, arguments.within, cloud)
+    find_objects(cloud, arguments.within)  # Refused before anything is told.
     _check_points(arguments, source, cloud, target)
     stages = (*STAGES, *["superpoints"] * arguments.superpoints)
     with stage_bar(sources[0].name, stages) as advance, where:
@@ -227,8 +220,9 @@ def _segment(
             viewpoint=arguments.viewpoint,
             partition=arguments.partition if arguments.superpoints else None,
             voxel=arguments.voxel,
-            within=objects,
+            within=arguments.within,
             begin=advance,
+            warn=lambda note: warn(f"{source}: {note}."),
         )
     for note in note_on_copies(seg.num_copies, len(cloud)):
         say(f"{source}: {note}")
@@ -287,8 +281,6 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
     parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
     written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
     note_input(source, cloud, target, written)
-    for note in check_finite(cloud):
-        warn(f"{source}: {note}.")
     if arguments.layout is None:
         check_output(target, cloud)
     grid = cloud.grid_shape
@@ -326,9 +318,8 @@ def _write_layout(
     layout, level = arguments.layout or "pointcept", arguments.level
     for note in note_on_origin(layout, cloud):
         warn(f"{cloud.source}: {note}.")
-    arrays = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
-    reading = Reading(cloud, arrays, _DATASET)
-    write_scan(layout, target.name, target, reading, seg, superpoints, level=level)
+    scene = SceneFiles(target.name, target, ())
+    write_scan(layout, scene, target, cloud, seg, superpoints, level=level)
 
 
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:

@@ -4,22 +4,23 @@ Every data set is a map-style :class:`torch.utils.data.Dataset`: ``len(data)``, 
 sample dict (``coord``, ``color``, ``segment``, ``instance``, ``name``, ...), ``transform=`` is
 called with it, and ``data.scenes`` lists what there is without reading it: :class:`SceneFiles` with
 ``name`` (the place below an output folder), ``path``, and ``files`` (every input file).
+``data.read_cloud(i)`` returns a scene as a :class:`torchrg.Cloud`; depth frames do not have it.
 :func:`collate_offset` joins samples into a ragged batch. :func:`read_room` reads one room of S3DIS,
 :func:`read_pointcept_scene` and :func:`write_pointcept_scene` one folder of Pointcept's layout.
 
 The guide with recipes for other programs says how their loaders take these results.
 
-A new data set is a :class:`~torchrg.datasets.folder.SceneDataset` in a file of its own, exported
-here, and a test; a new folder of depth frames is a row of
-:data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
+To add a data set, derive from :class:`SceneDataset`: it trains in a loader and
+:class:`torchrg.batch.sources.CloudSource` converts it. To add a folder of depth frames, add a row
+to :data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
 """
 
 from torchrg.datasets.collate import collate_offset
-from torchrg.datasets.folder import FolderOfClouds, SceneFiles, read_pointcept_area
+from torchrg.datasets.folder import FolderOfClouds, SceneDataset, SceneFiles, read_pointcept_area
 from torchrg.datasets.nag import make_nag
 from torchrg.datasets.pointcept import read_pointcept_scene, write_pointcept_scene
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
-from torchrg.datasets.s3dis import CLASS_ORDERS, S3DIS, Room, read_room
+from torchrg.datasets.s3dis import CLASS_ORDERS, S3DIS, read_room
 from torchrg.datasets.scannet import ScanNet, read_scannet_scan
 
 __all__ = [
@@ -28,8 +29,8 @@ __all__ = [
     "FolderOfClouds",
     "RGBDFrame",
     "RGBDFrames",
-    "Room",
     "ScanNet",
+    "SceneDataset",
     "SceneFiles",
     "collate_offset",
     "make_nag",

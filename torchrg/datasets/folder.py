@@ -2,20 +2,23 @@
 
 import os
 import re
-import unicodedata
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch.utils.data import Dataset
 
 from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
-from torchrg.datasets.pointcept import POINT_ARRAYS, read_pointcept_scene
-from torchrg.errors import FormatError
-from torchrg.io import FOLDER_SUFFIXES, read_cloud, takes_columns
+from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
+from torchrg.errors import ConfigError, FormatError
+from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
+from torchrg.io.colors import read_colors
+from torchrg.io.npy import map_folder
+from torchrg.structures import Cloud
 from torchrg.transforms.rows import Sample, SampleDict
 
 Transform = Callable[[SampleDict], Sample]
@@ -34,25 +37,88 @@ class SceneFiles(NamedTuple):
             slashes: ``Area_1/office_1``.
         path: The file or folder that is read.
         files: Every input file, in the order they are read; their bytes decide the result.
+        dataset: The data set whose classes it has, empty where nobody knows; None of a plain cloud.
+        place: Where it is in the release, which some programs keep. Default: its name.
+        num_points: Its number of points by the headers or sizes of its files, for ``convert``.
+        item: What else reads it; plain values that travel between processes.
     """
 
     name: str
     path: Path
     files: tuple[Path, ...]
+    dataset: str | None = None
+    place: str = ""
+    num_points: int = 0
+    item: Any = None
 
 
 class SceneDataset(Dataset[Sample]):
-    """A map-style data set whose items are known before they are read.
+    r"""A map-style data set that lists its scenes before it reads them; base of data sets.
 
-    A data set sets ``scenes`` and ``transform``, and says how to read a sample.
+    A data set of your own sets ``root`` and ``scenes`` and overrides :meth:`read_scene`. It then
+    works in a :class:`torch.utils.data.DataLoader`, and
+    :class:`torchrg.batch.sources.CloudSource` converts it.
+
+    Attributes:
+        root: The folder of the data set.
+        scenes: Name, path and input files of each scene.
+        transform: Called with each sample. Default: none.
+
+    Example:
+        >>> import tempfile
+        >>> class TextScans(SceneDataset):
+        ...     kind = "text-scans"
+        ...     def __init__(self, root):
+        ...         self.root = Path(root)
+        ...         paths = sorted(self.root.glob("*.txt"))
+        ...         self.scenes = [SceneFiles(path.stem, path, (path,), "") for path in paths]
+        ...     def read_scene(self, scene):
+        ...         rows = np.loadtxt(scene.path)
+        ...         return Cloud(rows[:, :3], {"segment": rows[:, 3].astype(np.int16)})
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = (Path(root) / "a.txt").write_text("0 0 0 4\n1 0 0 4\n")
+        ...     TextScans(root)[0]["segment"].tolist()
+        [4, 4]
     """
 
+    root: Path
     scenes: list[SceneFiles]
-    transform: Transform | None
+    transform: Transform | None = None
+    kind: ClassVar[str] = "scenes"
+    """Name of the kind of data set in records of :mod:`torchrg.batch`."""
+
+    def read_scene(self, scene: SceneFiles) -> Cloud:
+        """Return the cloud of a scene, labels among its fields."""
+        raise NotImplementedError
+
+    def read_cloud(self, index: int) -> Cloud:
+        """Return the cloud of the scene of an index."""
+        return self.read_scene(self.scenes[index])
 
     def read_sample(self, index: int) -> SampleDict:
-        """Return the sample of a scene."""
-        raise NotImplementedError
+        """Return the sample of a scene: its fields, and coordinates as they are in its files."""
+        cloud = self.read_cloud(index)
+        fields: SampleDict = {key: torch.from_numpy(v) for key, v in cloud.fields.items()}
+        for key in fields.keys() & {"segment", "segment200", "instance"}:
+            fields[key] = fields[key].reshape(len(cloud), -1)[:, 0].long()
+        if cloud.front is not None:
+            fields["front"] = torch.from_numpy(cloud.front)
+        header = cloud.header.items()
+        whole = {k: torch.from_numpy(v) for k, v in header if isinstance(v, np.ndarray)}
+        name = self.scenes[index].name
+        return {"coord": torch.from_numpy(cloud.coordinates), **fields, **whole, "name": name}
+
+    def count_points(self, scene: SceneFiles) -> int:
+        """Return about how many points a scene has, without reading it."""
+        return estimate_points(scene.path / "coord.npy" if scene.path.is_dir() else scene.path)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what beside its files decides what is read, for JSON."""
+        return {}
+
+    def check_output(self, layout: str, out: Path) -> None:
+        """Raise ConfigError if results in a layout would be read as scenes from where they go."""
+        check_outside(self.root, out)
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -92,6 +158,8 @@ class FolderOfClouds(SceneDataset):
         UserWarning: If links are passed over.
     """
 
+    kind = "folder"
+
     def __init__(
         self,
         root: str | os.PathLike[str],
@@ -113,9 +181,9 @@ class FolderOfClouds(SceneDataset):
             raise FormatError(
                 f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
             )
-        self.scenes = [SceneFiles(self._name_of(path), path, _files_of(path)) for path in paths]
+        self.scenes = [self._scene(path) for path in paths]
         first: dict[str, Path] = {}
-        for name, path, _ in self.scenes:
+        for name, path, *_ in self.scenes:
             if first.setdefault(name, path) != path:
                 one, other = (place.relative_to(self.root) for place in (first[name], path))
                 raise FormatError(
@@ -123,17 +191,43 @@ class FolderOfClouds(SceneDataset):
                     "rename one, or choose between them by suffixes."
                 )
 
-    def _name_of(self, path: Path) -> str:
-        """Return the name of a cloud: the path without the suffix, whatever else there is."""
+    def _scene(self, path: Path) -> SceneFiles:
+        """Return a cloud, named by the path without the suffix, whatever else there is."""
         inside = path.relative_to(self.root)
-        return (inside if path.is_dir() else inside.with_suffix("")).as_posix()
+        if not path.is_dir():
+            return SceneFiles(inside.with_suffix("").as_posix(), path, (path,))
+        files = tuple(f for name in POINT_ARRAYS if (f := path / f"{name}.npy").is_file())
+        # Classes without those of ScanNet are of a data set that nobody knows.
+        is_known = {"segment", "segment20"} & {file.stem for file in files} != {"segment"}
+        return SceneFiles(inside.as_posix(), path, files, "ScanNet" if is_known else "")
+
+    def describe(self) -> dict[str, Any]:
+        """Return what beside its files decides what is read, for JSON."""
+        return {} if self.columns is None else {"columns": list(self.columns)}
+
+    def check_output(self, layout: str, out: Path) -> None:
+        """Raise ConfigError if results go to ``root`` but do not complete folders of Pointcept."""
+        files = [scene.path.name for scene in self.scenes if not scene.path.is_dir()]
+        if files or layout != "pointcept":
+            what = f"the results of {files[0]}" if files else f"layout {layout}"
+            check_outside(self.root, out, f"for {what}")
+
+    def read_scene(self, scene: SceneFiles) -> Cloud:
+        """Return the cloud of a file, or of a folder in Pointcept's layout."""
+        path = scene.path
+        if not path.is_dir():
+            return read_cloud(path, columns=self.columns if takes_columns(path) else None)
+        arrays, notes = map_folder(path, SOURCE_ARRAYS), tuple[str, ...]()
+        if "color" in arrays:
+            arrays["color"], notes = read_colors(path / "color.npy", arrays["color"])
+        return Cloud(arrays.pop("coord"), arrays, source=str(path), notes=notes)
 
     def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a cloud."""
-        name, path, _ = self.scenes[index]
+        name, path, *_ = self.scenes[index]
         if path.is_dir():
             return {**read_pointcept_scene(path), "name": name}
-        cloud = read_cloud(path, columns=self.columns if takes_columns(path) else None)
+        cloud = self.read_cloud(index)
         fields = {
             _FIELD_KEYS.get(field, field): as_tensor(str(path), field, values)
             for field, values in cloud.fields.items()
@@ -182,12 +276,10 @@ def is_scene(folder: Path) -> bool:
     return (folder / "coord.npy").is_file()
 
 
-def _files_of(path: Path) -> tuple[Path, ...]:
-    """Return the input files of a cloud."""
-    if not path.is_dir():
-        return (path,)
-    files = (path / f"{name}.npy" for name in POINT_ARRAYS)
-    return tuple(file for file in files if file.is_file())
+def check_outside(root: Path, out: Path, why: str = "so that no result is read as a scan") -> None:
+    """Check that results go elsewhere than to the folder of a data set."""
+    if out == root:
+        raise ConfigError(f"{out}: expected a directory outside {root}, {why}; choose another.")
 
 
 def check_folder(folder: Path) -> None:
@@ -269,16 +361,3 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     ]
     # Names that differ in case or leading zeros only still have one order.
     return (*key, (2, name))
-
-
-def folded_name(name: str) -> str:
-    """Return what names have in common that some file systems take for the same.
-
-    Those of macOS and Windows do not tell case apart, nor how letters with accents are put
-    together, and what is written on others is carried there.
-
-    Example:
-        >>> folded_name("B\u00fcro") == folded_name("bu\u0308RO")
-        True
-    """
-    return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())

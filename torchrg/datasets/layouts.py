@@ -13,7 +13,7 @@ import pickletools
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,16 @@ import torch
 from numpy.typing import NDArray
 
 from torchrg._optional import require
+from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.nag import encode_nag, make_nag
-from torchrg.datasets.pointcept import write_files
+from torchrg.datasets.pointcept import write_files, write_pointcept_scene, write_results
 from torchrg.datasets.s3dis import CLASS_ORDERS
-from torchrg.datasets.scannet import NYU_IDS
+from torchrg.datasets.scannet import NYU_IDS, read_objects
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.colors import narrow_colors
+from torchrg.io.files import folded_name
 from torchrg.plane_table import describe_planes
-from torchrg.structures import UNLABELED, Planes, Superpoints
+from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints
 
 Files = dict[str, NDArray[Any] | bytes]
 """Contents by paths below the output directory: arrays as ``.npy``, or bytes."""
@@ -146,6 +149,81 @@ def check_layout(layout: str, dataset: str, what: str) -> None:
         )
     if layout == "nag":
         require("h5py", extra="nag", purpose="write layout nag")
+
+
+def check_stems(layout: str, places: Mapping[str, str]) -> None:
+    """Raise FormatError if a scan would write into the files of another in a layout.
+
+    ``places`` says where each scan is in its data set, by its name.
+    """
+    taken: dict[str, str] = {}
+    for name, place in places.items() if layout != "pointcept" else ():
+        stem = stem_of(layout, name, place)
+        other = taken.setdefault(folded_name(stem), name)
+        if other != name:
+            raise FormatError(
+                f"expected files of its own for each scan, got {stem} for {other} and {name} in "
+                f"layout {layout}; rename one, or choose layout pointcept."
+            )
+
+
+def note_on_origin(layout: str, cloud: Cloud) -> tuple[str, ...]:
+    """Return what a user should know of the coordinates of a cloud in a layout."""
+    if layout == "pointcept" or not cloud.origin.any():
+        return ()
+    place = " ".join(f"{value:.12g}" for value in cloud.origin)
+    return (f"coordinates are written about {place}, as they are far from the origin",)
+
+
+def write_scan(
+    layout: str,
+    scene: SceneFiles,
+    folder: Path,
+    cloud: Cloud,
+    seg: Segmentation,
+    superpoints: Superpoints | None,
+    *,
+    level: int = 0,
+) -> list[str]:
+    """Write a scene in a layout, into the folder of its name; return the paths of files from there.
+
+    Every layout but ``"pointcept"`` needs superpoints, of which it takes one ``level``. Colors of
+    16 bits are rounded to 8, which is what readers of layouts expect.
+    """
+    if "color" in cloud.fields:
+        color = narrow_colors(cloud.fields["color"])
+        cloud = replace(cloud, fields={**cloud.fields, "color": color})
+    levels = [] if superpoints is None else [*superpoints.by_level().values()][level:]
+    superpoint = levels[0] if levels else None
+    if layout == "pointcept" or superpoint is None:
+        origin = cloud.origin.tolist()
+        if scene.dataset is not None:
+            sample = {**cloud.fields, "coord": cloud.coordinates}
+            return write_pointcept_scene(folder, sample, seg, superpoint=superpoint, origin=origin)
+        fields = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
+        fields |= {} if superpoint is None else {"superpoint": superpoint}
+        return write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
+    split, stem = split_name(scene.name)
+    is_known = scene.dataset is not None
+    objects = None
+    if layout == "scannet" and scene.dataset == "ScanNet" and scene.path.is_file():
+        objects = read_objects(scene.path, len(cloud))
+    given = {**cloud.fields, **cloud.header} if is_known else cloud.fields
+    scan = LayoutScan(
+        stem,
+        split,
+        folder=scene.place or scene.name,
+        dataset=scene.dataset if scene.dataset is not None else "ScanNet",
+        coord=cloud.points.numpy(),
+        normal=seg.normals.numpy(),
+        superpoint=superpoint,
+        plane=seg.labels.numpy(),
+        given={k: np.asarray(v) for k, v in given.items() if is_known or k == "color"},
+        objects=objects,
+        coarser=levels[1:],
+    )
+    out = folder.parents[scene.name.count("/")]
+    return write_layout(layout, folder, out, scan, seg.planes, cloud.origin)
 
 
 def write_layout(

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -36,6 +37,8 @@ POINT_ARRAYS = (
 """Arrays of a scene folder that have a row for each point."""
 GIVEN_ARRAYS = POINT_ARRAYS[:8]
 """Those that come with the points."""
+SOURCE_ARRAYS = tuple(name for name in GIVEN_ARRAYS if name != "normal")
+"""Those of a scene that go along with results."""
 _SCANNET = ("segment20", "segment200")
 _LABELS = ("segment", *_SCANNET, "instance", "superpoint", "plane")
 _FEATURES = ("strength", "curvature")
@@ -131,6 +134,32 @@ def write_pointcept_scene(
     _check_kept(place, arrays, inputs)
     new = {name: values for name, values in arrays.items() if name not in inputs}
     return write_arrays(place, new, describe_planes(segmentation.planes, origin=origin))
+
+
+def write_results(
+    folder: Path,
+    coord: NDArray[np.floating],
+    segmentation: Segmentation,
+    *,
+    fields: Mapping[str, NDArray[Any]] | None = None,
+    origin: Sequence[float] | None = None,
+) -> list[str]:
+    """Write ``coord``, ``normal``, ``curvature``, ``plane`` as ``.npy``, and ``planes.json``.
+
+    Into a folder that exists; ``coord`` ``(*, 3)`` in the dtype to be written, the segmentation of
+    the same leading axes, further ``fields`` by name. ``origin`` is where the origin of the
+    segmentation is, in the coordinates of ``coord``. Returns the names of the files; those of
+    others are never replaced, see :func:`torchrg.datasets.pointcept.write_arrays`.
+    """
+    arrays: dict[str, NDArray[Any]] = {
+        "coord": coord,
+        "normal": segmentation.normals.numpy(),
+        "curvature": segmentation.curvature.numpy(),
+        "plane": segmentation.labels.numpy().astype(np.int32),
+        **(fields or {}),
+    }
+    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    return write_arrays(folder, arrays, describe_planes(segmentation.planes, origin=origin))
 
 
 def write_arrays(

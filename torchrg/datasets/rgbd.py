@@ -120,7 +120,7 @@ class RGBDFrames(SceneDataset):
         self.transform = transform
         self.scenes = [SceneFiles(frame.name, frame.depth, frame.files) for frame in self.frames]
         first: dict[str, Path] = {}
-        for number, (name, path, _) in enumerate(self.scenes):
+        for number, (name, path, *_) in enumerate(self.scenes):
             first.setdefault(name, path)
             if len(first) <= number:
                 raise ConfigError(

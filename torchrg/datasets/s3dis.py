@@ -15,19 +15,19 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
 from torchrg.io.colors import find_white, narrow_colors, read_colors
 from torchrg.io.files import check_file
-from torchrg.transforms.rows import SampleDict
+from torchrg.structures import Cloud
 
 CLASS_ORDERS = {
     "pointcept": (
@@ -57,36 +57,12 @@ _LARGEST = float(np.finfo(np.float32).max)
 _NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
-class Room(NamedTuple):
-    """The points of a room; those of an object follow each other.
-
-    Attributes:
-        coord: Coordinates in metres, shape ``(N, 3)``, float32.
-        color: Colours, shape ``(N, 3)``, uint8.
-        segment: Class of each point, a place in :data:`CLASS_ORDERS`, shape ``(N,)``, int16.
-        instance: Object of each point, counted from zero in natural order of the file names, shape
-            ``(N,)``, int16, or int32 with more objects than that holds.
-        repairs: A line for each byte that was read as another one: file, line and column, counted
-            from one, and the line before and after. The file itself is not changed.
-        notes: A line for each entry of the folder that is no object, for each file whose class is
-            not among the 13, ``stairs`` for example, and for each with the points of another; and
-            what reading colors took for granted.
-    """
-
-    coord: NDArray[np.float32]
-    color: NDArray[np.uint8]
-    segment: NDArray[np.signedinteger]
-    instance: NDArray[np.signedinteger]
-    repairs: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
 class S3DIS(SceneDataset):
     """The rooms of S3DIS, read from ``ROOT/Area_i/<room>/Annotations/*.txt``, aligned or not.
 
-    A sample has ``coord``, ``color``, ``segment`` and ``instance`` of a :class:`Room`, the last two
-    as int64, and ``name``, as in ``Area_1/office_1``. Points are in the order of the objects, not
-    in that of the room's own text file.
+    A sample has ``coord``, ``color``, ``segment`` and ``instance`` of :func:`read_room`, the last
+    two as int64, and ``name``, as in ``Area_1/office_1``. Points are in the order of the objects,
+    not in that of the room's own text file.
 
     The text is read each time, and nothing is written; ``torchrg convert s3dis`` writes arrays,
     which :class:`torchrg.datasets.FolderOfClouds` reads at once.
@@ -113,6 +89,8 @@ class S3DIS(SceneDataset):
         [1] I. Armeni et al. 3D semantic parsing of large-scale indoor spaces. CVPR, 2016.
     """
 
+    kind = "s3dis"
+
     def __init__(
         self,
         root: str | os.PathLike[str],
@@ -127,20 +105,28 @@ class S3DIS(SceneDataset):
         self.transform = transform
         self.scenes = [scene for area in areas for scene in _scenes_of_area(self.root, area)]
 
-    def read_sample(self, index: int) -> SampleDict:
-        """Return the sample of a room."""
-        room = self.read_room(index)
-        return {
-            "coord": torch.from_numpy(room.coord),
-            "color": torch.from_numpy(room.color),
-            "segment": torch.from_numpy(room.segment).long(),
-            "instance": torch.from_numpy(room.instance).long(),
-            "name": self.scenes[index].name,
-        }
+    def read_scene(self, scene: SceneFiles) -> Cloud:
+        """Return the cloud of a room; see :func:`read_room`."""
+        return read_room(scene.path, class_order=self.class_order)
 
-    def read_room(self, index: int) -> Room:
-        """Return the room of a scene, with the notes and repairs that a sample has not."""
-        return read_room(self.scenes[index].path, class_order=self.class_order)
+    def count_points(self, scene: SceneFiles) -> int:
+        """Return the number of points by the size of the files and the lines of the largest."""
+        sizes = {file: file.stat().st_size for file in scene.files}
+        largest = max(sizes, key=lambda file: sizes[file])
+        return round(sum(sizes.values()) * estimate_points(largest) / max(sizes[largest], 1))
+
+    def describe(self) -> dict[str, Any]:
+        """Return what beside its files decides what is read, for JSON."""
+        return {"class_order": self.class_order}
+
+    def check_output(self, layout: str, out: Path) -> None:
+        """Raise ConfigError if a layout has classes in another order, or results go to ``root``."""
+        super().check_output(layout, out)
+        if layout != "pointcept" and self.class_order != "pointcept":
+            raise ConfigError(
+                f"expected --class-order with --layout pointcept, got layout {layout}, which "
+                "has the order pointcept; leave it out."
+            )
 
 
 def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
@@ -166,15 +152,31 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
             "fetch the others unless you mean to go without.",
             stacklevel=3,
         )
-    return [SceneFiles(f"{folder.name}/{room.name}", room, object_files(room)) for room in rooms]
+    return [
+        SceneFiles(f"{folder.name}/{room.name}", room, object_files(room), "S3DIS")
+        for room in rooms
+    ]
 
 
-def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
-    """Read a room from the raw release; nothing is written.
+def find_areas(root: Path) -> tuple[int, ...]:
+    """Return the numbers of the areas that are there; all six if none is, to be told so."""
+    return tuple(n for n in ROOMS_PER_AREA if (root / f"Area_{n}").is_dir()) or (*ROOMS_PER_AREA,)
+
+
+def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
+    """Read a room from the raw release; nothing is written. The points of an object are in a row.
 
     Args:
         path: Folder of the room, the one above ``Annotations``.
         class_order: What the numbers in ``segment`` mean: a key of :data:`CLASS_ORDERS`.
+
+    Returns:
+        The cloud, in float32, with ``color`` ``(N, 3)`` uint8, ``segment`` ``(N,)`` int16, and
+        ``instance`` ``(N,)``, the object, counted in natural order of the file names, int16, or
+        int32 with more than that holds. ``repairs`` has a line for each byte that was read as
+        another one: file, line and column, counted from one, and the line before and after; the
+        file itself is not changed. ``notes`` has one for each entry of the folder that is no
+        object, and for each file whose class is not among the 13, ``stairs`` for example.
 
     Raises:
         FormatError: If there is no object, or a line of one is not a point.
@@ -193,13 +195,17 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Room:
     color, more = read_colors(path, np.concatenate(colors))
     counts = [len(coord) for coord in coords]
     dtype = np.int16 if len(objects) <= np.iinfo(np.int16).max else np.int32
-    return Room(
+    fields: dict[str, NDArray[Any]] = {
+        "color": narrow_colors(color),
+        "segment": np.repeat(np.array(numbers, np.int16), counts),
+        "instance": np.repeat(np.arange(len(objects), dtype=dtype), counts),
+    }
+    return Cloud(
         np.concatenate(coords),
-        narrow_colors(color),
-        np.repeat(np.array(numbers, np.int16), counts),
-        np.repeat(np.arange(len(objects), dtype=dtype), counts),
-        tuple(itertools.chain.from_iterable(repairs)),
-        (*notes, *more),
+        fields,
+        source=str(path),
+        notes=(*notes, *more),
+        repairs=tuple(itertools.chain.from_iterable(repairs)),
     )
 
 

@@ -9,13 +9,13 @@ import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
@@ -23,6 +23,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io import read_cloud
 from torchrg.io.files import DAMAGES, read_text, refusing
 from torchrg.plane_table import Arrays
+from torchrg.structures import Cloud
 from torchrg.transforms.rows import SampleDict
 
 MESH, MESH_PLUSPLUS = "_vh_clean_2.ply", "mesh_aligned_0.05.ply"
@@ -104,6 +105,8 @@ class ScanNet(SceneDataset):
         [2] C. Yeshwanth et al. ScanNet++: a high-fidelity dataset of 3D indoor scenes. ICCV, 2023.
     """
 
+    kind = "scannet"
+
     def __init__(
         self,
         root: str | os.PathLike[str],
@@ -135,20 +138,29 @@ class ScanNet(SceneDataset):
         # Every scan needs them: what is wrong with them is told before the first.
         _read_mapping(self.root) if is_plus else _read_categories(self.root)
 
+    def read_scene(self, scene: SceneFiles) -> Cloud:
+        """Return the cloud of a scan; see :func:`read_scannet_scan`."""
+        cloud = read_scannet_scan(scene.path, self.root)
+        if "instance" in cloud.fields or scene.name.startswith("test/"):
+            return cloud
+        note = "no labels: annotations or the table of their words are missing"
+        return replace(cloud, notes=(*cloud.notes, note))
+
+    def check_output(self, layout: str, out: Path) -> None:
+        """Raise ConfigError if files of ScanNet go to ``root``; others may go beside the meshes."""
+        if layout == "scannet":
+            super().check_output(layout, out)
+
     def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a scan."""
-        name, mesh, _ = self.scenes[index]
-        arrays = read_scannet_scan(mesh, self.root)
-        arrays.pop("category", None)
-        if "segment20" in arrays:
-            arrays["segment"] = arrays.pop("segment20")
-        sample: SampleDict = {key: torch.from_numpy(values) for key, values in arrays.items()}
-        for key in {"segment", "segment200", "instance"} & set(arrays):
-            sample[key] = sample[key].reshape(len(arrays["coord"]), -1)[:, 0].long()
-        return {**sample, "name": name}
+        sample = super().read_sample(index)
+        sample.pop("category", None)
+        if "segment20" in sample:
+            sample["segment"] = sample.pop("segment20")
+        return sample
 
 
-def read_scannet_scan(mesh: Path, root: Path) -> Arrays:
+def read_scannet_scan(mesh: Path, root: Path) -> Cloud:
     """Read a scan of ScanNet or ScanNet++ from the raw release; nothing is written.
 
     Args:
@@ -156,27 +168,24 @@ def read_scannet_scan(mesh: Path, root: Path) -> Arrays:
         root: Folder of the data set, in which tables of classes are looked for.
 
     Returns:
-        ``coord`` ``(N, 3)`` float32, ``color`` ``(N, 3)`` uint8 and, where they are known,
-        ``axis_align_matrix`` ``(4, 4)`` float64 and labels as Pointcept stores them: of ScanNet
-        ``segment20``, ``segment200``, ``instance`` ``(N,)`` int64, and ``category``, the number in
-        NYU40, 0 for none; of ScanNet++ ``segment`` and ``instance`` ``(N, 3)`` int16, the smallest
-        object first. ``front`` ``(N, 3)`` float32 is that of :class:`torchrg.Cloud`, by the faces.
+        The vertices, in float32, with ``front`` by the faces and, where they are known, ``color``
+        ``(N, 3)`` uint8 and labels as Pointcept stores them: of ScanNet ``segment20``,
+        ``segment200``, ``instance`` ``(N,)`` int64, and ``category``, the number in NYU40, 0 for
+        none; of ScanNet++ ``segment`` and ``instance`` ``(N, 3)`` int16, the smallest object first.
+        Its header has ``axis_align_matrix`` ``(4, 4)`` float64.
 
     Raises:
         FormatError: If a file is damaged, or is of another number of vertices.
     """
-    cloud = read_cloud(mesh)
-    arrays: Arrays = {"coord": cloud.coordinates.astype(np.float32)}
-    if "color" in cloud.fields:
-        arrays["color"] = cloud.fields["color"]
-    if cloud.front is not None:
-        arrays["front"] = cloud.front
+    cloud, files = read_cloud(mesh), _files_of(mesh)
+    fields = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
     if mesh.name == MESH_PLUSPLUS:
-        return arrays | _labels_plus(mesh, root, len(cloud))
-    files = _files_of(mesh)
-    if "text" in files:
-        arrays |= _alignment(files["text"])
-    return arrays | _labels(files, root, len(cloud))
+        header, labels = {}, _labels_plus(mesh, root, len(cloud))
+    else:
+        header = _alignment(files["text"]) if "text" in files else {}
+        labels = _labels(files, root, len(cloud))
+    coordinates = cloud.coordinates.astype(np.float32)
+    return replace(cloud, coordinates=coordinates, fields=fields | labels, header=header)
 
 
 def read_objects(mesh: Path, count: int) -> list[tuple[dict[str, Any], NDArray[np.integer]]] | None:
@@ -217,7 +226,10 @@ def _scene(root: Path, mesh: Path) -> SceneFiles:
     name = mesh.parent.parent.name if is_plus else mesh.parent.name
     names = ("map_benchmark.csv", "top100.txt") if is_plus else (CATEGORIES,)
     tables = filter(None, (_find(root, table) for table in names))
-    return SceneFiles(name, mesh, (mesh, *_files_of(mesh).values(), *tables))
+    # Programs that read superpoints of ScanNet++ have scans where the release has data.
+    place = f"scans/{name}/scans" if is_plus else mesh.parent.relative_to(root).as_posix()
+    dataset = "ScanNet++" if is_plus else "ScanNet"
+    return SceneFiles(name, mesh, (mesh, *_files_of(mesh).values(), *tables), dataset, place)
 
 
 def _files_of(mesh: Path) -> dict[str, Path]:

@@ -1,6 +1,7 @@
 """Files: checked before they are read, and written whole or not at all."""
 
 import errno
+import hashlib
 import os
 import re
 import secrets
@@ -8,6 +9,7 @@ import shutil
 import stat
 import struct
 import tokenize
+import unicodedata
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -319,3 +321,44 @@ def refusing(message: str, *errors: type[BaseException], repair: str = "") -> It
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or its name if it has none; no full stop."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def mark_of(name: str) -> str:
+    """Return the mark of the files that are being written for a scan in an output directory.
+
+    It is the same in every run, so that each removes what one that was killed has left; see
+    :func:`torchrg.io.files.marked_parts`.
+
+    Example:
+        >>> mark_of("Area_1/office_1")
+        '65d1ec9889e61d51'
+    """
+    return hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+
+
+def folded_name(name: str) -> str:
+    """Return what names have in common that some file systems take for the same.
+
+    Those of macOS and Windows do not tell case apart, nor how letters with accents are put
+    together, and what is written on others is carried there.
+
+    Example:
+        >>> folded_name("B\u00fcro") == folded_name("bu\u0308RO")
+        True
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())
+
+
+def words_of(raw: bytes) -> list[str]:
+    r"""Return the words of a line of a header: UTF-8, or Latin-1, which some programs write.
+
+    Example:
+        >>> words_of("property float höhe".encode())
+        ['property', 'float', 'höhe']
+        >>> words_of(b"property float h\xf6he")
+        ['property', 'float', 'höhe']
+    """
+    try:
+        return [word.decode() for word in raw.split()]
+    except UnicodeDecodeError:
+        return [word.decode("latin-1") for word in raw.split()]

@@ -16,8 +16,8 @@ import numpy as np
 from torchrg.errors import FormatError
 from torchrg.io.columns import Spelling, flatten_cloud, write_records
 from torchrg.io.fields import Columns, Values, assemble_cloud
-from torchrg.io.files import check_end, check_promise
-from torchrg.io.text import read_rows, words_of
+from torchrg.io.files import check_end, check_promise, words_of
+from torchrg.io.text import read_rows
 from torchrg.structures import FARTHEST, Cloud
 
 _LONGEST_HEADER = 1 << 16

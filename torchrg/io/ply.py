@@ -25,8 +25,8 @@ from torchrg.io.columns import (
 )
 from torchrg.io.faces import Fronts, find_fronts
 from torchrg.io.fields import LARGEST_WHOLE, Values, assemble_cloud
-from torchrg.io.files import check_end, check_promise
-from torchrg.io.text import read_rows, skip_lines, words_of
+from torchrg.io.files import check_end, check_promise, words_of
+from torchrg.io.text import read_rows, skip_lines
 from torchrg.structures import Cloud
 
 _TYPES = {

@@ -259,21 +259,6 @@ def _repair_of(text: str, num_columns: int, form: _Form | None) -> str:
     return "repair or delete this line"
 
 
-def words_of(raw: bytes) -> list[str]:
-    r"""Return the words of a line of a header: UTF-8, or Latin-1, which some programs write.
-
-    Example:
-        >>> words_of("property float höhe".encode())
-        ['property', 'float', 'höhe']
-        >>> words_of(b"property float h\xf6he")
-        ['property', 'float', 'höhe']
-    """
-    try:
-        return [word.decode() for word in raw.split()]
-    except UnicodeDecodeError:
-        return [word.decode("latin-1") for word in raw.split()]
-
-
 def _num_columns(dtype: np.dtype[Any]) -> int:
     """Return the number of columns of a row."""
     return sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
