@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._parallel import ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg.moments import dot
 
@@ -83,6 +84,15 @@ def find_faces(
     return joined, signs
 
 
+def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
+    """Return the neighbors of some points at some ranks; lists on a disk leave the memory again."""
+    parts = []
+    for chunk in torch.split(rows, ROWS_IN_CACHE):
+        parts.append(near[chunk][:, ranks])
+        scratch.release()
+    return torch.cat(parts) if parts else near[:0, ranks]
+
+
 def find_surfaces(points: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
     """Find connected surfaces, over edges and across thin plates; see :func:`find_faces`.
 
@@ -133,16 +143,17 @@ def _join_patches(
         local implicit quadric regression. IEEE Visualization, 2003.
     """
     rows, num_faces = places_of(faces < 0), int(faces.max()) + 1
-    ends = near[rows][:, [rank for rank in _RANKS if rank < near.shape[1]]]
+    ends = gather_lists(near, rows, [rank for rank in _RANKS if rank < near.shape[1]])
     cosine, bend = _compare(points, normals, rows, ends)
     usual = float(bend[::8].median()) if bend.numel() else 0.0
-    node = torch.full((len(points),), -1)
-    node[rows] = torch.arange(len(rows))
+    node = torch.full((len(points),), -1, dtype=torch.int32)
+    node[rows] = torch.arange(len(rows), dtype=torch.int32)
     there = node[ends]
     is_smooth = (bend <= min(max(_BENDS * usual, _MIN_BEND), _MAX_BEND)) & (there >= 0)
-    starts = torch.repeat_interleave(is_smooth.sum(dim=1))
+    starts = torch.repeat_interleave(is_smooth.sum(dim=1, dtype=torch.int32))
     smooth = (values.numpy() for values in (starts, there[is_smooth], cosine[is_smooth] < 0))
     patch, sign = _find_components(len(rows), *smooth)
+    del node, there, starts, smooth
     faces, signs = faces.clone(), signs.clone()
     faces[rows], signs[rows] = num_faces + patch, sign.to(signs)
     is_between = faces[ends] != faces[rows, None]
@@ -234,8 +245,10 @@ def _find_components(
 
     num_links = np.cumsum(np.bincount(starts, minlength=num_nodes))
     bounds = np.concatenate([[0], num_links, num_links[-1:] + num_links])
-    copies = np.concatenate([ends + num_nodes * is_turned, ends + num_nodes * ~is_turned])
-    links = np.ones(len(copies), np.int8), copies.astype(np.int32), bounds.astype(np.int32)
+    other = np.int32(num_nodes) * is_turned
+    ends = ends.astype(np.int32, copy=False)
+    copies = np.concatenate([ends + other, ends + (np.int32(num_nodes) - other)])
+    links = np.ones(len(copies), np.int8), copies, bounds.astype(np.int32)
     graph = csr_array(links, shape=(2 * num_nodes, 2 * num_nodes))
     upright, opposite = connected_components(graph, directed=False)[1].reshape(2, num_nodes)
     alone = 2 * num_nodes + np.arange(num_nodes)

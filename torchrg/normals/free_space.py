@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, map_tasks
 from torchrg.linalg.moments import dot, kth_smallest
+from torchrg.normals.faces import gather_lists
 
 _SPACINGS_PER_CELL = 1.5
 _SPACING_QUANTILE = 0.9
@@ -57,8 +58,10 @@ def vote_free_side(
     ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive where the normal points to the freer side.
     """
     low = points.amin(dim=0)
-    x, y, z = ((points - low) / width).long().unbind(dim=1)
-    codes = (x * _MAX_CELLS + y) * _MAX_CELLS + z
+    codes = torch.zeros(len(points), dtype=torch.int64)
+    for axis in range(3):
+        codes *= _MAX_CELLS
+        codes += ((points[:, axis] - low[axis]) / width).long()
     cells = np.sort(torch.unique_consecutive(codes).numpy())
     cells = cells[np.append(True, cells[1:] != cells[:-1])]
     x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
@@ -87,7 +90,7 @@ def cell_width(points: Tensor, near: Tensor) -> float:
     if rank == 0:
         return 1.0
     rows = torch.arange(0, len(points), max(len(points) // ROWS_AT_ONCE, 1))
-    arms = points[near[rows, rank]] - points[rows]
+    arms = points[gather_lists(near, rows, [rank])[:, 0]] - points[rows]
     # A disk of that radius holds ``rank`` points, one for each square of the spacing.
     spacing = dot(arms, arms).sqrt() * math.sqrt(math.pi / rank)
     at = math.ceil(_SPACING_QUANTILE * len(rows)) - 1
@@ -100,7 +103,8 @@ def _find_obstacles(
     points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, width: float
 ) -> list[Tensor]:
     """Return the worth of paths to the nearest faces ahead and behind on which neighbors lie."""
-    ends, own = near[rows, :_NUM_OBSTACLES], normals[rows, None]
+    ranks = list(range(min(_NUM_OBSTACLES, near.shape[1])))
+    ends, own = gather_lists(near, rows, ranks), normals[rows, None]
     arms = points[ends] - points[rows, None]
     height = dot(arms, own)
     is_face = dot(normals[ends], own).abs() > _PARALLEL
