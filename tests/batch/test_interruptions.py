@@ -51,7 +51,9 @@ def undisturbed(rooms, tmp_path_factory):
 
 def convert_here(rooms, out):
     """Convert rooms in this process, and return the bytes of every result."""
-    for job in list_jobs(CloudSource(FolderOfClouds(rooms), load_config("classic")), out):
+    for job in list_jobs(
+        CloudSource(FolderOfClouds(rooms), load_config("classic", **{"planes.up": "z"})), out
+    ):
         assert convert_scan(job).status == "converted"
     assert len(results_of(out)) == 6 * len(NAMES)
     return results_of(out)

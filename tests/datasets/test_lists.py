@@ -21,7 +21,7 @@ from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.errors import FormatError
 from torchrg.scenes import make_room
 
-CLASSIC = load_config("classic")
+CLASSIC = load_config("classic", **{"planes.up": "z"})
 SPLITS = {
     "train": ["scene0009_00", "scene0010_00"],
     "val": ["scene0011_00"],

@@ -90,7 +90,7 @@ def test_what_leads_nowhere_fails_the_site(tmp_path, text, code):
 @pytest.mark.parametrize("prog", command_page.PROGS)
 def test_the_page_of_commands_says_what_help_says(prog, capsys):
     with pytest.raises(SystemExit):
-        main([*prog.split()[1:], "--help"])
+        main([*prog.split()[1:], "--help-all"])
     words = " ".join(capsys.readouterr().out.split())
     flags = command_page.flags_of(command_page.PROGS[prog])
     assert len(flags) > 1
