@@ -45,7 +45,7 @@ def segment_cloud(
         cloud: The cloud, its labels among its fields.
         settings: How planes are found.
         orient: Side to which normals point; see :func:`torchrg.segment_planes`.
-        viewpoint: Where the sensor stood, likewise.
+        viewpoint: Where the sensor stood; see there.
         partition: How superpoints are made. Default: none are.
         voxel: Side of voxels, of which one point each is segmented.
         within: Name of the field of objects that contain planes; see :func:`find_objects`.

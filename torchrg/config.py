@@ -584,7 +584,7 @@ def _preset_file(name: object, *, expected: str) -> Path:
     if name in _MEASURED_NOW:
         raise ConfigError(
             f"{expected} {', '.join(preset_names())}, got {name!r}; leave it out: the default "
-            "measures what that preset set. up tells which axis points up."
+            "measures what that preset set. up names the axis that points up."
         )
     if name not in preset_names():
         raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}.")

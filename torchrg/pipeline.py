@@ -85,9 +85,9 @@ def segment_planes(
         a tenth of the time; ``orient="none"`` saves it.
 
     Args:
-        points: Points, shape ``(N, 3)``, float32 or float64; a cloud, whose ``points`` are taken;
-            or the path of a file. Tensors far from the origin should be float64, or moved to it
-            first, as :func:`torchrg.read_cloud` does.
+        points: Points, shape ``(N, 3)``, float32 or float64, a cloud, or the path of a file.
+            Planes of a cloud or a file are about :attr:`torchrg.Cloud.origin`, as its points are.
+            Tensors far from the origin should be float64, or moved to it first.
         config: Settings, a dictionary of them, or the name of a preset or a file. Default: that of
             :func:`torchrg.load_config`.
         orient: Side to which normals point, as in :func:`torchrg.normals.orient_normals`. Default:

@@ -125,6 +125,8 @@ def test_fields_become_what_is_written(line, changes):
         ("a --output b --size 2", "unrecognized option --size. Did you mean --part.size? See"),
         ("a -o b --is_on", "unrecognized option --is-on. Did you mean --part.is-on? See"),
         ("a --out b --kind one two", "expected one value for --kind, got one two; separate"),
+        ("a --out b --part.is-on c", "unrecognized argument c."),
+        ("a --out b --other.size 2", "unrecognized option --other.size. Did you mean --part.size?"),
     ],
 )
 def test_what_is_written_wrongly_is_one_line(line, message):

@@ -33,7 +33,7 @@ from torchrg.structures import Segmentation
 
 @dataclass(frozen=True)
 class CloudSource(Source):
-    """The clouds of a data set: what is done with each, what is written, in which layout.
+    """The clouds of a data set, with the settings of their conversion and their layout.
 
     Plain clouds become ``coord``, ``normal``, ``curvature`` and ``plane`` as ``.npy``, ``color``
     too where there are colours, and ``planes.json``; coordinates are the input's own, points that
@@ -87,7 +87,7 @@ class CloudSource(Source):
         """Return the files that decide the results of a scene."""
         if not (scene.path / "coord.npy").is_file():
             return scene.files
-        # In place, nothing but the coordinates, for superpoints the colours, decides what is added.
+        # In place, only coordinates, and colors for superpoints, decide the added arrays.
         within = self.within or "coord"
         decisive = ("coord", *["color"] * self.superpoint, within, f"{within}20")
         used = decisive if in_place else SOURCE_ARRAYS

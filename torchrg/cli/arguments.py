@@ -198,17 +198,21 @@ def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]
         if not before:
             return f"unrecognized argument {word}."
         words = [*itertools.takewhile(lambda x: x[:1] != "-", arguments[before[-1] + 1 :])]
-        flag = arguments[before[-1]].partition("=")[0]
+        given = arguments[before[-1]]
+        takes_one = any(flag.name == given and flag.hint is not bool for flag in flags)
+        if len(words) == 1 or not takes_one:
+            return f"unrecognized argument {word}."
         return (
-            f"expected one value for {flag}, got {' '.join(words)}; separate values with commas: "
-            f"{flag} {','.join(words)}."
+            f"expected one value for {given}, got {' '.join(words)}; separate values with commas: "
+            f"{given} {','.join(words)}."
         )
     asked = word.partition("=")[0].replace("_", "-")
     names = {flag.name: flag.name for flag in flags if not flag.is_positional}
     # The name of a setting without its part comes first.
     tails = {f"--{name.lstrip('-').rpartition('.')[2]}": name for name in reversed(names)}
     near = difflib.get_close_matches(asked, [*tails, *names], n=1)
-    name = tails.get(asked) or (near and (names.get(near[0]) or tails[near[0]]))
+    tail = f"--{asked.lstrip('-').rpartition('.')[2]}"
+    name = tails.get(tail) or next((names.get(word) or tails[word] for word in near), "")
     return f"unrecognized option {asked}.{f' Did you mean {name}?' if name else ''}"
 
 

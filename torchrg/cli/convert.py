@@ -103,7 +103,7 @@ class Arguments:
     much again, and all take some three times as long without kernels."""
 
     def source(self, root: Path) -> Source:
-        """Return what is converted; the path is absolute."""
+        """Return the source to convert; the path is absolute."""
         raise NotImplementedError
 
 
@@ -137,7 +137,7 @@ class CloudArguments(Arguments):
         raise NotImplementedError
 
     def source(self, root: Path) -> Source:
-        """Return the clouds of the data set, and what is written of each."""
+        """Return the clouds of the data set, and the settings of their results."""
         names = ("layout", "partition", "level", "orient", "within", "table")
         output: dict[str, Any] = {name: getattr(self, name) for name in names}
         settings = self.settings.resolved

@@ -209,7 +209,7 @@ def _segment(
     ]
     cloud = merge_clouds(clouds) if len(clouds) > 1 else clouds[0]
     where = _arrays_of(arguments, source, target, len(cloud), limit)
-    find_objects(cloud, arguments.within)  # Refused before anything is told.
+    find_objects(cloud, arguments.within)  # An unknown field fails before any warning.
     _check_points(arguments, source, cloud, target)
     stages = (*STAGES, *["superpoints"] * arguments.superpoints)
     with stage_bar(sources[0].name, stages) as advance, where:

@@ -37,7 +37,7 @@ class SceneFiles(NamedTuple):
             slashes: ``Area_1/office_1``.
         path: The file or folder that is read.
         files: Every input file, in the order they are read; their bytes decide the result.
-        dataset: The data set whose classes it has, empty where nobody knows; None of a plain cloud.
+        dataset: The data set whose classes it has, empty if unknown; None for a plain cloud.
         place: Where it is in the release, which some programs keep. Default: its name.
         num_points: Its number of points by the headers or sizes of its files, for ``convert``.
         item: What else reads it; plain values that travel between processes.
@@ -113,7 +113,7 @@ class SceneDataset(Dataset[Sample]):
         return estimate_points(scene.path / "coord.npy" if scene.path.is_dir() else scene.path)
 
     def describe(self) -> dict[str, Any]:
-        """Return what beside its files decides what is read, for JSON."""
+        """Return the settings that change what is read, for JSON."""
         return {}
 
     def check_output(self, layout: str, out: Path) -> None:
@@ -197,12 +197,12 @@ class FolderOfClouds(SceneDataset):
         if not path.is_dir():
             return SceneFiles(inside.with_suffix("").as_posix(), path, (path,))
         files = tuple(f for name in POINT_ARRAYS if (f := path / f"{name}.npy").is_file())
-        # Classes without those of ScanNet are of a data set that nobody knows.
+        # Without the classes of ScanNet, the data set is unknown.
         is_known = {"segment", "segment20"} & {file.stem for file in files} != {"segment"}
         return SceneFiles(inside.as_posix(), path, files, "ScanNet" if is_known else "")
 
     def describe(self) -> dict[str, Any]:
-        """Return what beside its files decides what is read, for JSON."""
+        """Return the settings that change what is read, for JSON."""
         return {} if self.columns is None else {"columns": list(self.columns)}
 
     def check_output(self, layout: str, out: Path) -> None:

@@ -62,9 +62,9 @@ class OrientedTransform(CloudTransform):
 
     def __init__(
         self,
-        *,
         orient: Orientation = "auto",
         viewpoint: Sequence[float] | None = None,
+        *,
         keep_neighbors: bool = False,
         keys: Mapping[str, str] | None = None,
     ) -> None:
@@ -140,9 +140,7 @@ class EstimateNormals(OrientedTransform):
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(
-            orient=orient, viewpoint=viewpoint, keep_neighbors=keep_neighbors, keys=keys
-        )
+        super().__init__(orient, viewpoint, keep_neighbors=keep_neighbors, keys=keys)
         self.config = settings_of("EstimateNormals", NormalsConfig, config, changes)
         self.residual, self.chunk_size = residual, chunk_size
 
@@ -150,10 +148,10 @@ class EstimateNormals(OrientedTransform):
         """Return normals and curvature of a cloud."""
         distinct = distinct_points(cloud["coord"])
         neighbors = search(distinct.points, self.config.k)
+        points, front = find_directions(type(self).__name__, cloud["coord"], **self.side(cloud))
         found = estimate_normals(
             distinct.points, self.config, neighbors=neighbors, chunk_size=self.chunk_size
         )
-        points, front = find_directions(type(self).__name__, cloud["coord"], **self.side(cloud))
 
         def turn(side: Orientation) -> Tensor:
             return distinct.restore(turn_faces(distinct.points, found.normals, side, neighbors))
@@ -186,18 +184,6 @@ class OrientNormals(OrientedTransform):
     """
 
     reads = ("coord", "normal")
-
-    def __init__(
-        self,
-        orient: Orientation = "auto",
-        viewpoint: Sequence[float] | None = None,
-        *,
-        keep_neighbors: bool = False,
-        keys: Mapping[str, str] | None = None,
-    ) -> None:
-        super().__init__(
-            orient=orient, viewpoint=viewpoint, keep_neighbors=keep_neighbors, keys=keys
-        )
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the normals of a cloud, turned."""
@@ -303,9 +289,7 @@ class SegmentPlanes(OrientedTransform):
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(
-            orient=orient, viewpoint=viewpoint, keep_neighbors=keep_neighbors, keys=keys
-        )
+        super().__init__(orient, viewpoint, keep_neighbors=keep_neighbors, keys=keys)
         self.config = settings_of("SegmentPlanes", PipelineConfig, config, changes)
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
