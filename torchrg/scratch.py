@@ -54,8 +54,9 @@ if hasattr(os, "register_at_fork"):
 def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Keep large arrays on the disk of a folder: results are the same, and memory is bounded.
 
-    Segmenting a cloud then takes about 150 bytes of memory a point, beside pages of the files that
-    the system has not yet taken back, and up to nine bytes of disk for each neighbour of a point.
+    Segmenting a cloud then takes about 350 bytes of memory a point, with the pages of the files
+    that the system has not yet taken back, and up to nine bytes of disk for each neighbor of a
+    point.
     Inside a result there is no such array, so it can be used afterwards. The folder should be on a
     disk, as some ``/tmp`` is not.
 

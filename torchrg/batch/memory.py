@@ -5,7 +5,7 @@ from pathlib import Path
 
 from torchrg.pipeline import BYTES_PER_POINT, BYTES_PER_POINT_ON_DISK
 
-PROCESS_BYTES = 500_000_000
+PROCESS_BYTES = 400_000_000
 """Memory of a process before the first point: Python, torch, scipy."""
 _CGROUP = Path("/sys/fs/cgroup")
 """Where Linux shows control groups, with which containers are limited."""
@@ -26,7 +26,7 @@ def memory_of_scan(num_points: int, *, on_disk: bool = False) -> int:
 
     Example:
         >>> memory_of_scan(1_000_000), memory_of_scan(10_000_000, on_disk=True)
-        (1600000000, 2000000000)
+        (1300000000, 3900000000)
     """
     return PROCESS_BYTES + (BYTES_PER_POINT_ON_DISK if on_disk else BYTES_PER_POINT) * num_points
 
