@@ -23,7 +23,7 @@ MADE = "made"
 BLOCK = re.compile(r"^```(\w+)( hidden| page)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _PICTURE = re.compile(r"(!\[[^\]]*\]\()")
 _NAME = re.compile(r"`(torchrg(?:\.\w+)*)`")
-_MOST_LINES = 40
+_MAX_LINES = 40
 """Lines of what a block prints that a page shows."""
 
 
@@ -74,8 +74,8 @@ def _linked(prose: str, stem: str) -> str:
 def _shown(printed: str) -> str:
     """Return what an example prints as a block below it."""
     lines = printed.splitlines()
-    more = [f"... {len(lines) - _MOST_LINES} more lines"] if len(lines) > _MOST_LINES else []
-    shown = "\n".join([*lines[:_MOST_LINES], *more])
+    more = [f"... {len(lines) - _MAX_LINES} more lines"] if len(lines) > _MAX_LINES else []
+    shown = "\n".join([*lines[:_MAX_LINES], *more])
     return f"\n\n```{{code-block}} text\n:class: printed\n\n{shown}\n```"
 
 

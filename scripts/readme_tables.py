@@ -122,8 +122,8 @@ def to_section(figures: Figures) -> str:
         for work, row in figures["times"].items()
     ]
     quality = [
-        [title, *(f"{share:.2f}" for share in shares), ""]
-        for title, shares in figures["quality"].items()
+        [title, *(f"{fraction:.2f}" for fraction in fractions), ""]
+        for title, fractions in figures["quality"].items()
     ]
     quality += [
         [title, f"{ours:.2f}", *[""] * len(PEERS), f"{peer:.2f}"]

@@ -177,13 +177,13 @@ def study(cases: Sequence[Case], table: Sequence[Constant]) -> Iterator[Finding]
         with moved(constant, factor) as value:
             if value == constant.value:
                 return Change(value), []
-            worst, share, changed = Change(value), 0.0, []
+            worst, fraction, changed = Change(value), 0.0, []
             for case in some:
                 for name, after in score(case).items():
                     change = after - before[case.name][name]
                     relative = abs(change) / (TOLERANCES.get(name) or 100 / case.num_faces)
-                    if relative > share:
-                        worst, share = Change(value, name, case.name, change), relative
+                    if relative > fraction:
+                        worst, fraction = Change(value, name, case.name, change), relative
                     if relative > 1 and not (changed and changed[-1] is case):
                         changed.append(case)
         return worst, changed
@@ -206,17 +206,17 @@ def study(cases: Sequence[Case], table: Sequence[Constant]) -> Iterator[Finding]
 
 def make_cases(parts: Path | None, *, quick: bool) -> list[Case]:
     """Return the clouds: rooms (one in quick runs), parts if there are any, shapes."""
-    share = 0.6 if quick else 1.0
+    fraction = 0.6 if quick else 1.0
     cases = []
     for name, (layout, noise) in list(_ROOMS.items())[: 1 if quick else None]:
-        room = make_room(round(_ROOM_POINTS * share), noise=noise, seed=3, layout=layout)
+        room = make_room(round(_ROOM_POINTS * fraction), noise=noise, seed=3, layout=layout)
         neighbors = search_knn(room.points, _CONFIG.normals.k)
         faces = len(room.labels.unique())
         cases.append(Case(name, room.points, neighbors, room.labels, room.normals, faces))
     if parts is not None:
-        cases.append(_read_parts(parts, round(_PART_POINTS * share)))
+        cases.append(_read_parts(parts, round(_PART_POINTS * fraction)))
     for name, (shape, noise, k, adaptive_k) in _SHAPES.items():
-        num_points = round((_SHAPE_POINTS if adaptive_k is None else _SHAPE_POINTS // 4) * share)
+        num_points = round((_SHAPE_POINTS if adaptive_k is None else _SHAPE_POINTS // 4) * fraction)
         scene = make_shape(shape, num_points, noise, seed=1)
         neighbors = search_knn(scene.points, k)
         cases.append(

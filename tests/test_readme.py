@@ -19,7 +19,7 @@ from torchrg.structures import Cloud
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-MOST_LINES = 170
+MAX_LINES = 170
 TEXTS = [README, *(ROOT / ".github").glob("*.md")]
 
 
@@ -91,7 +91,7 @@ def test_links_lead_to_files(text):
 
 
 def test_readme_stays_short():
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
 def test_figures_are_those_that_are_kept():
@@ -115,12 +115,12 @@ def test_figures_are_medians_means_and_what_lies_between_two_partitions():
     by["pclrg"] = [run(3.0, 5.0), run(4.0, 9.0), run(5.0, 6.0)]
     made = {"commit": "2f26e94", "processor": "a processor", "cores": 2}
     peers = {"made_with": made, "results": {"room random": by, "room sorted": by}}
-    shares = {"consensus": [{"recall_iou50": 0.8}], "PCL": [{"recall_iou50": 0.5}]}
+    fractions = {"consensus": [{"recall_iou50": 0.8}], "PCL": [{"recall_iou50": 0.5}]}
     other = {"consensus": [{"recall_iou50": 0.6}], "PCL": [{"recall_iou50": 0.1}]}
-    for clouds in (shares, other):
+    for clouds in (fractions, other):
         clouds["Open3D"] = clouds["CGAL growing, pca"] = clouds["PCL"]
         clouds["CGAL RANSAC, pca"] = [{"recall_iou50": 0.2}]
-    accuracy = {"results": {"room, 1 mm": shares, "rooms/room_2": other}}
+    accuracy = {"results": {"room, 1 mm": fractions, "rooms/room_2": other}}
     levels = [{"count": 100, "asa": 0.5}, {"count": 900, "asa": 0.7}]
     parts = {"torchrg": [{"levels": levels}], "cut pursuit": [{"levels": levels}]}
     figures = readme_tables.times_of(peers) | readme_tables.quality_of(accuracy)

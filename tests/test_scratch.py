@@ -27,7 +27,7 @@ PRESETS = ("classic", "paper", "algorithm2", "consensus")
 def small(monkeypatch):
     """Let blocks be small, and all arrays be on the disk."""
     monkeypatch.setattr(blocks, "BLOCK_SIZE", 700)
-    monkeypatch.setattr(scratch, "_LEAST_BYTES", 1)
+    monkeypatch.setattr(scratch, "_MIN_BYTES", 1)
     monkeypatch.setattr(scratch, "_RELEASE_SECONDS", 0.001)
 
 
@@ -148,7 +148,7 @@ def test_without_the_call_that_reserves_it_the_disk_is_filled(tmp_path, small, m
 KILLED = """
 import os, signal, sys, torchrg
 from torchrg import scratch
-scratch._LEAST_BYTES = 1
+scratch._MIN_BYTES = 1
 def end(stage):
     if stage == sys.argv[2]:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -43,7 +43,7 @@ CHILD_ENVIRONMENT = dict.fromkeys(
 """Environment of every process that is started here, set before Python and its libraries read it:
 one thread, and no module from the folder that the command runs in."""
 
-_LEAST_ROWS = 4096
+_MIN_ROWS = 4096
 """Rows at some tenths of a microsecond each that are worth a thread's start."""
 
 _KEPT_BYTES = 31 * 2**20
@@ -82,7 +82,7 @@ def map_chunks(
     chunk_size: int,
     device: torch.device,
     *,
-    least: int = _LEAST_ROWS,
+    least: int = _MIN_ROWS,
 ) -> list[Result]:
     """Call ``work`` on slices that together cover all rows, in their order; see :func:`map_tasks`.
 

@@ -203,10 +203,10 @@ class GrowingConfig:
         """Return the settings with numbers; see :meth:`PipelineConfig.at_sampling`."""
         least, tolerance = self.min_size, self.facet_tolerance
         if least == "auto":
-            side, (low, high) = _SIDE_OF_REGION, _LEAST_SIZES
+            side, (low, high) = _SIDE_OF_REGION, _MIN_SIZES
             drawn = _facets(sampling) * _ramp(sampling.exactness, *_EXACTNESS)
             side += drawn * (_SIDE_OF_FACETS - side)
-            high += round(drawn * (_LEAST_OF_FACETS - high))
+            high += round(drawn * (_MIN_OF_FACETS - high))
             size = round(sampling.density * (side * sampling.height) ** 2)
             least = min(max(size, low), high)
         if tolerance == "auto":
@@ -232,11 +232,11 @@ _WHITE_FRACTION = 0.45
 and other bent faces come in pieces there, too."""
 _SIDE_OF_REGION = 1 / 27
 """Side of the least region by the height of the cloud: 10 cm in a room of 2.7 m."""
-_LEAST_SIZES = 20, 50
+_MIN_SIZES = 20, 50
 """Bounds of the points of the least region: fewer have no sure plane, and 50 is the paper's."""
 _EXACTNESS = 0.1, 0.2
 """Exactness up to which points are measured, and from which on they are drawn from a mesh."""
-_SIDE_OF_FACETS, _LEAST_OF_FACETS = 1 / 13, 200
+_SIDE_OF_FACETS, _MIN_OF_FACETS = 1 / 13, 200
 """Side of the least region by the height of the cloud, and its most points, where points are drawn
 from a mesh: smaller ones are facets of what is curved, 20 cm in a room."""
 

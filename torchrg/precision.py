@@ -69,7 +69,7 @@ def note_on_steps(
     if len(finite_points) < 3:
         return ""
     with np.errstate(over="ignore", invalid="ignore"):
-        ranks = [int(share * (len(finite_points) - 1)) for share in _QUARTILES]
+        ranks = [int(fraction * (len(finite_points) - 1)) for fraction in _QUARTILES]
         # One rank and one column at a time: a third of the time of np.quantile.
         low, high = np.array(
             [[np.partition(column, k)[k] for column in finite_points.T] for k in ranks],
@@ -108,8 +108,8 @@ def _spacing(points: NDArray[np.floating], side: float) -> float:
 
     cells = np.floor(points.astype(np.float64) / side).clip(-(2.0**62), 2.0**62).astype(np.int64)
     hashes = np.bitwise_xor.reduce(cells * _PRIMES, axis=1).view(np.uint64) * np.uint64(_MIXING)
-    share = min(_SAMPLE / len(points), 1.0)
-    chosen = points[hashes <= share * np.iinfo(np.uint64).max]
+    fraction = min(_SAMPLE / len(points), 1.0)
+    chosen = points[hashes <= fraction * np.iinfo(np.uint64).max]
     places = np.unique(chosen.astype(np.float64), axis=0)
     if len(places) < 2:
         return math.inf

@@ -66,7 +66,7 @@ _KINDS = {
     "valid": ("b", ()),
 }
 """NumPy's kinds of numbers of a field, and shape of a row."""
-_MOST_SEARCHED = 100_000
+_MAX_SEARCHED = 100_000
 """Points of a random sample that tell which planes meet where no result says it."""
 _NEIGHBORS = 50
 """As many neighbours as normals are estimated from by default: of a cloud that is not sampled the
@@ -204,7 +204,7 @@ class Result:
         if neighbors is not None and len(neighbors.indices) != len(rows):
             neighbors = None
         if neighbors is None and bool((self.labels[rows] >= 0).any()):
-            places = np.random.default_rng(0).permutation(len(rows))[:_MOST_SEARCHED]
+            places = np.random.default_rng(0).permutation(len(rows))[:_MAX_SEARCHED]
             sampled = rows[torch.from_numpy(places).sort().values]
             k = min(_NEIGHBORS, len(sampled))
             neighbors = search_knn(self.cloud.points[sampled], k, canonical=True)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 
-_LEAST_BYTES = 2**24
+_MIN_BYTES = 2**24
 """Bytes of the smallest array that goes to the disk; all smaller ones together are few."""
 BYTES_PER_NEIGHBOR = 9
 """Bytes that a neighbour of a point takes at most: four in its list, and four and a mark in that of
@@ -97,7 +97,7 @@ def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
         (3, 2)
     """
     folder, size = _folder.get(), math.prod(shape) * np.dtype(dtype).itemsize
-    if folder is None or size < _LEAST_BYTES:
+    if folder is None or size < _MIN_BYTES:
         return np.empty(shape, dtype)
     try:
         with tempfile.TemporaryFile(dir=folder, buffering=0) as file:

@@ -37,11 +37,11 @@ class Case(Benchmark):
 
     def clouds(self) -> Mapping[str, Callable[[], tuple[Tensor, Tensor]]]:
         return {
-            f"{kind} {share:.0%}": lambda kind=kind, share=share: contaminated(
-                kind, share, torch.Generator().manual_seed(SEED), self.patches
+            f"{kind} {fraction:.0%}": lambda kind=kind, fraction=fraction: contaminated(
+                kind, fraction, torch.Generator().manual_seed(SEED), self.patches
             )
             for kind in OUTLIERS
-            for share in SHARES
+            for fraction in SHARES
         }
 
     def contenders(self) -> Mapping[str, Callable[[tuple[Tensor, Tensor]], Figures]]:

@@ -99,13 +99,13 @@ class Case(Benchmark):
         promised = [
             PROMISED_BYTES + PROMISED_BYTES_A_POINT * scan["num_points"] for scan in report["scans"]
         ]
-        shares = [s["peak_memory"] / p for s, p in zip(report["scans"], promised, strict=True)]
+        fractions = [s["peak_memory"] / p for s, p in zip(report["scans"], promised, strict=True)]
         return {
             **{name: report[name] for name in REPORTED},
             "with start and checks": seconds,
             "minutes for S3DIS": S3DIS_POINTS / report["points_per_second"] / 60,
             "GB": report["peak_memory"] / 1e9,
-            "of what is promised": max(shares),
+            "of what is promised": max(fractions),
             "sha256": _digest(out),
         }
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import ContingencyTable, check_labels, count_overlaps, share
+from torchrg.metrics.contingency import ContingencyTable, check_labels, count_overlaps, fraction
 from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
 
@@ -129,9 +129,9 @@ def score_voxels(
         len(torch.unique(voxels[chosen])) for chosen in (labels != UNLABELED, true)
     )
     return VoxelScore(
-        precision=share(num_right, num_found),
-        recall=share(num_right, num_true),
-        f1=share(2 * num_right, num_found + num_true),
+        precision=fraction(num_right, num_found),
+        recall=fraction(num_right, num_true),
+        f1=fraction(2 * num_right, num_found + num_true),
     )
 
 
@@ -218,13 +218,13 @@ def count_segcomp(table: ContingencyTable, *, threshold: float = 0.8) -> SegComp
 
 
 def _wholes(
-    wholes: Tensor, inside: Tensor, shares: Tensor, overlaps: Tensor, sizes: Tensor, limit: float
+    wholes: Tensor, inside: Tensor, fractions: Tensor, overlaps: Tensor, sizes: Tensor, limit: float
 ) -> Tensor:
     """Return the mean of the two measures of each whole made of several parts, 0 for others."""
     count = torch.bincount(wholes[inside], minlength=len(sizes))
     points = sizes.new_zeros(len(sizes)).index_add_(0, wholes[inside], overlaps[inside])
     held = points.double() / sizes
-    total = shares.new_zeros(len(sizes)).index_add_(0, wholes[inside], shares[inside])
+    total = fractions.new_zeros(len(sizes)).index_add_(0, wholes[inside], fractions[inside])
     mean = total / count.clamp(min=1)
     return torch.where((count >= 2) & (held > limit), (mean + held) / 2, 0)
 
@@ -252,7 +252,7 @@ def score_evops(table: ContingencyTable) -> EvopsScore:
     """
     matched = table.iou[table.iou >= _MATCH_IOU]
     return EvopsScore(
-        precision=share(len(matched), len(table.region_sizes)),
-        recall=share(len(matched), len(table.face_sizes)),
-        mean_iou=share(float(matched.sum()), len(matched)),
+        precision=fraction(len(matched), len(table.region_sizes)),
+        recall=fraction(len(matched), len(table.face_sizes)),
+        mean_iou=fraction(float(matched.sum()), len(matched)),
     )

@@ -207,11 +207,11 @@ def _edge_claims(scores: Scores) -> list[Block]:
 
     def more_right(found: Mapping[str, Record]) -> tuple[bool, str]:
         right = [found[method]["faces"]["right_at_edges"] for method in PAPERS]
-        return right[2] > max(right[:2]), ", ".join(f"{share:.3f}" for share in right)
+        return right[2] > max(right[:2]), ", ".join(f"{fraction:.3f}" for fraction in right)
 
     def blank(found: Mapping[str, Record]) -> tuple[bool, str]:
         none = [found[method]["faces"]["none_at_edges"] for method in PAPERS]
-        return none[0] > max(none[1:]), ", ".join(f"{share:.3f}" for share in none)
+        return none[0] > max(none[1:]), ", ".join(f"{fraction:.3f}" for fraction in none)
 
     def more_regions(found: Mapping[str, Record]) -> tuple[bool, str]:
         regions = [found[method]["regions"] for method in PAPERS]
@@ -241,7 +241,7 @@ def _edge_claims(scores: Scores) -> list[Block]:
             _each(scores, blank),
             "Shares of the points at edges that are in no region. Classic's are not blank but in "
             "a region of another face, or in a smaller one, as it runs over edges: "
-            f"{'; '.join(f'{title} {shares}' for title, shares in wrong.items())}.",
+            f"{'; '.join(f'{title} {fractions}' for title, fractions in wrong.items())}.",
             quick_tells=False,
         ),
         claim(

@@ -39,7 +39,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Record], float | None]]] = {
     "F1, all faces": (".1f", lambda record: record["labels"]["f1"]),
     f"F1, {LARGE:,} points and more": (".1f", lambda record: record["faces"]["f1_large"]),
     "F1, objects": (".1f", lambda record: record["faces"].get("f1_objects")),
-    "labelled": (".3f", lambda record: record["share_labeled"]),
+    "labelled": (".3f", lambda record: record["fraction_labeled"]),
     "mean best IoU": (".3f", lambda record: record["labels"]["mean_best_iou"]),
     "faces found": (".3f", lambda record: record["labels"]["recall_iou50"]),
     "right at edges": (".3f", lambda record: record["faces"]["right_at_edges"]),
@@ -164,16 +164,16 @@ def draw_figures(run: Run, key: str, number: str) -> list[Block]:
     blocks = [figure(file, f"**{number}**, {cloud.origin}. Points of no region are gray.")]
     if cloud.labels is None:
         return blocks
-    shares = []
+    fractions = []
     for title, labels in labelings.items():
         counts = outcomes_of(labels, cloud.labels).bincount(minlength=len(OUTCOMES)).double()
-        shares.append([title, *(f"{100 * value:.1f} %" for value in counts / counts.sum())])
+        fractions.append([title, *(f"{100 * value:.1f} %" for value in counts / counts.sum())])
     meanings = [meaning for _, meaning in OUTCOMES.values()]
     file = draw_outcomes(run.folder, f"{name}_errors", cloud, labelings)
     return [
         *blocks,
         figure(file, f"What became of each point of {cloud.origin}."),
-        table("Share of the points of that figure", ["method", *meanings], shares),
+        table("Share of the points of that figure", ["method", *meanings], fractions),
     ]
 
 
@@ -207,7 +207,7 @@ def angle_blocks(run: Run, key: str, record: Record) -> list[Block]:
         [
             angle,
             f"{one['regions']:,}",
-            f"{100 * one['share_labeled']:.1f} %",
+            f"{100 * one['fraction_labeled']:.1f} %",
             f"{one['ari']:.3f}" if "ari" in one else "-",
         ]
         for angle, one in record["angles"].items()

@@ -70,7 +70,7 @@ def score(run: Run, key: str, method: str) -> Record:
     """Score a segmentation by all indices against the truth of its cloud.
 
     Returns:
-        The record: ``regions``, ``share_labeled``, and with a truth ``labels`` (the fields of
+        The record: ``regions``, ``fraction_labeled``, and with a truth ``labels`` (the fields of
         :class:`torchrg.metrics.LabelScore`) and ``faces`` (:func:`reproduction.faces.score_faces`).
     """
     loaded = run.cloud(key)
@@ -137,7 +137,7 @@ def count_regions(labels: Tensor) -> Record:
     """Return how many regions there are, and the share of points that lie in one."""
     return {
         "regions": int(labels.max()) + 1,
-        "share_labeled": float((labels >= 0).double().mean()),
+        "fraction_labeled": float((labels >= 0).double().mean()),
     }
 
 

@@ -89,10 +89,11 @@ def _claims(records: list[Record]) -> list[Block]:
             f"ARI of the two at least {least['ari']:.3f} (at {least['angle']:g} degrees)",
         )
         low, middle, high = (mine[angle]["quantiles"][0] for angle in DRAWN_DEG)
-        shares = [f"{100 * found['share_labeled']:.1f} %" for found in (low, middle)]
-        joined[method] = (low["share_labeled"] < middle["share_labeled"], " < ".join(shares))
-        shares = [f"{100 * found['largest']:.1f} %" for found in (middle, high)]
-        largest[method] = (high["largest"] > middle["largest"], " < ".join(shares))
+        fractions = [f"{100 * found['fraction_labeled']:.1f} %" for found in (low, middle)]
+        fewer = low["fraction_labeled"] < middle["fraction_labeled"]
+        joined[method] = (fewer, " < ".join(fractions))
+        fractions = [f"{100 * found['largest']:.1f} %" for found in (middle, high)]
+        largest[method] = (high["largest"] > middle["largest"], " < ".join(fractions))
     return [
         claim(
             "II.B",
@@ -109,7 +110,7 @@ def _draw(path: Path, records: list[Record]) -> None:
     """Plot what the limits do."""
     panels = {
         "regions": "regions",
-        "share_labeled": "points labelled (%)",
+        "fraction_labeled": "points labelled (%)",
         "largest": "points in the largest region (%)",
     }
     if "f1" in records[0]["quantiles"][0]:

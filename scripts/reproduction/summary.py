@@ -62,7 +62,7 @@ def take_results(report: Record) -> Record:
                 "title": record["title"],
                 "method": record["method"],
                 "faces": record["labels"]["faces"],
-                "share_labeled": record["share_labeled"],
+                "fraction_labeled": record["fraction_labeled"],
                 **{name: record["labels"][name] for name in ("ari", "f1", "mean_best_iou")},
                 **{name: record["faces"].get(name) for name in ("f1_large", "f1_objects")},
             }

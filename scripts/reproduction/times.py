@@ -33,8 +33,8 @@ def ratio(record: Record) -> float | None:
     minutes = MINUTES[record["cloud"]].get(record["method"])
     if minutes is None:
         return None
-    share: float = record["points"] / POINTS[record["cloud"]]
-    return 60 * minutes * share / record["total"]
+    fraction: float = record["points"] / POINTS[record["cloud"]]
+    return 60 * minutes * fraction / record["total"]
 
 
 def ratio_table(run: Run, records: list[Record]) -> Block:

@@ -78,24 +78,24 @@ class Disk:
         shutil.rmtree(after, ignore_errors=True)
         self._cut(self.root, after, rng, rng.choice([0.0, 0.5, 0.9]))
 
-    def _cut(self, folder, after, rng, share):
+    def _cut(self, folder, after, rng, fraction):
         after.mkdir()
         flushed = self._names(folder)
         # A folder that was removed holds nothing now, but may have come back with what it held.
         written = _entries(folder) if folder.is_dir() else {}
         for name in sorted({*flushed, *written}):
-            is_written = rng.random() < share
+            is_written = rng.random() < fraction
             entry = (written if is_written else flushed).get(name)
             path = folder / name
             if entry is None:
                 continue
             inode, is_folder = entry
             if is_folder:
-                self._cut(path, after / name, rng, share)
+                self._cut(path, after / name, rng, fraction)
             elif entry != written.get(name):
                 (after / name).write_bytes(self._content(inode))
             else:
-                content = _lose(self._content(inode), path.read_bytes(), rng, share)
+                content = _lose(self._content(inode), path.read_bytes(), rng, fraction)
                 (after / name).write_bytes(content)
 
     def restore(self, after):
@@ -110,14 +110,14 @@ def _entries(folder):
     return {path.name: [path.lstat().st_ino, path.is_dir()] for path in folder.iterdir()}
 
 
-def _lose(flushed, written, rng, share):
+def _lose(flushed, written, rng, fraction):
     """Return a file some of whose pages are as they were when it was flushed, or zero."""
     if flushed == written:
         return written
     size = len(rng.choice([flushed, written]))
     pages = []
     for old, new in zip_longest(_pages(flushed), _pages(written), fillvalue=b""):
-        page = new if rng.random() < share else old
+        page = new if rng.random() < fraction else old
         pages.append(page.ljust(PAGE, b"\0"))
     return b"".join(pages)[:size].ljust(size, b"\0")
 

@@ -79,7 +79,7 @@ def write_stations(path, points, normals):
     return np.concatenate(truth)
 
 
-def share(normals, truth):
+def fraction(normals, truth):
     """Share of normals that point to the true side."""
     return ((normals * truth).sum(axis=1) > 0).mean()
 
@@ -111,7 +111,7 @@ def test_all_doors_give_one_answer(room, mesh, files, tmp_path, run, preset, nam
     if name != "points":
         write_mesh(path, points, faces=faces[:, ::-1])
     expected = segment_planes(path, preset)
-    assert share(expected.normals.numpy(), side * truth) >= 0.97
+    assert fraction(expected.normals.numpy(), side * truth) >= 0.97
     cloud = read_cloud(path)
     seg = segment_planes(cloud, preset)
     assert torch.equal(seg.labels, expected.labels)
@@ -132,7 +132,7 @@ def test_all_doors_give_one_answer(room, mesh, files, tmp_path, run, preset, nam
     flags = ("--method", settings.method, "--normals.k", settings.k)
     assert run("normals", path, "--out", tmp_path / "b.npz", *flags).code == 0
     with np.load(tmp_path / "b.npz") as result:
-        assert share(result["normals"], side * truth) >= 0.97
+        assert fraction(result["normals"], side * truth) >= 0.97
 
 
 def test_normals_point_into_rooms_to_the_front_of_faces_and_to_scanners(mesh, files, tmp_path):
@@ -140,10 +140,12 @@ def test_normals_point_into_rooms_to_the_front_of_faces_and_to_scanners(mesh, fi
     shutil.copytree(files, tmp_path / "in")
     truths = {"stations": write_stations(tmp_path / "in" / "stations.e57", *mesh[:2])}
     found = convert(folder_source(tmp_path), tmp_path / "out")
-    shares = {name: share(normals, truths.get(name, truth)) for name, normals in found.items()}
-    assert shares.pop("outwards") < 0.05
-    assert len(shares) == 4
-    assert min(shares.values()) > 0.95, shares
+    fractions = {
+        name: fraction(normals, truths.get(name, truth)) for name, normals in found.items()
+    }
+    assert fractions.pop("outwards") < 0.05
+    assert len(fractions) == 4
+    assert min(fractions.values()) > 0.95, fractions
     record = json.loads((tmp_path / "out" / "points" / "provenance.json").read_text())
     assert record["source"]["orient"] == "auto"
 
@@ -158,9 +160,9 @@ def test_other_sides_are_other_results(mesh, files, tmp_path):
         (job,) = list_jobs(source, tmp_path / "out")
         assert reason_to_convert(job) != ""
         found[orient] = convert(source, tmp_path / "out")["outwards"]
-    assert share(found["interior"], truth) > 0.95
+    assert fraction(found["interior"], truth) > 0.95
     assert (found["up"][:, 2] >= 0).all()
-    assert share(found["none"], truth) < 0.7
+    assert fraction(found["none"], truth) < 0.7
     (job,) = list_jobs(folder_source(tmp_path, "viewpoint"), tmp_path / "out")
     assert re.search("outwards.ply: expected poses .*; use interior", convert_scan(job).reason)
 
@@ -179,7 +181,7 @@ def test_meshes_of_scannet_say_which_side_is_seen(mesh, tmp_path):
     # A room from outside, which only its faces can tell.
     write_mesh(tmp_path / "in" / "scans" / name, points, color, faces=faces[:, ::-1])
     found = convert(CloudSource(ScanNet(tmp_path / "in"), CLASSIC), tmp_path / "out")
-    assert share(found["scene0000_00"], -truth) > 0.95
+    assert fraction(found["scene0000_00"], -truth) > 0.95
     assert not [*tmp_path.rglob("front.npy")]
 
 
@@ -191,9 +193,9 @@ def test_segment_writes_what_convert_writes(mesh, files, tmp_path, run, flags):
     assert run("segment", *inputs, "--out", out, "--preset", "classic", *flags).code == 0
     with np.load(out) as result:
         normals, provenance = result["normals"], json.loads(str(result["provenance"]))
-    assert share(normals[: len(truth)], -truth) > 0.93
+    assert fraction(normals[: len(truth)], -truth) > 0.93
     if "--merge" in flags:
-        assert share(normals[len(truth) :], truth) > 0.93
+        assert fraction(normals[len(truth) :], truth) > 0.93
     assert provenance["orient"] == "auto"
 
 
@@ -202,7 +204,7 @@ def test_normals_by_viewpoint_look_to_the_scanners_of_the_file(mesh, tmp_path, r
     for command in (("normals", "--method", "pca"), ("segment", "--preset", "classic")):
         places = (tmp_path / "a.e57", "--out", tmp_path / "a.npz")
         assert run(*command, *places, "--orient", "viewpoint").code == 0
-        assert share(np.load(tmp_path / "a.npz")["normals"], truth) > 0.97
+        assert fraction(np.load(tmp_path / "a.npz")["normals"], truth) > 0.97
 
 
 def corner(path):
@@ -257,5 +259,5 @@ def test_damaged_faces_are_noted_and_the_room_decides(mesh, files, tmp_path, run
     places = (tmp_path / "a.ply", "--out", tmp_path / "a.npz")
     done = run("segment", *places, "--preset", "classic")
     assert re.search(r"its faces left out: expected faces of .* got vertex 9,000,000", done.err)
-    assert share(np.load(tmp_path / "a.npz")["normals"], truth) > 0.95
+    assert fraction(np.load(tmp_path / "a.npz")["normals"], truth) > 0.95
     assert read_cloud(tmp_path / "a.ply").front is None

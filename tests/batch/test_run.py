@@ -90,7 +90,7 @@ def test_many_small_scans_take_room_and_time_of_their_own(faults, tmp_path):
 
 
 def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchrg.cli.report.MOST_ROWS", 1)
+    monkeypatch.setattr("torchrg.cli.report.MAX_ROWS", 1)
     report = run(faults.make_jobs(tmp_path, {"9_a": "plain", "8_b": "corrupt"}))
     table = format_report(report)
     assert "8_b" in table

@@ -33,7 +33,7 @@ def rooms(room, tmp_path_factory):
     "flags", [(), ("--voxel", "0.1"), ("--superpoints", "300,50"), ("--layout", "npy")]
 )
 def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, run, monkeypatch, flags):
-    monkeypatch.setattr(scratch, "_LEAST_BYTES", 1)
+    monkeypatch.setattr(scratch, "_MIN_BYTES", 1)
     monkeypatch.setattr(blocks, "BLOCK_SIZE", 10_000)
     name = "out" if "--layout" in flags else "out.npz"
     files = (rooms / "a.npz", "--preset", "classic", *flags)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchrg.depth.normals import fit_pixels, least_in_windows
+from torchrg.depth.normals import fit_pixels, min_in_windows
 from torchrg.depth.pixels import holds
 from torchrg.depth.windows import CELL_SIZES, Image, Windows, fit_windows, noise_by_size
 
@@ -58,7 +58,7 @@ def test_windows_without_enough_pixels_or_along_a_line_have_no_plane():
 
 def test_least_in_windows_is_that_of_a_literal_search(rng):
     image = torch.rand(7, 9, generator=rng)
-    values, places = least_in_windows(image, 2)
+    values, places = min_in_windows(image, 2)
     for row in range(7):
         for column in range(9):
             window = image[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]

@@ -4,29 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.structures import PLANE_COLUMNS, Cloud, Planes, Segmentation
-
-
-@pytest.fixture
-def make_cloud():
-    """A cloud with a field of every kind that all formats hold."""
-
-    def make(num_points=60, dtype=np.float32, origin=(0.0, 0.0, 0.0), **options):
-        rng = np.random.default_rng(0)
-        normals = rng.normal(size=(num_points, 3)).astype(np.float32)
-        fields = {
-            "color": rng.integers(0, 256, (num_points, 3)).astype(np.uint8),
-            "intensity": rng.random(num_points).astype(np.float32),
-            "labels": rng.integers(-1, 5, num_points),
-            "normals": normals / np.linalg.norm(normals, axis=1, keepdims=True),
-            "curvature": (rng.random(num_points) / 3).astype(np.float32),
-            "histogram": rng.random((num_points, 4)).astype(np.float32),
-            "ring": rng.integers(0, 200, num_points).astype(np.uint8),
-        }
-        coordinates = (rng.normal(size=(num_points, 3)) + np.array(origin)).astype(dtype)
-        return Cloud(coordinates, fields, **options)
-
-    return make
+from torchrg.structures import PLANE_COLUMNS, Planes, Segmentation
 
 
 @pytest.fixture

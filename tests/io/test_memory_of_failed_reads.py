@@ -13,7 +13,7 @@ from torchrg.structures import Cloud
 
 NUM_POINTS = 2_000
 NUM_READS = 150
-MOST_KEPT_BYTES = 30_000_000
+MAX_KEPT_BYTES = 30_000_000
 """A fifth of a megabyte a read; a reader that is not given back takes some."""
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
@@ -56,4 +56,4 @@ def test_failed_reads_keep_no_memory(tmp_path, suffix, request):
     fail(20)
     before = resident_bytes()
     fail(NUM_READS)
-    assert resident_bytes() - before < MOST_KEPT_BYTES
+    assert resident_bytes() - before < MAX_KEPT_BYTES

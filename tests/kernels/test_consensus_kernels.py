@@ -43,13 +43,13 @@ def both(function, *arguments, **settings):
         return found, function(*arguments, **settings)
 
 
-def assert_same_planes(found, expected, unit, share=1.0, rows=slice(None)):
+def assert_same_planes(found, expected, unit, fraction=1.0, rows=slice(None)):
     """Compare normals and offsets, by angle and to a share of a unit for each row."""
     angle = unsigned_angle_deg(found[0], expected[0])[rows]
     turned = torch.where((found[0] * expected[0]).sum(dim=1) < 0, -1.0, 1.0)
     error = ((found[1] * turned - expected[1]).abs() / unit)[rows]
     same = (angle < 0.1) & (error < 1e-3)
-    assert same.float().mean() >= share, (angle.max(), error.max())
+    assert same.float().mean() >= fraction, (angle.max(), error.max())
 
 
 def test_broken_planes(points, near, survey):

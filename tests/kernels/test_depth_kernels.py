@@ -20,8 +20,8 @@ from torchrg.depth.pixels import describe_pixels
 from torchrg.depth.segment import _inverse_cloud
 from torchrg.depth.windows import Image
 from torchrg.linalg.moments import Segments
+from torchrg.regions.extents import outer_places
 from torchrg.regions.growth import number_by_size
-from torchrg.regions.table import outer_places
 from torchrg.scenes import build_room
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")

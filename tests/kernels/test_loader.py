@@ -108,7 +108,7 @@ def test_kernels_serve_plain_tensors_of_single_precision_alone():
     assert not kernels.serve(plain.double())
     assert not kernels.serve(plain.requires_grad_())
     assert not kernels.serve(plain.detach(), k=0)
-    assert not kernels.serve(plain.detach(), k=kernels.MOST_NEIGHBORS + 1)
+    assert not kernels.serve(plain.detach(), k=kernels.MAX_NEIGHBORS + 1)
     assert not kernels.serve(torch.rand(3, device="meta"))
     assert not any(torch.vmap(lambda row: torch.tensor(kernels.serve(row)))(torch.rand(2, 3)))
 

@@ -76,10 +76,10 @@ class Cone(Surface):
 
     def _draw(self, rng: np.random.Generator, count: int) -> Array:
         (r0, z0), (r1, z1) = self.start, self.end
-        share = rng.random(count)
+        fraction = rng.random(count)
         # The further from the axis, the longer the circle.
-        radius = np.sqrt(r0 * r0 + share * (r1 * r1 - r0 * r0))
-        step = share if r0 == r1 else (radius - r0) / (r1 - r0)
+        radius = np.sqrt(r0 * r0 + fraction * (r1 * r1 - r0 * r0))
+        step = fraction if r0 == r1 else (radius - r0) / (r1 - r0)
         angles = _draw_angles(rng, count, self.sector)
         sides = (radius * np.cos(angles), radius * np.sin(angles), z0 + step * (z1 - z0))
         return np.stack(sides, axis=1)

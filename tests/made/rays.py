@@ -104,10 +104,10 @@ def scan_scene(model: SceneModel, num_points: int, *, noise: float = 0.0, seed: 
     normals.
     """
     rng = np.random.default_rng([seed, _PLACES])
-    shares = np.diff(np.arange(len(model.viewpoints) + 1) * num_points // len(model.viewpoints))
+    fractions = np.diff(np.arange(len(model.viewpoints) + 1) * num_points // len(model.viewpoints))
     scans = [
-        _scan(model, viewpoint, int(share), rng)
-        for viewpoint, share in zip(model.viewpoints, shares, strict=True)
+        _scan(model, viewpoint, int(fraction), rng)
+        for viewpoint, fraction in zip(model.viewpoints, fractions, strict=True)
     ]
     places, labels = (np.concatenate(parts) for parts in zip(*scans, strict=True))
     outwards = np.empty_like(places)

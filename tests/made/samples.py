@@ -44,8 +44,8 @@ def in_pieces(scene: Scene, num_points: int, *, num_pieces: int = 40, seed: int 
         column = places[rows, int(np.argmax(np.ptp(places[rows], axis=0)))]
         below = column <= column.min() + np.ptp(column) * rng.uniform(0.25, 0.75)
         pieces += [rows[below], rows[~below]]
-    share = num_points // num_pieces
-    kept = np.concatenate([rng.permutation(rows)[:share] for rows in pieces])
+    fraction = num_points // num_pieces
+    kept = np.concatenate([rng.permutation(rows)[:fraction] for rows in pieces])
     return take_rows(scene, torch.from_numpy(kept))
 
 
@@ -60,9 +60,9 @@ def drawn_from_triangles(scene: Scene, num_points: int, *, seed: int = 0) -> Sce
     starts = rng.integers(0, len(near), num_points)
     others = rng.permuted(np.tile(np.arange(1, 1 + num_neighbors), (num_points, 1)), axis=1)[:, :2]
     corners = np.column_stack([starts, np.take_along_axis(near[starts], others, axis=1)])
-    shares = rng.dirichlet((1, 1, 1), num_points)
-    places = np.einsum("nc,ncx->nx", shares, scene.points.numpy()[corners].astype(np.float64))
-    nearest = corners[np.arange(num_points), shares.argmax(axis=1)]
+    fractions = rng.dirichlet((1, 1, 1), num_points)
+    places = np.einsum("nc,ncx->nx", fractions, scene.points.numpy()[corners].astype(np.float64))
+    nearest = corners[np.arange(num_points), fractions.argmax(axis=1)]
     drawn = take_rows(scene, torch.from_numpy(nearest))
     return drawn._replace(points=torch.from_numpy(places.astype(np.float32)))
 
@@ -82,7 +82,7 @@ def objects_of(scene: Scene) -> Tensor:
 
 
 def contaminated(
-    kind: str, share: float, rng: torch.Generator, count: int = 30
+    kind: str, fraction: float, rng: torch.Generator, count: int = 30
 ) -> tuple[Tensor, Tensor]:
     """Return noisy planes turned at random, a share of the points outliers, and their normals.
 
@@ -93,7 +93,7 @@ def contaminated(
     """
     patches = torch.rand(count, _PATCH_SIZE, 3, generator=rng) - 0.5
     patches[..., 2] = 0.01 * torch.randn(count, _PATCH_SIZE, generator=rng)
-    number = round(share * _PATCH_SIZE)
+    number = round(fraction * _PATCH_SIZE)
     scatter = torch.randn(count, number, 3, generator=rng)
     patches[:, :number] = {
         "cluster": torch.tensor([0.2, 0.1, 0.4]) + 0.05 * scatter,

@@ -52,7 +52,7 @@ def scored_by_loops(labels, truth):
         "faces": len(faces),
         "points": len(labels),
         "mean_best_iou": np.mean([max(iou[a, b] for a in regions) for b in faces]),
-        "share_labeled": np.mean([a != -1 for a in labels]),
+        "fraction_labeled": np.mean([a != -1 for a in labels]),
     }
     for bound in (50, 80):
         hits = [pair for pair, value in iou.items() if value > bound / 100]
@@ -83,7 +83,7 @@ def test_indices_by_hand():
     assert score.f1 == pytest.approx(2 * 87.5 * 75 / (87.5 + 75))
     assert score.mean_best_iou == pytest.approx((3 / 4 + 2 / 4) / 2)
     assert (score.precision_iou50, score.recall_iou50) == (0.5, 0.5)
-    assert score.share_labeled == 6 / 8
+    assert score.fraction_labeled == 6 / 8
 
 
 def test_the_truth_itself_scores_full_marks(rng):

@@ -106,13 +106,13 @@ def row_of_points(count):
     return torch.arange(float(count))[:, None] * torch.tensor([1.0, 0, 0])
 
 
-@pytest.mark.parametrize(("distance", "share"), [(1.0, 1.0), (0.99, 0.875)])
-def test_borders_agree_up_to_the_distance_and_at_it(distance, share):
+@pytest.mark.parametrize(("distance", "fraction"), [(1.0, 1.0), (0.99, 0.875)])
+def test_borders_agree_up_to_the_distance_and_at_it(distance, fraction):
     places = torch.arange(40)
     score = score_partition(
         (places >= 21).long(), (places >= 20).long(), row_of_points(40), boundary_distance=distance
     )
-    assert (score.boundary_recall, score.boundary_precision) == (share, share)
+    assert (score.boundary_recall, score.boundary_precision) == (fraction, fraction)
 
 
 def test_borders_among_points_that_are_not_scored_do_not_count():

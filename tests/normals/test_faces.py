@@ -179,7 +179,7 @@ def test_threads_and_disks_and_longer_lists_change_nothing(furnished, tmp_path, 
             results.append(orient_normals(points, normals, orient=side))
     finally:
         torch.set_num_threads(before)
-    monkeypatch.setattr(scratch, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(scratch, "_MIN_BYTES", 0)
     with scratch.on_disk(tmp_path):
         results.append(orient_normals(points, normals, orient=side))
         longer = search_knn(points, 50)

@@ -61,7 +61,7 @@ def literal(patch, noise, decay):
         return start
     largest = ((points @ start) ** 2).max()
     through, weights = through_query(start, largest)
-    first, error, share = near_query(through, weights, largest / 4)
+    first, error, fraction = near_query(through, weights, largest / 4)
     if abs(start @ first) >= 0.996:
         return first
     across = np.cross(np.cross(start, first), first)
@@ -71,11 +71,11 @@ def literal(patch, noise, decay):
     if abs(through @ other) >= 0.95:
         return first
     second, other_error, other_share = near_query(other, weights, mu / 2)
-    if error < other_error and share > 0.1:
+    if error < other_error and fraction > 0.1:
         return first
     if other_share > 0.1:
         return second
-    return first if share > 0.1 or error < other_error else second
+    return first if fraction > 0.1 or error < other_error else second
 
 
 @pytest.mark.parametrize(

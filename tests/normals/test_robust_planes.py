@@ -23,11 +23,11 @@ FITS = {
 fits = pytest.mark.parametrize("fit", FITS.values(), ids=[robust.__name__ for robust in FITS])
 
 
-def contaminated(rng, share, count=20, k=40):
+def contaminated(rng, fraction, count=20, k=40):
     """Noisy floors of which a share of the points is scattered above; float64."""
     patches = torch.rand(count, k, 3, generator=rng, dtype=torch.float64)
     patches[..., 2] = 0.01 * torch.randn(count, k, generator=rng, dtype=torch.float64)
-    num_outliers = round(share * k)
+    num_outliers = round(fraction * k)
     high = torch.rand(count, num_outliers, generator=rng, dtype=torch.float64)
     patches[:, k - num_outliers :, 2] = 0.1 + high * patches[:, k - num_outliers :, 0]
     return patches

@@ -74,9 +74,9 @@ def test_a_point_that_joined_unconnected_is_a_seed_once_a_connected_seed_reaches
 def testcurvature_limit_is_the_lower_quantile():
     for num_values in (12, 237):
         values = torch.rand(num_values, generator=torch.Generator().manual_seed(0))
-        for share in (0.0, 0.5, 0.95, 0.98, 1.0):
-            expected = np.quantile(values.numpy(), share, method="lower")
-            assert curvature_limit(values, share).item() == expected
+        for fraction in (0.0, 0.5, 0.95, 0.98, 1.0):
+            expected = np.quantile(values.numpy(), fraction, method="lower")
+            assert curvature_limit(values, fraction).item() == expected
 
 
 def test_regions_smaller_than_min_size_are_not_labelled():

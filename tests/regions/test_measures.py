@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrg.linalg.moments import Segments
-from torchrg.regions.table import fit_rectangles
+from torchrg.regions.extents import fit_rectangles
 
 
 def turned(places, angle):

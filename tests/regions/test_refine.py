@@ -9,7 +9,7 @@ from tests.regions.growing_clouds import papers_growing
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.adjacency import LEAST_CONTACTS, NearestPoints
+from torchrg.regions.adjacency import MIN_CONTACTS, NearestPoints
 from torchrg.regions.edges import GrowingCloud
 from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
 from torchrg.regions.growth import label_regions
@@ -198,7 +198,7 @@ def test_halves_of_a_rim_are_merged_though_other_faces_are_nearer(gap, step, mer
     cloud, order = flat_cloud(np.concatenate([top, bottom, rim]), k=50, normals=normals)
     labels = torch.from_numpy(faces)[order]
     pairs, counts = NearestPoints(cloud.neighbors).contacts(labels)
-    assert counts[(pairs == torch.tensor([0, 1])).all(dim=1)].sum() < LEAST_CONTACTS
+    assert counts[(pairs == torch.tensor([0, 1])).all(dim=1)].sum() < MIN_CONTACTS
     refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
     assert bool((refined == torch.where(labels == 1, 0, labels)).all()) == merged
     assert merged or torch.equal(refined, labels)

@@ -186,8 +186,8 @@ def test_planes_are_what_most_points_are_on(room, parts):
     planes = room[2]
     for number, plane in enumerate(parts.plane.tolist()):
         inside = planes[parts.labels == number]
-        shares = {p: float((inside == p).double().mean()) for p in inside.unique().tolist()}
-        most = [p for p, share in shares.items() if share > 0.5 and p >= 0]
+        fractions = {p: float((inside == p).double().mean()) for p in inside.unique().tolist()}
+        most = [p for p, fraction in fractions.items() if fraction > 0.5 and p >= 0]
         assert plane == (most[0] if most else -1)
     assert 5 < (parts.plane >= 0).sum() < len(parts.plane)
 

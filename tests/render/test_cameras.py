@@ -115,7 +115,7 @@ def test_sensor_camera_stands_in_the_origin_and_ignores_what_is_behind(rng):
     camera = sensor_camera(torch.cat([points, behind]), width=320)
     assert torch.equal(camera.extrinsics[0], torch.eye(4, dtype=torch.float64))
     size = torch.tensor([320.0, float(camera.height)], dtype=torch.float64)
-    shares = (pixels_of(camera, points) + 0.5) / size
-    assert float(shares.amin()) > 0.029
-    assert float(shares.amax()) < 0.971
-    assert float((shares.amax(0) - shares.amin(0)).amax()) == pytest.approx(0.94, abs=1e-3)
+    fractions = (pixels_of(camera, points) + 0.5) / size
+    assert float(fractions.amin()) > 0.029
+    assert float(fractions.amax()) < 0.971
+    assert float((fractions.amax(0) - fractions.amin(0)).amax()) == pytest.approx(0.94, abs=1e-3)

@@ -49,10 +49,10 @@ def kept_share(points, faces, view, *, up=UP, labeled=True, **settings):
 @pytest.mark.parametrize("azimuth_deg", [30.0, 210.0])
 def test_cutaway_leaves_out_ceiling_and_near_walls_only(rng, azimuth_deg, labeled):
     points, faces = box_room(rng)
-    shares = kept_share(points, faces, "cutaway", azimuth_deg=azimuth_deg, labeled=labeled)
-    assert float(shares[1]) < 0.02
-    assert float(shares[[0, 6]].amin()) > 0.85
-    walls = shares[2:6]
+    fractions = kept_share(points, faces, "cutaway", azimuth_deg=azimuth_deg, labeled=labeled)
+    assert float(fractions[1]) < 0.02
+    assert float(fractions[[0, 6]].amin()) > 0.85
+    walls = fractions[2:6]
     assert int((walls < 0.1).sum()) == 2
     assert int((walls > 0.8).sum()) == 2
     assert min(walls[0], walls[1]) < 0.1 < max(walls[0], walls[1])
@@ -61,9 +61,9 @@ def test_cutaway_leaves_out_ceiling_and_near_walls_only(rng, azimuth_deg, labele
 def test_a_ceiling_much_sparser_than_the_rest_is_left_out(rng):
     points, faces = box_room(rng)
     kept = (faces != 1) | (torch.rand(len(faces), generator=rng) < 0.03)
-    shares = kept_share(points[kept], faces[kept], "cutaway", azimuth_deg=30.0)
-    assert float(shares[1]) == 0
-    assert float(shares[[0, 6]].amin()) > 0.85
+    fractions = kept_share(points[kept], faces[kept], "cutaway", azimuth_deg=30.0)
+    assert float(fractions[1]) == 0
+    assert float(fractions[[0, 6]].amin()) > 0.85
 
 
 @pytest.mark.parametrize(("scale", "turn_deg"), [(1e-4, 0.0), (1e3, 28.0)])
@@ -73,10 +73,10 @@ def test_cut_does_not_depend_on_unit_heading_or_origin(rng, scale, turn_deg):
     cos, sin, zero, one = angle.cos(), angle.sin(), torch.tensor(0.0), torch.tensor(1.0)
     turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one]).view(3, 3)
     moved = scale * ((points @ turn.T).double() + torch.tensor([5e5, 4e6, 100.0]))
-    shares = kept_share(moved, faces, "cutaway", azimuth_deg=30.0)
-    assert float(shares[1]) == 0
-    assert int((shares[2:6] < 0.1).sum()) == 2
-    assert float(shares[[0, 6]].amin()) > 0.85
+    fractions = kept_share(moved, faces, "cutaway", azimuth_deg=30.0)
+    assert float(fractions[1]) == 0
+    assert int((fractions[2:6] < 0.1).sum()) == 2
+    assert float(fractions[[0, 6]].amin()) > 0.85
 
 
 def test_outside_leaves_out_nothing(rng):
@@ -94,18 +94,18 @@ def test_a_table_as_large_as_half_the_room_is_no_ceiling(rng):
 
 def test_upward_axis_is_a_setting(rng):
     points, faces = box_room(rng)
-    shares = kept_share(points[:, [0, 2, 1]], faces, "above", up=torch.tensor([0.0, 1, 0]))
-    assert float(shares[1]) == 0
-    assert float(shares[[0, 2, 3, 4, 5, 6]].amin()) > 0.85
+    fractions = kept_share(points[:, [0, 2, 1]], faces, "above", up=torch.tensor([0.0, 1, 0]))
+    assert float(fractions[1]) == 0
+    assert float(fractions[[0, 2, 3, 4, 5, 6]].amin()) > 0.85
 
 
 def test_two_ceilings_of_different_height_go_both(rng):
     low, low_faces = box_room(rng, (6.0, 4.0, 2.2), table=False)
     high, high_faces = box_room(rng, (6.0, 4.0, 2.9), table=False)
     points = torch.cat([low, high + torch.tensor([6.2, 0.0, 0.0])])
-    shares = kept_share(points, torch.cat([low_faces, high_faces + 6]), "above")
-    assert float(shares[[1, 7]].amax()) < 0.05
-    assert float(shares[[0, 6]].amin()) > 0.95
+    fractions = kept_share(points, torch.cat([low_faces, high_faces + 6]), "above")
+    assert float(fractions[[1, 7]].amax()) < 0.05
+    assert float(fractions[[0, 6]].amin()) > 0.95
 
 
 def test_what_is_in_a_wall_goes_with_it_and_what_stands_before_it_stays(rng):
@@ -126,14 +126,14 @@ def test_what_is_in_a_wall_goes_with_it_and_what_stands_before_it_stays(rng):
 
 def test_a_wall_between_two_rooms_stays(rng):
     points, faces = box_room(rng, table=False)
-    shares = kept_share(
+    fractions = kept_share(
         torch.cat([points, points + torch.tensor([0.0, 4.1, 0.0])]),
         torch.cat([faces, faces + 6]),
         "cutaway",
         azimuth_deg=30.0,
     )
-    assert float(shares[[5, 10]].amin()) == 1
-    assert float(torch.minimum(shares[4], shares[11])) == 0
+    assert float(fractions[[5, 10]].amin()) == 1
+    assert float(torch.minimum(fractions[4], fractions[11])) == 0
 
 
 def test_a_room_is_seen_from_the_side_where_a_wall_is_missing(rng):

@@ -11,7 +11,7 @@ def angles_deg(covariance, normals):
     return torch.rad2deg((found * normals).sum(dim=1).abs().clamp(max=1).acos())
 
 
-# The largest share of each kind that an estimator withstands in every patch.
+# The largest fraction of each kind that an estimator withstands in every patch.
 WITHSTOOD = {
     "paper": (fit_detmcd, {"cluster": 0.1, "shell": 0.45, "far": 0.45}),
     "planes": (
@@ -27,17 +27,17 @@ WITHSTOOD = {
 
 
 LEVELS = [
-    (name, kind, share)
+    (name, kind, fraction)
     for name, (_, withstood) in WITHSTOOD.items()
     for kind, largest in withstood.items()
-    for share in (0.0, 0.1, 0.3, 0.45)
-    if share <= largest
+    for fraction in (0.0, 0.1, 0.3, 0.45)
+    if fraction <= largest
 ]
 
 
-@pytest.mark.parametrize(("name", "kind", "share"), LEVELS)
-def test_normal_stays_within_two_degrees(name, kind, share, rng):
-    patches, normals = contaminated(kind, share, rng)
+@pytest.mark.parametrize(("name", "kind", "fraction"), LEVELS)
+def test_normal_stays_within_two_degrees(name, kind, fraction, rng):
+    patches, normals = contaminated(kind, fraction, rng)
     angles = angles_deg(WITHSTOOD[name][0](patches).covariance, normals)
     assert angles.median() < 1
     assert angles.quantile(0.9) < 2

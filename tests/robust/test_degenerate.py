@@ -241,13 +241,13 @@ def patches(draw):
     order = draw(st.lists(st.integers(0, few - 1), min_size=num_points, max_size=num_points))
     patch = np.array([distinct[i] for i in order])
     flat = draw(st.sampled_from(["no", "axis", "tilt", "line"]))
-    share = draw(st.integers(0, num_points))
+    fraction = draw(st.integers(0, num_points))
     if flat == "axis":
-        patch[:share, draw(st.integers(0, 2))] = draw(coordinates(scales))
+        patch[:fraction, draw(st.integers(0, 2))] = draw(coordinates(scales))
     elif flat == "tilt":
-        patch[:share, 2] = patch[:share, 0] / 2 - patch[:share, 1]
+        patch[:fraction, 2] = patch[:fraction, 0] / 2 - patch[:fraction, 1]
     elif flat == "line":
-        patch[:share, 1], patch[:share, 2] = 2 * patch[:share, 0], -patch[:share, 0]
+        patch[:fraction, 1], patch[:fraction, 2] = 2 * patch[:fraction, 0], -patch[:fraction, 0]
     return patch
 
 

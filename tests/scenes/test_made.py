@@ -231,8 +231,8 @@ def test_path_to_the_nearest_hit_is_free_and_what_is_behind_is_not(seed):
     model = build_room(seed, layout=CURVED)
     origin, steps = model.viewpoints[0], unit(np.random.default_rng(0).standard_normal((1000, 3)))
     distances, faces = (values[0] for values in cast_rays(model, origin, steps[None]))
-    for share in np.linspace(0.01, 0.9999, 60):
-        assert not is_occupied(model.parts, origin + share * distances[:, None] * steps).any()
+    for fraction in np.linspace(0.01, 0.9999, 60):
+        assert not is_occupied(model.parts, origin + fraction * distances[:, None] * steps).any()
     has_body = np.array([len(model.parts[part].solids) > 0 for part in model.objects])
     has_body[:6] = False
     assert has_body[faces].sum() > 100

@@ -181,8 +181,8 @@ def test_noise_is_along_the_normal_or_along_each_axis(exact):
 def test_points_are_in_random_order():
     random = make_room(5000, seed=1).labels
     same = (random[1:] == random[:-1]).double().mean()
-    shares = random.bincount().double() / 5000
-    assert abs(same - (shares**2).sum()) < 0.02
+    fractions = random.bincount().double() / 5000
+    assert abs(same - (fractions**2).sum()) < 0.02
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ import pytest
 
 README = guide_pages.GUIDES.parents[1] / "README.md"
 PAGES = [README, *guide_pages.guide_files()]
-MOST_WORDS = 35
+MAX_WORDS = 35
 MODULES = sorted((guide_pages.GUIDES.parents[1] / "torchrg").rglob("*.py"))
 VAGUE = re.compile(r"\b(?:found|given|some|own|part|rest|kept|known)\b")
-MOST_VAGUE = 1000
+MAX_VAGUE = 1000
 
 
 def sentences_of(markdown):
@@ -38,7 +38,7 @@ def test_sentences_are_told_apart():
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_sentences_are_short(page):
     text = page.read_text(encoding="utf-8").replace("```{glossary}", "")
-    long = [line for line in sentences_of(text) if len(line.split()) > MOST_WORDS]
+    long = [line for line in sentences_of(text) if len(line.split()) > MAX_WORDS]
     assert not long
 
 
@@ -80,4 +80,4 @@ def test_docstrings_of_constants_begin_with_what_they_are():
 
 def test_vague_words_are_rare():
     counts = {path: len(VAGUE.findall(path.read_text(encoding="utf-8"))) for path in MODULES}
-    assert sum(counts.values()) <= MOST_VAGUE, sorted(counts.items(), key=lambda item: -item[1])[:5]
+    assert sum(counts.values()) <= MAX_VAGUE, sorted(counts.items(), key=lambda item: -item[1])[:5]

@@ -19,9 +19,9 @@ def segcomp_by_definition(labels, truth, limit):
     regions, faces = sets_of(labels), sets_of(truth)
     instances = []
     for (a, region), (b, face) in product(regions.items(), faces.items()):
-        shares = len(region & face) / len(region), len(region & face) / len(face)
-        if min(shares) > limit:
-            instances.append((sum(shares) / 2, 0, {("region", a), ("face", b)}))
+        fractions = len(region & face) / len(region), len(region & face) / len(face)
+        if min(fractions) > limit:
+            instances.append((sum(fractions) / 2, 0, {("region", a), ("face", b)}))
     for kind, own, wholes, other, parts in (
         (1, "face", faces, "region", regions),
         (2, "region", regions, "face", faces),

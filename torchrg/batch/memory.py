@@ -14,7 +14,7 @@ _CGROUP_FILES = (
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
 )
 """Limit and use of a control group, of versions 2 and 1."""
-_SHARE = 0.8
+_FRACTION = 0.8
 """Share of the free memory that a batch may take. The rest is for the process that starts the
 others, and for what else the machine does."""
 
@@ -33,7 +33,7 @@ def memory_of_scan(num_points: int, *, on_disk: bool = False) -> int:
 
 def spare_memory() -> int:
     """Return the bytes that a batch may take when no limit is given: a share of what is free."""
-    return int(_SHARE * available_memory())
+    return int(_FRACTION * available_memory())
 
 
 def available_memory() -> int:

@@ -45,7 +45,7 @@ _NO_IMAGES = ("planes", "points", "neighbors", "sampling", "num_copies")
 _MAX_MISFIT = 0.01
 """Median distance of points from their pixels, as a fraction of the longer side of the image, up to
 which a camera may be that of a cloud."""
-_LEAST_BYTES_A_PIXEL = 300
+_MIN_BYTES_A_PIXEL = 300
 """Memory that labelling takes at least for each pixel."""
 
 
@@ -213,10 +213,10 @@ def _label(
     for table in tables:
         write_table(table, describe_planes(seg.planes, origin=origin.tolist()))
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
-    share = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
+    percent = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
     say(
         f"{source}: {width} x {height} pixels, {num_seen:,} with depth, {num_planes:,} planes, "
-        f"{share:.1f} % of these labelled, {time.perf_counter() - begin:.1f} s -> {target}"
+        f"{percent:.1f} % of these labelled, {time.perf_counter() - begin:.1f} s -> {target}"
     )
 
 
@@ -224,7 +224,7 @@ def _check_memory(image: Path) -> None:
     """Refuse an image that says it has more pixels than memory has room for, before it is read."""
     is_depth, free = image.suffix.lower() in DEPTH_SUFFIXES, available_memory()
     size = num_pixels(image) if is_depth else 0
-    if (needed := size * _LEAST_BYTES_A_PIXEL) > free:
+    if (needed := size * _MIN_BYTES_A_PIXEL) > free:
         raise FormatError(
             f"{image}: expected an image that memory has room for, got {size:,} pixels, which take "
             f"at least {needed / 1e9:,.1f} GB of {free / 1e9:,.1f} that are free; make it smaller, "

@@ -31,9 +31,9 @@ from torchrg.io.fields import COLUMNS_RULE
 from torchrg.normals import Orientation
 from torchrg.structures import FARTHEST, Sampling
 
-_MOST_THREADS = 1024
+_MAX_THREADS = 1024
 """More than any machine has cores; many more cannot be started, and torch ends with the process."""
-_MOST_GIGABYTES = 1_000_000
+_MAX_GIGABYTES = 1_000_000
 """A petabyte, more than any machine has memory."""
 
 CloudsFlag = Annotated[
@@ -293,8 +293,8 @@ def use_threads(threads: int | None) -> None:
     """Let torch use so many threads; None leaves it to torch."""
     if threads is None:
         return
-    if not 1 <= threads <= _MOST_THREADS:
-        raise ConfigError(f"expected --threads from 1 to {_MOST_THREADS:,}, got {threads}.")
+    if not 1 <= threads <= _MAX_THREADS:
+        raise ConfigError(f"expected --threads from 1 to {_MAX_THREADS:,}, got {threads}.")
     torch.set_num_threads(threads)
 
 
@@ -302,9 +302,9 @@ def bytes_of_limit(limit_memory: float | None, usual: int = 0) -> int:
     """Return the limit of memory in bytes, the usual one where none is set; refuse a wrong one."""
     if limit_memory is None:
         return usual
-    if not 0 < limit_memory <= _MOST_GIGABYTES:
+    if not 0 < limit_memory <= _MAX_GIGABYTES:
         raise ConfigError(
-            f"expected --limit-memory above 0 and at most {_MOST_GIGABYTES:,} GB, got "
+            f"expected --limit-memory above 0 and at most {_MAX_GIGABYTES:,} GB, got "
             f"{limit_memory}."
         )
     return int(limit_memory * 1e9)

@@ -11,7 +11,7 @@ _SECONDS_PER_SCAN = 0.03
 """Time of one core of an AMD EPYC for a scan of 40 points: hashes, and files that are flushed."""
 _SHORT = 100
 """Seconds or minutes from which on a duration is in the next unit."""
-MOST_ROWS = 300
+MAX_ROWS = 300
 """Most scans of a batch that is printed scan by scan."""
 
 
@@ -54,11 +54,11 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     """Return a report as text: a row for each scan, notes below, then the sums.
 
-    With more than :data:`MOST_ROWS` scans, only failures have a row. ``unit`` is what a scan is
+    With more than :data:`MAX_ROWS` scans, only failures have a row. ``unit`` is what a scan is
     called where its number in a second counts.
     """
     stages = list(report.stage_seconds)
-    shown = report.scans if len(report.scans) <= MOST_ROWS else report.with_status("failed")
+    shown = report.scans if len(report.scans) <= MAX_ROWS else report.with_status("failed")
     head = ["scan", "status", "points", "planes", *(f"{stage} (s)" for stage in stages), "GB"]
     rows = [_row(scan, stages) for scan in shown]
     totals = report.with_status("converted")
@@ -73,7 +73,7 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
             again = [f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []
             told = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
             notes += [printable(f"{scan.name}: {note}") for note in told]
-    if len(report.scans) > MOST_ROWS and (num_noted := sum(bool(s.warnings) for s in report.scans)):
+    if len(report.scans) > MAX_ROWS and (num_noted := sum(bool(s.warnings) for s in report.scans)):
         notes.append(f"{num_noted:,} {unit}s have notes, which report.json holds")
     seconds = report.seconds or math.inf
     speed = (

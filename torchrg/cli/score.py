@@ -30,7 +30,7 @@ from torchrg.structures import UNLABELED, Cloud
 Scores: TypeAlias = dict[str, dict[str, float | None]]
 """Indices by part (``labels``, ``normals``, ``superpoints``) and name."""
 
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 """Scans that an error names, so that it stays one line."""
 
 
@@ -116,7 +116,7 @@ def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
     )
     for folder, missing in ((truth, {*ours} - {*theirs}), (predicted, {*theirs} - {*ours})):
         if missing:
-            first, more = sorted(missing, key=natural_key)[:_MOST_NAMED], len(missing) - _MOST_NAMED
+            first, more = sorted(missing, key=natural_key)[:_MAX_NAMED], len(missing) - _MAX_NAMED
             raise FormatError(
                 f"{folder}: expected a counterpart of every scan, got none of {', '.join(first)}"
                 f"{f' and {more} more' if more > 0 else ''}."

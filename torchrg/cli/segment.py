@@ -41,11 +41,11 @@ from torchrg.io import (
     RESULT_FIELDS,
     check_output,
     estimate_points,
-    merge_clouds,
     read_cloud,
     write_cloud,
 )
 from torchrg.io.files import check_space, mark_of
+from torchrg.merge import merge_clouds
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes, write_index
@@ -207,7 +207,7 @@ def _segment(
     clouds = [
         read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources
     ]
-    cloud = merge_clouds(clouds) if len(clouds) > 1 else clouds[0]
+    cloud = merge_clouds(clouds)
     where = _arrays_of(arguments, source, target, len(cloud), limit)
     find_objects(cloud, arguments.within)  # An unknown field fails before any warning.
     _check_points(arguments, source, cloud, target)
@@ -341,8 +341,8 @@ def _report(
         is_place = (finite == finite[0]).all()
         warn(f"{source}: no plane found: {'all points are equal' if is_place else reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes)
-    share = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
+    percent = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
     say(
-        f"{source}: {num_points:,} points, {num_planes:,} planes, {share:.1f} % of the points "
+        f"{source}: {num_points:,} points, {num_planes:,} planes, {percent:.1f} % of the points "
         f"labelled, {seconds:.1f} s -> {target}"
     )

@@ -43,7 +43,7 @@ _CENTERED = 127.5
 """Half of the largest colour: what SPFormer and ISBNet divide colours by before they take off 1."""
 MODES = {"train": "train", "val": "validation", "test": "test"}
 """Names of splits in Mask3D."""
-_MOST_OBJECTS = 999
+_MAX_OBJECTS = 999
 """Objects that a scan may have in Mask3D, whose ground truth is the class in thousands and the
 number of the object, counted from one."""
 _EXACT = 2**24
@@ -468,7 +468,7 @@ def _mask3d_files(
     if labels is not None:
         category, instance = labels
         _check_numbers(scan, "numbers of classes", category, 0, _EXACT)
-        _check_numbers(scan, "numbers of objects", instance, -1, _MOST_OBJECTS)
+        _check_numbers(scan, "numbers of objects", instance, -1, _MAX_OBJECTS)
         columns += [category[:, None], instance[:, None]]
         truth = (category + first_class) * 1000 + instance + 1
         entry["instance_gt_filepath"] = path = f"instance_gt/{truth_place}.txt"

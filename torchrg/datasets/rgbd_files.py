@@ -44,7 +44,7 @@ _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
 """Median depths in meters beyond which the depth scale is doubted. Depth cameras see 0.1 to 20."""
 _SAMPLED = 20_000
 """Pixels that the median is taken of."""
-_MOST_SECONDS = 0.02
+_MAX_SECONDS = 0.02
 """Most seconds between an image and a pose that belong together."""
 
 
@@ -276,7 +276,7 @@ def read_nearest(
         place = bisect_left(others, time)
         around = range(max(place - 1, 0), min(place + 1, len(others)))
         best = min(around, key=lambda i: abs(others[i] - time), default=None)
-        if best is not None and abs(others[best] - time) > _MOST_SECONDS:
+        if best is not None and abs(others[best] - time) > _MAX_SECONDS:
             best = None
         nearest.append(None if best is None else values[best])
     return nearest

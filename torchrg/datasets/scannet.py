@@ -59,7 +59,7 @@ _SPLITS = {
 """Files that list the scans of each split, one a line."""
 _PLACES = ("", "splits", "meta_data", "metadata/semantic_benchmark")
 """Folders below the root in which such files, and tables of classes, are looked for."""
-_MOST_LABELS = 3
+_MAX_LABELS = 3
 """Objects that a vertex of ScanNet++ may be of at once."""
 _LARGEST_CLASS = 65_535
 """Largest number of a class: labels of the release have 16 bits."""
@@ -344,13 +344,13 @@ def _labels_plus(mesh: Path, root: Path, count: int) -> Arrays:
     renamed = _read_mapping(root)
     if not {"segments", "groups"} <= files.keys() or not classes or renamed is None:
         return {}
-    segment = np.full((count, _MOST_LABELS), _NONE, dtype=np.int16)
+    segment = np.full((count, _MAX_LABELS), _NONE, dtype=np.int16)
     instance = segment.copy()
     sizes = np.full(segment.shape, np.inf)
     used = np.zeros(count, dtype=np.int64)
     for word, (number,), _, inside in _groups(files, count, ["objectId"], np.iinfo(np.int16).max):
         label = classes.get(renamed.get(word, ""))
-        rows = inside[used[inside] < _MOST_LABELS]
+        rows = inside[used[inside] < _MAX_LABELS]
         if label is None or not len(rows):
             continue
         place = (rows, used[rows])

@@ -16,28 +16,28 @@ from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
 from torchrg.regions.repair import renumber
 
-_MOST_WIDTH = 10.0
+_MAX_WIDTH = 10.0
 """Pixels; a wider strip is a face of its own."""
-_MOST_SHARE = 0.4
+_MAX_FRACTION = 0.4
 """Width of a strip as a share of that of the face beside it."""
-_MOST_TURN_DEG = 35.0
+_MAX_TURN_DEG = 35.0
 """Either half of a rounded edge of a right angle is turned by less against its face."""
-_LEAST_BESIDE = 0.5
+_MIN_BESIDE = 0.5
 """Share of the length of a strip along which it meets the face without a step."""
-_MOST_NOISE = 3.0
+_MAX_NOISE = 3.0
 """A gap of less than this many standard deviations of the noise of a pixel is no step."""
-_LEAST_REACH = 2.0
+_MIN_REACH = 2.0
 """Regions meet without a step if their planes cross within so many pixels of the border, or within
 half the width of the strip if that is more."""
 
 _EVERY = 4
 """Every fourth row and column is looked at."""
-_LEAST_LINES = 2
+_MIN_LINES = 2
 """Rows and columns, of those looked at, that must lead from one region to the other."""
-_MOST_OFFSET = 0.5
+_MAX_OFFSET = 0.5
 """The middle of the smaller region may be off the plane of the larger by this many of its
 thicknesses."""
-_LEAST_NEARER = 0.5
+_MIN_NEARER = 0.5
 """Least share, of the pixels between two regions, in front of their plane. The others may lie on it
 or have no depth, as in the shadow of something nearer."""
 
@@ -91,23 +91,23 @@ def join_strips(
         apart = planes[pair[:, 0]] - planes[pair[:, 1]]
         a, b, c = apart.unbind(dim=1)
         gap = (a * x[here % len(x)] + b * y[here // len(x)] + c).abs()
-        meetings.append((pair, apart, gap - _MOST_NOISE * noise[here]))
+        meetings.append((pair, apart, gap - _MAX_NOISE * noise[here]))
     pairs, apart, gap = (torch.cat(columns) for columns in zip(*meetings, strict=True))
     edges = torch.bincount(torch.cat(sides) + 1, minlength=num_regions + 1)[1:]
     width = 2 * count / edges
     pitch = torch.stack([(place[-1] - place[0]) / max(len(place) - 1, 1) for place in rays])
     slope = (apart[:, :2] * pitch).norm(dim=1)
     smooth = [
-        pairs[gap <= slope * (width[pairs[:, 0]] / 2).clamp(min=_LEAST_REACH)],
-        pairs.flip(1)[gap <= slope * (width[pairs[:, 1]] / 2).clamp(min=_LEAST_REACH)],
+        pairs[gap <= slope * (width[pairs[:, 0]] / 2).clamp(min=_MIN_REACH)],
+        pairs.flip(1)[gap <= slope * (width[pairs[:, 1]] / 2).clamp(min=_MIN_REACH)],
     ]
     strip, face = torch.cat(smooth).unbind(dim=1)
     keys, contacts = torch.unique(strip * num_regions + face, return_counts=True)
     strip, face = keys // num_regions, keys % num_regions
     ours, theirs = (normals[columns][:, :, None].unbind(dim=1) for columns in (strip, face))
-    joins = (width[strip] < _MOST_WIDTH) & (width[strip] <= _MOST_SHARE * width[face])
-    joins &= sq_chords(ours, theirs).squeeze(1) <= deg_to_sq_chord(_MOST_TURN_DEG)
-    joins &= contacts >= _LEAST_BESIDE * (count / width)[strip]
+    joins = (width[strip] < _MAX_WIDTH) & (width[strip] <= _MAX_FRACTION * width[face])
+    joins &= sq_chords(ours, theirs).squeeze(1) <= deg_to_sq_chord(_MAX_TURN_DEG)
+    joins &= contacts >= _MIN_BESIDE * (count / width)[strip]
     joins &= ~torch.isin(face, strip[joins])
     if not bool(joins.any()):
         return labels
@@ -136,7 +136,7 @@ def hidden_contacts(
     pairs, tables = _aligned_pairs(planes), (planes.normal, planes.center, reach)
     if serves(points):
         image = points.T, seen, labels.view(seen.shape)
-        (lines, *_) = kernels.call("count_lines", *image, *tables, pairs, _EVERY, _LEAST_NEARER)
+        (lines, *_) = kernels.call("count_lines", *image, *tables, pairs, _EVERY, _MIN_NEARER)
     else:
         pixels = points.view(*seen.shape, 3), seen, labels.view(seen.shape)
         rows = [values[::_EVERY] for values in pixels]
@@ -147,7 +147,7 @@ def hidden_contacts(
                 for a, b in pairs.tolist()
             ]
         )
-    lead = lines >= _LEAST_LINES
+    lead = lines >= _MIN_LINES
     return pairs[lead].sort(dim=1).values, lines[lead] * _EVERY
 
 
@@ -155,7 +155,7 @@ def _aligned_pairs(planes: RegionPlanes) -> Tensor:
     """Return pairs ``(p, 2)`` of a larger region and a smaller one whose middle is on its plane."""
     normal, center, count = planes.normal, planes.center, planes.num_points
     away = normal @ center.T - (normal * center).sum(dim=1, keepdim=True)
-    aligned = away.abs() <= _MOST_OFFSET * planes.thickness[:, None]
+    aligned = away.abs() <= _MAX_OFFSET * planes.thickness[:, None]
     place = torch.arange(len(count), device=count.device)
     is_larger = (count[:, None] > count) | ((count[:, None] == count) & (place[:, None] < place))
     both_flat = ~(planes.curved[:, None] | planes.curved)
@@ -186,5 +186,5 @@ def _count_lines(
     gap = place[:, 1:] - previous - 1
     nearer = passed[:, :-1] - passed.gather(1, before)
     other = (first[:, 1:] & second.gather(1, before)) | (second[:, 1:] & first.gather(1, before))
-    leads = here & other & (previous >= 0) & (gap > 0) & (nearer >= _LEAST_NEARER * gap)
+    leads = here & other & (previous >= 0) & (gap > 0) & (nearer >= _MIN_NEARER * gap)
     return int(leads.any(dim=1).sum())

@@ -12,7 +12,7 @@ from torchrg.config import DepthConfig
 from torchrg.depth.faces import borders, hidden_contacts, join_strips
 from torchrg.depth.passes import serves
 from torchrg.linalg.moments import Segments
-from torchrg.regions.fit import BISQUARE_CUT, MOST_FITTED, RegionPlanes
+from torchrg.regions.fit import BISQUARE_CUT, MAX_FITTED, RegionPlanes
 from torchrg.regions.growth import number_by_size
 from torchrg.regions.repair import absorb_points, merge_coplanar
 from torchrg.robust.scale import MAD_FACTOR
@@ -44,7 +44,7 @@ _NUM_FITS = 2
 """Fits of a region's plane, a plain one and a reweighted one: its pixels are near the plane
 already."""
 
-_MOST_MOVES = 16
+_MAX_MOVES = 16
 """Pixels by which a border may move: windows hardly reach farther from their middle."""
 
 _STRAIGHT = 0.85
@@ -198,7 +198,7 @@ def _planes_over_rays(fit: RegionPlanes) -> Tensor:
 
 
 def fit_inverse_planes(
-    cloud: InverseCloud, labels: Tensor, *, most: int = MOST_FITTED
+    cloud: InverseCloud, labels: Tensor, *, most: int = MAX_FITTED
 ) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, which alone has noise.
 
@@ -207,8 +207,8 @@ def fit_inverse_planes(
     is what is thicker than noise and a slight bend can make it. Fits are to ``most`` pixels of each
     region, in even steps.
     """
-    shares = Segments(labels, most=most).shares(len(labels) + 1)
-    parts = map_tasks(lambda share: _fit_together(cloud, share), shares, labels.device)
+    chunks = Segments(labels, most=most).chunks(len(labels) + 1)
+    parts = map_tasks(lambda chunk: _fit_together(cloud, chunk), chunks, labels.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
@@ -263,14 +263,14 @@ def move_to_creases(
     if serves(cloud.points):
         image = labels.view(cloud.seen.shape)
         room = [torch.empty_like(image) for _ in range(3)]
-        limits = _MOST_MOVES, _STRAIGHT
+        limits = _MAX_MOVES, _STRAIGHT
         kernels.call(
             "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *room
         )
         return labels
     grid = PixelGrid(cloud.seen.shape)
     rows = torch.unique(torch.cat(grid.borders(labels)))
-    for _ in range(_MOST_MOVES):
+    for _ in range(_MAX_MOVES):
         around = grid.around(rows)
         across = _regions_across(cloud, labels, planes, middles, reach, rows, around)
         moved = across != labels[rows]

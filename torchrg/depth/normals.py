@@ -32,11 +32,11 @@ _OWN_REACH = 3.5
 _SAME_NOISE = 2.0
 """A flat window deviates from its plane at most by a factor of 1 plus this over its side in pixels
 more than its quarters do from planes of their own."""
-_LEAST_QUARTERS = 0.7
+_MIN_QUARTERS = 0.7
 """Least deviation of the quarters of a window that is counted, in units of the tolerance."""
 _BEND = 0.005
 """Share of half its side by which a flat window may bend, however little noise there is."""
-_MOST_BEND = 0.03
+_MAX_BEND = 0.03
 """Share of half its side by which a window of the smallest size may bend where none is flat. Twice
 as much would hide creases of 20 degrees."""
 _STEEPEST = 4.0
@@ -198,10 +198,10 @@ def rate_windows(
         usual = _deviation_of_quarters(tables[quarters][3], relative.shape)
         # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
         usual = usual * (by_noise / noises[quarters].at(mean))
-        usual = torch.maximum(usual, _LEAST_QUARTERS * tolerance)
+        usual = torch.maximum(usual, _MIN_QUARTERS * tolerance)
         is_flat &= deviation <= (1 + _SAME_NOISE / (SIDE * size)) * usual
     relative = torch.where(is_flat, relative, torch.inf)
-    table[NUM_PLANE:] = torch.stack([by_noise, tolerance, _MOST_BEND * bend, relative])
+    table[NUM_PLANE:] = torch.stack([by_noise, tolerance, _MAX_BEND * bend, relative])
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
@@ -231,7 +231,7 @@ def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first:
         pass_over_rows("offer_windows", table.shape[1], *image, table, *choice, size, first)
         return
     itself = torch.arange(windows.mean.numel(), device=table.device).view_as(windows.mean)
-    least, flattest = least_in_windows(windows.relative, REACH)
+    least, flattest = min_in_windows(windows.relative, REACH)
     beside = torch.where(least.isfinite(), flattest, -1)
     reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
     flat = torch.where(windows.relative.isfinite(), itself, -1)
@@ -295,7 +295,7 @@ def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach
     return is_near
 
 
-def least_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+def min_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     """Return the least value within reach of each cell along both axes, and its row-major place."""
     best, place = -image[None, None], torch.arange(image.numel(), device=image.device)
     for axis in (1, 0):

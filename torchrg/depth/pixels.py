@@ -24,9 +24,10 @@ whatever the angle is. The small windows of a narrow face turn by noise alone.""
 class Pixels(NamedTuple):
     """What the windows of pixels say, ``(H, W)``; normals are unit ones ``(H, W, 3)``.
 
-    ``curvature`` is the share of a window's variance across its plane; ``noise`` is that of inverse
-    depth as large windows see it. ``valid`` tells which pixels have a plane; normals and curvature
-    are 0 at others. ``right`` and ``down`` tell which are on one surface with the next.
+    ``curvature`` is the fraction of a window's variance across its plane; ``noise`` is the noise
+    of inverse depth in large windows. ``valid`` marks pixels that have a plane; normals and
+    curvature are 0 at the others. ``right`` and ``down`` mark pixels that lie on one surface with
+    the next.
     """
 
     normals: Tensor

@@ -23,9 +23,9 @@ SIDE = 2 * REACH + 1
 """Cells along a side of a window."""
 NARROW = ((3, 9), (9, 3))
 """Rows and columns of narrow windows in pixels; each has about as many as the smallest square."""
-_LEAST_SHARE = 0.4
+_MIN_FRACTION = 0.4
 """Least share of a window's pixels that must be seen for it to have a plane."""
-_LEAST_SPREAD = 0.2
+_MIN_SPREAD = 0.2
 """Least determinant of the covariance of a window's pixels, as a share of that of a full window.
 With less, the pixels lie nearly on a line and tell no plane."""
 _NUM_MOMENTS = 10
@@ -36,13 +36,13 @@ _PIXELS_APART = 4
 """Windows overlap: of the small ones those so many pixels apart tell as much of noise as all."""
 _NUM_BINS = 12
 """Classes of depth that noise is fitted to."""
-_MOST_GROWTH = 1.4
+_MAX_GROWTH = 1.4
 """Noise of windows grows at most by this from one size to the next."""
-_MOST_JITTER = 0.15
+_MAX_JITTER = 0.15
 """Pixels by which rays may be off the middles of their pixels, standard deviation."""
 _ROUNDING = 8.0
 """Least noise of inverse depth, in units of the rounding of the depth."""
-_LEAST_ROUNDING = 1e-7
+_MIN_ROUNDING = 1e-7
 """Least noise of inverse depth as a share of it, whatever the dtype: the rounding of float32."""
 
 
@@ -185,19 +185,19 @@ def _sums_around(cells: Tensor) -> Tensor:
 def _least_of(rows: int, columns: int) -> tuple[float, float]:
     """Return the count and the spread of pixels of a window that has a plane, at least."""
     full = (rows * rows - 1) * (columns * columns - 1) / 144
-    return _LEAST_SHARE * rows * columns, _LEAST_SPREAD * full
+    return _MIN_FRACTION * rows * columns, _MIN_SPREAD * full
 
 
 def _planes_of_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
     """Return planes ``(5, *)`` of windows of so many pixels, from sums of moments ``(10, *)``."""
     count = sums[0]
-    share = 1 / count.clamp(min=1)
-    u, v, w, uu, uv, vv, uw, vw, ww = (moment * share for moment in sums[1:])
+    weight = 1 / count.clamp(min=1)
+    u, v, w, uu, uv, vv, uw, vw, ww = (moment * weight for moment in sums[1:])
     uu, uv, vv = uu - u * u, uv - u * v, vv - v * v
     uw, vw, ww = uw - u * w, vw - v * w, ww - w * w
     spread = uu * vv - uv * uv
-    least_count, least_spread = _least_of(rows, columns)
-    has_plane = (count >= least_count) & (spread > least_spread)
+    min_count, min_spread = _least_of(rows, columns)
+    has_plane = (count >= min_count) & (spread > min_spread)
     spread = torch.where(has_plane, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
     variance = (ww - u_slope * uw - v_slope * vw).clamp(min=0) * count / (count - 3).clamp(min=1)
@@ -236,7 +236,7 @@ def noise_by_size(
     noise has a factor for each size. It is never less than the rounding of ``dtype``, that of the
     depth.
     """
-    rounding = max(_ROUNDING * machine_epsilon(dtype), _LEAST_ROUNDING)
+    rounding = max(_ROUNDING * machine_epsilon(dtype), _MIN_ROUNDING)
     if noise is not None:
         constant, growth = noise
         return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
@@ -247,7 +247,7 @@ def noise_by_size(
     for size, (*_, deviation, mean) in windows.items():
         ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
         usual = float(_low_quantile(ratios)) if len(ratios) else factor
-        factor = usual if factor == 0 else min(max(usual, factor), _MOST_GROWTH * factor)
+        factor = usual if factor == 0 else min(max(usual, factor), _MAX_GROWTH * factor)
         noises[size] = shape._replace(factor=factor)
     return noises
 
@@ -275,7 +275,7 @@ def find_jitter(table: Tensor, size: int) -> float:
     is_steep = slope > 0
     ratio = deviation[order][is_steep] / slope[is_steep]
     steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
-    return min([_MOST_JITTER, *(float(_low_quantile(ratios)) for ratios in steep if len(ratios))])
+    return min([_MAX_JITTER, *(float(_low_quantile(ratios)) for ratios in steep if len(ratios))])
 
 
 def _low_quantile(values: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ from torchrg.io.e57 import count_e57, read_e57
 from torchrg.io.fields import checked_coordinates, put_results
 from torchrg.io.files import ARCHIVE_DAMAGES, atomic_path, check_file, check_place
 from torchrg.io.las import check_las, count_las, read_las, write_las
-from torchrg.io.merge import merge_clouds
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
 from torchrg.io.ply import count_ply, read_ply, write_ply
@@ -33,7 +32,6 @@ __all__ = [
     "atomic_path",
     "check_output",
     "estimate_points",
-    "merge_clouds",
     "read_cloud",
     "takes_columns",
     "write_cloud",

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN, read_colors
-from torchrg.io.faces import Fronts
 from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import DAMAGES, check_promise, refusing
 from torchrg.io.headers import check_grid, distance_outside
+from torchrg.mesh import Fronts
 from torchrg.structures import FARTHEST, Cloud, bounding_box
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")

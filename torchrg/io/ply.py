@@ -23,10 +23,10 @@ from torchrg.io.columns import (
     narrow_integers,
     write_records,
 )
-from torchrg.io.faces import Fronts, find_fronts
 from torchrg.io.fields import LARGEST_WHOLE, Values, assemble_cloud
 from torchrg.io.files import check_end, check_promise, words_of
 from torchrg.io.text import read_rows, skip_lines
+from torchrg.mesh import Fronts, find_fronts
 from torchrg.structures import Cloud
 
 _TYPES = {

@@ -36,7 +36,7 @@ _COMMENTS = ("#", "//")
 _COLMAP = "POINT3D_ID, X, Y, Z"
 """Comment of COLMAP above its points, which are followed by the images that see them, in
 ``points3D.txt``."""
-_MOST_DIGITS = 18
+_MAX_DIGITS = 18
 """Most digits of a number of points; no file has room for more points."""
 
 
@@ -186,7 +186,7 @@ def _without_counts(lines: list[str], counts: list[int]) -> list[str]:
 
 def _count_of(text: str) -> int | None:
     """Return the count of points that a line is, or None."""
-    return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
+    return int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else None
 
 
 def _parse(

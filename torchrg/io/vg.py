@@ -69,5 +69,5 @@ def _fitted(points: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def _group_color(place: int) -> str:
     """Return a colour that differs from those of the planes before."""
-    shares = (0.2 + 0.7 * ((place + 1) * step % 1) for step in (0.618, 0.382, 0.854))
-    return " ".join(f"{round(share, 4)}" for share in shares)
+    colors = (0.2 + 0.7 * ((place + 1) * step % 1) for step in (0.618, 0.382, 0.854))
+    return " ".join(f"{round(color, 4)}" for color in colors)

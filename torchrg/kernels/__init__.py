@@ -21,9 +21,9 @@ from torch import Tensor
 
 from torchrg._checks import has_values
 
-MOST_NEIGHBORS = 512
-"""Values of a row that kernels have room for, ``MOST`` in ``plain.h``. Longer ones are left to the
-definitions."""
+MAX_NEIGHBORS = 512
+"""Maximum number of values of a row in kernels, ``MAX_WIDTH`` in ``plain.h``. The torch definitions
+serve longer rows."""
 
 SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
@@ -98,7 +98,7 @@ def serve(*tensors: Tensor | None, k: int = 1) -> bool:
     present = [tensor for tensor in tensors if tensor is not None]
     return (
         _library() is not None
-        and 0 < k <= MOST_NEIGHBORS
+        and 0 < k <= MAX_NEIGHBORS
         and has_values(*present)
         and all(
             tensor.device.type == "cpu"
@@ -130,7 +130,7 @@ def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
     if status == 1:
         raise IndexError(f"{name}: a list of neighbors names a row that is not there.")
     if status:
-        raise ValueError(f"{name}: expected rows of 1 to {MOST_NEIGHBORS} values, got {lengths}.")
+        raise ValueError(f"{name}: expected rows of 1 to {MAX_NEIGHBORS} values, got {lengths}.")
     return outputs
 
 

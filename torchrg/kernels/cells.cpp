@@ -3,17 +3,17 @@
 
 namespace {
 
-constexpr int MOST_CANDIDATES = 4096;  // points of a cell and those around it
-constexpr int MOST_CHOSEN = 1024;      // of these, the ones that are sorted
+constexpr int MAX_CANDIDATES = 4096;  // points of a cell and those around it
+constexpr int MAX_CHOSEN = 1024;      // of these, the ones that are sorted
 constexpr double SURELY = 1e-6;        // rounding of which cell a point at a border is in
 
 struct Candidates {
-  alignas(32) double x[MOST_CANDIDATES], y[MOST_CANDIDATES], z[MOST_CANDIDATES],
-      square[MOST_CANDIDATES];
-  int32_t row[MOST_CANDIDATES], chosen[MOST_CHOSEN + 1];
-  alignas(32) double distance[MOST_CHOSEN];
-  alignas(32) int64_t rank[MOST_CHOSEN];
-  int32_t row_of[MOST_CHOSEN];
+  alignas(32) double x[MAX_CANDIDATES], y[MAX_CANDIDATES], z[MAX_CANDIDATES],
+      square[MAX_CANDIDATES];
+  int32_t row[MAX_CANDIDATES], chosen[MAX_CHOSEN + 1];
+  alignas(32) double distance[MAX_CHOSEN];
+  alignas(32) int64_t rank[MAX_CHOSEN];
+  int32_t row_of[MAX_CHOSEN];
 };
 
 // Sorts chosen candidates by distance, then row; returns the distance of the last of k.
@@ -81,7 +81,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
                     Ints starts, Flagged asked, Longs order, int32_t* found, bool* certain,
                     int64_t from, int64_t to, int64_t width, int64_t height, int64_t first_row,
                     double x, double y, double z, double size) {
-  if (k < 1 || k > MOST || from < 0 || to > num_cells - 1) return TOO_WIDE;
+  if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
   if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
   if (num_points > INT32_MAX || num_cells > INT32_MAX) return TOO_WIDE;
   Candidates all;
@@ -97,7 +97,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
       if (first[g] < 0 || length[g] < 0 || first[g] + length[g] > num_points) return NO_SUCH_ROW;
       number += length[g];
     }
-    if (number <= k || number > MOST_CANDIDATES) continue;
+    if (number <= k || number > MAX_CANDIDATES) continue;
     int n = 0;
     for (int g = 0; g < 9; g++) {
       if (!are_rows(rows + first[g], length[g], num_points)) return NO_SUCH_ROW;
@@ -125,17 +125,17 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
       for (int turn = 0; turn < 8; turn++) {
         count = 0;
         for (int t = 0; t < n; t++) {
-          all.chosen[count < MOST_CHOSEN ? count : MOST_CHOSEN] = t;
+          all.chosen[count < MAX_CHOSEN ? count : MAX_CHOSEN] = t;
           count += all.square[t] < within;
         }
-        if (count > MOST_CHOSEN)
+        if (count > MAX_CHOSEN)
           within *= 0.7;
         else if (count < k && within < most)
           within = smaller(within * 1.6, most);
         else
           break;
       }
-      if (count < k || count > MOST_CHOSEN) continue;
+      if (count < k || count > MAX_CHOSEN) continue;
       const int64_t to_row = order ? order[row] : row;
       if (to_row < 0 || to_row >= num_points) return NO_SUCH_ROW;
       int32_t* list = found + k * to_row;

@@ -6,7 +6,7 @@ namespace {
 
 // Of torchrg/normals/consensus/constants.py, in the order of its names here.
 struct Constants {
-  float vote_reach, vote_falloff, fit_reach, fit_falloff, gap, corner_limit, corner_share;
+  float vote_reach, vote_falloff, fit_reach, fit_falloff, gap, corner_limit, corner_fraction;
   float num_refits, num_alternations, least;
 };
 
@@ -34,7 +34,7 @@ INLINE void residuals(const Patch& patch, const Plane& plane, float* rests) {
 // hypotheses._refitted
 INLINE void refit(const Patch& patch, const float* weights, float reach, bool bisquare,
                   Plane& plane) {
-  alignas(32) float shares[MOST];
+  alignas(32) float shares[MAX_WIDTH];
   for (int j = 0; j < patch.width; j += LANES) {
     const Lanes rest = plane.residuals(patch, j) / reach;
     Lanes near = positive(1 - rest * rest);
@@ -48,7 +48,7 @@ INLINE void refit(const Patch& patch, const float* weights, float reach, bool bi
 // hypotheses.vote_planes
 Plane vote(const Patch& patch, const float* counted, float noise, const float* start,
            const int64_t* ranks, int64_t num_pairs, const Constants& constants) {
-  alignas(32) float weights[MOST], nearness[MOST];
+  alignas(32) float weights[MAX_WIDTH], nearness[MAX_WIDTH];
   const float most = farthest(patch, counted), far = most > 0 ? most : 1;
   for (int j = 0; j < patch.width; j += LANES) {
     const Lanes near = patch.sq_lengths(j) / far;
@@ -102,7 +102,7 @@ INLINE float side(float sum) { return sum >= 0 ? 1 : -1; }
 // points in turn. Leaves the points of each plane, and signed distances from the surface.
 Meeting alternate(const Patch& patch, int count, float* first, float* second, float* third,
                   float* outer, const Constants& constants) {
-  alignas(32) float r[MOST], s[MOST], t[MOST];
+  alignas(32) float r[MAX_WIDTH], s[MAX_WIDTH], t[MAX_WIDTH];
   const int width = patch.width;
   bool present = true;
   float cuts = 0;
@@ -145,14 +145,15 @@ Meeting alternate(const Patch& patch, int count, float* first, float* second, fl
 // hypotheses.fit_meeting_planes
 Meeting meet(const Patch& patch, const Plane& voted, float noise, int count, const int64_t* ranks,
              int64_t num_pairs, const Constants& constants) {
-  alignas(32) float first[MOST], second[MOST], third[MOST], outer[MOST], rest[MOST];
+  alignas(32) float first[MAX_WIDTH], second[MAX_WIDTH], third[MAX_WIDTH];
+  alignas(32) float outer[MAX_WIDTH], rest[MAX_WIDTH];
   const int width = patch.width;
   const float gap = constants.gap * noise;
   residuals(patch, voted, rest);
   near(patch, rest, gap, patch.weight, first), beyond(patch, rest, gap, second);
   const Meeting best = alternate(patch, count, first, second, nullptr, outer, constants);
   if (!(best.deviation > constants.corner_limit * noise)) return best;
-  const float least = constants.corner_share * best.deviation;
+  const float least = constants.corner_fraction * best.deviation;
   // Three planes from the two and what is off them.
   beyond(patch, outer, gap, third);
   for (int j = 0; j < width; j += LANES) {
@@ -210,7 +211,7 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
   Constants constants;
   __builtin_memcpy(&constants, numbers, sizeof constants);
   const float turns = constants.num_alternations;
-  if (!(turns >= 1 && turns < MOST && constants.num_refits < MOST)) return TOO_WIDE;
+  if (!(turns >= 1 && turns < MAX_WIDTH && constants.num_refits < MAX_WIDTH)) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   bool inside = true;
   const int64_t status = visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, Patch& patch) {

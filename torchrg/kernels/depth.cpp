@@ -10,8 +10,8 @@ typedef const double* Doubles;
 constexpr int REACH = 2, SIDE = 5, NUM_SIZES = 4, MOMENTS = 10, COLUMNS = 9;
 constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns that are fitted together
 constexpr int LONG = 9, SHORT = 3;  // sides of narrow windows in pixels
-constexpr double FLAT = 1.35, OWN_REACH = 3.5, SAME_NOISE = 2, LEAST_QUARTERS = 0.7;
-constexpr double BEND = 0.005, MOST_BEND = 0.03, STEEPEST = 4;
+constexpr double FLAT = 1.35, OWN_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
+constexpr double BEND = 0.005, MAX_BEND = 0.03, STEEPEST = 4;
 constexpr double NONE = __builtin_inf();
 
 INLINE double square(double value) { return value * value; }
@@ -22,7 +22,7 @@ INLINE bool are_rows_of(int64_t from, int64_t to, int64_t height) {
 
 // windows._planes_of_sums: slopes, origin, deviation and mean of window j.
 template <int N>
-INLINE void solve(const double (&s)[MOMENTS][N], int j, double least_count, double least_spread,
+INLINE void solve(const double (&s)[MOMENTS][N], int j, double min_count, double min_spread,
                   double (&to)[5][N]) {
   const double count = s[0][j], share = 1 / larger(count, 1.0);
   const double u = s[1][j] * share, v = s[2][j] * share, w = s[3][j] * share;
@@ -30,7 +30,7 @@ INLINE void solve(const double (&s)[MOMENTS][N], int j, double least_count, doub
                vv = s[6][j] * share - v * v, uw = s[7][j] * share - u * w,
                vw = s[8][j] * share - v * w, ww = s[9][j] * share - w * w;
   const double determinant = uu * vv - uv * uv;
-  const bool has_plane = (count >= least_count) & (determinant > least_spread);
+  const bool has_plane = (count >= min_count) & (determinant > min_spread);
   const double spread = has_plane ? determinant : 1;
   const double u_slope = (vv * uw - uv * vw) / spread, v_slope = (uu * vw - uv * uw) / spread;
   const double rest = ww - u_slope * uw - v_slope * vw;
@@ -50,8 +50,8 @@ INLINE void write_moments(uint8_t seen, double u, double v, double value, double
 // Fits planes (5, h, w) to the windows around cells, of which `read` gives the sums of a row's
 // columns, and adds cells up to those of twice the width.
 template <class Read>
-int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double least_count,
-                double least_spread, double* planes, double* coarse, Read read) {
+int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count,
+                double min_spread, double* planes, double* coarse, Read read) {
   alignas(32) double ring[SIDE][MOMENTS][WIDE], down[WIDE], sums[MOMENTS][TILE], solved[5][TILE];
   const int64_t coarse_w = (w + 1) / 2, coarse_size = (h + 1) / 2 * coarse_w;
   for (int64_t left = 0; left < w; left += TILE) {
@@ -77,7 +77,7 @@ int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double least_cou
               (one[0] + other[0]) + (left + j + 1 < w ? one[1] + other[1] : 0);
         }
       }
-      for (int j = 0; j < TILE; j++) solve(sums, j, least_count, least_spread, solved);
+      for (int j = 0; j < TILE; j++) solve(sums, j, min_count, min_spread, solved);
       for (int part = 0; part < 5; part++)
         __builtin_memcpy(planes + (part * h + i) * w + left, solved[part], width * sizeof(double));
     }
@@ -147,12 +147,12 @@ INLINE double sq_slope_noise(const Window& window, double tolerance) {
 
 // The windows around pixels, as windows.fit_windows; `coarse` (10, p, q) gets cells of 2 pixels.
 KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, Doubles values, Flagged seen,
-                         Doubles u, Doubles v, double* planes, double* coarse, double least_count,
-                         double least_spread, int64_t from, int64_t to) {
+                         Doubles u, Doubles v, double* planes, double* coarse, double min_count,
+                         double min_spread, int64_t from, int64_t to) {
   if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
     return TOO_WIDE;
   const auto* ones = reinterpret_cast<const uint8_t*>(seen);
-  return fit_all(h, w, from, to, least_count, least_spread, planes, coarse,
+  return fit_all(h, w, from, to, min_count, min_spread, planes, coarse,
                  [&](int64_t row, int64_t first, int count, double (*sums)[WIDE], int at) {
                    for (int j = 0; j < count; j++) {
                      const int64_t pixel = row * w + first + j;
@@ -163,11 +163,11 @@ KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, 
 
 // The same around larger cells.
 KERNEL fit_cell_windows(int64_t m, int64_t h, int64_t w, int64_t p, int64_t q, Doubles cells,
-                        double* planes, double* coarse, double least_count, double least_spread,
+                        double* planes, double* coarse, double min_count, double min_spread,
                         int64_t from, int64_t to) {
   if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
     return TOO_WIDE;
-  return fit_all(h, w, from, to, least_count, least_spread, planes, coarse,
+  return fit_all(h, w, from, to, min_count, min_spread, planes, coarse,
                  [&](int64_t row, int64_t first, int count, double (*sums)[WIDE], int at) {
                    for (int k = 0; k < MOMENTS; k++)
                      __builtin_memcpy(sums[k] + at, cells + (k * h + row) * w + first,
@@ -193,7 +193,7 @@ KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, D
     const double straight = nearness > square(STEEPEST * mean) ? 0 : nearness;
     const double bend = mean > 0 ? half * straight / mean : 0;
     columns[NOISE][k] = by_noise, columns[TOLERANCE][k] = larger(by_noise, BEND * bend);
-    columns[STRONGEST][k] = MOST_BEND * bend;
+    columns[STRONGEST][k] = MAX_BEND * bend;
   }
   const double factor_of_quarters = 1 + SAME_NOISE / double(SIDE * size);
   for (int64_t i = from; i < to; i++)
@@ -209,7 +209,7 @@ KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, D
               squares += square(quarters[k * q + l]), count += 1;
         double usual = square_root(count > 0 ? squares / count : NONE);
         usual = usual * (columns[NOISE][own] / finer.at(columns[MEAN][own]));
-        is_flat = deviation <= factor_of_quarters * larger(usual, LEAST_QUARTERS * tolerance);
+        is_flat = deviation <= factor_of_quarters * larger(usual, MIN_QUARTERS * tolerance);
       }
       columns[RELATIVE][own] = is_flat ? deviation / tolerance : NONE;
     }
@@ -276,7 +276,7 @@ INLINE void visit_narrow(int64_t h, int64_t w, int64_t pixel, int shape, const V
 
 // windows.fit_narrow_windows, lying (0) and upright (1), of pixels that `numbers` numbers.
 KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u, Doubles v,
-                          Longs numbers, Longs pixels, double least_count, double least_spread,
+                          Longs numbers, Longs pixels, double min_count, double min_spread,
                           double* planes, int64_t from, int64_t to) {
   if (!are_rows_of(from, to, n)) return TOO_WIDE;
   for (int64_t number = from; number < to; number++) {
@@ -288,7 +288,7 @@ KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubl
         write_moments(1, u[c], v[r], values[r * w + c], terms, 0);
         for (int m = 0; m < MOMENTS; m++) sums[m][shape] += terms[m][0];
       });
-      solve(sums, shape, least_count, least_spread, solved);
+      solve(sums, shape, min_count, min_spread, solved);
       for (int part = 0; part < 5; part++)
         planes[(2 * part + shape) * n + number] = solved[part][shape];
     }
@@ -572,7 +572,7 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
 // on at the other past what is nearer; points are (3, h w).
 KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Doubles points,
                    Flagged seen, Longs labels, Doubles normals, Doubles centers, Doubles reach,
-                   Longs pairs, int64_t every, double least_nearer, int64_t* counts,
+                   Longs pairs, int64_t every, double min_nearer, int64_t* counts,
                    int64_t* firsts, int64_t* lasts) {
   if (every < 1) return TOO_WIDE;
   if (P != h * w || !are_labels(labels, P, M)) return NO_SUCH_ROW;
@@ -606,7 +606,7 @@ KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Double
           if (is_end || height < -reach[first]) {
             const int64_t gap = i - previous - 1;
             leads = is_end && end >= 0 && end != label && gap > 0 &&
-                    double(passed) >= least_nearer * double(gap);
+                    double(passed) >= min_nearer * double(gap);
             previous = i, end = is_end ? label : -1, passed = 0;
           }
           passed += height > reach[first];

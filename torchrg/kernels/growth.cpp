@@ -90,17 +90,17 @@ KERNEL meet_others(int64_t num_points, int64_t num_rows, int64_t k, Ints labels,
 // members; `numbers` need no values before, as a number counts where the member so numbered is it.
 KERNEL connected(int64_t num_points, int64_t k, int64_t num_rows, Ints indices, Flagged mask,
                  Flagged asked, int32_t* numbers, int64_t first, int64_t least, bool* joined) {
-  constexpr int WORDS = MOST / 64;
-  if (k < 1 || k > MOST || first < 0 || num_rows > num_points - first) return TOO_WIDE;
-  uint64_t bits[MOST][WORDS];
-  int32_t members[MOST];
+  constexpr int WORDS = MAX_WIDTH / 64;
+  if (k < 1 || k > MAX_WIDTH || first < 0 || num_rows > num_points - first) return TOO_WIDE;
+  uint64_t bits[MAX_WIDTH][WORDS];
+  int32_t members[MAX_WIDTH];
   int count = 0;
   const auto find = [&](int64_t point) {
     const int32_t number = numbers[point];
     return uint32_t(number) < uint32_t(count) && members[number] == point ? number : -1;
   };
   for (int64_t start = first, stop = first; start < first + num_rows; start = stop) {
-    for (count = 0; stop < first + num_rows && count + k <= MOST; stop++) {
+    for (count = 0; stop < first + num_rows && count + k <= MAX_WIDTH; stop++) {
       if (!are_rows(indices + stop * k, k, num_points)) return NO_SUCH_ROW;
       for (int64_t e = stop * k; e < (stop + 1) * k; e++)
         if ((!mask || mask[e]) && find(indices[e]) < 0)

@@ -18,7 +18,7 @@ typedef const bool* Flagged;
 enum Status { DONE = 0, NO_SUCH_ROW = 1, TOO_WIDE = 2 };
 
 constexpr int LANES = 8;
-constexpr int MOST = 512;  // values of a row: neighbours of a point, points of a patch
+constexpr int MAX_WIDTH = 512;  // values of a row: neighbours of a point, points of a patch
 constexpr float INFINITE = __builtin_inff();
 
 #ifdef __AVX__
@@ -130,7 +130,7 @@ INLINE int padded(int count) { return (count + LANES - 1) / LANES * LANES; }
 
 // Neighbours about the first of them, each with its weight; what fills up the lanes has none.
 struct Patch {
-  alignas(32) float x[MOST], y[MOST], z[MOST], weight[MOST];
+  alignas(32) float x[MAX_WIDTH], y[MAX_WIDTH], z[MAX_WIDTH], weight[MAX_WIDTH];
   int width;
 
   INLINE_MEMBER Lanes along(float a, float b, float c, int j) const {
@@ -186,7 +186,7 @@ INLINE bool gather(const Lists& lists, int64_t i, Patch& patch) {
 // Calls `visit` with each place, the row there and its patch: of all lists, or of n rows.
 template <class Visit>
 INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
-  if (lists.k < 1 || lists.k > MOST) return TOO_WIDE;
+  if (lists.k < 1 || lists.k > MAX_WIDTH) return TOO_WIDE;
   Patch patch;
   for (int64_t q = 0; q < n; q++) {
     const int64_t i = rows ? rows[q] : q;

@@ -4,7 +4,7 @@
 // torchrg.normals.pca.fit_normals_pca of lists of rows. Patches as narrow as their covariance's own
 // rounding are flagged and left to the definition, which looks at them again.
 KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
-                       Flagged mask, Floats resolution, double tolerance, double narrow_share,
+                       Flagged mask, Floats resolution, double tolerance, double narrow_fraction,
                        float* normals, float* curvature, float* residual_rms, bool* valid,
                        bool* narrow) {
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
@@ -15,7 +15,7 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
     decompose(covariance, plane);
     const float sum = covariance[0] + covariance[3] + covariance[5], low = float(plane.low);
     const float length = square_root(float(plane.high)), width = square_root(float(plane.middle));
-    narrow[i] = !(width >= float(narrow_share) * length);
+    narrow[i] = !(width >= float(narrow_fraction) * length);
     valid[i] = width > larger(float(tolerance) * length, resolution[i]);
     write(valid[i] ? plane : Plane{}, normals, i);
     curvature[i] = valid[i] ? smaller(low / (sum > 0 ? sum : 1), 1 / 3.0f) : 0;
@@ -27,7 +27,7 @@ namespace {
 
 // torchrg.normals.consensus.noise._small_deviations: of the first neighbours from their own plane.
 INLINE float of_few(const Patch& patch, int count, float breadth) {
-  alignas(32) float weights[MOST], inside[MOST];
+  alignas(32) float weights[MAX_WIDTH], inside[MAX_WIDTH];
   const int width = padded(count);
   for (int j = 0; j < width; j++) inside[j] = j < count, weights[j] = inside[j] * patch.weight[j];
   if (weights[count - 1] == 0) return INFINITE;
@@ -44,7 +44,7 @@ INLINE float of_few(const Patch& patch, int count, float breadth) {
 // torchrg.normals.consensus.noise._layered_deviations: of the sides of a plane from two parallel
 // ones, without what is asked of the result.
 INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_refits, float least) {
-  alignas(32) float sides[2][MOST];
+  alignas(32) float sides[2][MAX_WIDTH];
   for (int turn = 0;; turn++) {
     float numbers[2], means[2][3], covariances[2][6], pooled[6];
     for (int j = 0; j < patch.width; j += LANES) {
@@ -75,7 +75,7 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
               double breadth, double kurtosis, double share, int64_t num_refits, int64_t least,
               float* offsets, float* radius, float* whole, float* layered, bool* again,
               float* of_fewer, float* of_more) {
-  if (few < 4 || more < 4 || uint64_t(num_refits) > MOST) return TOO_WIDE;
+  if (few < 4 || more < 4 || uint64_t(num_refits) > MAX_WIDTH) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
     again[i] = false;
@@ -155,8 +155,8 @@ INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
 KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_rows, int64_t k,
                           Floats values, Ints indices, Flagged mask, double quantile,
                           int64_t rank_of_all, float* found) {
-  if (k < 1 || k > MOST || !(quantile >= 0 && quantile <= 1)) return TOO_WIDE;
-  alignas(32) int32_t keys[MOST * LANES], ranks[LANES];
+  if (k < 1 || k > MAX_WIDTH || !(quantile >= 0 && quantile <= 1)) return TOO_WIDE;
+  alignas(32) int32_t keys[MAX_WIDTH * LANES], ranks[LANES];
   const int64_t num_found = num_rows * num_columns;
   for (int64_t start = 0; start < num_found; start += LANES) {
     for (int lane = 0; lane < LANES; lane++) {

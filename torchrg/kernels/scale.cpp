@@ -69,8 +69,8 @@ float majority_difference(const float* row, int n) {
 
 // torchrg.robust.scale._majority_difference of sorted rows; NaN where a difference is not finite.
 KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, float* found) {
-  if (n < 2 || n > MOST) return TOO_WIDE;
-  alignas(32) float row[MOST + LANES];
+  if (n < 2 || n > MAX_WIDTH) return TOO_WIDE;
+  alignas(32) float row[MAX_WIDTH + LANES];
   for (int i = 0; i < LANES; i++) row[n + i] = INFINITE;
   for (int64_t i = 0; i < num_rows; i++) {
     __builtin_memcpy(row, rows + i * n, n * sizeof *row);

@@ -14,9 +14,10 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
                      Flagged mask, Floats noise, Longs rows, double agreement, double reach,
                      double falloff, double ridge, double max_tilt, float* normals,
                      float* offsets) {
-  if (k < 1 || k > MOST) return TOO_WIDE;
-  alignas(32) float x[MOST], y[MOST], z[MOST], a[MOST], b[MOST], c[MOST], rests[MOST], errors[MOST],
-      weights[MOST];
+  if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
+  alignas(32) float x[MAX_WIDTH], y[MAX_WIDTH], z[MAX_WIDTH];
+  alignas(32) float a[MAX_WIDTH], b[MAX_WIDTH], c[MAX_WIDTH];
+  alignas(32) float rests[MAX_WIDTH], errors[MAX_WIDTH], weights[MAX_WIDTH];
   const float tilt = float(max_tilt);
   for (int64_t q = 0; q < num_rows; q++) {
     const int64_t i = rows[q];
@@ -99,7 +100,7 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
                      float* offsets) {
   if (step < 1) return TOO_WIDE;
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  alignas(32) float weights[MOST];
+  alignas(32) float weights[MAX_WIDTH];
   return visit_patches(lists, rows, num_rows, [&](int64_t q, int64_t i, const Patch& patch) {
     const int32_t* row = indices + i * k;
     const float most = farthest(patch, patch.weight), far = most > 0 ? most : 1;
@@ -157,7 +158,7 @@ KERNEL fit_paraboloids(int64_t num_points, int64_t k, int64_t num_rows, Floats p
                        float* offsets, float* deviations) {
   constexpr int TERMS = 6;
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  alignas(32) float us[MOST], vs[MOST], heights[MOST];
+  alignas(32) float us[MAX_WIDTH], vs[MAX_WIDTH], heights[MAX_WIDTH];
   return visit_patches(lists, rows, num_rows, [&](int64_t q, int64_t i, const Patch& patch) {
     const float radius = square_root(farthest(patch, patch.weight));
     const float scale = radius > 0 ? 1 / radius : 0;

@@ -18,7 +18,7 @@ from torchrg._checks import check_floating, check_shapes
 from torchrg._parallel import allowed_threads
 from torchrg.linalg.eigen import smallest_eigenvector3
 
-_LEAST_POINTS = 2**16
+_MIN_POINTS = 2**16
 """Points that are worth a thread's start."""
 
 _SORTED_SIZE = 50
@@ -157,10 +157,10 @@ class Segments:
             region, row = last, end
         return parts
 
-    def shares(self, most: int) -> "list[Segments]":
+    def chunks(self, most: int) -> "list[Segments]":
         """Return what :meth:`split` does, in about equally large parts for each thread."""
-        share = max(len(self.rows) // allowed_threads() + 1, _LEAST_POINTS)
-        return self.split(min(share, most))
+        size = max(len(self.rows) // allowed_threads() + 1, _MIN_POINTS)
+        return self.split(min(size, most))
 
     def take(self, values: Tensor) -> Tensor:
         """Return the values of the points that have a region, region by region."""
@@ -412,8 +412,8 @@ def fit_parallel_planes(
     means, covariances = zip(
         *(weighted_moments(columns, weights) for weights in groups), strict=True
     )
-    shares = totals / totals.sum(dim=0).clamp(min=1)
-    pooled = (shares[:, :, None, None] * torch.stack(covariances)).sum(dim=0)
+    fractions = totals / totals.sum(dim=0).clamp(min=1)
+    pooled = (fractions[:, :, None, None] * torch.stack(covariances)).sum(dim=0)
     values, normals = smallest_eigenvector3(pooled)
     offsets = dot(normals, torch.stack(means))
     return normals, offsets, values[:, 0].clamp(min=0)

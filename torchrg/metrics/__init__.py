@@ -60,7 +60,7 @@ _LABELS = {
     Index(
         "fraction", True
     ): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 recall_iou80 "
-    "share_labeled covering ari",
+    "fraction_labeled covering ari",
 }
 _SUPERPOINTS = {
     Index("fraction", True): "asa oracle_miou boundary_recall boundary_precision",

@@ -159,6 +159,6 @@ def check_one_device(caller: str, **arguments: Tensor) -> None:
         raise ShapeError(f"{caller}: expected {names} on one device, got {' and '.join(devices)}.")
 
 
-def share(count: float, whole: float) -> float:
+def fraction(count: float, whole: float) -> float:
     """Return ``part / whole``, and 0 where the whole is 0."""
     return count / whole if whole else 0.0

@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.metrics.contingency import ContingencyTable, count_overlaps, share
+from torchrg.metrics.contingency import ContingencyTable, count_overlaps, fraction
 
 
 class LabelScore(NamedTuple):
@@ -26,7 +26,7 @@ class LabelScore(NamedTuple):
         precision_iou50: Regions with a face at IoU > 0.5, of all regions.
         recall_iou50: Faces with a region at IoU > 0.5, of all faces.
         precision_iou80: The same at IoU > 0.8; so is ``recall_iou80``.
-        share_labeled: Scored points that lie in a region.
+        fraction_labeled: Scored points that lie in a region.
         covering: See :func:`segmentation_covering`.
         ari: See :func:`adjusted_rand_index`.
     """
@@ -43,7 +43,7 @@ class LabelScore(NamedTuple):
     recall_iou50: float
     precision_iou80: float
     recall_iou80: float
-    share_labeled: float
+    fraction_labeled: float
     covering: float
     ari: float
 
@@ -78,7 +78,7 @@ def score_labels(
         >>> score = score_labels(torch.tensor([8, 8, 8, 3, -1]), torch.tensor([0, 0, 1, 1, 1]))
         >>> score.pairs, round(score.precision, 1), round(score.recall, 1), round(score.f1, 1)
         (2, 83.3, 66.7, 74.1)
-        >>> score.recall_iou50, score.share_labeled
+        >>> score.recall_iou50, score.fraction_labeled
         (0.5, 0.8)
     """
     table = count_overlaps("score_labels", labels, truth, min_size, ignore)
@@ -88,17 +88,17 @@ def score_labels(
     return LabelScore(
         precision=precision,
         recall=recall,
-        f1=share(2 * precision * recall, precision + recall),
+        f1=fraction(2 * precision * recall, precision + recall),
         pairs=num_pairs,
         regions=num_regions,
         faces=num_faces,
         points=table.num_points,
-        mean_best_iou=share(float(_best_iou(table).sum()), num_faces),
-        precision_iou50=share(matched50, num_regions),
-        recall_iou50=share(matched50, num_faces),
-        precision_iou80=share(matched80, num_regions),
-        recall_iou80=share(matched80, num_faces),
-        share_labeled=share(int(table.region_sizes.sum()), table.num_points),
+        mean_best_iou=fraction(float(_best_iou(table).sum()), num_faces),
+        precision_iou50=fraction(matched50, num_regions),
+        recall_iou50=fraction(matched50, num_faces),
+        precision_iou80=fraction(matched80, num_regions),
+        recall_iou80=fraction(matched80, num_faces),
+        fraction_labeled=fraction(int(table.region_sizes.sum()), table.num_points),
         covering=segmentation_covering(table),
         ari=adjusted_rand_index(table),
     )
@@ -121,7 +121,7 @@ def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]
     precision = shared / table.region_sizes[table.regions[pairs]]
     recall = shared / table.face_sizes[table.faces[pairs]]
     count = len(pairs)
-    return share(float(precision.sum()), count), share(float(recall.sum()), count), count
+    return fraction(float(precision.sum()), count), fraction(float(recall.sum()), count), count
 
 
 def match_regions(table: ContingencyTable) -> Tensor:

@@ -12,8 +12,8 @@ from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import (
     check_labels,
     contingency_table,
+    fraction,
     have_other_label,
-    share,
 )
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.structures import UNLABELED
@@ -116,13 +116,13 @@ def score_partition(
         )
     num_scored = int(scored.sum())
     return PartitionScore(
-        asa=share(num_right, num_scored),
+        asa=fraction(num_right, num_scored),
         oracle_miou=miou,
         boundary_recall=recall,
         boundary_precision=precision,
         boundary_distance=boundary_distance if points is not None else None,
         count=count,
-        points_per_superpoint=share(int(has_one.sum()), count),
+        points_per_superpoint=fraction(int(has_one.sum()), count),
         points=num_scored,
     )
 
@@ -142,7 +142,7 @@ def _score_oracle(superpoints: Tensor, truth: Tensor) -> tuple[int, float]:
     right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, most)
     sizes = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, table.region_sizes)
     iou = right.double() / (sizes + table.face_sizes - right)
-    return int(right.sum()), share(float(iou.sum()), num_parts)
+    return int(right.sum()), fraction(float(iou.sum()), num_parts)
 
 
 def _score_borders(
@@ -167,10 +167,10 @@ def _score_borders(
     )
     if len(ours) == 0 or len(theirs) == 0:
         return 0.0, 0.0, distance
-    shares = []
+    fractions = []
     for of, near in ((theirs, ours), (ours, theirs)):
         # The bound of the search excludes the distance itself.
         limit = np.nextafter(distance, np.inf)
         distances = cKDTree(near).query(of, distance_upper_bound=limit)[0]
-        shares.append(float(np.isfinite(distances).mean()))
-    return shares[0], shares[1], distance
+        fractions.append(float(np.isfinite(distances).mean()))
+    return fractions[0], fractions[1], distance

@@ -18,7 +18,7 @@ from torchrg.neighbors.order import MORTON_BITS, morton_codes
 BLOCK_SIZE = 300_000
 """Points of a block. Smaller ones search more points around them in vain, larger ones take more
 memory."""
-_LEAST_CANDIDATES = 65536
+_MIN_CANDIDATES = 65536
 _CANDIDATES = 2
 """Rows searched at a time at most: as many as two blocks have, and so many that a small block is
 not searched in crumbs."""
@@ -149,7 +149,7 @@ def search_block(
     first, last = np.searchsorted(boxes.starts, (block.start, block.stop))
     reach = _reach_of_boxes(points[block], boxes, slice(first, last), k)
     nearest = np.empty((block.stop - block.start, k), dtype=np.int32)
-    most = max(_CANDIDATES * len(nearest), _LEAST_CANDIDATES) if most is None else most
+    most = max(_CANDIDATES * len(nearest), _MIN_CANDIDATES) if most is None else most
     waiting = [slice(first, last)]
     while waiting:
         run = waiting.pop()

@@ -34,7 +34,7 @@ _MIN_FOR_CELLS = 2000
 _SIZE_STEP = 1.5
 """Cells of one size answer for points whose k-th neighbour is from 1 / 1.75 to 1 size away."""
 
-_MIN_SHARE = 0.03
+_MIN_FRACTION = 0.03
 """Share of the points for which another size of cells is worth its sort."""
 
 _CELLS_A_POINT = 8
@@ -395,7 +395,7 @@ def _cell_sizes(reach: NDArray[np.float64]) -> list[float]:
     """Return ascending sizes of cells that together answer for nearly all of a sample."""
     sizes: list[float] = []
     reach = np.sort(reach[reach > 0])
-    few = int(_MIN_SHARE * len(reach))
+    few = int(_MIN_FRACTION * len(reach))
     while len(reach) > few:
         sizes.append(_SIZE_STEP * float(reach[few]))
         reach = reach[reach > sizes[-1]]

@@ -12,10 +12,10 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
 from torchrg.structures import UNLABELED
 
-_MOST_VOXELS = 2**53
+_MAX_VOXELS = 2**53
 """Most voxels along one axis: float64 counts no further."""
 
-_MOST_KEYS = 2**62
+_MAX_KEYS = 2**62
 """Most cells with numbers of their own in int64; the square of the number of points is below it."""
 
 
@@ -58,7 +58,7 @@ def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
         return Voxels(finite, inverse)
     columns = [column[finite].double() for column in tensor.detach().unbind(dim=-1)]
     scaled = [(column - column.min()) / size for column in columns]
-    if max(float(column.max()) for column in scaled) >= _MOST_VOXELS:
+    if max(float(column.max()) for column in scaled) >= _MAX_VOXELS:
         raise ConfigError(
             f"sample_voxels: expected size to divide the cloud's extent into less than 2^53 "
             f"cells, got {size!r}; choose a larger one."
@@ -97,7 +97,7 @@ def cell_keys(cells: Sequence[Tensor]) -> Tensor:
     num_keys = 1
     for cell in cells:
         number, count = cell.long(), int(cell.max()) + 1
-        if num_keys * count > _MOST_KEYS:
+        if num_keys * count > _MAX_KEYS:
             values, number = torch.unique(number, return_inverse=True)
             used, keys = torch.unique(keys, return_inverse=True)
             num_keys, count = len(used), len(values)

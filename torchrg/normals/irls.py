@@ -26,7 +26,7 @@ from torchrg.structures import Neighbors, NormalFit
 _HEAVY = 0.25
 """Weight above which a point belongs to the plane."""
 
-_LEAST_STEPS = 5
+_MIN_STEPS = 5
 """Steps that are taken at least, even if the start is close to the limit."""
 
 _CLOSE_TO_PCA = 0.996
@@ -39,10 +39,10 @@ _SAME_SOLUTION = 0.95
 _SECOND_START = 0.35
 """Quantile of the squared distances at which the second solution starts."""
 
-_LEAST_SHARE = 0.1
+_MIN_FRACTION = 0.1
 """Share of the points. A solution that explains fewer gives way to the other one."""
 
-_LEAST_NOISE = 1e-4
+_MIN_NOISE = 1e-4
 """Share of the distance to the farthest point. Exact planes have no noise, and without a least
 value the steps would never end. The numbers above are those of the authors' program."""
 
@@ -198,7 +198,7 @@ def _fit_rows(
     start = fit_normals_pca(patches, others, resolution=resolution)
     _, offsets = about_first(patches, mask)
     radius = (offsets * offsets).sum(dim=-1).amax(dim=-1).detach().sqrt()
-    noise = torch.maximum(noise, _LEAST_NOISE * radius)
+    noise = torch.maximum(noise, _MIN_NOISE * radius)
     is_flat = start.residual_rms <= noise
     flat = (start.valid & is_flat).nonzero().squeeze(-1)
     plane = replace_rows(plane, flat, start.each(lambda values: values[flat]))
@@ -264,7 +264,7 @@ def _first_wins(first: _Solution, second: _Solution, points: _Offsets) -> Tensor
     """Return whether the first of two solutions is to be taken, shape ``(n,)``."""
     nearer = first.error < second.error
     many_first, many_second = (
-        solution.heavy.sum(dim=-1) > _LEAST_SHARE * points.counted.sum(dim=-1)
+        solution.heavy.sum(dim=-1) > _MIN_FRACTION * points.counted.sum(dim=-1)
         for solution in (first, second)
     )
     return torch.where(many_second, nearer & many_first, nearer | many_first)
@@ -350,6 +350,6 @@ def _count_steps(mu: Tensor, limit: Tensor, decay: float, *, stay_above: bool) -
         following = mu / decay
         goes_on = following >= limit if stay_above else mu > limit
         if not bool(goes_on.any()):
-            return num_steps.clamp(min=_LEAST_STEPS)
+            return num_steps.clamp(min=_MIN_STEPS)
         num_steps += goes_on.squeeze(-1)
         mu = torch.where(goes_on, following, mu)

@@ -182,7 +182,7 @@ def _fit_height(
     rough = [rounding[..., None] / side for side in sides]
     exact = rank_tolerance(u.shape[-1], u.dtype)
     quadratic = torch.where(torch.as_tensor(count, device=u.device) < _NUM_TERMS, torch.inf, exact)
-    shares = (
+    fractions = (
         exact,
         exact + rough[0],
         exact + rough[1],
@@ -191,7 +191,7 @@ def _fit_height(
         quadratic + 2 * rough[1],
     )
     terms = _quadratic_terms(ones, u / sides[0], v / sides[1])
-    coefficients, residual = least_squares(list(zip(terms, shares, strict=True)), w)
+    coefficients, residual = least_squares(list(zip(terms, fractions, strict=True)), w)
     p, q = sides
     units = (torch.ones_like(p), p, q, p * p / 2, p * q, q * q / 2)
     derivatives = [(c / unit).squeeze(-1) for c, unit in zip(coefficients, units, strict=True)]
@@ -221,13 +221,13 @@ def least_squares(
     """
     basis: list[Tensor] = []
     mixing: list[list[Tensor]] = []
-    for column, share in columns:
+    for column, fraction in columns:
         residual, mix = column, []
         for direction in basis:
             mix.append((direction * residual).sum(dim=-1, keepdim=True))
             residual = residual - mix[-1] * direction
         sq_rest = (residual * residual).sum(dim=-1, keepdim=True)
-        is_independent = sq_rest > share * share * (column * column).sum(dim=-1, keepdim=True)
+        is_independent = sq_rest > fraction * fraction * (column * column).sum(dim=-1, keepdim=True)
         length = torch.where(is_independent, sq_rest, 1.0).sqrt()
         basis.append(torch.where(is_independent, residual / length, 0.0))
         mixing.append([*mix, length])

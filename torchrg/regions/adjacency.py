@@ -18,7 +18,7 @@ from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 NUM_CONTACTS = 8
 """Neighbours that surround a point of a surface; more reach across gaps."""
 
-LEAST_CONTACTS = 3
+MIN_CONTACTS = 3
 """Regions that touch in fewer edges neither meet nor are merged: one may be an outlier's."""
 
 PARALLEL_DEG = 15.0
@@ -79,21 +79,27 @@ def find_adjacency(
         spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
         farthest = torch.maximum(reach[pair], _MAX_STEEPNESS * spacing)
         size = edge.norm(dim=1)
-        share = math.pi**2 * spacing * spacing / (2 * num_nearest * num_nearest * size)
-        share = torch.where(size > 0, share, 0.0)
+        length_each = math.pi**2 * spacing * spacing / (2 * num_nearest * num_nearest * size)
+        length_each = torch.where(size > 0, length_each, 0.0)
         flat = across.abs().amax(dim=0) <= farthest
-        return on_lines.pair, _edges(points, on_lines).norm(dim=1), pair[flat], share[flat]
+        return (
+            on_lines.pair,
+            _edges(points, on_lines).norm(dim=1),
+            pair[flat],
+            length_each[flat],
+        )
 
     lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
-    for on_line, size, on_curve, share in border.map_contacts(measure):
+    for on_line, size, on_curve, length_each in border.map_contacts(measure):
         lines.add(on_line, size)
-        curves.add(on_curve, share)
-    (sizes, on_line), (shares, on_curve) = (kind.on(points.device) for kind in (lines, curves))
+        curves.add(on_curve, length_each)
+    (sizes, on_line), (lengths, on_curve) = (kind.on(points.device) for kind in (lines, curves))
     along = torch.linalg.cross(first, second)
     along = along / along.norm(dim=1, keepdim=True)
     length = _length_on_line(points, border, along, sizes / on_line)
-    meets = on_line + on_curve >= LEAST_CONTACTS
-    return PlaneAdjacency(pairs[meets], torch.where(crossing, length, shares)[meets], angle[meets])
+    meets = on_line + on_curve >= MIN_CONTACTS
+    length = torch.where(crossing, length, lengths)
+    return PlaneAdjacency(pairs[meets], length[meets], angle[meets])
 
 
 class NearestPoints:

@@ -14,13 +14,13 @@ from torchrg.linalg import eigh3_of_few, unit_direction
 from torchrg.regions.fit import with_table_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
-_MOST_TILT_DEG = 30.0
+_MAX_TILT_DEG = 30.0
 """A room is tilted by less, so that no wall is taken for its floor."""
 _NEAR_DEG = 3.0
 """Planes of one direction differ by less: walls are built within a degree, scanned within two."""
 _NUM_FITS = 5
 """Reweighted fits, after which a direction stands."""
-_LEAST_SHARE = 0.02
+_MIN_FRACTION = 0.02
 """Share of the area of all planes below which those of a direction are furniture, not a room."""
 
 
@@ -156,17 +156,17 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
 
 def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
     """Return the direction that most area is level or upright to; see :func:`align_axes`."""
-    level = (normals @ upwards).abs() >= math.cos(math.radians(_MOST_TILT_DEG))
+    level = (normals @ upwards).abs() >= math.cos(math.radians(_MAX_TILT_DEG))
     candidates = normals[level & (areas > 0)]
     if not len(candidates):
         # Walls alone say where up is, too: across their normals.
-        upright = (normals @ upwards).abs() <= math.sin(math.radians(_MOST_TILT_DEG))
+        upright = (normals @ upwards).abs() <= math.sin(math.radians(_MAX_TILT_DEG))
         spread = (areas * upright)[:, None, None] * normals[:, :, None] * normals[:, None, :]
         values, vectors = eigh3_of_few(spread.sum(dim=0))
-        if not bool(values[1] > _LEAST_SHARE * values[2]) or values[2] == 0:
+        if not bool(values[1] > _MIN_FRACTION * values[2]) or values[2] == 0:
             raise ConfigError(
                 "align_axes: expected a floor, a ceiling, or walls in two directions, got none "
-                f"within {_MOST_TILT_DEG:g} degrees of that; segment the cloud first, or say where "
+                f"within {_MAX_TILT_DEG:g} degrees of that; segment the cloud first, or say where "
                 "up is."
             )
         candidates = vectors[:, 0][None]
@@ -196,7 +196,7 @@ def _bisquare(angles: Tensor) -> Tensor:
 def _find_heading(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor | None:
     """Return the horizontal direction next to x that most walls are along, None without walls."""
     across = areas * _bisquare((normals @ axis).abs().clamp(max=1).asin())
-    if not bool(across.sum() > _LEAST_SHARE * areas.sum()):
+    if not bool(across.sum() > _MIN_FRACTION * areas.sum()):
         return None
     first = _horizontal(torch.eye(3, dtype=torch.float64)[0], axis)
     second = torch.linalg.cross(axis, first)
@@ -238,7 +238,7 @@ def _origin(planes: Planes, rotation: Tensor) -> Tensor:
     low, high = (center - reach)[used].amin(dim=0), (center + reach)[used].amax(dim=0)
     upright = (planes.normal.cpu().double() @ rotation[2]).abs().clamp(max=1)
     area = planes.area.cpu().double()
-    level = (upright.acos() < math.radians(_NEAR_DEG)) & (area > _LEAST_SHARE * area.sum())
+    level = (upright.acos() < math.radians(_NEAR_DEG)) & (area > _MIN_FRACTION * area.sum())
     if bool(level.any()):
         low[2] = center[level, 2].amin()
     return torch.stack([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])

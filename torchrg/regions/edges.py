@@ -51,7 +51,7 @@ class GrowingCloud(NamedTuple):
     colors: Tensor | None = None
     max_color_distance: float = math.inf
     signed_normals: bool = False
-    angle_share: float = 1.0
+    angle_fraction: float = 1.0
 
 
 def is_order_free(config: GrowingConfig) -> bool:
@@ -139,7 +139,7 @@ def accept_edges(
     if isinstance(ids, slice):
         ids = torch.arange(ids.start, ids.stop, device=cloud.points.device)
     near, signed = cloud.neighbors.at(rows), cloud.signed_normals
-    max_angle_deg = cloud.angle_share * config.max_angle_deg
+    max_angle_deg = cloud.angle_fraction * config.max_angle_deg
     angle = distance = None
     if max_angle_deg < 90 or signed:
         angle = cloud.points.new_tensor(deg_to_sq_chord(max_angle_deg))

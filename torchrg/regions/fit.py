@@ -33,11 +33,11 @@ _CURVED_SPREAD_DEG = 8.0
 """Root mean square angle of a region's normals to the direction they share, from which on it is
 curved: a smooth bend by three to four times this angle has this spread, a full column 45."""
 
-MOST_FITTED = 4096
+MAX_FITTED = 4096
 """Points of a region that its plane is fitted to while regions change: more of them move it by less
 than a fiftieth of their noise."""
 
-LEAST_FITTED = 10
+MIN_FITTED = 10
 """Points whose plane says where others at its border belong: that of three passes through them."""
 
 _BENT = 0.5
@@ -52,7 +52,7 @@ _MAX_FACET_RMS = 1.5
 """Facet tolerances, root mean square, within which the points of a faceted region are on one plane,
 however much their normals are spread."""
 
-_LEAST_HEIGHT = 0.2
+_MIN_HEIGHT = 0.2
 """An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. What is
 thinner than 0.2 a w is a plane with noisy normals."""
 
@@ -143,12 +143,12 @@ def fit_planes(
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
-    shares = segments.shares(POINTS_AT_ONCE)
-    sizes = [len(share.counts) for share in shares]
-    own = torch.split(normals, sizes) if shared else [None] * len(shares)
+    chunks = segments.chunks(POINTS_AT_ONCE)
+    sizes = [len(chunk.counts) for chunk in chunks]
+    own = torch.split(normals, sizes) if shared else [None] * len(chunks)
     parts = map_tasks(
         lambda task: _fit_together(task[0], points, normals, task[1]),
-        list(zip(shares, own, strict=True)),
+        list(zip(chunks, own, strict=True)),
         points.device,
     )
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
@@ -158,8 +158,8 @@ def _shared_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor
     """Return the normal that points share, signs aside, and the spread of theirs, in degrees."""
     columns = segments.take_about(normals, normals.new_zeros(len(segments.counts), 3).double())
     _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
-    shares, directions = eigh3_of_few(squares)
-    return directions[:, :, 2], (1 - shares[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
+    eigenvalues, directions = eigh3_of_few(squares)
+    return directions[:, :, 2], (1 - eigenvalues[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
 
 
 def _fit_together(
@@ -182,7 +182,7 @@ def _fit_together(
         weights, median, squares = segments.reweigh(local, mean, normal, resolution, factors)
     thickness = MAD_FACTOR * median
     # The angle times the width across the bend, which is at least the middle one, is its height.
-    height = _LEAST_HEIGHT * spread.deg2rad() * variances[:, 1].clamp(min=0).sqrt()
+    height = _MIN_HEIGHT * spread.deg2rad() * variances[:, 1].clamp(min=0).sqrt()
     # Of an arc without width the plane is its own, and says nothing of its thickness.
     crosses = (usual * normal).sum(dim=1).abs() > math.sqrt(0.5)
     return RegionPlanes(
@@ -208,7 +208,7 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     thick: in faces a few centimetres wide, noise spreads normals, too. ``labels`` ``(N,)`` are 0 to
     M-1, each at least once, or negative.
     """
-    segments = Segments(labels, most=MOST_FITTED)
+    segments = Segments(labels, most=MAX_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
     radii = map_tasks(
         lambda rows: neighborhood_radii(cloud.points, cloud.neighbors.at(rows)),

@@ -22,7 +22,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
 from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
-from torchrg.regions.fit import LEAST_FITTED, RegionFits
+from torchrg.regions.fit import MIN_FITTED, RegionFits
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
 from torchrg.structures import UNLABELED, Neighbors
@@ -142,9 +142,9 @@ def label_regions(
     least = int(config.min_size)
     if config.absorb:
         # A region may be large enough only with the points that it absorbs.
-        least = min(least, max(least // 2, LEAST_FITTED))
+        least = min(least, max(least // 2, MIN_FITTED))
     # Facets make a face together, however small they are.
-    fitted = least if config.facet_tolerance is None else min(least, LEAST_FITTED)
+    fitted = least if config.facet_tolerance is None else min(least, MIN_FITTED)
     labels, fits = number_by_size(roots, fitted), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
         mixed = find_mixed_regions(cloud, labels, fits.of(labels), config, chunk_size)

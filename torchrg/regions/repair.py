@@ -12,13 +12,13 @@ from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords, unsigned_angle_deg
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import (
-    LEAST_CONTACTS,
+    MIN_CONTACTS,
     PARALLEL_DEG,
     NearestPoints,
     find_contacts,
 )
 from torchrg.regions.edges import GrowingCloud
-from torchrg.regions.fit import LEAST_FITTED, RegionFits, RegionPlanes
+from torchrg.regions.fit import MIN_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
 
 _AGREE = 0.3
@@ -101,7 +101,7 @@ def refine_regions(
         labels = _drop_small(labels, 1)
         planes = fits.of(labels)
         # Where a bent face ends its plane does not say.
-        vague = planes.bent | (planes.num_points < LEAST_FITTED)
+        vague = planes.bent | (planes.num_points < MIN_FITTED)
         reach = torch.where(vague, torch.nan, planes.times_thickness(config.absorb_reach))
         labels = refine_borders(cloud, labels, planes, reach)
         labels = assign_levels(cloud, labels, planes)
@@ -235,7 +235,7 @@ def merge_coplanar(
     region from then on, with the smallest label of its parts.
     """
     pairs, num_contacts = contacts
-    pairs = pairs[(num_contacts >= LEAST_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
+    pairs = pairs[(num_contacts >= MIN_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
     return _merge(labels, pairs, _moments_of(planes), tolerance)
 
 
@@ -257,7 +257,7 @@ def merge_facets(
     one plane goes. ``contacts`` and labels are those of :func:`merge_coplanar`.
     """
     pairs, num_contacts = contacts
-    pairs = pairs[num_contacts >= LEAST_CONTACTS]
+    pairs = pairs[num_contacts >= MIN_CONTACTS]
     scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
     moments = _moments_of(planes)._replace(scale=scale, noise=noise)
     return _merge(labels, pairs, moments, 1.0, max_tilt=_FACET_TILT * tolerance)
@@ -366,15 +366,15 @@ def _root(owner: list[int], i: int) -> int:
 def _joined(a: _Moments, b: _Moments) -> _Moments:
     """Return the moments of two sets of regions, taken together one by one."""
     weight = a.weight + b.weight
-    share_a, share_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
-    mean = share_a * a.mean + share_b * b.mean
+    fraction_a, fraction_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
+    mean = fraction_a * a.mean + fraction_b * b.mean
     covariance = torch.zeros_like(a.covariance)
-    for side, share in ((a, share_a), (b, share_b)):
+    for side, fraction in ((a, fraction_a), (b, fraction_b)):
         shift = side.mean - mean
         spread = side.covariance + shift[:, :, None] * shift[:, None, :]
-        covariance = covariance + share[:, :, None] * spread
+        covariance = covariance + fraction[:, :, None] * spread
     noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
-    scale = (share_a[:, 0] * a.scale.square() + share_b[:, 0] * b.scale.square()).sqrt()
+    scale = (fraction_a[:, 0] * a.scale.square() + fraction_b[:, 0] * b.scale.square()).sqrt()
     values, axes = eigh3_of_few(covariance)
     return _Moments(weight, mean, covariance, scale, noise, values[:, 0], axes[:, :, 0])
 
@@ -451,7 +451,7 @@ def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> 
     neighbors are decided again in the next pass.
     """
     beside = NearestPoints(cloud.neighbors)
-    flat = ~planes.curved & (planes.num_points >= LEAST_FITTED)
+    flat = ~planes.curved & (planes.num_points >= MIN_FITTED)
     flat = torch.cat([flat, flat.new_zeros(1)])
     labels = labels.clone()
     rows = _touching(labels, beside)

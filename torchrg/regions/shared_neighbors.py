@@ -13,7 +13,7 @@ _BLOCK_SIZE = 64
 """Points of a block: smaller ones repeat the lists around them more often, larger ones have larger
 products of matrices."""
 
-_MOST_IN_KERNEL = kernels.MOST_NEIGHBORS // 8
+_MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
 """Neighbours up to which the kernel is the faster one: the points that occur in the lists of one of
 its blocks are at most eight times as many."""
 
@@ -57,7 +57,7 @@ class SharedNeighbors:
         if self._min_shared <= 0:
             return asked.clone()
         k = asked.shape[1]
-        if k <= _MOST_IN_KERNEL and kernels.serve(*self._neighbors, asked, k=k):
+        if k <= _MAX_IN_KERNEL and kernels.serve(*self._neighbors, asked, k=k):
             numbers = self._buffer()
             edges = *self._neighbors, asked, numbers, rows.start, self._min_shared
             (joined,) = kernels.call("connected", *edges)

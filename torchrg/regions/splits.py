@@ -19,46 +19,46 @@ from torchrg.linalg import deg_to_sq_chord, sq_chords, unsigned_angle_deg
 from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, NearestPoints
 from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
-from torchrg.regions.fit import MOST_FITTED, RegionPlanes, fit_planes, fit_regions
+from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
 from torchrg.regions.repair import misfit_of_pairs, renumber
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import UNLABELED, Neighbors
 
-_CORE_SHARE = 0.5
+_CORE_FRACTION = 0.5
 """Share of the limits of angle and distance within which the core of a face is connected."""
 
 _SMOOTH_ANGLE = 0.3
 """A surface is smooth where normals of neighbours differ by less than this share of the largest
 angle."""
 
-_LEAST_SMOOTH = 0.7
+_MIN_SMOOTH = 0.7
 """Cores grow only through points with at least 0.7 of the smooth neighbours that are usual (the
 median) in their region; elsewhere noise may hide an edge."""
 
-_MOST_OFF_PLANE = 0.1
+_MAX_OFF_PLANE = 0.1
 """Share of a region's points off its plane up to which the others are one face."""
 
 _EXACT_REACH = 4.0
 """Points of exact faces lie within this many least thicknesses of the plane of their region."""
 
-_LEAST_FLAT = 0.5
+_MIN_FLAT = 0.5
 """A region is made of faces if at least this share of its points is in flat cores: a noisy column
 breaks into cores that are few, and curved."""
 
-_LEAST_FACE = 0.05
+_MIN_FACE = 0.05
 """A flat core beside curved ones is a face if it has at least this share of the points of the
 region, as the panel that a moulding runs around. Smaller ones belong to the bend."""
 
-_OPEN_SHARE = 0.1
+_OPEN_FRACTION = 0.1
 """A surface goes on between two cores if at least this share of the edges between them passes the
 criteria; across a bridge few do."""
 
-_LEAST_MISFIT = 2.0
+_MIN_MISFIT = 2.0
 """Two cores lie on one plane if their misfit to it is below this many thicknesses, as it is for
 parts of a face that noise has bent."""
 
-_MOST_TURNED_DEG = 30.0
-"""Largest angle between the planes of cores that are joined, degrees. ``_LEAST_MISFIT`` alone would
+_MAX_TURNED_DEG = 30.0
+"""Largest angle between the planes of cores that are joined, degrees. ``_MIN_MISFIT`` alone would
 join narrow strips on both sides of an edge."""
 
 _NUM_AVERAGED = 16
@@ -144,7 +144,7 @@ def find_mixed_regions(
     region, has_region = labels.clamp(min=0), labels >= 0
     off = has_region & (planes.distances(cloud.points, region) > limit[region])
     num_off = torch.bincount(labels[off], minlength=len(limit))
-    on_plane = num_off <= _MOST_OFF_PLANE * planes.num_points
+    on_plane = num_off <= _MAX_OFF_PLANE * planes.num_points
     mixed = num_off >= int(config.min_size)
     rows = (torch.where(on_plane[region], off, has_region) & mixed[region]).nonzero().squeeze(1)
     if len(rows) == 0:
@@ -160,14 +160,14 @@ def find_mixed_regions(
     turn = torch.cat(turns)
     near, aligned = (
         torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
-        for limit in (config.max_angle_deg, _CORE_SHARE * config.max_angle_deg)
+        for limit in (config.max_angle_deg, _CORE_FRACTION * config.max_angle_deg)
     )
     faces = _part_of(cloud, labels, rows)
     smooth = _are_smooth(faces, labels[rows], _SMOOTH_ANGLE * config.max_angle_deg, chunk_size)
     faces = faces._replace(
         valid=faces.valid & smooth,
-        reach=None if faces.reach is None else _CORE_SHARE * faces.reach,
-        angle_share=_CORE_SHARE,
+        reach=None if faces.reach is None else _CORE_FRACTION * faces.reach,
+        angle_fraction=_CORE_FRACTION,
     )
     return MixedRegions(rows, faces, near, aligned, on_plane)
 
@@ -227,8 +227,8 @@ def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: T
     num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
     of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
     covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
-    curved = ~(on_plane | (covered >= _LEAST_FLAT * of_region))
-    is_face = flat & (num_points >= _LEAST_FACE * of_region[owner])
+    curved = ~(on_plane | (covered >= _MIN_FLAT * of_region))
+    is_face = flat & (num_points >= _MIN_FACE * of_region[owner])
     joined = curved[owner] & ~is_face
     numbers = torch.arange(len(owner) + 1, device=cores.device)
     numbers[-1] = UNLABELED
@@ -247,23 +247,26 @@ def _owners(labels: Tensor, cores: Tensor) -> Tensor:
 
 def _planes_of(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
     """Return the planes of cores."""
-    return fit_planes(Segments(cores, most=MOST_FITTED), cloud.points, cloud.normals)
+    return fit_planes(Segments(cores, most=MAX_FITTED), cloud.points, cloud.normals)
 
 
 def _are_smooth(
     cloud: GrowingCloud, regions: Tensor, max_angle_deg: float, chunk_size: int
 ) -> Tensor:
     """Tell at which points the surface bends no more than is usual in their region."""
-    shares = torch.zeros_like(cloud.curvature, dtype=torch.float64)
-    rows, limit = torch.arange(len(shares), device=shares.device), deg_to_sq_chord(max_angle_deg)
-    for chunk in chunks_of(len(shares), chunk_size):
+    fractions = torch.zeros_like(cloud.curvature, dtype=torch.float64)
+    rows, limit = (
+        torch.arange(len(fractions), device=fractions.device),
+        deg_to_sq_chord(max_angle_deg),
+    )
+    for chunk in chunks_of(len(fractions), chunk_size):
         near, counted = cloud.neighbors.at(chunk), cloud.neighbors.counted(chunk)
         alike = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
-        shares[chunk] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
+        fractions[chunk] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
     segments = Segments(regions)
-    usual = segments.median(segments.take(shares))
-    return shares >= _LEAST_SMOOTH * usual[regions]
+    usual = segments.median(segments.take(fractions))
+    return fractions >= _MIN_SMOOTH * usual[regions]
 
 
 def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
@@ -315,8 +318,8 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
     planes = _planes_of(cloud, cores)
     one, other = planes.normal[pairs].unbind(dim=1)
     turn = unsigned_angle_deg(one, other)
-    joined = (misfit_of_pairs(planes, pairs) < _LEAST_MISFIT) & (turn <= _MOST_TURNED_DEG)
-    joined |= num_open >= _OPEN_SHARE * num_edges
+    joined = (misfit_of_pairs(planes, pairs) < _MIN_MISFIT) & (turn <= _MAX_TURNED_DEG)
+    joined |= num_open >= _OPEN_FRACTION * num_edges
     ends = pairs[joined].T.cpu().numpy()
     ones = np.ones(ends.shape[1], dtype=np.int8)
     graph = coo_array((ones, (ends[0], ends[1])), shape=(num_cores, num_cores))

@@ -52,11 +52,11 @@ _PLANE_WEIGHT = 0.25
 """Weight of a contact between points of different planes, as of normals that differ by 29
 degrees."""
 
-_LEAST_DIFFERENCE = 0.01
+_MIN_DIFFERENCE = 0.01
 """Squared difference of normals, that of 6 degrees, which counts even between regions of one
 surface."""
 
-_MOST_EDGES = 64
+_MAX_EDGES = 64
 """Edges of a vertex that it lists at most, which bounds the memory; reconstructions have 6."""
 
 _BORDERS_A_TURN = 8
@@ -239,9 +239,9 @@ def _listed(edges: Tensor, num_places: int) -> Tensor:
     """Return the first 64 places that edges lead to from each ``(n, K)``; itself where fewer."""
     counts = torch.bincount(edges[:, 0], minlength=num_places)
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
-    first = column < _MOST_EDGES
+    first = column < _MAX_EDGES
     width = max(int(counts.max()), 1) if len(edges) else 1
-    listed = torch.arange(num_places, dtype=torch.int32)[:, None].repeat(1, min(width, _MOST_EDGES))
+    listed = torch.arange(num_places, dtype=torch.int32)[:, None].repeat(1, min(width, _MAX_EDGES))
     listed[edges[first, 0], column[first]] = edges[first, 1].to(torch.int32)
     return listed
 
@@ -503,12 +503,12 @@ def _costs(regions: _Regions, borders: _Borders, bound: float) -> Tensor:
     means = regions.features / regions.size[:, None]
     if kernels.serve():
         boxes = regions.low, regions.high
-        limits = _LEAST_DIFFERENCE, bound
+        limits = _MIN_DIFFERENCE, bound
         return kernels.call("merging_costs", regions.size, means, *boxes, *borders, *limits)[0]
     cost = torch.empty_like(borders.contacts)
     for rows in chunks_of(len(cost), ROWS_AT_ONCE):
         a, b = borders.first[rows], borders.second[rows]
-        difference = borders.difference[rows] / borders.contacts[rows] + _LEAST_DIFFERENCE
+        difference = borders.difference[rows] / borders.contacts[rows] + _MIN_DIFFERENCE
         for step in (means[a] - means[b]).unbind(dim=1):
             difference += step * step
         size_a, size_b = regions.size[a], regions.size[b]

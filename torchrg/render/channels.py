@@ -134,12 +134,14 @@ def _of_normals(normals: Tensor) -> Channel:
     return Channel("normal", values, colors, legend)
 
 
-def _on_scale(mode: str, shares: Tensor, shown: Mapping[float, str]) -> Channel:
+def _on_scale(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Channel:
     """Return the colours of shares of a scale, and of those whose meaning is shown."""
     steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
     colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
-    legend = [(colors[round(_LEVELS * share)].tolist(), text) for share, text in shown.items()]
-    values = (shares.clamp(0, 1).nan_to_num() * _LEVELS).round().numpy().astype(np.uint8)
+    legend = [
+        (colors[round(_LEVELS * fraction)].tolist(), text) for fraction, text in shown.items()
+    ]
+    values = (fractions.clamp(0, 1).nan_to_num() * _LEVELS).round().numpy().astype(np.uint8)
     return Channel(mode, values, colors, legend)
 
 

@@ -113,8 +113,8 @@ def choose_colors(
         2
     """
     repulsion = _likeness().T
-    share = sizes / sizes.sum()
-    strength = (8 * share).clamp(_ELSEWHERE, 1).double()
+    fraction = sizes / sizes.sum()
+    strength = (8 * fraction).clamp(_ELSEWHERE, 1).double()
     choices = torch.full_like(sizes, -1) if fixed is None else fixed.clone()
     done = choices >= 0
     field = strength[done] @ repulsion[choices[done]] + _GRAY_WEIGHT * repulsion[-1]
@@ -129,7 +129,7 @@ def choose_colors(
         near = slice(starts[plane], starts[plane + 1])
         placed = choices[others[near]]
         cost = field + (pull[near] * (placed >= 0)) @ repulsion[placed]
-        calm = bool(share[plane] > _LARGE)
+        calm = bool(fraction[plane] > _LARGE)
         pick = cost[:num_calm].argmin() if calm else num_calm + cost[num_calm:].argmin()
         choices[plane] = pick
         field += strength[plane] * repulsion[pick]

@@ -23,26 +23,26 @@ from torchrg.structures import PLANE_KINDS, UNLABELED, Planes
 
 View = Literal["cutaway", "above", "outside", "sensor"]
 
-LEAST_FACING = {"cutaway": 0.1, "above": 0.7}
+MIN_FACING = {"cutaway": 0.1, "above": 0.7}
 """Least cosine between the direction of an outer side and that toward the viewer for it to be cut
 away, by the view. From above only what lies nearly flat is in the way."""
-MOST_SIDES = 7
+MAX_SIDES = 7
 """Outer sides of a cloud: bits of a byte, the last of which hides planes on a page."""
-_MOST_WALLS = 60
+_MAX_WALLS = 60
 """So many of the largest walls and ceilings may be outer ones, which bounds the memory."""
 _ANGLE_DEG = 4.0
 """Angle of growth on voxels, which have little noise: with more, ceilings grow into walls."""
 _ALIKE = 0.9
 """Least cosine between the directions of walls that are cut away together."""
-_MOST_BEYOND = 0.03
+_MAX_BEYOND = 0.03
 """Largest share of the cloud beyond an outer wall: scanners see through doors and windows."""
-_LEAST_INSIDE = 0.05
+_MIN_INSIDE = 0.05
 """Least share of the cloud on the inner side of an outer wall."""
 _THICKNESS = 1.5
 """Voxels nearer to a wall than this many of their edges, and twice its own noise, are in it."""
 _BELOW_CEILING = 0.15
 """Share of the cloud's height below a ceiling that goes with it: lamps and beams hang there."""
-_MOST_PIXELS = 500
+_MAX_PIXELS = 500
 """Side of the picture that tells how much a view shows."""
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
 """Azimuths that are tried, in degrees. None looks straight at a wall, so that two walls of a corner
@@ -67,7 +67,7 @@ class Sides(NamedTuple):
 
     def bits_toward(self, toward: Tensor, view: View) -> int:
         """Return the bits of the sides that a view from a direction leaves out."""
-        facing = self.directions @ toward > LEAST_FACING.get(view, math.inf)
+        facing = self.directions @ toward > MIN_FACING.get(view, math.inf)
         return sum(1 << place for place, cut in enumerate(facing.tolist()) if cut)
 
 
@@ -102,10 +102,10 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
     kind = classify_planes(planes, centers, numbers, up)
     walls, ceilings = (kind == PLANE_KINDS.index(name) for name in ("wall", "ceiling"))
     directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
-    powers = 1 << torch.arange(MOST_SIDES, device=centers.device)
+    powers = 1 << torch.arange(MAX_SIDES, device=centers.device)
     by_place = (covered * powers).sum(dim=1)
     is_labeled = of_points >= 0
-    inside = torch.zeros(len(present) + 1, MOST_SIDES, device=centers.device)
+    inside = torch.zeros(len(present) + 1, MAX_SIDES, device=centers.device)
     inside.index_add_(0, of_points[is_labeled], covered[surface.voxel_of[is_labeled]].float())
     counts = torch.bincount(of_points[is_labeled], minlength=len(inside))
     of_planes = ((2 * inside > counts[:, None]) * powers).sum(dim=1)
@@ -118,9 +118,9 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
 def _outer(
     surface: Surface, planes: Planes, walls: Tensor, ceilings: Tensor, up: Tensor, height: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the directions of outer sides, and which voxels are in each ``(V, MOST_SIDES)``."""
+    """Return the directions of outer sides, and which voxels are in each ``(V, MAX_SIDES)``."""
     rows = (walls | ceilings).nonzero().squeeze(1)
-    rows = rows[planes.area[rows].argsort(descending=True, stable=True)][:_MOST_WALLS]
+    rows = rows[planes.area[rows].argsort(descending=True, stable=True)][:_MAX_WALLS]
     local = surface.centers[:, None] - planes.center[rows]
     across = torch.einsum("vmi,mji->vmj", local, planes.axes[rows]).abs()
     thickness = _THICKNESS * surface.size + 2 * planes.rms[rows]
@@ -128,17 +128,17 @@ def _outer(
     beside = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
     heights = (local * planes.normal[rows]).sum(dim=2)
     directions: list[Tensor] = []
-    covered = torch.zeros(len(local), MOST_SIDES, dtype=torch.bool, device=local.device)
+    covered = torch.zeros(len(local), MAX_SIDES, dtype=torch.bool, device=local.device)
     for place, row in enumerate(rows.tolist()):
         for sign in (1, -1):
             outward, above = sign * planes.normal[row], sign * heights[:, place]
             beyond = (beside[:, place] & (above > thickness[place])).float().mean()
             inside = (above < -thickness[place]).float().mean()
-            is_outer = bool((beyond <= _MOST_BEYOND) & (inside >= _LEAST_INSIDE))
+            is_outer = bool((beyond <= _MAX_BEYOND) & (inside >= _MIN_INSIDE))
             if not is_outer or (ceilings[row] and outward @ up < 0):
                 continue
             alike = [n for n, each in enumerate(directions) if each @ outward > _ALIKE]
-            if not alike and len(directions) < MOST_SIDES:
+            if not alike and len(directions) < MAX_SIDES:
                 alike = [len(directions)]
                 directions.append(outward)
             for side in alike[:1]:
@@ -231,7 +231,7 @@ def _count_seen(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
     right = torch.linalg.cross(viewpoint.up, viewpoint.toward)
     places = centers @ torch.stack([right, viewpoint.up], dim=1)
     places -= places.amin(dim=0)
-    pitch = max(1.5 * surface.size, float(places.amax()) / _MOST_PIXELS)
+    pitch = max(1.5 * surface.size, float(places.amax()) / _MAX_PIXELS)
     column, row = (places / pitch).long().unbind(dim=1)
     pixels, height = column * (int(row.amax()) + 1) + row, centers @ viewpoint.toward
     front = height.new_full((int(pixels.amax()) + 1,), -torch.inf)

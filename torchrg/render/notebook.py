@@ -13,7 +13,7 @@ from torchrg.render.page import Page, make_page
 from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
 
-MOST_ROWS = 12
+MAX_ROWS = 12
 """Planes in the table, the largest ones."""
 
 
@@ -53,7 +53,7 @@ def as_html(segmentation: Segmentation) -> str:
             content = base64.b64encode(path.read_bytes()).decode("ascii")
         picture = f'<img src="data:image/png;base64,{content}" style="max-width: 640px" alt="">'
     planes, labels = describe_planes(segmentation.planes)["planes"], segmentation.labels
-    share = 100 * float((labels >= 0).double().mean()) if labels.numel() else 0.0
+    percent = 100 * float((labels >= 0).double().mean()) if labels.numel() else 0.0
     counts = f"{labels.numel():,} points, {len(planes):,} planes"
     rows = [
         (
@@ -65,11 +65,11 @@ def as_html(segmentation: Segmentation) -> str:
             " ".join(f"{value:.3f}" for value in plane["normal"]),
             f"{plane['offset']:.5g}",
         )
-        for plane in planes[:MOST_ROWS]
+        for plane in planes[:MAX_ROWS]
     ]
     names = ("plane", "kind", "points", "area", "rms", "normal", "offset")
     cells = "".join(f"<th>{name}</th>" for name in names)
     lines = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    more = f"<p>and {len(planes) - MOST_ROWS:,} more</p>" if len(planes) > MOST_ROWS else ""
+    more = f"<p>and {len(planes) - MAX_ROWS:,} more</p>" if len(planes) > MAX_ROWS else ""
     table = f"<table><tr>{cells}</tr>{lines}</table>{more}" if rows else ""
-    return f"<div><p>{counts}, {share:.1f} % of the points labelled</p>{picture}{table}</div>"
+    return f"<div><p>{counts}, {percent:.1f} % of the points labelled</p>{picture}{table}</div>"

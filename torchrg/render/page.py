@@ -45,7 +45,7 @@ from torchrg.render.content import (
     radii_of,
     rounded,
 )
-from torchrg.render.cutaway import LEAST_FACING, View, choose_viewpoint
+from torchrg.render.cutaway import MIN_FACING, View, choose_viewpoint
 from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud
 
@@ -150,8 +150,8 @@ def make_page(
         "modes": [(mode, MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
         "toward": rounded(_direction_of_view(shown, view, frame, azimuth_deg)),
-        "cut": view in LEAST_FACING,
-        "leastFacing": LEAST_FACING["above" if view == "above" else "cutaway"],
+        "cut": view in MIN_FACING,
+        "leastFacing": MIN_FACING["above" if view == "above" else "cutaway"],
         "frame": {
             "origin": frame.origin.tolist(),
             "rotation": frame.rotation.tolist(),

@@ -11,7 +11,7 @@ from torchrg.neighbors.order import spread_bits
 
 _BITS = 20
 """The longest side of a cloud is ``2**_BITS`` steps; points of one step are duplicates."""
-_MOST_VOXELS = 60_000
+_MAX_VOXELS = 60_000
 """Most voxels of a cloud: a room of 6 m has them every 5 cm."""
 _ALL_BELOW = 1000
 """A cloud of fewer points has a voxel for each of them."""
@@ -128,7 +128,7 @@ def sample_surface(points: Tensor) -> Surface:
 
 def _level_of_voxels(codes: Tensor) -> int:
     """Return how often steps are doubled until voxels hold two on average, and are few enough."""
-    most = min(_MOST_VOXELS, max(_ALL_BELOW, len(codes) // 2))
+    most = min(_MAX_VOXELS, max(_ALL_BELOW, len(codes) // 2))
     level = 0
     while int((codes >> 3 * level).diff().count_nonzero()) >= most:
         level += 1

@@ -29,7 +29,7 @@ Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
 PATCHES_IN_CACHE = 4096
 """Patches that are worked on together, so that what they need fits the processor's cache."""
 
-_LEAST_PATCHES = 64
+_MIN_PATCHES = 64
 """Fewer patches than this are not worth the start of a thread."""
 
 
@@ -167,11 +167,11 @@ def fit_patchwise(
 def _with_gradients(fit: RobustFit, patches: Tensor, weights: Tensor) -> RobustFit:
     """Return a fit whose location and covariance have the gradients of weighted points."""
     total = weights.sum(dim=-1, keepdim=True)
-    shares = (weights / torch.where(total > 0, total, 1.0))[..., None]
-    points = torch.where(shares > 0, patches, 0.0)
-    mean = (shares * points).sum(dim=-2, keepdim=True)
+    fractions = (weights / torch.where(total > 0, total, 1.0))[..., None]
+    points = torch.where(fractions > 0, patches, 0.0)
+    mean = (fractions * points).sum(dim=-2, keepdim=True)
     offsets = (points - mean).unbind(dim=-1)
-    scatter = second_moments(offsets, shares.squeeze(-1))
+    scatter = second_moments(offsets, fractions.squeeze(-1))
     size, size_of_scatter = (
         m.detach().diagonal(dim1=-2, dim2=-1).sum(dim=-1) for m in (fit.covariance, scatter)
     )
@@ -210,7 +210,7 @@ def _fit_groups(
             block = block.gather(1, order[..., None].expand(-1, -1, size))
             _store(out, chosen, _spread(fit(block), order, num_points))
 
-        map_chunks(work, len(rows), chunk_size, patches.device, least=_LEAST_PATCHES)
+        map_chunks(work, len(rows), chunk_size, patches.device, least=_MIN_PATCHES)
     return out
 
 

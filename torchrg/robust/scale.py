@@ -38,7 +38,7 @@ _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
 _TAU_WEIGHT_CUT = 4.5
 """A value that deviates by more than this many median deviations has no weight in the centre."""
 
-_GPU_SHARE = 256
+_GPU_FRACTION = 256
 """Factor of the work at a time on a GPU, which has the memory for it and is slow to start."""
 
 _TAU_SCALE_CUT = 3.0
@@ -319,7 +319,7 @@ def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
     n, on_cpu = sorted_rows.shape[1], sorted_rows.device.type == "cpu"
     lags = range(1, half_size(n))
     rank, width = comb(half_size(n), 2), sum(n - lag for lag in lags)
-    size = (1 if on_cpu else _GPU_SHARE) * CACHE_BYTES // (width * sorted_rows.element_size())
+    size = (1 if on_cpu else _GPU_FRACTION) * CACHE_BYTES // (width * sorted_rows.element_size())
 
     def select(chunk: slice) -> Tensor:
         rows = sorted_rows[chunk]

@@ -169,9 +169,9 @@ def _draw_places(
     """Return points, normals and faces of exactly ``num_points`` places, face after face."""
     areas = np.array([surface.area for surface in model.surfaces])
     drawn: list[tuple[Floats, Floats, NDArray[np.int64]]] = []
-    missing, share_kept = num_points, 1.0
+    missing, fraction_kept = num_points, 1.0
     while missing > 0:
-        num_tried = int(missing / share_kept * _SPARE) + 16
+        num_tried = int(missing / fraction_kept * _SPARE) + 16
         num_kept = 0
         for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
             tried = model.surfaces[face].sample(rng, int(count))
@@ -181,7 +181,7 @@ def _draw_places(
             drawn.append((points, normals, np.full(len(points), face)))
             num_kept += len(points)
         missing -= num_kept
-        share_kept = max(num_kept, 1) / num_tried
+        fraction_kept = max(num_kept, 1) / num_tried
     points, normals, labels = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
     # A random subset: to keep the first would leave the last faces short of points.
     chosen = np.sort(rng.permutation(len(labels))[:num_points])

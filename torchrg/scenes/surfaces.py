@@ -163,7 +163,7 @@ class Solid:
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Return which points of shape ``(N, 3)`` are inside it, or on its surface."""
-        shares = 2 * np.abs(self.frame.to_local(points)) / self.size
-        curved, straight = shares[:, : self.num_round], shares[:, self.num_round :]
+        fractions = 2 * np.abs(self.frame.to_local(points)) / self.size
+        curved, straight = fractions[:, : self.num_round], fractions[:, self.num_round :]
         inside: NDArray[np.bool_] = np.vecdot(curved, curved) <= 1
         return inside & (straight <= 1).all(axis=1)

@@ -70,7 +70,7 @@ def estimate_consensus(
         return fit._replace(sharp=torch.zeros_like(fit.valid))
     survey = survey_noise(points, neighbors, fit, chunk_size=size)
     if config.adaptive_k is not None:
-        count = wanted_neighbors(_share_of_noise(survey), neighbors.indices.shape[1], config)
+        count = wanted_neighbors(_noise_fraction(survey), neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
             fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
@@ -79,8 +79,8 @@ def estimate_consensus(
     if config.noise_scope == "auto":
         config = config.at_sampling(measure_sampling(points, neighbors))
     if config.noise_scope == "regional":
-        share = constants.REGIONAL_SHARE
-        noise = torch.minimum(noise, share * regional_noise(noise, neighbors))
+        fraction = constants.REGIONAL_FRACTION
+        noise = torch.minimum(noise, fraction * regional_noise(noise, neighbors))
         survey = survey._replace(noise=noise)
 
     planes, sharp, voted = fit_surfaces(points, neighbors, fit, survey, chunk_size=size)
@@ -97,16 +97,16 @@ def estimate_consensus(
     return NormalFit(planes.normals, curvature, fit.valid, residual_rms, sharp)
 
 
-def _share_of_noise(survey: Survey) -> Tensor:
+def _noise_fraction(survey: Survey) -> Tensor:
     """Return the noise by the radius of each neighbourhood, shape ``(N,)``; NaN where unknown."""
     is_told = survey.noise.isfinite() & (survey.radius > 0)
     return torch.where(is_told, survey.noise / survey.radius, torch.nan)
 
 
-def wanted_neighbors(shares: Tensor, count: int, config: NormalsConfig) -> int:
+def wanted_neighbors(fractions: Tensor, count: int, config: NormalsConfig) -> int:
     """Return the number of neighbours with which noise is a small share of the radius.
 
-    ``shares`` are noise by radius of all points with ``count`` neighbours, NaN where unknown;
+    ``fractions`` are noise by radius of all points with ``count`` neighbours, NaN where unknown;
     ``config.adaptive_k`` is the most there may be.
 
     Example:
@@ -114,8 +114,8 @@ def wanted_neighbors(shares: Tensor, count: int, config: NormalsConfig) -> int:
         >>> wanted_neighbors(shares, 50, NormalsConfig(adaptive_k=300))
         200
     """
-    finite = shares[~shares.isnan()]
+    finite = fractions[~fractions.isnan()]
     if config.adaptive_k is None or len(finite) == 0:
         return count
     wanted = round(count * (float(finite.median()) / constants.ADAPTIVE_NOISE) ** 2)
-    return min(max(count, wanted), config.adaptive_k, len(shares))
+    return min(max(count, wanted), config.adaptive_k, len(fractions))

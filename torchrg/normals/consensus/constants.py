@@ -37,13 +37,13 @@ it is asked for: fewer leave small faces of fused meshes in the one behind them.
 REGIONAL_QUANTILE = 0.1
 """Share. Quantile over the neighbours in each of these steps: higher ones do not leave the slope of
 a step, as a neighbourhood at its end lies on it for the most part."""
-REGIONAL_SHARE = 0.8
+REGIONAL_FRACTION = 0.8
 """Ratio. What counts of the noise of the region: both faces at a step of a mesh deviate from one
 plane by little more than its bumps do, and what is looked at closely loses nothing."""
 MAX_LAYERED_KURTOSIS = 2.2
 """Ratio. Kurtosis of the residuals from one plane up to which two parallel planes are tried. It is
 1 for both faces of a plate without noise, 1.8 for an even spread, and 3 for noise."""
-MAX_LAYERED_SHARE = 0.35
+MAX_LAYERED_FRACTION = 0.35
 """Deviations of one plane. Two parallel planes are the faces of a plate if they leave no more than
 this. They leave 0.5 of an even spread and 0.6 of noise."""
 MIN_BREADTH = 0.03
@@ -58,7 +58,7 @@ FLAT_LIMIT = 1.05
 CURVED_LIMIT = 1.2
 """s. A paraboloid stands if the neighbours deviate from it by no more than this. A larger one
 misses edges; a smaller one spares fewer points without an edge the fits that come later."""
-CURVED_SHARE = 0.15
+CURVED_FRACTION = 0.15
 """Deviations of the plane. Where there is next to no noise, a paraboloid stands if it leaves no
 more than this. A symmetric edge has 0.27."""
 FAR_OFF = 2.0
@@ -91,7 +91,7 @@ MIN_PLANE_POINTS = 5
 """Points. A plane with fewer points fits them wherever they are, and explains nothing."""
 CORNER_LIMIT = 1.15
 """s. Three planes are tried where two planes leave a deviation above this."""
-CORNER_SHARE = 0.9
+CORNER_FRACTION = 0.9
 """Deviations of two planes. Three planes replace two if they leave less than this."""
 MEETING_LIMIT = 1.3
 """s. Two or three planes explain the neighbours if these deviate by no more than this."""

@@ -180,7 +180,7 @@ def fit_meeting_planes(
     rows = (two.deviations > constants.CORNER_LIMIT * noise).nonzero().squeeze(-1)
     corners = (columns[0][rows], columns[1][rows], columns[2][rows])
     start = MeetingPlanes(*(values[rows] for values in two))
-    least = constants.CORNER_SHARE * start.deviations
+    least = constants.CORNER_FRACTION * start.deviations
     best = start._replace(deviations=least)
     for groups in (
         split_off(wedge.first[rows], wedge.outer[rows], noise[rows]),

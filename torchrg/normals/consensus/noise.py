@@ -94,8 +94,8 @@ def survey_noise(
             radius
             * (size / torch.as_tensor(count, dtype=radius.dtype, device=radius.device)).sqrt()
         )
-        share = noise_of_size / torch.where(radius > 0, limit * near, 1.0)
-        below = (1 - share * share).clamp_(min=0)
+        fraction = noise_of_size / torch.where(radius > 0, limit * near, 1.0)
+        below = (1 - fraction * fraction).clamp_(min=0)
         scaled = noise_of_size / torch.where(below > 0, below, 1.0).sqrt_()
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
     common = _neighbor_quantiles(noise[:, None], neighbors, constants.COMMON_QUANTILE)[:, 0]
@@ -142,7 +142,7 @@ def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> 
             *counts,
             constants.MIN_BREADTH,
             constants.MAX_LAYERED_KURTOSIS,
-            constants.MAX_LAYERED_SHARE,
+            constants.MAX_LAYERED_FRACTION,
             constants.NUM_REFITS,
             constants.MIN_PLANE_POINTS,
         )
@@ -189,7 +189,7 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole:
     num_upper = upper.sum(dim=1)
     deviations = square_root(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
-    layered &= deviations <= constants.MAX_LAYERED_SHARE * whole
+    layered &= deviations <= constants.MAX_LAYERED_FRACTION * whole
     return torch.where(layered, deviations, torch.inf)
 
 

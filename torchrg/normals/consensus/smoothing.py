@@ -270,11 +270,11 @@ def _inliers(
     return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 
-def _falling(columns: Columns, share: float) -> Tensor:
+def _falling(columns: Columns, fraction: float) -> Tensor:
     """Return weights that fall with the squared distance, by a share at the farthest neighbour."""
     sq_distances = sq_lengths(columns)
     farthest = sq_distances.amax(dim=1, keepdim=True)
-    return 1 - share * sq_distances / torch.where(farthest > 0, farthest, 1.0)
+    return 1 - fraction * sq_distances / torch.where(farthest > 0, farthest, 1.0)
 
 
 def _balanced(columns: Columns, weights: Tensor) -> Tensor:

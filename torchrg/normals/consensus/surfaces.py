@@ -61,7 +61,7 @@ def fit_surfaces(
     not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
     map_chosen(bend, not_flat, chunk_size)
     broken = not_flat & (bent > constants.CURVED_LIMIT * noise)
-    broken &= bent > constants.CURVED_SHARE * survey.deviations
+    broken &= bent > constants.CURVED_FRACTION * survey.deviations
     far_off = bent > constants.FAR_OFF * noise
     gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
     by_votes, meeting = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
@@ -125,7 +125,7 @@ def _numbers() -> Tensor:
             constants.FIT_FALLOFF,
             constants.MEETING_GAP,
             constants.CORNER_LIMIT,
-            constants.CORNER_SHARE,
+            constants.CORNER_FRACTION,
             constants.NUM_REFITS,
             constants.NUM_ALTERNATIONS,
             constants.MIN_PLANE_POINTS,

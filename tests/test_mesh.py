@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg import mesh
 from torchrg.errors import ShapeError
-from torchrg.io import faces as faces_module
-from torchrg.io import merge_clouds, ply, read_cloud, write_cloud
+from torchrg.io import ply, read_cloud, write_cloud
+from torchrg.merge import merge_clouds
 from torchrg.regions.axes import move_cloud
 from torchrg.structures import Cloud
 
@@ -104,7 +105,7 @@ def test_fronts_do_not_depend_on_how_much_is_read_at_a_time(tmp_path, monkeypatc
     points, faces = make_points(), make_faces(500, 5)
     path = write_mesh(tmp_path / "a.ply", points, faces, order)
     monkeypatch.setattr(ply, "_BYTES_AT_ONCE", 100)
-    monkeypatch.setattr(faces_module, "_CORNERS_AT_ONCE", 10)
+    monkeypatch.setattr(mesh, "_CORNERS_AT_ONCE", 10)
     np.testing.assert_allclose(read_cloud(path).front, fronts_by_loop(points, faces), atol=1e-6)
 
 
@@ -239,7 +240,7 @@ def test_faces_that_cancel_or_have_no_place_say_nothing():
     finite = np.isfinite(points).all(axis=1)
 
     def fronts(*faces):
-        return faces_module.find_fronts(map(np.array, faces), points, finite)
+        return mesh.find_fronts(map(np.array, faces), points, finite)
 
     assert fronts(there)[:3].any(axis=1).all()
     assert not fronts(there, back).any()
@@ -252,9 +253,9 @@ def test_faces_that_cancel_or_have_no_place_say_nothing():
 def test_far_places_small_units_and_float32_give_the_same_fronts():
     points, faces = make_points().astype(np.float64), np.array(make_faces())
     known = np.ones(len(points), bool)
-    expected = faces_module.find_fronts([faces], points, known)
+    expected = mesh.find_fronts([faces], points, known)
     for moved in (points * 1e-12, points * 1e9, points + 5e6, points.astype(np.float32)):
-        found = faces_module.find_fronts([faces], moved, known)
+        found = mesh.find_fronts([faces], moved, known)
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 

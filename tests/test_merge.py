@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import merge_clouds, read_cloud, write_cloud
+from torchrg.io import read_cloud, write_cloud
 from torchrg.io.e57 import ScanPose
+from torchrg.merge import merge_clouds
 from torchrg.structures import Cloud
 
 

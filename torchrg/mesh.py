@@ -18,7 +18,7 @@ _CORNERS_AT_ONCE = 1 << 18
 _MAX_CORNERS = 2
 """Corners of a face by the vertices of its mesh. A face with holes has the vertices of the edges
 that lead to them twice; a larger one is damage, for which no memory is taken."""
-_LEAST_AGREEMENT = 1e-3
+_MIN_AGREEMENT = 1e-3
 """Least length of a sum of normals as a share of the areas. A shorter one is rounding, as where
 each face is there twice, once for each of its sides."""
 
@@ -68,7 +68,7 @@ def find_fronts(
             for total, values in zip((areas, *sums), (sizes, *normals.T), strict=True):
                 np.add.at(total, part.reshape(-1), np.repeat(values, part.shape[1]))
     length = np.linalg.norm(sums, axis=0)
-    is_clear = length > _LEAST_AGREEMENT * areas
+    is_clear = length > _MIN_AGREEMENT * areas
     fronts = np.where(is_clear, sums / np.where(is_clear, length, 1.0), 0.0)
     return np.ascontiguousarray(fronts.T, dtype=np.float32)
 
