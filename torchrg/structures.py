@@ -580,8 +580,6 @@ class Superpoints:
             ['superpoint', 'superpoint_1', 'superpoint_2']
         """
         return {
-            "superpoint" if i == 0 else f"superpoint_{i}": level.numpy(force=True).astype(
-                np.int32
-            )
+            "superpoint" if i == 0 else f"superpoint_{i}": level.numpy(force=True).astype(np.int32)
             for i, level in enumerate((self.labels, *self.levels))
         }

@@ -146,7 +146,9 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
         for path, cloud, field in ((predicted, ours, "superpoint"), (truth, theirs, "labels")):
             if field not in cloud.fields:
                 named = ", ".join(cloud.fields) or "points alone"
-                raise FormatError(f"{path}: expected the field {field} for --superpoints, got {named}.")
+                raise FormatError(
+                    f"{path}: expected the field {field} for --superpoints, got {named}."
+                )
         indices = score_partition(
             ours.fields["superpoint"],
             theirs.fields["labels"],
