@@ -107,6 +107,9 @@ def test_what_leads_nowhere_fails_the_site(tmp_path, text, code):
     pages.mkdir()
     (pages / "index.md").write_text(f"# Title\n\n{text}\n")
     assert docs.build_site(pages, tmp_path / "site") == code
+    if code == 0:
+        search = (tmp_path / "site" / "_static" / "language_data.js").read_text()
+        assert "guides come before module pages" in search
 
 
 @pytest.mark.parametrize("prog", command_page.PROGS)
