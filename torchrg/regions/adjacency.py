@@ -1,4 +1,4 @@
-"""Which planes meet, along which length, and at which angle."""
+"""Region adjacency: pairs of planes that meet, boundary lengths and angles."""
 
 import math
 from array import array
@@ -16,27 +16,27 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
 NUM_CONTACTS = 8
-"""Neighbours that surround a point of a surface; more reach across gaps."""
+"""Nearest neighbors that count as adjacent; farther neighbors reach across gaps."""
 
 MIN_CONTACTS = 3
-"""Regions that touch in fewer edges neither meet nor are merged: one may be an outlier's."""
+"""Minimum number of edges between two regions that meet or are merged: a single edge may be an
+outlier's."""
 
 PARALLEL_DEG = 15.0
-"""At a smaller angle the line in which two planes cross may be far from where the faces end."""
+"""Below this angle the intersection line of two planes may lie far from where the regions end."""
 
 _CHUNKS_AT_ONCE = 16
-"""Chunks whose edges threads share, so few that what is kept of them is little."""
+"""Chunks of edges per parallel batch, few enough that their results need little memory."""
 
 _MAX_CELL = 2.0**53
-"""Largest number of a cell on a line. float64 does not tell cells beyond it apart."""
+"""Largest cell index on a line. float64 cannot distinguish cells beyond it."""
 
 _REACH = 4.0
-"""An edge that leads across the planes by at most this many of their thicknesses is within their
-noise."""
+"""Maximum out-of-plane component of an edge within the noise, in thicknesses of the planes."""
 
 _MAX_STEEPNESS = 0.25
-"""An edge follows the surface if it leads across the planes by at most this share of the way to the
-8th neighbour. One beyond this and the noise goes to a parallel surface."""
+"""An edge follows the surface if its out-of-plane component is at most this fraction of the
+distance to the 8th neighbor. Beyond this and the noise it leads to a parallel surface."""
 
 
 def find_adjacency(
@@ -48,17 +48,17 @@ def find_adjacency(
     *,
     curved: Tensor,
 ) -> PlaneAdjacency:
-    r"""Find pairs of regions that meet, and measure where they do.
+    r"""Find pairs of regions that meet, and measure their common boundary.
 
-    Flat regions at an angle meet along the line in which their planes cross: the neighbours of one
-    in the other, however narrow the strip without labels between them, are projected onto it. Their
-    extent there, gaps left out, is the length. Of parallel or curved regions only the 8 nearest
-    neighbours count, and the length is that of a curve that so many edges cross: with density
-    :math:`\rho` and n edges from each point a curve of length L meets edges with
-    :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy and Crofton) [1].
+    Non-parallel flat regions meet along the intersection line of their planes. Edges between their
+    points, also across a narrow unlabeled strip, are projected onto it; the covered length without
+    gaps is the boundary length. For parallel or curved regions only the 8 nearest neighbors count.
+    Their length is that of a curve crossed by the edges: with density :math:`\rho` and n edges per
+    point, a curve of length L crosses edges with :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy
+    and Crofton) [1].
 
-    The planes have unit normals ``(M, 3)`` and a standard deviation of their points (``thickness``,
-    ``(M,)``). Regions that touch in less than three edges do not meet.
+    Planes are given by unit normals ``(M, 3)`` and the standard deviation of their points
+    (``thickness``, ``(M,)``). Regions joined by fewer than three edges do not meet.
 
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
@@ -103,13 +103,13 @@ def find_adjacency(
 
 
 class NearestPoints:
-    """Who is beside whom in a cloud: the 8 nearest neighbours, at most, are beside each point.
+    """Adjacency of a point cloud: up to 8 nearest neighbors per point.
 
     Example:
-        >>> beside = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
-        >>> beside.around(torch.tensor([2, 0])).tolist()
+        >>> adjacency = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
+        >>> adjacency.neighbor_rows(torch.tensor([2, 0])).tolist()
         [[1], [1]]
-        >>> beside.contacts(torch.tensor([0, 1, 1]))
+        >>> adjacency.contacts(torch.tensor([0, 1, 1]))
         (tensor([[0, 1]]), tensor([2]))
     """
 
@@ -119,7 +119,7 @@ class NearestPoints:
         self.neighbors = Neighbors(neighbors.indices[:, columns], valid)
 
     def around(self, rows: Rows) -> Tensor:
-        """Return the points beside some, shape ``(n, 8)``; where there are fewer, the point."""
+        """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
         near, counted = self.neighbors.at(rows)
         if counted is None:
             return near
@@ -129,29 +129,29 @@ class NearestPoints:
         return torch.where(counted, near, numbers[:, None].to(near.dtype))
 
     def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
-        """Return those of the rows that have a new one beside them."""
+        """Return the candidates that have a changed neighbor."""
         num_points = len(self.neighbors.indices)
         is_new = torch.zeros(num_points, dtype=torch.bool, device=waiting.device)
         is_new[new] = True
         return waiting[is_new[self.around(waiting)].any(dim=1)]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what :func:`find_contacts` does, of the nearest points."""
+        """Apply :func:`find_contacts` to the nearest neighbors."""
         return find_contacts(labels, self.neighbors)
 
 
 def find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return the pairs of regions with neighbours of each other, and how often they are.
+    """Return pairs of adjacent regions and the number of edges between them.
 
-    Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending, and
-    counts ``(E,)``.
+    For labels ``(N,)``, negative if unlabeled: pairs ``(E, 2)``, smaller label first, ascending,
+    and counts ``(E,)``.
     """
     border = _Border(labels, neighbors)
     return border.pairs, border.counts
 
 
 class _Contacts(NamedTuple):
-    """Edges between regions: numbers of their pairs, ends of the edges, columns in the lists."""
+    """Edges between regions: pair index, end points, and column in the neighbor lists."""
 
     pair: Tensor
     source: Tensor
@@ -160,7 +160,7 @@ class _Contacts(NamedTuple):
 
 
 class _Totals:
-    """Sums of values of each pair, and how many these are: one after the other on any device."""
+    """Per-pair sums and counts, accumulated in a fixed order on every device."""
 
     def __init__(self, num_pairs: int) -> None:
         self._sums, self._counts = np.zeros(num_pairs), np.zeros(num_pairs, dtype=np.int64)
@@ -177,14 +177,13 @@ class _Totals:
 
 
 class _Border:
-    """The edges between regions, found anew each time: all of them may outweigh the cloud.
+    """Edges between regions, recomputed on each pass: storing all could take more than the cloud.
 
-    ``pairs`` ``(E, 2)`` are the regions with an edge between them, ascending, and ``counts``
-    ``(E,)`` the edges of each pair.
+    ``pairs`` ``(E, 2)`` are the adjacent regions, ascending, and ``counts`` ``(E,)`` their edges.
     """
 
     def __init__(self, labels: Tensor, neighbors: Neighbors) -> None:
-        # Narrow numbers are gathered three times as fast.
+        # int32 indexing is three times faster.
         self._labels, self._neighbors = labels.to(torch.int32), neighbors
         self._num_regions = int(labels.max()) + 1 if len(labels) else 0
         meets = torch.empty_like(labels, dtype=torch.bool)
@@ -194,7 +193,7 @@ class _Border:
 
         map_chunks(mark, len(labels), ROWS_IN_CACHE, labels.device)
         self._rows = places_of(meets).to(torch.int32)
-        # Small tensors kept from each chunk would split the room that glibc has for the next.
+        # Keeping small tensors of every chunk would fragment the heap (glibc).
         counts: Counter[int] = Counter()
         for rows in torch.split(self._rows, ROWS_IN_CACHE):
             values = torch.unique(self._edges_of(rows)[2], return_counts=True)
@@ -209,20 +208,20 @@ class _Border:
         return max(self._neighbors.indices.shape[1], 1)
 
     def _meets_others(self, rows: slice) -> Tensor:
-        """Return which of some points have a neighbour of another region, shape ``(n,)``."""
+        """Return which points have a neighbor in another region, shape ``(n,)``."""
         own, near = self._labels[rows], self._neighbors.at(rows)
         if kernels.serve(own, *near):
             return kernels.call("meet_others", self._labels, own, *near)[0]
         return self._touches(own, near)[0].any(dim=1)
 
     def _touches(self, own: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
-        """Return which neighbours of points of some regions are of another one, and of which."""
+        """Return a mask of the neighbors in another region, and their labels."""
         other = near.of(self._labels)
         touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
         return touches if near.valid is None else touches & near.valid, other
 
     def _edges_of(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where in the lists of some points other regions are, the lists, and the pairs."""
+        """Return the flat list indices of boundary edges, the neighbor lists, and the pairs."""
         label, near = self._labels[rows], self._neighbors.at(rows)
         scratch.release()
         touches, other = self._touches(label, near)
@@ -233,7 +232,7 @@ class _Border:
         return places, near.indices, lower.long() * self._num_regions + higher
 
     def map_contacts(self, work: Callable[[_Contacts], Result]) -> Iterator[Result]:
-        """Yield what work makes of all edges, those of some points at a time, in their order."""
+        """Yield the results of ``work`` for all edges in order, one chunk of points at a time."""
 
         def find(rows: Tensor) -> Result:
             places, targets, keys = self._edges_of(rows)
@@ -248,7 +247,7 @@ class _Border:
 
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
-    """Return the chosen ones of the edges."""
+    """Return the selected edges."""
     rows = chosen.nonzero().squeeze(1)
     return _Contacts(*(values.index_select(0, rows) for values in contacts))
 
@@ -260,7 +259,7 @@ def _edges(points: Tensor, contacts: _Contacts) -> Tensor:
 
 
 def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Tensor) -> Tensor:
-    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
+    """Return the length of each pair's line covered by edge midpoints, shape ``(E,)``."""
     origin = points[:1].double()
     cells = array("q"), array("q")
 
@@ -285,17 +284,17 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
 
 
 def _each_once(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cells of pairs ascending, each once."""
+    """Return the distinct cells of each pair, ascending."""
     if len(cell) == 0:
         return pair, cell
-    # Ranks of cells are small enough for a number with the pair, which cells far apart are not.
+    # Cell ranks fit into one integer with the pair; indices of distant cells do not.
     cells, rank = torch.unique(cell, return_inverse=True)
     keys = torch.unique(pair * len(cells) + rank)
     return keys // len(cells), cells[keys % len(cells)]
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distance to the last of the contact neighbours of points, and their number."""
+    """Return the distance to the last contact neighbor of each point, and their number."""
     nearest = NearestPoints(neighbors).neighbors.at(rows)
     number = nearest.counted().sum(dim=1)
     last = nearest.indices.gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)

@@ -1,9 +1,9 @@
-"""Classes of planes: floors, ceilings and walls, by where they lie in the room around them.
+"""Plane classification: floors, ceilings and walls, from the surrounding room.
 
-A cloud may hold several rooms and storeys, and what a scanner sees through windows. So
-:func:`classify_planes` compares each plane with the room around it, not with the whole cloud. It
-counts voxels, so that neither the density nor copies of points matter. Points without a label,
-such as single outliers, play no part.
+A cloud may contain several rooms and storeys, and points seen through windows.
+:func:`classify_planes` therefore compares each plane with its surrounding room, not with the whole
+cloud. It counts voxels, so density and duplicates do not matter. Unlabeled points, such as
+outliers, are ignored.
 """
 
 import math
@@ -17,85 +17,85 @@ from torch.nn import functional
 from torchrg.structures import PLANE_KINDS, Planes
 
 _MAX_TILT_DEG = 15.0
-"""A floor or ceiling is within this angle of horizontal, a wall of vertical."""
+"""Maximum angle of floors and ceilings to horizontal, and of walls to vertical."""
 
 _LEVEL_DEG = 5.0
-"""Planes within this angle of horizontal tell exactly where up is: in a building of 30 m, an error
-of 2 degrees makes a difference in height of 1 m."""
+"""Maximum angle to horizontal of planes that define up exactly: over 30 m an error of 2 degrees
+changes the height by 1 m."""
 
 _MAX_BEND = 0.02
-"""Largest RMS distance of the points from the plane of a flat region, as a fraction of its short
-side: a wall with a bulge is a wall, and a pillar is not."""
+"""Maximum RMS distance of the points to the plane of a flat region, as a fraction of its short
+side: a bulging wall is flat, a pillar is not."""
 
 _END_FRACTION = 0.15
 """A floor lies in this lowest fraction of its room's height, a ceiling in the highest."""
 
 _MIN_AREA = 0.1
-"""Least area of a floor or ceiling, in squares of the wall height: 0.7 m² in a room of 2.7 m."""
+"""Minimum area of a floor or ceiling, in squares of the wall height: 0.7 m² in a room of 2.7 m."""
 
 _MIN_WIDTH = 0.2
-"""Least width of floors and ceilings in wall heights, and of walls as a fraction of the height of
-their room: beams and the sides of pillars have less."""
+"""Minimum width of floors and ceilings in wall heights, and of walls as a fraction of the room
+height: excludes beams and the sides of pillars."""
 
 _MIN_HIGH_WALL = 1 / 3
-"""Least height of a wall that reaches the top, as a fraction of its room's height: furniture and
-openings hide the rest."""
+"""Minimum height of a wall that reaches the top, as a fraction of its room's height: furniture and
+openings hide the remaining part."""
 
 _MIN_LOW_WALL = 0.5
-"""Least height of a wall that ends below the top, as a fraction of its room's height."""
+"""Minimum height of a wall that ends below the top, as a fraction of its room's height."""
 
 _MIN_LOW_WALL_AREA = 0.25
-"""Least area of a wall that ends below the top, as a fraction of the largest vertical plane's:
-doors and sides of cabinets have less."""
+"""Minimum area of a wall that ends below the top, as a fraction of the largest vertical plane:
+excludes doors and sides of cabinets."""
 
 _TOP_FRACTION = 0.1
 """A plane in this highest fraction of its room's height reaches the top; a tall window does not."""
 
 _MAX_POSITIONS = 2**20
-"""Positions of all planes together, as areas. A position is 1 to 2 cm wide in a room. So points
-that are dense near a scanner count once, and sparse ones on a facade outside count little."""
+"""Maximum number of sampling positions on all planes, by area; 1 to 2 cm wide in a room. Dense
+points near a scanner count once, and a sparse facade outside counts little."""
 
 _VOXELS = 48
-"""Voxels in the height of a wall: 6 cm in a room, less than the thickness of a slab."""
+"""Voxels per wall height: 6 cm in a room, less than the thickness of a slab."""
 
 _COLUMN = 8
 """Voxels along the side of a column: 45 cm in a room."""
 
 _REACH = 2
-"""Columns on each side that belong to the room around a column: 2.2 m in all, more than the width
-of a bed or table, less than that of a room."""
+"""Columns on each side in the neighborhood of a column: 2.2 m in total, wider than a bed or table,
+narrower than a room."""
 
 _OUTSIDE = 0.02
-"""Fraction of a room's voxels that may lie below its floor, or above its ceiling: reflections."""
+"""Maximum fraction of a room's voxels below its floor or above its ceiling: reflections."""
 
 _MIN_ROOM = 0.5
-"""Least height of a room in wall heights. A column that sees less around it looks farther."""
+"""Minimum height of a room in wall heights; column neighborhoods grow until it is reached."""
 
 _MAX_SLAB = 0.25
-"""Largest thickness of the slab between storeys, in wall heights."""
+"""Maximum thickness of the slab between storeys, in wall heights."""
 
 _WALLS_IN_SLAB = 0.25
-"""Largest ratio of the walls in a slab to those above it, and below it: only stairwells go on."""
+"""Maximum ratio of walls in a slab to walls above and below it: only stairwells continue."""
 
 _TOUCHING = 2
-"""Voxels between a slab and the broad plane below or above it, at most."""
+"""Maximum gap between a slab and the broad plane below or above it, in voxels."""
 
 _BITS = 20
-"""Voxels along each axis, as a power of two: 60 km with voxels of 6 cm. Farther ones are merged."""
+"""Voxels along each axis, as a power of two: 60 km with voxels of 6 cm; farther ones are merged."""
 
 
 def classify_planes(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) -> Tensor:
-    """Return the class of each plane, as a place in :data:`torchrg.structures.PLANE_KINDS`.
+    """Return the class of each plane, as an index into :data:`torchrg.structures.PLANE_KINDS`.
 
-    The constants above are the thresholds. A horizontal plane is a floor or ceiling if it is broad,
-    and most of it is low or high in the room around it, else "horizontal". A vertical plane is a
-    wall if it is wide and tall, and reaches the top of its room or is large, else "vertical".
-    Planes between are "oblique", bent ones "other". A plane that is both low and high is a floor.
+    The constants above are the thresholds. A horizontal plane is a floor or ceiling if it is broad
+    and most of it is low or high in the surrounding room, otherwise "horizontal". A vertical plane
+    is a wall if it is wide and tall, and reaches the top of its room or is large, otherwise
+    "vertical". Other planes are "oblique", curved ones "other". A low and high plane is a floor.
 
     Args:
-        planes: The plane table; its ``kind`` is not read.
+        planes: The plane table; its ``kind`` is ignored.
         points: Points, shape ``(N, 3)``.
-        labels: Row of the plane of each point, shape ``(N,)``, or negative.
+        labels: Plane ID of each point, shape ``(N,)``, negative if unlabeled.
         up: Upward direction, shape ``(3,)``.
     """
     kinds = {name: place for place, name in enumerate(PLANE_KINDS)}
@@ -126,7 +126,7 @@ def classify_planes(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) 
     counts = torch.bincount(plane, minlength=len(kind)).clamp(min=1)
 
     def mostly(holds: Tensor) -> Tensor:
-        """Return for which planes something holds in at least half of their voxels."""
+        """Return the planes for which a condition holds in at least half of the voxels."""
         return 2 * torch.bincount(plane[holds], minlength=len(kind)) >= counts
 
     room = (high - low)[column].clamp(_MIN_ROOM * _VOXELS, _VOXELS)
@@ -149,7 +149,7 @@ def classify_planes(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) 
 
 
 def _upward(planes: Planes, is_level: Tensor, up: Tensor) -> Tensor:
-    """Return the mean normal of level planes by area, on the side of ``up``; ``up`` without any."""
+    """Return the area-weighted mean normal of level planes on the side of ``up``, or ``up``."""
     normal = planes.normal.double()
     weighted = normal * (planes.area.double() * _along(normal, up).sign())[:, None]
     mean = weighted[is_level].sum(dim=0)
@@ -159,10 +159,10 @@ def _upward(planes: Planes, is_level: Tensor, up: Tensor) -> Tensor:
 def _in_voxels(
     planes: Planes, points: Tensor, owner: Tensor, up: Tensor, vertical: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, list[Tensor]]:
-    """Return lowest and highest point, width and area of planes, and the voxel of each point.
+    """Return the lowest and highest point, width and area of planes, and the voxel of each point.
 
-    Lengths are in voxels. Those of points are integers from 0 to ``2**_BITS - 1`` along three axes,
-    the last of them upwards.
+    Lengths are in voxels. Voxel coordinates are integers from 0 to ``2**_BITS - 1`` along three
+    axes, the last of them upwards.
     """
     middle = planes.center.double().median(dim=0).values
     places = [_along(points.double() - middle, axis) for axis in _upright_axes(up)]
@@ -184,7 +184,7 @@ def _in_voxels(
 
 
 def _distinct(owner: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
-    """Return each voxel of each plane once: the plane, and the three coordinates."""
+    """Return the distinct voxels of each plane: the plane ID, and the three coordinates."""
     voxels, voxel = torch.unique((x << 2 * _BITS) | (y << _BITS) | z, return_inverse=True)
     plane, voxel = _divided(torch.unique(owner * len(voxels) + voxel), len(voxels))
     across, z = _divided(voxels[voxel], 1 << _BITS)
@@ -221,7 +221,7 @@ def _weighted_median(values: Tensor, weights: Tensor) -> float:
 def _find_slabs(bottom: Tensor, top: Tensor, length: Tensor, levels: Tensor) -> Tensor:
     """Return the heights that separate storeys, ascending.
 
-    There, walls stop for the thickness of a slab, and a broad plane is below or above.
+    At these heights walls are interrupted by a slab's thickness, next to a broad plane.
 
     Args:
         bottom: Lowest point of each vertical plane, shape ``(V,)``.
@@ -248,10 +248,11 @@ def _find_slabs(bottom: Tensor, top: Tensor, length: Tensor, levels: Tensor) -> 
 
 
 def _room_heights(columns: Tensor, column: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the lowest and the highest voxel of the room around each column, shape ``(C,)``.
+    """Return the lowest and highest voxel of the room around each column, shape ``(C,)``.
 
     Args:
-        columns: Storey and place of each column in one number, ascending, shape ``(C,)``.
+        columns: Storey and position of each column, packed into one integer, ascending, shape
+            ``(C,)``.
         column: Column of each voxel, shape ``(V,)``.
         z: Height of each voxel, shape ``(V,)``.
     """

@@ -1,4 +1,4 @@
-"""Polygons about the points of planar regions."""
+"""Boundary polygons of planar regions."""
 
 from typing import Any
 
@@ -9,12 +9,12 @@ from torchrg._optional import require
 
 
 def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
-    """Return the outline of points in a plane: rings through some of them.
+    """Return the boundary polygons of points in a plane, as rings through some of the points.
 
-    The points near an edge, found with square cells, are triangulated. Triangles over cells without
-    points are left out, and the others united. Holes and dents narrower than ``width``, that of the
-    cells, are filled. Outer rings ``(V, 2)``, the first point not repeated, run counter-clockwise,
-    holes clockwise; points on one line have none.
+    Points near an edge, found with square cells, are triangulated. Triangles over empty cells are
+    dropped, the remaining ones united. Holes and dents narrower than ``width``, the cell width, are
+    filled. Outer rings ``(V, 2)`` run counterclockwise, holes clockwise, without repeating the
+    first point; collinear points have none.
 
     Raises:
         MissingDependencyError: If shapely is not installed.
@@ -38,13 +38,13 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.
     tried = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
     reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
     covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
-    # Triangles that share whole edges are a coverage, which is united twenty times as fast.
+    # Triangles sharing complete edges form a coverage, whose union is twenty times faster.
     shape = shapely.coverage_union_all(shapely.polygons(triangles[covered]))
     return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
 
 
 def _rings(shapely: Any, shape: Any, min_area: float) -> list[NDArray[np.float64]]:  # noqa: ANN401
-    """Return the rings of a polygon or of several, largest polygon first, without specks."""
+    """Return the rings of one or more polygons, largest first, without specks."""
     parts = [polygon for polygon in shapely.get_parts(shape) if polygon.geom_type == "Polygon"]
     largest = max((polygon.area for polygon in parts), default=0.0)
     parts = [polygon for polygon in parts if polygon.area >= min(min_area, largest)]

@@ -1,4 +1,4 @@
-"""Regions after growth: points at borders go where they belong, parts of one face are merged."""
+"""Region refinement after growing: boundary reassignment and merging of coplanar regions."""
 
 import heapq
 from typing import NamedTuple, Protocol
@@ -22,54 +22,55 @@ from torchrg.regions.fit import MIN_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
 
 _AGREE = 0.3
-"""Share of the largest angle. Regions too small before absorption whose normals are off by less,
-root mean square, are faces: of a small one half is border. Others would
-make many regions of clutter."""
+"""Fraction of ``max_angle_deg``. A region below ``min_size`` is kept before boundary assignment if
+the RMS angle of its normals is smaller, since about half of a small surface is boundary. Other
+small regions are clutter."""
 
 _MAX_PASSES = 10
-"""Passes over the borders at most. Points that moved lead to the next: narrow strips fill from
-their ends."""
+"""Maximum number of boundary passes. Each pass revisits the neighbors of changed points, so narrow
+strips are filled from their ends."""
 
 _ROUNDING = 0.01
-"""Distances of less than this many thicknesses decide nothing."""
+"""Distance differences below this many thicknesses are ignored."""
 
 _MIN_STEP = 1.5
-"""Parallel planes this many thicknesses apart are two levels, not pieces of one face."""
+"""Minimum distance of two levels, in thicknesses; closer planes are parts of one surface."""
 
 _LEVEL_REACH = 3.0
-"""Thicknesses of the nearer plane beyond which a point is on neither level."""
+"""Maximum distance of a point to its level, in thicknesses of the nearer plane."""
 
 _ONE_SIDED = 0.5
-"""A face ends at another plane if the mean distance of its points from that, with signs, is this
-share of the mean without; of a face that goes on behind the plane it is near 0."""
+"""A region ends at another plane if the mean signed distance of its points to that plane is at
+least this fraction of the mean absolute distance. It is near 0 for a region that continues behind
+it."""
 
 
 _FACET_TURN_DEG = 25.0
-"""The plane through two facets of a flat face is not turned by more against either of them. Those
-of ten points are turned most; the sides of a thin board are turned by 90."""
+"""Maximum angle between either of two facets and their joint plane. Facets of ten points come
+closest to it; the two sides of a thin board differ by 90 degrees."""
 
 _FACET_TILT = 2 / 3
-"""Largest root mean square distance, in tolerances, that the turn alone gives the points of a
-facet. Without it a plane across the step between two shelves, 5 cm, explains both."""
+"""Maximum RMS distance, in tolerances, that tilting to the joint plane adds to the points of a
+facet. Otherwise one plane across a 5 cm step would explain two shelves."""
 
 
 class Beside(Protocol):
-    """Who is beside whom: nearest points (:mod:`torchrg.regions.adjacency`), or pixels."""
+    """Adjacency of points (:mod:`torchrg.regions.adjacency`) or of pixels."""
 
     def around(self, rows: Tensor) -> Tensor:
-        """Return the points beside some ``(n,)``, shape ``(n, 8)``."""
+        """Return the neighbors of the given points ``(n,)``, shape ``(n, 8)``."""
 
     def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
-        """Return those of the rows that have a new one beside them."""
+        """Return the candidates that have a changed neighbor."""
 
 
 def refine_regions(
     cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, fits: RegionFits | None = None
 ) -> Tensor:
-    """Apply the steps after growth that the settings ask for to a cloud in canonical order.
+    """Apply the enabled refinement steps to a cloud in canonical order.
 
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; so are the regions returned,
-    perhaps with gaps in their numbers. ``fits`` may know the planes of these labels already.
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; the returned labels may have
+    gaps. ``fits`` may already hold the planes of these labels.
     """
     if not bool((labels >= 0).any()):
         return labels
@@ -89,7 +90,7 @@ def refine_regions(
             planes.times_thickness(config.absorb_reach),
             valid=cloud.valid,
             normals=cloud.normals,
-            # The normals of facets say little of the face; the distance decides.
+            # Facet normals say little about the surface; the distance decides.
             max_angle_deg=90.0 if config.faceted is True else config.absorb_angle_deg,
         )
         labels = _drop_small(labels, int(config.min_size))
@@ -100,13 +101,13 @@ def refine_regions(
     if config.refine_borders:
         labels = _drop_small(labels, 1)
         planes = fits.of(labels)
-        # Where a bent face ends its plane does not say.
+        # The plane of a bent region does not show where the region ends.
         vague = planes.bent | (planes.num_points < MIN_FITTED)
         reach = torch.where(vague, torch.nan, planes.times_thickness(config.absorb_reach))
         labels = refine_borders(cloud, labels, planes, reach)
         labels = assign_levels(cloud, labels, planes)
         if config.facet_tolerance is not None:
-            # Something narrower than a neighborhood may part a face in facets.
+            # A gap narrower than a neighborhood may divide a faceted surface.
             near = cloud.neighbors if config.faceted is True else beside.neighbors
             tolerance = float(config.facet_tolerance)
             contacts = find_contacts(labels, near)
@@ -117,7 +118,7 @@ def refine_regions(
 def _drop_scattered(
     cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
 ) -> Tensor:
-    """Return labels without small regions whose normals do not agree, with gaps."""
+    """Remove small regions with inconsistent normals; the labels may then have gaps."""
     small = torch.bincount(labels + 1, minlength=1)[1:] < int(config.min_size)
     small = torch.cat([small, small.new_zeros(1)])
     segments = Segments(torch.where(small[labels], labels, UNLABELED))
@@ -130,16 +131,16 @@ def _drop_scattered(
 
 
 def _drop_small(labels: Tensor, min_size: int) -> Tensor:
-    """Return labels without regions of fewer points, and without gaps in their numbers."""
+    """Remove regions smaller than ``min_size`` and make the labels consecutive."""
     is_large = torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1)
     return renumber(labels, torch.where(is_large, is_large.cumsum(0) - 1, UNLABELED))
 
 
 def renumber(labels: Tensor, numbers: Tensor) -> Tensor:
-    """Return labels with other numbers of regions ``(M,)``, those without a region as they are."""
+    """Map the labels of regions to ``mapping`` ``(M,)``; unlabeled points stay unlabeled."""
     table = torch.cat([numbers, numbers.new_tensor([UNLABELED])])
     if table.device.type == "cpu":
-        # Three times faster than torch's.
+        # Three times faster than indexing in torch.
         return torch.from_numpy(np.take(table.numpy(), labels.numpy()))
     return table[labels]
 
@@ -155,18 +156,17 @@ def absorb_points(
     normals: Tensor | None = None,
     max_angle_deg: float = 90.0,
 ) -> Tensor:
-    """Give points without a region to regions they touch, until none can be given.
+    """Assign unlabeled points to adjacent regions until nothing changes.
 
-    A point may join a region when a point beside it belongs to it, its distance to the region's
-    plane is within reach, and its normal, if there are normals ``(N, 3)``, is within the angle of
-    the plane's. Of several regions it joins the one whose plane is nearest. Points that joined have
-    the next beside them.
+    A point joins an adjacent region if its distance to the region's plane is at most ``reach`` and
+    the angle between its normal (if given) and the plane normal is at most ``max_angle_deg``. The
+    nearest plane wins. Newly labeled points can admit their neighbors.
 
-    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` are of a cloud or an image, as ``beside`` is.
-    Reach ``(M,)`` 0 keeps all but the points exactly on the plane out, NaN all; ``valid`` ``(N,)``
-    may join.
+    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` belong to a cloud or an image, matching
+    ``adjacency``. A ``reach`` ``(M,)`` of 0 admits only points exactly on the plane, NaN none. Only
+    ``valid`` points ``(N,)`` are assigned.
     """
-    # Narrow numbers are gathered faster, and take half of the memory.
+    # int32 is faster to index and halves the memory.
     labels = labels.to(torch.int32)
     limit = deg_to_sq_chord(max_angle_deg)
     rows = waiting = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
@@ -185,13 +185,13 @@ def absorb_points(
         rows = rows[joined]
         labels[rows] = choice[joined]
         waiting = waiting[labels[waiting] == UNLABELED]
-        # What did not fit does not fit later: only a new neighbour may change it.
+        # A rejected point is reconsidered only if one of its neighbors was labeled.
         rows = beside.reached(waiting, rows)
     return labels.long()
 
 
 def _least(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the option ``(n,)`` of the least cost, of equal ones the smallest, and its cost."""
+    """Return the cheapest option ``(n,)`` and its cost; ties go to the smaller option."""
     least = cost.amin(dim=1, keepdim=True)
     ranked = torch.where(cost == least, options, torch.iinfo(options.dtype).max)
     return ranked.amin(dim=1), least.squeeze(1)
@@ -200,10 +200,10 @@ def _least(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
 def _contacts_to_merge(
     labels: Tensor, beside: NearestPoints, planes: RegionPlanes, neighbors: Neighbors
 ) -> tuple[Tensor, Tensor]:
-    """Return pairs of regions that touch, perhaps twice; of two strips all neighbours count.
+    """Return adjacent pairs of regions, possibly twice; between strips all K neighbors count.
 
-    Around the end of a strip that is narrower than a neighbourhood, such as the rim of a table top,
-    the nearest points are those of the faces beside it.
+    At the end of a strip narrower than a neighborhood, such as the rim of a table top, the nearest
+    points belong to the adjacent surfaces.
     """
     strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
     parts = (
@@ -221,18 +221,17 @@ def merge_coplanar(
     *,
     tolerance: float,
 ) -> Tensor:
-    """Merge regions that touch and lie on one plane, the pair that fits best first.
+    """Greedily merge adjacent coplanar regions, best fit first.
 
-    Two regions are merged when one plane explains both: the root mean square distance of either to
-    the plane through both is at most ``tolerance`` times what it is to its own, or the floor of the
-    planes. Merged regions count with the mean square of the distances in their parts, so that a
-    thick region across a step does not join its two sides. Of the smaller one the larger one's
-    noise counts if that is more: what noise breaks off a face is thinner than the face, or curved.
-    Otherwise curved regions have no plane.
+    Two regions are merged if the RMS distance of each to their joint plane is at most ``tolerance``
+    times its RMS distance to its own plane (or the floor). Merged regions use the mean square
+    distance of their parts, so a thick region across a step does not join both sides. For the
+    smaller region, the noise of the larger one is used if it is higher: fragments that noise splits
+    off a surface are thinner than the surface, or curved. Other curved regions are not merged.
 
-    ``contacts`` are pairs of regions that touch ``(E, 2)``, and how many contacts each has, as
-    :meth:`torchrg.regions.adjacency.NearestPoints.contacts` gives them. What is merged is one
-    region from then on, with the smallest label of its parts.
+    ``contacts`` are adjacent pairs ``(E, 2)`` and their edge counts, as returned by
+    :meth:`torchrg.regions.adjacency.NearestPoints.contacts`. A merged region takes the smallest
+    label of its parts.
     """
     pairs, num_contacts = contacts
     pairs = pairs[(num_contacts >= MIN_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
@@ -246,15 +245,15 @@ def merge_facets(
     *,
     tolerance: float,
 ) -> Tensor:
-    """Merge regions that touch and lie within a distance of one plane, the nearest pair first.
+    """Greedily merge adjacent regions within a fixed distance of one plane.
 
-    Reconstructed meshes show a flat face as facets: each is an exact plane, so that its own
-    thickness does not say how far from the face it may be. Two regions are merged when the root
-    mean square distance of either to the plane through both is at most ``tolerance``, in the unit
-    of the cloud, and that plane is turned against neither by more than 25 degrees: a strip narrower
-    than the tolerance lies near any plane that it touches. Nor may the turn alone lift the points
-    of either by more than two thirds of the tolerance. So the facets of a bend join only as far as
-    one plane goes. ``contacts`` and labels are those of :func:`merge_coplanar`.
+    A reconstructed mesh represents a flat surface by facets. Each facet is exactly planar, so its
+    thickness does not show how far it may be from the surface. Two regions are merged, smallest
+    distance first, if the RMS distance of each to their joint plane is at most ``tolerance`` (in
+    coordinate units) and the joint plane is tilted by at most 25 degrees against both, since a
+    strip narrower than the tolerance is close to any adjacent plane. The tilt alone must not move
+    the points of either by more than two thirds of the tolerance, so the facets of a bend are
+    merged only as far as they are coplanar. For ``contacts`` and labels see :func:`merge_coplanar`.
     """
     pairs, num_contacts = contacts
     pairs = pairs[num_contacts >= MIN_CONTACTS]
@@ -264,9 +263,9 @@ def merge_facets(
 
 
 class _Moments(NamedTuple):
-    """Moments of regions, the distance that counts as on their planes, and noise they lend.
+    """Moments of regions, their coplanarity scale, and the noise they lend to smaller regions.
 
-    ``normal`` ``(M, 3)`` is the axis of the least variance ``(M,)``.
+    ``normal`` ``(M, 3)`` is the axis of minimum variance ``(M,)``.
     """
 
     weight: Tensor
@@ -278,7 +277,7 @@ class _Moments(NamedTuple):
     normal: Tensor
 
     def at(self, rows: Tensor | slice) -> "_Moments":
-        """Return those of some of the regions."""
+        """Return the moments of the given regions."""
         return _Moments(*(values[rows] for values in self))
 
 
@@ -298,9 +297,9 @@ def _moments_of(planes: RegionPlanes) -> _Moments:
 
 
 def misfit_of_pairs(planes: RegionPlanes, pairs: Tensor) -> Tensor:
-    """Return how far from the joint plane the worse of two regions is, shape ``(E,)``.
+    """Return the larger of both regions' RMS distances to their joint plane, shape ``(E,)``.
 
-    In thicknesses of the thicker one, whether it is curved or not; nothing is known of the noise.
+    In thicknesses of the thicker region, curved or not; noise is ignored.
     """
     thickness = planes.thickness[pairs].amax(dim=1)
     moments = _moments_of(planes)
@@ -316,7 +315,7 @@ def _merge(
     *,
     max_tilt: float | None = None,
 ) -> Tensor:
-    """Return labels of merged regions, the smallest of each, within a largest tilt."""
+    """Merge pairs within both limits; a merged region takes its smallest label."""
     pairs, groups = pairs.cpu(), _Moments(*(values.cpu().clone() for values in moments))
     touching: list[set[int]] = [set() for _ in groups.weight]
     owner, age = list(range(len(touching))), [0] * len(touching)
@@ -356,7 +355,7 @@ def _merge(
 
 
 def _root(owner: list[int], i: int) -> int:
-    """Return the region that region i has become part of."""
+    """Return the representative of region i (union-find)."""
     while owner[i] != i:
         owner[i] = owner[owner[i]]
         i = owner[i]
@@ -364,7 +363,7 @@ def _root(owner: list[int], i: int) -> int:
 
 
 def _joined(a: _Moments, b: _Moments) -> _Moments:
-    """Return the moments of two sets of regions, taken together one by one."""
+    """Return the pairwise joint moments of two sets of regions."""
     weight = a.weight + b.weight
     fraction_a, fraction_b = (a.weight / weight)[:, None], (b.weight / weight)[:, None]
     mean = fraction_a * a.mean + fraction_b * b.mean
@@ -380,7 +379,7 @@ def _joined(a: _Moments, b: _Moments) -> _Moments:
 
 
 def _misfit(a: _Moments, b: _Moments, both: _Moments) -> Tensor:
-    """Return the RMS distance to the joint plane of the worse of two regions, by its scale."""
+    """Return the larger of both regions' RMS distances to the joint plane, in their own scales."""
     misfits, normal = [], both.normal
     for side, other in ((a, b), (b, a)):
         variance = (normal[:, None] @ side.covariance @ normal[:, :, None])[:, 0, 0]
@@ -392,7 +391,7 @@ def _misfit(a: _Moments, b: _Moments, both: _Moments) -> Tensor:
 
 
 def _are_turned(a: _Moments, b: _Moments, both: _Moments, max_tilt: float) -> Tensor:
-    """Return whether the joint plane is turned too far against that of either."""
+    """Return whether the joint plane is tilted too far against either region's plane."""
     joint = both.normal
     turned = torch.zeros(len(joint), dtype=torch.bool)
     for side in (a, b):
@@ -405,18 +404,19 @@ def _are_turned(a: _Moments, b: _Moments, both: _Moments, max_tilt: float) -> Te
 def refine_borders(
     cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    """Give points where regions touch to the one that explains them best.
+    """Reassign boundary points to the region that explains them best.
 
-    Of the flat regions of a point's 8 nearest neighbours and its own, the two with the nearest
-    planes, by their thickness, count if they are within reach. With the distances :math:`r` from a
-    plane and :math:`e` of the point's foot on it beyond the line in which it meets the other plane,
-    the point joins the region of the smaller :math:`r^2 + e^2`: noise moves points off their plane,
-    not along it. A region ends at the other plane where its points among the point's neighbours are
-    on one side of that. Points of nearly parallel planes stay where they are. Points that moved
-    and their neighbours are decided again in the next pass.
+    Candidates are the flat regions of a point and of its 8 nearest neighbors; the two with the
+    smallest distance in units of their thickness are compared, if within ``reach``. Let :math:`r`
+    be the point-to-plane distance and :math:`e` the distance by which the projected point lies
+    beyond the intersection line with the other plane. The point goes to the region with the smaller
+    :math:`r^2 + e^2`, because noise moves points off their plane, not along it. A region is taken
+    to end at the other plane if its points in the neighborhood lie on one side of that plane.
+    Points of nearly parallel planes keep their label. Changed points and their neighbors are
+    revisited in the next pass.
 
-    ``reach`` ``(M,)`` is the distance up to which points may be on a plane, NaN for regions that
-    are not flat and keep what they have.
+    ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
+    which are left unchanged.
     """
     beside = NearestPoints(cloud.neighbors)
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
@@ -443,12 +443,12 @@ def refine_borders(
 
 
 def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> Tensor:
-    """Give points where parallel regions touch to the nearer plane.
+    """Reassign boundary points of parallel regions to the nearer plane.
 
-    The planes must be 1.5 thicknesses apart at the point, so that pieces of one face stay as they
-    are. The point moves if it is nearer to the other plane, and so are the points of both regions
-    among its 8 nearest on average: a single residual is noise. Points that moved and their
-    neighbors are decided again in the next pass.
+    The planes must be 1.5 thicknesses apart at the point, so that parts of one surface are
+    unchanged. A point moves if it is nearer to the other plane, and so is the mean of the points of
+    both regions among its 8 nearest: a single residual is noise. Changed points and their neighbors
+    are revisited in the next pass.
     """
     beside = NearestPoints(cloud.neighbors)
     flat = ~planes.curved & (planes.num_points >= MIN_FITTED)
@@ -488,8 +488,8 @@ def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> 
 
 
 def _touching(labels: Tensor, beside: NearestPoints) -> Tensor:
-    """Return the points that have one of another region among their nearest neighbours."""
-    # Narrow numbers are gathered three times as fast.
+    """Return the boundary points: points with a nearest neighbor in another region."""
+    # int32 indexing is three times faster.
     narrow = labels.to(torch.int32)
     rows_of_chunks = []
     for chunk in chunks_of(len(labels), ROWS_AT_ONCE):
@@ -507,7 +507,7 @@ def _choose(
     rows: Tensor,
     near: Tensor,
 ) -> Tensor:
-    """Return the region of some points, of labels ``near`` ``(n, 8)`` and their own."""
+    """Choose a region for each of ``rows`` among its label and its neighbors' labels ``near``."""
     label, place = labels[rows], cloud.points[rows].double()
     options = torch.cat([label[:, None], near], dim=1)
     region = options.clamp(min=0)
@@ -519,7 +519,7 @@ def _choose(
     cost = torch.where(usable, cost, torch.inf)
     first, first_cost = _least(cost, options)
     second, second_cost = _least(torch.where(options == first[:, None], torch.inf, cost), options)
-    # A region that the point is far from is growth's choice.
+    # Keep the label assigned by region growing if the point is far from its plane.
     remains = ((label >= 0) & ~usable[:, 0]) | first_cost.isinf()
     choice = torch.where(remains, label, first)
 
@@ -547,7 +547,7 @@ def _beyond(
     label: Tensor,
     other: Tensor,
 ) -> Tensor:
-    """Return how far beyond another plane the feet of points on their own are, where that ends."""
+    """Return how far the projections of points lie beyond the plane at which their region ends."""
     near = cloud.neighbors.at(rows)
     indices = near.indices.long()
     inside = (labels[indices] == label[:, None]) & near.counted()

@@ -1,4 +1,4 @@
-"""Shared nearest neighbours: whether two points have enough of them in common, counted exactly."""
+"""Exact shared-nearest-neighbor connectivity."""
 
 import math
 
@@ -10,31 +10,31 @@ from torchrg._parallel import chunks_of, map_tasks
 from torchrg.structures import Neighbors
 
 _BLOCK_SIZE = 64
-"""Points of a block: smaller ones repeat the lists around them more often, larger ones have larger
-products of matrices."""
+"""Points per block: smaller blocks repeat more of the surrounding lists, larger ones have larger
+matrix products."""
 
 _MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
-"""Neighbours up to which the kernel is the faster one: the points that occur in the lists of one of
-its blocks are at most eight times as many."""
+"""Maximum number of neighbors for which the kernel is faster: a block of the kernel has at most
+eight times as many members."""
 
 
 def min_shared_neighbors(connectivity: float, k: int) -> int:
-    """Return the least number of common neighbours of connected points, eq. (10).
+    """Return the minimum number of common neighbors of connected points, eq. (10).
 
-    ``ceil(connectivity * k)`` of the decimal fraction that was written: 0.07 * 100 is 7, not the
-    7.000000000000001 of binary arithmetic.
+    ``ceil(connectivity * k)`` in decimal arithmetic: 0.07 * 100 is 7, not the binary
+    7.000000000000001.
     """
     return math.ceil(round(connectivity * k, 9))
 
 
 class SharedNeighbors:
-    """Tells which points of a cloud are connected: share at least so many of their neighbours.
+    """Connectivity test: whether two points share at least ``min_shared`` neighbors.
 
-    Lists of a block of points are rows of a matrix with a column for each of its members, the
-    points that occur in them; the product of two rows counts what they share. Lists of points
-    outside of the block lose only members that no list of the block has, so the counts are exact.
-    Points should be in canonical order: then a block is a patch of surface and has few members.
-    Each is among its own neighbours.
+    The lists of a block of points are rows of a matrix with one column per member, i.e. per point
+    in any of the lists; the product of two rows counts their common neighbors. Lists of points
+    outside the block lose only members that are in no list of the block, so the counts are exact.
+    Points should be in canonical order: a block is then a surface patch with few members. Each
+    point is in its own list.
 
     Example:
         >>> lists = torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 3], [3, 2, 1]])
@@ -49,10 +49,10 @@ class SharedNeighbors:
         self._buffers: list[Tensor] = []
 
     def connected(self, rows: slice, asked: Tensor) -> Tensor:
-        """Tell which of a block's edges join connected points, eq. (10).
+        """Return a mask of the block's edges that join connected points, eq. (10).
 
-        ``asked`` says which of the edges from the points ``rows`` to test, shape ``(n, K)``, bool;
-        the others are False.
+        Only edges in the mask ``candidates`` from the points ``rows`` are tested, shape ``(n, K)``,
+        bool; the others are False.
         """
         if self._min_shared <= 0:
             return asked.clone()
@@ -75,7 +75,7 @@ class SharedNeighbors:
         return result
 
     def _count(self, start: int, stop: int) -> Tensor:
-        """Return the number of common neighbours along all edges of a block, shape ``(n, K)``."""
+        """Return the number of common neighbors along all edges of a block, shape ``(n, K)``."""
         lists, numbers = self._neighbors.indices[start:stop].long(), self._buffer()
         members = lists.flatten()
         places = torch.arange(len(members), dtype=numbers.dtype, device=numbers.device)
@@ -86,7 +86,7 @@ class SharedNeighbors:
         columns = numbers[theirs.indices.long()].long().clamp(max=len(members) - 1)
         counted = (members[columns] == theirs.indices) & theirs.counted()
         occurs = torch.zeros(len(members), len(members) + 1, device=members.device)
-        # What is no member falls into the last column.
+        # Non-members are scattered into an extra last column.
         occurs.scatter_(1, torch.where(counted, columns, len(members)), 1.0)
         occurs = occurs[:, :-1]
         shared = (occurs[numbers[start:stop]] @ occurs.T).gather(1, numbers[lists].long())
@@ -94,7 +94,7 @@ class SharedNeighbors:
         return shared
 
     def _buffer(self) -> Tensor:
-        """Return room for a number of each point, of a block before if there is one."""
+        """Return a buffer with one integer per point, reusing an earlier one if available."""
         try:
             return self._buffers.pop()
         except IndexError:

@@ -1,10 +1,9 @@
-"""Under-segmentation: regions of several faces are split at bridges and at levels.
+"""Under-segmentation repair: splitting regions at bridges and at parallel levels.
 
-A bridge is a few points that join two faces. Which regions are mixed comes first
-(:func:`find_mixed_regions`). Within them growth goes on once more, under stricter limits; it finds
-*cores* of faces. :func:`cut_bridges` decides which cores are one surface, and gives the points
-between the others to the nearest. :func:`split_levels` splits a region that holds two parallel
-surfaces, as a wall and a board on it.
+A bridge is a few points that connect two surfaces. :func:`find_mixed_regions` detects mixed
+regions. Growing them again under stricter limits yields *cores*. :func:`cut_bridges` decides which
+cores are one surface and assigns the points between cores to the nearest. :func:`split_levels`
+splits regions that contain two parallel surfaces, such as a wall and a board on it.
 """
 
 from typing import NamedTuple
@@ -25,91 +24,92 @@ from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import UNLABELED, Neighbors
 
 _CORE_FRACTION = 0.5
-"""Share of the limits of angle and distance within which the core of a face is connected."""
+"""Fraction of the angle and distance limits within which the core of a surface is connected."""
 
 _SMOOTH_ANGLE = 0.3
-"""A surface is smooth where normals of neighbours differ by less than this share of the largest
+"""A surface is smooth where neighboring normals differ by less than this fraction of the maximum
 angle."""
 
 _MIN_SMOOTH = 0.7
-"""Cores grow only through points with at least 0.7 of the smooth neighbours that are usual (the
-median) in their region; elsewhere noise may hide an edge."""
+"""Cores grow only through points whose fraction of smooth neighbors is at least 0.7 of the median
+in their region; at other points noise may hide an edge."""
 
 _MAX_OFF_PLANE = 0.1
-"""Share of a region's points off its plane up to which the others are one face."""
+"""Maximum fraction of a region's points off its plane for which the plane is one surface."""
 
 _EXACT_REACH = 4.0
-"""Points of exact faces lie within this many least thicknesses of the plane of their region."""
+"""Maximum distance of the points of an exact surface to its plane, in minimum thicknesses."""
 
 _MIN_FLAT = 0.5
-"""A region is made of faces if at least this share of its points is in flat cores: a noisy column
-breaks into cores that are few, and curved."""
+"""Minimum fraction of points in flat cores of a piecewise planar region: a noisy column breaks into
+few, curved cores."""
 
 _MIN_FACE = 0.05
-"""A flat core beside curved ones is a face if it has at least this share of the points of the
-region, as the panel that a moulding runs around. Smaller ones belong to the bend."""
+"""Minimum fraction of the region's points in a flat core next to curved ones, such as a panel
+framed by a molding. Smaller ones belong to the bend."""
 
 _OPEN_FRACTION = 0.1
-"""A surface goes on between two cores if at least this share of the edges between them passes the
-criteria; across a bridge few do."""
+"""Minimum fraction of edges between two cores of one surface that pass the criteria; few do across
+a bridge."""
 
 _MIN_MISFIT = 2.0
-"""Two cores lie on one plane if their misfit to it is below this many thicknesses, as it is for
-parts of a face that noise has bent."""
+"""Two cores are coplanar if their misfit is below this many thicknesses, as for parts of a surface
+bent by noise."""
 
 _MAX_TURNED_DEG = 30.0
-"""Largest angle between the planes of cores that are joined, degrees. ``_MIN_MISFIT`` alone would
-join narrow strips on both sides of an edge."""
+"""Maximum angle between the planes of joined cores, in degrees. ``_MAX_MISFIT`` alone would join
+narrow strips on both sides of an edge."""
 
 _NUM_AVERAGED = 16
-"""Nearest neighbors whose residuals are averaged: a quarter of white noise remains."""
+"""Nearest neighbors whose residuals are averaged, which reduces white noise to a quarter."""
 
 _MIN_POINTS = 3
-"""Points of a region, in multiples of the least size, from which on it may hold two surfaces."""
+"""Minimum size of a region that may contain two surfaces, in multiples of ``min_size``."""
 
 _NOISE_QUANTILE, _NOISE_FACTOR = 0.33, 2.345
 """Quantile of the absolute residuals and its ratio to a standard deviation of normal noise. The
-lower third belongs to the main level even where a second one has nearly half of the points."""
+lower third belongs to the main level even if a second one has nearly half of the points."""
 
 _SEED_NOISES = 1.5
-"""Averaged residuals of this many standard deviations are six of their own."""
+"""Minimum averaged residual of a candidate, in standard deviations; equals six of the average's
+own."""
 
 _STEP_NOISES = 2.0
-"""Least step between two levels, in standard deviations of the residuals."""
+"""Minimum step between two levels, in standard deviations of the residuals."""
 
 _MAX_THICKNESS = 0.6
-"""Largest thickness of a second level, as a fraction of its step: a thicker one is a slope."""
+"""Maximum thickness of a second level, as a fraction of its step: a thicker one is a slope."""
 
 _MAX_VALLEY = 0.8
-"""Largest ratio of the points halfway to the second level to those on it. A step has a valley
-between its levels; a bend and the edge of a region have none."""
+"""Maximum ratio of points halfway to the second level to points on it. A step has a valley between
+its levels; a bend and the edge of a region have none."""
 
 _VALLEY_WIDTH = 1 / 6
-"""Half width of either band of residuals that is counted, as a fraction of the step."""
+"""Half-width of each counted band of residuals, as a fraction of the step."""
 
 _NUM_RINGS = 4
 """Rings of nearest neighbors around a level that are counted with it: they cross the step."""
 
 _MAX_LEVELS = 2
-"""Times that a region is searched: a board may hold a further level."""
+"""Maximum number of searches per region: a board may contain another level."""
 
 _BINS, _WINDOW, _PEAK_WIDTH = 64, (1, 2, 3, 2, 1), 1.5
-"""Bins of half a standard deviation among which the main level is sought, the weights by which
-their counts are smoothed, and the standard deviations around the peak that are averaged."""
+"""Number of half-standard-deviation bins of the main-level histogram, its smoothing weights, and
+the half-width of the averaged peak in standard deviations."""
 
 
 class MixedRegions(NamedTuple):
-    """Regions that do not lie on one plane, ``min_size`` points or more being off it.
+    """Non-planar regions, with at least ``min_size`` points off the plane.
 
     Attributes:
-        rows: Points that may be of another face, ascending, shape ``(n,)``: those off the plane
-            where nearly all points are on it, else all of the region.
-        part: These points as a cloud with limits of a core; only those are valid where the surface
-            bends no more than is usual in the region.
-        near: Points on the plane of a region of which nearly all are, whose normals are within the
-            largest angle of the plane's, shape ``(N,)``, bool.
-        aligned: Those of them whose normals are within the limits of a core.
-        on_plane: Regions of which nearly all points are on one plane, shape ``(M,)``, bool.
+        rows: Points that may be of another surface, ascending, shape ``(n,)``: the points off the
+            plane if nearly all points are on it, otherwise the complete region.
+        part: These points as a cloud with core limits; a point is valid only where the surface is
+            as smooth as is typical for the region.
+        near: Points on the plane of a region with nearly all points on it, and with a normal within
+            the maximum angle of the plane normal, shape ``(N,)``, bool.
+        aligned: Points in ``near`` with a normal within the core limits.
+        on_plane: Regions with nearly all points on one plane, shape ``(M,)``, bool.
     """
 
     rows: Tensor
@@ -120,7 +120,7 @@ class MixedRegions(NamedTuple):
 
 
 class _InnerEdges(NamedTuple):
-    """Edges from rows ``(n,)`` to neighbours: if of the same region, and if within all limits."""
+    """Edges from rows ``(n,)`` to neighbors; masks: same region, and within the full limits."""
 
     rows: Tensor
     targets: Tensor
@@ -135,9 +135,10 @@ def find_mixed_regions(
     config: GrowingConfig,
     chunk_size: int,
 ) -> MixedRegions | None:
-    """Find the regions that may be several faces, None if there are none.
+    """Detect regions that may contain several surfaces; None if there are none.
 
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` those of the regions.
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` the planes of the
+    regions.
     """
     limit = _EXACT_REACH * planes.floor
     limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
@@ -180,15 +181,15 @@ def cut_bridges(
     config: GrowingConfig,
     chunk_size: int,
 ) -> Tensor:
-    """Split regions of several faces that only a few points join.
+    """Split regions whose surfaces are connected only by a few points.
 
     ``grown`` ``(n,)`` are the cores in the ``part`` of the mixed regions, 0 to C-1 or
-    :data:`torchrg.UNLABELED`. They, and the plane if nearly all points are on one, belong together
-    where the surface goes on from one to the next, a tenth of the edges between them passing the
-    whole limits, and where one plane explains both. Regions with cores that do not are split: the
-    other points join the core of the nearest neighbour that they have an edge to, and no core grows
-    through them. Where most points are in curved cores, all that is no large flat one is one core.
-    The regions returned may have gaps in their numbers.
+    :data:`torchrg.UNLABELED`. If nearly all points are on a plane, the plane is a core too. Cores
+    are one surface if a tenth of the edges between them pass the full limits, or if one plane
+    explains both. Regions with several surfaces are split: each remaining point joins the core of
+    the nearest neighbor connected by an edge, without growing through other cores. If most points
+    are in curved cores, all cores except large flat ones form one core. The returned labels may
+    have gaps.
     """
     rows = mixed.rows[grown >= 0]
     if len(rows) == 0:
@@ -201,7 +202,7 @@ def cut_bridges(
     cores = _join_curved(cloud, labels, cores, mixed.on_plane)
     split = torch.bincount(_owners(labels, cores), minlength=len(mixed.on_plane)) > 1
     free = (labels >= 0) & split[labels.clamp(min=0)]
-    # Of points on the plane only those with its direction tell which cores it meets.
+    # Only points aligned with the plane show which cores it meets.
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
     plane_of[labels[on_core_plane]] = cores[on_core_plane]
     cores = torch.where(mixed.near & free & (cores < 0), plane_of[labels.clamp(min=0)], cores)
@@ -212,7 +213,7 @@ def cut_bridges(
 
 
 def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
-    """Make cores of the planes of regions that have other cores; tell their points."""
+    """Add the planes of regions with other cores as cores; also return a mask of their points."""
     has_core = torch.zeros_like(mixed.on_plane)
     has_core[labels[cores >= 0]] = True
     on_plane = mixed.aligned & has_core[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
@@ -222,7 +223,7 @@ def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Ten
 
 
 def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
-    """Return cores ``(N,)`` where those of a curved region that are no faces are one."""
+    """Merge the cores ``(N,)`` of each curved region, except its flat surfaces."""
     flat, owner = ~_planes_of(cloud, cores).curved, _owners(labels, cores)
     num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
     of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
@@ -239,21 +240,21 @@ def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: T
 
 
 def _owners(labels: Tensor, cores: Tensor) -> Tensor:
-    """Return the region of each core, in ascending order of the cores that have points."""
+    """Return the region of each non-empty core, ascending."""
     points = (cores >= 0).nonzero().squeeze(1)
     numbers, rows = torch.unique(cores[points], return_inverse=True)
     return labels.new_zeros(len(numbers)).index_copy_(0, rows, labels[points])
 
 
 def _planes_of(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
-    """Return the planes of cores."""
+    """Fit planes to cores."""
     return fit_planes(Segments(cores, most=MAX_FITTED), cloud.points, cloud.normals)
 
 
 def _are_smooth(
     cloud: GrowingCloud, regions: Tensor, max_angle_deg: float, chunk_size: int
 ) -> Tensor:
-    """Tell at which points the surface bends no more than is usual in their region."""
+    """Return a mask of points where the surface is as smooth as is typical for its region."""
     fractions = torch.zeros_like(cloud.curvature, dtype=torch.float64)
     rows, limit = (
         torch.arange(len(fractions), device=fractions.device),
@@ -270,7 +271,7 @@ def _are_smooth(
 
 
 def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
-    """Return some points as a cloud, where those of one region are neighbours."""
+    """Return a subset of points as a cloud, with neighbors limited to the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
     near = cloud.neighbors.at(rows)
@@ -292,7 +293,7 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
 def _find_edges(
     cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _InnerEdges:
-    """Return the edges of some points."""
+    """Return the edges of the given points."""
     near = cloud.neighbors.at(rows)
     inside = (near.of(labels) == labels[rows, None]) & near.counted()
     passed = torch.zeros_like(inside)
@@ -302,7 +303,7 @@ def _find_edges(
 
 
 def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tensor:
-    """Return the cores ``(N,)`` with those of one surface as one."""
+    """Return the cores ``(N,)`` with cores of one surface merged."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -328,7 +329,7 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
 
 
 def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
-    """Give points between the cores to that of the nearest neighbour they have an edge to."""
+    """Assign points between cores to the core of the nearest neighbor they have an edge to."""
     cores = cores.clone()
     waiting = torch.arange(len(edges.rows), device=cores.device)
     while len(waiting):
@@ -346,25 +347,25 @@ def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
 def split_levels(
     cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, config: GrowingConfig
 ) -> Tensor:
-    """Split regions that hold a second, parallel level of points beyond their noise.
+    """Split off second, parallel levels of points outside the noise of a region.
 
     The residuals of a region are measured from its main level, the mode, and averaged over the 16
-    nearest points of the region. Connected points whose average is more than 1.5 standard
-    deviations off are candidates, as far as they lie beyond half of their median step. A candidate
-    becomes a region of its own if
+    nearest points of the region. Candidates are connected points whose average exceeds 1.5 standard
+    deviations, limited to points beyond half of their median step. A candidate becomes a separate
+    region if
 
     - it has ``min_size`` points, and its step is two standard deviations and a facet tolerance;
-    - its plane is parallel to the region's, and its own thickness is below .6 of the step;
-    - in the rings around it fewer points lie halfway than on the level: there is a valley.
+    - its plane is parallel to the region's, and its thickness is below 0.6 of the step;
+    - in the surrounding rings fewer points lie halfway than on the level: there is a valley.
 
     Args:
         cloud: Points, normals and neighbors, in canonical order.
         labels: Regions, 0 to M-1 or negative, shape ``(N,)``.
         planes: Planes of the regions.
-        config: Settings; ``min_size`` and ``facet_tolerance`` are numbers.
+        config: Growing configuration; ``min_size`` and ``facet_tolerance`` are numbers.
 
     Returns:
-        Labels, shape ``(N,)``; second levels are numbered from M on. ``labels`` itself if there are
+        Labels, shape ``(N,)``; second levels are numbered from M. ``labels`` itself if there are
         none.
     """
     searched = labels
@@ -381,7 +382,7 @@ def split_levels(
         if not len(owner):
             break
         labels = torch.where(level >= 0, level + int(labels.max()) + 1, labels)
-        # Only regions that were split are searched again.
+        # Only split regions are searched again.
         rows = places_of(torch.isin(region, owner))
         searched = torch.full_like(labels, UNLABELED)
         searched[rows] = torch.unique(labels[rows], return_inverse=True)[1]
@@ -411,7 +412,7 @@ def _find_levels(
 
 
 def _numbers(kept: Tensor) -> Tensor:
-    """Return new numbers of the kept regions ``(M,)``, -1 for the others."""
+    """Return consecutive numbers of the kept regions ``(M,)``, -1 for removed ones."""
     return torch.where(kept, kept.cumsum(0) - 1, UNLABELED)
 
 
@@ -420,7 +421,7 @@ def _measure_residuals(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return residuals from the main level, their local average, and their standard deviation.
 
-    The first two are ``(N,)``, 0 without a region, the last is ``(M,)``, at least the floor.
+    The first two are ``(N,)``, 0 if unlabeled; the last is ``(M,)``, at least the floor.
     """
     segments, narrow = Segments(region), region.to(torch.int32)
     (along,) = segments.along(cloud.points, planes.center, planes.normal[:, None])
@@ -443,7 +444,7 @@ def _measure_residuals(
 
 
 def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
-    """Return the mode of the averaged residuals of each region, the mean around their peak."""
+    """Return the mode of the averaged residuals of each region, as the mean around their peak."""
     middle = segments.median(average)
     away = average - segments.spread(middle)
     width = torch.maximum(MAD_FACTOR * segments.median(away.abs()), floor)
@@ -460,7 +461,7 @@ def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
 
 
 def _components(chosen: Tensor, groups: Tensor, beside: NearestPoints) -> Tensor:
-    """Number the connected components of chosen points of one group, -1 for the other points."""
+    """Label the connected components of chosen points within each group, -1 for other points."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -478,7 +479,7 @@ def _components(chosen: Tensor, groups: Tensor, beside: NearestPoints) -> Tensor
 
 
 def _steps(level: Tensor, residual: Tensor) -> Tensor:
-    """Return the median absolute residual of each level, and infinity for points of none."""
+    """Return the median absolute residual of each level, plus infinity for unlabeled points."""
     segments = Segments(level)
     steps = segments.median(segments.take(residual.abs()))
     return torch.cat([steps, steps.new_tensor([torch.inf])])
@@ -487,14 +488,14 @@ def _steps(level: Tensor, residual: Tensor) -> Tensor:
 def _have_valleys(
     level: Tensor, step: Tensor, average: Tensor, region: Tensor, beside: NearestPoints
 ) -> Tensor:
-    """Return whether fewer points lie halfway to each level than on it, in rings around it."""
+    """Return a mask of levels with fewer points halfway to them than on them, in rings around."""
     ring = places_of(level >= 0)
     owner, side = level.clone(), Segments(level).first(average).sign()
     for _ in range(_NUM_RINGS):
         near = beside.around(ring).long()
         source = owner[ring, None].expand_as(near)
         is_new = (owner[near] < 0) & (region[near] == region[ring, None])
-        # Of several levels that reach a point the first takes it, whatever the order of the points.
+        # If several levels reach a point, the first wins, independent of the point order.
         target, source = near[is_new], source[is_new]
         first = torch.full_like(owner, len(step)).scatter_reduce_(0, target, source, "amin")
         ring = torch.unique(target)

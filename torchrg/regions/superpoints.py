@@ -1,7 +1,4 @@
-"""Superpoints: a partition of all points into connected parts of one orientation, in levels.
-
-Regions of a graph of neighbours merge pair by pair, the pair that costs the energy least first.
-"""
+"""Hierarchical superpoint partition by greedy region merging in a neighbor graph."""
 
 import math
 from collections import deque
@@ -26,46 +23,45 @@ from torchrg.regions.growth import number_by_count
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
 _NUM_NEIGHBORS = 1 + NUM_CONTACTS
-"""The point itself, and those that surround it on a surface."""
+"""The point itself and its adjacent neighbors."""
 
 _SPACINGS_IN_REACH = 1.6
-"""A circle around 8 points that are one spacing apart has this many spacings for its radius."""
+"""Radius, in spacings, of a circle around 8 points that are one spacing apart."""
 
 _COLOR_WEIGHT = 3.0
-"""Weight of a squared difference of colours in [0, 1] against one of unit normals: colours that are
-a third of the range apart in each channel weigh as much as a squared difference of normals of 1."""
+"""Weight of a squared color difference, channels in [0, 1], relative to unit normals: colors a
+third of the range apart in each channel weigh as much as a squared normal difference of 1."""
 
 _PLANE_FRACTION, _MAX_SPREAD_DEG = 0.5, 20.0
-"""How far the normal of a point is turned to the mean normal of its plane, where the normals of the
-plane have at most this RMS angle to it. Noise turns normals by chance, and edges bend them; a plane
-has neither. In a column, the RMS angle is 45 degrees."""
+"""Fraction by which a point normal is turned to the mean normal of its plane, and the maximum RMS
+angle of the normals of such a plane. Noise and edges perturb normals, but not a plane's mean. In a
+column, the RMS angle is 45 degrees."""
 
 _PLACE_SPACINGS = 150.0
-"""Length by which places are divided to become features, in spacings. It tells boards, pictures and
-doors apart that are flush with a wall."""
+"""Length, in spacings, that scales positions to features. It separates boards, pictures and doors
+that are flush with a wall."""
 
 _STEP_WEIGHT = 0.25
-"""Weight of the squared sine of the angle between a contact and the surface: one that leads off the
-surface at a right angle, as down a step, weighs as much as normals that differ by 29 degrees."""
+"""Weight of the squared sine of the angle between a contact and the surface: a perpendicular
+contact, as at a step, weighs as much as normals that differ by 29 degrees."""
 
 _PLANE_WEIGHT = 0.25
-"""Weight of a contact between points of different planes, as of normals that differ by 29
+"""Weight of a contact between points of different planes, equal to normals that differ by 29
 degrees."""
 
 _MIN_DIFFERENCE = 0.01
-"""Squared difference of normals, that of 6 degrees, which counts even between regions of one
-surface."""
+"""Squared normal difference, equal to 6 degrees, added even between regions of one surface."""
 
 _MAX_EDGES = 64
-"""Edges of a vertex that it lists at most, which bounds the memory; reconstructions have 6."""
+"""Maximum number of listed edges per vertex, which bounds the memory; reconstructions have 6."""
 
 _BORDERS_A_TURN = 8
-"""Towards a given number of superpoints one of so many borders, the cheapest, may vanish at a
-time."""
+"""When merging to a number of superpoints, the cheapest 1/8 of the boundaries are eligible per
+round."""
 
 _MUCH_LARGER = 16
-"""A region of so many times the points of another hardly changes by it, so it takes in all such
-that would rather join it than any other at a time. Else a floor takes in one speck at a time."""
+"""Minimum size ratio at which a region absorbs, in one round, all smaller ones that prefer it: they
+hardly change it. Otherwise a floor would absorb one speck per round."""
 
 
 def partition_points(
@@ -79,30 +75,29 @@ def partition_points(
 ) -> Superpoints:
     r"""Partition a cloud; see :func:`torchrg.make_superpoints`.
 
-    The first regions are single points, or whole planes and points. Of two regions that touch, of
-    :math:`n_a` and :math:`n_b` points, merging costs
+    Initial regions are single points, or complete planes and single points. Merging two adjacent
+    regions of :math:`n_a` and :math:`n_b` points costs
 
     .. math:: \frac{n_a n_b}{n_a + n_b} (d_{ab} + \epsilon) / \sqrt{c_{ab}},
 
-    where d is the squared difference of what the regions are (mean of :math:`n n^T` [1], of the
-    colour, and of the place in units of 150 spacings) and the mean of what parts the points at
-    their contacts (normals, a step between parallel surfaces, different planes), and c the number
-    of contacts. The first factor is Ward's [2]: the
-    increase of the variance within regions. Divided by the length of the border that vanishes it is
-    the strength of regularisation at which the energy of Mumford and Shah falls [3], the energy
-    that cut pursuit minimises [4] and, with places and normals, the supervoxels of [5] and [6];
-    normals come first as in [7]. Contacts are that length up to noise, hence their root. Pairs
-    merge up to each strength of the configuration, or until each of its numbers of superpoints is
-    left. Regions that are each other's cheapest partner merge at a time, and small ones with a much
-    larger one that is theirs: this needs no order of visits.
+    where d is the squared difference of the region features (mean of :math:`n n^T` [1], color, and
+    position in units of 150 spacings) plus the mean difference along their contacts (normals, steps
+    between parallel surfaces, different planes), and c is the number of contacts. The first factor
+    is Ward's [2], the increase of the variance within regions. Divided by the length of the removed
+    boundary, it is the regularization strength at which the Mumford-Shah energy falls [3]. Cut
+    pursuit minimizes this energy [4], and, with positions and normals, so do the supervoxels of [5]
+    and [6]; normals come first as in [7]. Contacts measure the boundary length up to noise, hence
+    the root. Pairs merge up to each configured strength, or until each configured number of
+    superpoints remains. Each round merges mutually cheapest partners, and small regions into a much
+    larger cheapest partner, so no visiting order is needed.
 
-    Where the normals of a plane agree, the normal of a point counts halfway between its own and
-    that of the plane, so noise decides less and places more.
+    If the normals of a plane agree, each point normal is moved halfway to the plane normal, which
+    gives noise less weight and positions more.
 
-    ``labels`` ``(N,)`` are those of planes, negative for none, ``colors`` ``(N, 3)`` are in [0, 1],
-    floating point and finite. Of a mesh with ``faces`` ``(F, 3)`` contacts are its edges, else
-    those of a point to the 8 nearest: ``neighbors`` of the distinct finite points in canonical
-    order, searched by default.
+    ``labels`` ``(N,)`` are plane IDs, negative if unlabeled; ``colors`` ``(N, 3)`` are in [0, 1],
+    floating point and finite. For a mesh with ``faces`` ``(F, 3)`` contacts are its edges,
+    otherwise edges to the 8 nearest points: ``neighbors`` of the distinct finite points in
+    canonical order, searched by default.
 
     References:
         [1] H. Knutsson. Representing local structure using tensors. SCIA, 1989.
@@ -143,8 +138,8 @@ def merge_copies(
 ) -> tuple[DistinctPoints, Tensor | None]:
     """Return the distinct points of a cloud, and their colors.
 
-    Of copies with other values the one on the largest plane stands for all. Their color is halfway
-    between the least and the largest of each channel, in whatever order they come.
+    Among duplicates with different values, the point on the largest plane represents all. Their
+    color is the midpoint of the channel minimum and maximum, independent of the order.
     """
     last = torch.iinfo(labels.dtype).max
     ties = labels.where(labels >= 0, last), *normals.detach().unbind(dim=1)
@@ -172,7 +167,7 @@ def _partition_places(
     edges: Tensor | None,
     neighbors: Neighbors | None,
 ) -> list[Tensor]:
-    """Return the region of each of distinct points ``(n,)`` in canonical order, level by level."""
+    """Return the region of each distinct point ``(n,)`` in canonical order, level by level."""
     if len(places) == 0:
         return [torch.zeros(0, dtype=torch.int64) for _ in range(config.num_levels)]
     k = min(_NUM_NEIGHBORS, len(places))
@@ -209,7 +204,7 @@ def _partition_places(
 
 
 def _lean_on_planes(normals: Tensor, labels: Tensor) -> Tensor:
-    """Return normals halfway between a point's own and that of its plane, where this is flat."""
+    """Return normals halfway between the point normal and the plane normal of flat planes."""
     rows = (labels >= 0).nonzero().squeeze(1)
     if len(rows) == 0:
         return normals
@@ -226,7 +221,7 @@ def _lean_on_planes(normals: Tensor, labels: Tensor) -> Tensor:
 
 
 def _mesh_edges(faces: Tensor, places: Tensor) -> Tensor:
-    """Return the pairs of places ``(E, 2)`` that edges of a mesh lead from and to, ascending."""
+    """Return the directed mesh edges as distinct pairs of points ``(E, 2)``, ascending."""
     corners = places[faces.long()]
     pairs = torch.cat([corners[:, [i, j]] for i in range(3) for j in range(3) if i != j])
     pairs = pairs[(pairs >= 0).all(dim=1) & (pairs[:, 0] != pairs[:, 1])]
@@ -236,7 +231,7 @@ def _mesh_edges(faces: Tensor, places: Tensor) -> Tensor:
 
 
 def _listed(edges: Tensor, num_places: int) -> Tensor:
-    """Return the first 64 places that edges lead to from each ``(n, K)``; itself where fewer."""
+    """Return up to 64 edge targets of each point ``(n, K)``, padded with the point itself."""
     counts = torch.bincount(edges[:, 0], minlength=num_places)
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
     first = column < _MAX_EDGES
@@ -247,9 +242,9 @@ def _listed(edges: Tensor, num_places: int) -> Tensor:
 
 
 class _Regions(NamedTuple):
-    """Points of R regions, sums of their features ``(R, F)``, boxes about them ``(R, 3)``, float64.
+    """Sizes of R regions, feature sums ``(R, F)`` and bounding boxes ``(R, 3)``, float64.
 
-    Without a bound on their extent boxes have no columns.
+    Without an extent bound the boxes have no columns.
     """
 
     size: Tensor
@@ -259,7 +254,7 @@ class _Regions(NamedTuple):
 
 
 class _Borders(NamedTuple):
-    """Pairs of regions that touch, ``first < second``, ascending, and sums over their contacts.
+    """Adjacent pairs of regions, ``first < second``, ascending, and sums over their contacts.
 
     The pairs are int32, the sums float64.
     """
@@ -271,21 +266,21 @@ class _Borders(NamedTuple):
 
 
 class _Graph(NamedTuple):
-    """Regions and their borders."""
+    """Regions and their boundaries."""
 
     regions: _Regions
     borders: _Borders
 
 
 def _median_spacing(places: Tensor, neighbors: Neighbors) -> float:
-    """Return the median distance to the nearest point that evenly spread points would have."""
+    """Return the median point spacing, assuming evenly spread points."""
     last = neighbors.indices[:, -1].long()
     reach = (places[last].double() - places.double()).norm(dim=1).median()
     return float(reach) / _SPACINGS_IN_REACH
 
 
 def _whole_planes(labels: Tensor, nearest: Tensor) -> Tensor:
-    """Return the first region of each point ``(n,)``: connected parts of planes, and points."""
+    """Return the initial region of each point ``(n,)``: connected parts of planes, or the point."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -318,7 +313,7 @@ def _describe(
     colors: Tensor | None,
     config: SuperpointsConfig,
 ) -> _Regions:
-    """Return sums and boxes of the first regions."""
+    """Return the feature sums and boxes of the initial regions."""
     places = places.double()
     x, y, z = normals.double().unbind(dim=1)
     off = math.sqrt(2)
@@ -336,8 +331,8 @@ def _describe(
 
 
 def _joined(regions: _Regions, new: Tensor) -> _Regions:
-    """Return regions of regions: the sums and boxes of those that become the same one ``(R,)``."""
-    # bincount adds one element after the other.
+    """Return merged regions: sums and boxes of regions with the same new index ``(R,)``."""
+    # bincount adds the elements in order.
     size = torch.bincount(new, weights=regions.size)
     features = regions.features.new_empty(len(size), regions.features.shape[1])
     for column, sums in zip(features.unbind(dim=1), regions.features.unbind(dim=1), strict=True):
@@ -355,7 +350,7 @@ def _joined(regions: _Regions, new: Tensor) -> _Regions:
 def _describe_borders(
     regions: Tensor, places: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
 ) -> _Borders:
-    """Return the borders of the first regions: a contact leads from a point to a near one."""
+    """Return the boundaries of the initial regions: contacts lead from a point to a near one."""
     difference = torch.empty(nearest.shape, dtype=torch.float64)
 
     def measure(rows: slice) -> None:
@@ -371,10 +366,10 @@ def _describe_borders(
 def _contact_differences(
     rows: slice, places: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
 ) -> Tensor:
-    """Return what parts points from those near them, shape ``(n, K)``, float64; see the formula.
+    """Return the differences between points and near points, shape ``(n, K)``, float64.
 
-    That is the squared difference of their normals, the squared sine of the angle at which the way
-    between them leaves the flatter of the surfaces, and whether they are on different planes.
+    See the formula: squared normal difference, squared sine of the angle between the contact and
+    the flatter surface, and whether the planes differ.
     """
     near = nearest[rows]
     if kernels.serve(places, normals):
@@ -399,9 +394,9 @@ def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
 
 
 def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor) -> _Borders:
-    """Return one row for each pair of different regions, with the sums of its rows.
+    """Return one row per pair of different regions, with the sums of its rows.
 
-    Without numbers of contacts each row is one.
+    Without ``contacts`` each row counts as one.
     """
     if len(a) == 0:
         return _Borders(a, b, difference, difference)
@@ -427,7 +422,7 @@ def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor | None, difference: T
 def _merge_to_strength(
     strength: float, graphs: list[_Graph], min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
-    """Merge pairs that cost at most ``strength``, then small regions; return what each became."""
+    """Merge pairs that cost at most ``strength``, then small regions; return graph and indices."""
     graph, become = _last(_merging(graphs, bound, lambda cost, graph: cost <= strength))
     graph, merged = _last(_merging([graph], bound, partial(_joins_small, min_size)))
     return graph, merged[become]
@@ -436,11 +431,11 @@ def _merge_to_strength(
 def _merge_to_count(
     count: int, graphs: list[_Graph], min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
-    """Merge the pairs that cost least until ``count`` regions are left, none of them too small.
+    """Merge the cheapest pairs until ``count`` regions remain, all of them large enough.
 
-    Those that are too small join others at the last time when enough of the rest are left: so late
-    that points have become regions, and early enough to count only what stays. Returns what
-    :func:`_merge_to_strength` returns.
+    Small regions are merged at the last round with enough large regions: late enough that points
+    have become regions, early enough that only final regions count. Returns the same as
+    :func:`_merge_to_strength`.
     """
     num_large = 0
     for state in _merging(graphs, bound, _is_cheap, count):
@@ -458,13 +453,13 @@ def _last(states: Iterator[tuple[_Graph, Tensor]]) -> tuple[_Graph, Tensor]:
 
 
 def _joins_small(min_size: int, cost: Tensor, graph: _Graph) -> Tensor:
-    """Return which borders are those of a region with fewer points."""
+    """Return a mask of boundaries of a region smaller than ``min_size``."""
     size = graph.regions.size
     return torch.minimum(size[graph.borders.first], size[graph.borders.second]) < min_size
 
 
 def _is_cheap(cost: Tensor, graph: _Graph) -> Tensor:
-    """Return which borders are among those that cost least."""
+    """Return a mask of the cheapest boundaries."""
     return cost <= cost.kthvalue(-(-len(cost) // _BORDERS_A_TURN)).values
 
 
@@ -474,12 +469,12 @@ def _merging(
     is_eligible: Callable[[Tensor, _Graph], Tensor],
     count: int = 1,
 ) -> Iterator[tuple[_Graph, Tensor]]:
-    """Yield the graph and what regions become while eligible pairs merge to ``count``.
+    """Yield the graph and the new region indices while eligible pairs merge down to ``count``.
 
-    The graph leaves its list, so that nobody else keeps the first, which is the largest.
+    The list is emptied so that the initial (largest) graph can be freed.
     """
     graph = graphs.pop()
-    # Two that fit into the box of a third one by one may not fit together.
+    # Merging several regions into one at a time could exceed the extent bound.
     ratio = _MUCH_LARGER if bound == math.inf else math.inf
     become = torch.arange(len(graph.regions.size))
     while True:
@@ -499,7 +494,7 @@ def _merging(
 
 
 def _costs(regions: _Regions, borders: _Borders, bound: float) -> Tensor:
-    """Return what merging at each border costs, infinite where the box would exceed the bound."""
+    """Return the merge cost of each boundary, infinite if the box would exceed the bound."""
     means = regions.features / regions.size[:, None]
     if kernels.serve():
         boxes = regions.low, regions.high
@@ -524,10 +519,10 @@ def _costs(regions: _Regions, borders: _Borders, bound: float) -> Tensor:
 def _choose_pairs(
     borders: _Borders, cost: Tensor, size: Tensor, ratio: float, most: int
 ) -> tuple[Tensor, Tensor]:
-    """Return regions, and those that they are to become part of, each of which stays itself.
+    """Return regions to merge and their targets, which remain.
 
-    Those are each other's cheapest, or the cheapest of one that has ``ratio`` times fewer points;
-    at most so many, those that cost least. Of equal costs the first border's counts.
+    A pair is mutually cheapest, or the source's cheapest partner has ``ratio`` times its points.
+    Returns at most ``max_merges`` pairs, cheapest first; ties go to the first boundary.
     """
     num_regions, num_borders = len(size), len(cost)
     least, best = _cheapest_borders(borders, cost, num_regions)
@@ -544,12 +539,12 @@ def _choose_pairs(
         asking, wanted = asking[cheapest], wanted[cheapest]
     owner = torch.arange(num_regions).index_copy(0, asking, wanted)
     gone = asking
-    # What joins one of a mutual pair may find it gone.
+    # The target may itself have merged into its mutual partner.
     return gone, owner[owner[gone]]
 
 
 def _cheapest_borders(borders: _Borders, cost: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
-    """Return the least cost at each region's borders, and its first border of that cost, or E."""
+    """Return each region's minimum boundary cost, and its first boundary of that cost, or E."""
     least = cost.new_full((num_regions,), math.inf)
     if kernels.serve():
         (best,) = kernels.call("cheapest_borders", borders.first, borders.second, cost, least)
@@ -565,7 +560,7 @@ def _cheapest_borders(borders: _Borders, cost: Tensor, num_regions: int) -> tupl
 def _merge(
     regions: _Regions, borders: _Borders, gone: Tensor, owners: Tensor
 ) -> tuple[_Regions, _Borders, Tensor]:
-    """Make regions part of others that stay; return the new number of each region too."""
+    """Merge regions into their targets; also return the new index of each region."""
     num_regions = len(regions.size)
     owner = torch.arange(num_regions).index_copy(0, gone, owners)
     stays = owner == torch.arange(num_regions)
@@ -581,7 +576,7 @@ def _merge(
 
 
 def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
-    """Return the plane that more than half of the points of each superpoint are on, or -1."""
+    """Return the plane ID of more than half of each superpoint's points, or -1."""
     has_one = superpoints >= 0
     count = int(superpoints.max()) + 1 if bool(has_one.any()) else 0
     sizes = torch.bincount(superpoints[has_one], minlength=count)

@@ -1,4 +1,4 @@
-"""The plane table: what each region measures, and which others it meets."""
+"""Plane table: fits, measurements and adjacency of regions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,27 +38,28 @@ def summarize_planes(
 ) -> Planes:
     """Fit a plane to each region and measure it.
 
-    Copies of a point in one region count once, except in ``count``. The table does not depend on
-    the order of the points, but for which planes meet, which the neighbors say.
+    Duplicates in one region count once, except in ``count``. The table does not depend on the point
+    order, except the adjacency, which depends on ``neighbors``.
 
     Args:
-        points: Points, shape ``(N, 3)``; those without a label may hold anything.
-        normals: Unit normals of any sign, shape ``(N, 3)``. They tell curved regions from flat
-            ones, and decide where points do not: in regions of one or two points, or along a line.
+        points: Points, shape ``(N, 3)``; unlabeled points may have any value.
+        normals: Unit normals of any sign, shape ``(N, 3)``. They distinguish curved from flat
+            regions, and define the planes of degenerate ones (one or two points, or collinear).
         labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
-        neighbors: Neighbours of each point, to tell which planes meet.
-        up: The upward direction, to tell floors, ceilings and walls: three numbers, or an axis such
-            as ``"z"`` or ``"-y"``.
-        outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
-        canonical: Whether the points already are finite and in canonical order, copies of one
-            region side by side; saves a sort.
-        facet_tolerance: Of faces in facets, whose normals are spread, in the unit of the points:
-            regions within 1.5 of it, root mean square, are planes. Default: normals decide alone.
+        neighbors: Neighbors of each point. Default: no adjacency.
+        up: Upward direction for the classification: three numbers, or an axis such as ``"z"`` or
+            ``"-y"``. Default: no classes.
+        outline: Whether to trace polygons; requires shapely (``torchrg[outline]``).
+        canonical: Whether the points are finite and in canonical order with duplicates of a region
+            adjacent; saves a sort.
+        facet_tolerance: For faceted surfaces with spread normals, in the unit of the points:
+            regions within an RMS distance of 1.5 times this value are planes. Default: the normals
+            alone decide.
 
     Raises:
         ShapeError: If a shape or dtype is not as above, or a labeled point is not finite.
         ConfigError: If ``up`` is not a direction.
-        MissingDependencyError: If outlines are asked for and shapely is not installed.
+        MissingDependencyError: If polygons are requested and shapely is not installed.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]])
@@ -112,7 +113,7 @@ def _distinct_members(points: Tensor, labels: Tensor, *, canonical: bool) -> Row
 def measure_planes(
     segments: Segments, points: Tensor, fit: RegionPlanes, *, outline: bool = False
 ) -> Planes:
-    """Measure regions on the planes that were fitted to them; see :func:`summarize_planes`."""
+    """Measure regions on their fitted planes; see :func:`summarize_planes`."""
     first, second = _plane_axes(fit)
     chunks = segments.chunks(POINTS_AT_ONCE)
     sizes = [len(chunk.counts) for chunk in chunks]
@@ -148,9 +149,10 @@ def measure_planes(
 def _measure(
     points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor], *, outline: bool
 ) -> tuple[list[Tensor], _Outlines]:
-    """Return mean, area, rectangle and outlines of regions, by centers ``(M, 3)`` and axes.
+    """Return mean, area, rectangle and polygons of regions, given their plane frames.
 
-    The axes ``(M, 3, 3)`` are two in the plane and its normal; the mean is in space.
+    A frame is the centers ``(M, 3)`` and the axes ``(M, 3, 3)``: two in the plane, then its normal.
+    The mean is in space.
     """
     u, v, height = segments.along(points, *frame)
     mean = torch.stack([segments.mean(column) for column in (u, v, height)], dim=1)
@@ -165,7 +167,7 @@ def _measure(
 def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
     """Return two unit directions that span each plane, the first along the region."""
     first = _without(eigh3_of_few(fit.covariance)[1][:, :, 2], fit.normal)
-    # The points of one place have no direction of their own: any in the plane will do.
+    # A region at a single position has no direction: any direction in the plane will do.
     least = fit.normal.abs().argmin(dim=1)
     other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
     first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
@@ -174,7 +176,7 @@ def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
 
 
 def _without(vectors: Tensor, normals: Tensor) -> Tensor:
-    """Return vectors less their component along the normals."""
+    """Return vectors without their component along the normals."""
     return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
 
 
@@ -186,7 +188,7 @@ def _outlines(
     frame: tuple[Tensor, Tensor],
     dtype: torch.dtype,
 ) -> _Outlines:
-    """Trace the outline of each region, and lift it into space."""
+    """Trace the polygons of each region, and lift them into space."""
     outlines = []
     counts = segments.counts.tolist()
     parts = torch.split(torch.stack([u, v], dim=1), counts)
