@@ -14,7 +14,7 @@ from torchrg._parallel import places_of
 from torchrg.depth.passes import serves
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
-from torchrg.regions.repair import renumber
+from torchrg.regions.repair import remap_labels
 
 _MAX_WIDTH = 10.0
 """Pixels; a wider strip is a face of its own."""
@@ -115,7 +115,7 @@ def join_strips(
     joins &= contacts == most[strip]
     unchanged = torch.arange(num_regions, device=labels.device)
     target = torch.where(most > 0, num_regions, unchanged)
-    return renumber(labels, target.scatter_reduce(0, strip[joins], face[joins], "amin"))
+    return remap_labels(labels, target.scatter_reduce(0, strip[joins], face[joins], "amin"))
 
 
 def hidden_contacts(

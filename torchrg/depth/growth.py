@@ -108,24 +108,24 @@ def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:
 
 
 class PixelGrid:
-    """The eight pixels around each pixel of an image, a :class:`torchrg.regions.repair.Beside`."""
+    """8-connected pixel grid, a :class:`torchrg.regions.repair.Adjacency`."""
 
     def __init__(self, shape: torch.Size) -> None:
         self.height, self.width = shape
 
-    def around(self, rows: Tensor) -> Tensor:
-        """Return the pixels around some, ``(n, 8)``; for those outside the nearest inside."""
+    def neighbor_rows(self, rows: Tensor) -> Tensor:
+        """Return the neighbors of pixels ``(n, 8)``, clamped to the image."""
         down, right = torch.tensor(_AROUND, device=rows.device).T
         row = (rows[:, None] // self.width + down).clamp(0, self.height - 1)
         column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)
         around: Tensor = row * self.width + column
         return around
 
-    def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
-        """Return those of the pixels that have a new one beside them."""
-        is_reached = waiting.new_zeros(self.height * self.width, dtype=torch.bool)
-        is_reached[self.around(new)] = True
-        return waiting[is_reached[waiting]]
+    def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
+        """Return the candidates that have a changed neighbor."""
+        is_near = candidates.new_zeros(self.height * self.width, dtype=torch.bool)
+        is_near[self.neighbor_rows(changed)] = True
+        return candidates[is_near[candidates]]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of regions that touch, and the number of contacts of each pair."""
@@ -271,7 +271,7 @@ def move_to_creases(
     grid = PixelGrid(cloud.seen.shape)
     rows = torch.unique(torch.cat(grid.borders(labels)))
     for _ in range(_MAX_MOVES):
-        around = grid.around(rows)
+        around = grid.neighbor_rows(rows)
         across = _regions_across(cloud, labels, planes, middles, reach, rows, around)
         moved = across != labels[rows]
         if not bool(moved.any()):

@@ -63,8 +63,8 @@ def find_adjacency(
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
     """
-    border = _Border(labels, neighbors)
-    pairs = border.pairs
+    edges = _RegionEdges(labels, neighbors)
+    pairs = edges.pairs
     first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
     angle = unsigned_angle_deg(first, second)
     crossing = (angle > PARALLEL_DEG) & ~curved[pairs].any(dim=1)
@@ -74,7 +74,7 @@ def find_adjacency(
         is_crossing = crossing[contacts.pair]
         on_lines = _select(contacts, is_crossing)
         on_curves = _select(contacts, ~is_crossing & (contacts.column <= NUM_CONTACTS))
-        edge, pair = _edges(points, on_curves), on_curves.pair
+        edge, pair = _edge_vectors(points, on_curves), on_curves.pair
         across = torch.stack([(edge * side[pair]).sum(dim=1) for side in (first, second)])
         spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
         farthest = torch.maximum(reach[pair], _MAX_STEEPNESS * spacing)
@@ -84,19 +84,19 @@ def find_adjacency(
         flat = across.abs().amax(dim=0) <= farthest
         return (
             on_lines.pair,
-            _edges(points, on_lines).norm(dim=1),
+            _edge_vectors(points, on_lines).norm(dim=1),
             pair[flat],
             length_each[flat],
         )
 
     lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
-    for on_line, size, on_curve, length_each in border.map_contacts(measure):
+    for on_line, size, on_curve, length_each in edges.map_contacts(measure):
         lines.add(on_line, size)
         curves.add(on_curve, length_each)
-    (sizes, on_line), (lengths, on_curve) = (kind.on(points.device) for kind in (lines, curves))
+    (sizes, on_line), (lengths, on_curve) = (kind.to(points.device) for kind in (lines, curves))
     along = torch.linalg.cross(first, second)
     along = along / along.norm(dim=1, keepdim=True)
-    length = _length_on_line(points, border, along, sizes / on_line)
+    length = _length_on_line(points, edges, along, sizes / on_line)
     meets = on_line + on_curve >= MIN_CONTACTS
     length = torch.where(crossing, length, lengths)
     return PlaneAdjacency(pairs[meets], length[meets], angle[meets])
@@ -118,7 +118,7 @@ class NearestPoints:
         valid = None if valid is None else valid[:, columns]
         self.neighbors = Neighbors(neighbors.indices[:, columns], valid)
 
-    def around(self, rows: Rows) -> Tensor:
+    def neighbor_rows(self, rows: Rows) -> Tensor:
         """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
         near, counted = self.neighbors.at(rows)
         if counted is None:
@@ -128,12 +128,12 @@ class NearestPoints:
             numbers = torch.arange(len(self.neighbors.indices), device=near.device)[numbers]
         return torch.where(counted, near, numbers[:, None].to(near.dtype))
 
-    def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
+    def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
         """Return the candidates that have a changed neighbor."""
         num_points = len(self.neighbors.indices)
-        is_new = torch.zeros(num_points, dtype=torch.bool, device=waiting.device)
-        is_new[new] = True
-        return waiting[is_new[self.around(waiting)].any(dim=1)]
+        is_changed = torch.zeros(num_points, dtype=torch.bool, device=candidates.device)
+        is_changed[changed] = True
+        return candidates[is_changed[self.neighbor_rows(candidates)].any(dim=1)]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Apply :func:`find_contacts` to the nearest neighbors."""
@@ -146,8 +146,8 @@ def find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]
     For labels ``(N,)``, negative if unlabeled: pairs ``(E, 2)``, smaller label first, ascending,
     and counts ``(E,)``.
     """
-    border = _Border(labels, neighbors)
-    return border.pairs, border.counts
+    edges = _RegionEdges(labels, neighbors)
+    return edges.pairs, edges.counts
 
 
 class _Contacts(NamedTuple):
@@ -171,12 +171,12 @@ class _Totals:
         np.add.at(self._sums, owner, values.cpu().numpy())
         np.add.at(self._counts, owner, 1)
 
-    def on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+    def to(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return sums and counts, each ``(E,)``."""
         return torch.from_numpy(self._sums).to(device), torch.from_numpy(self._counts).to(device)
 
 
-class _Border:
+class _RegionEdges:
     """Edges between regions, recomputed on each pass: storing all could take more than the cloud.
 
     ``pairs`` ``(E, 2)`` are the adjacent regions, ascending, and ``counts`` ``(E,)`` their edges.
@@ -189,14 +189,14 @@ class _Border:
         meets = torch.empty_like(labels, dtype=torch.bool)
 
         def mark(chunk: slice) -> None:
-            meets[chunk] = self._meets_others(chunk)
+            meets[chunk] = self._at_boundary(chunk)
 
         map_chunks(mark, len(labels), ROWS_IN_CACHE, labels.device)
         self._rows = places_of(meets).to(torch.int32)
         # Keeping small tensors of every chunk would fragment the heap (glibc).
         counts: Counter[int] = Counter()
         for rows in torch.split(self._rows, ROWS_IN_CACHE):
-            values = torch.unique(self._edges_of(rows)[2], return_counts=True)
+            values = torch.unique(self._boundary_edges(rows)[2], return_counts=True)
             counts.update(dict(zip(*(of_chunk.tolist() for of_chunk in values), strict=True)))
         self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
         self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
@@ -207,43 +207,43 @@ class _Border:
     def _width(self) -> int:
         return max(self._neighbors.indices.shape[1], 1)
 
-    def _meets_others(self, rows: slice) -> Tensor:
+    def _at_boundary(self, rows: slice) -> Tensor:
         """Return which points have a neighbor in another region, shape ``(n,)``."""
-        own, near = self._labels[rows], self._neighbors.at(rows)
-        if kernels.serve(own, *near):
-            return kernels.call("meet_others", self._labels, own, *near)[0]
-        return self._touches(own, near)[0].any(dim=1)
+        label, near = self._labels[rows], self._neighbors.at(rows)
+        if kernels.serve(label, *near):
+            return kernels.call("meet_others", self._labels, label, *near)[0]
+        return self._crossing_neighbors(label, near)[0].any(dim=1)
 
-    def _touches(self, own: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
+    def _crossing_neighbors(self, label: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
         """Return a mask of the neighbors in another region, and their labels."""
         other = near.of(self._labels)
-        touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
-        return touches if near.valid is None else touches & near.valid, other
+        crosses = (other != label[:, None]) & (other >= 0) & (label >= 0)[:, None]
+        return crosses if near.valid is None else crosses & near.valid, other
 
-    def _edges_of(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _boundary_edges(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the flat list indices of boundary edges, the neighbor lists, and the pairs."""
         label, near = self._labels[rows], self._neighbors.at(rows)
         scratch.release()
-        touches, other = self._touches(label, near)
-        places = places_of(touches)
-        first = label.index_select(0, places // self._width)
-        second = other.reshape(-1).index_select(0, places)
+        crosses, other = self._crossing_neighbors(label, near)
+        flat_index = places_of(crosses)
+        first = label.index_select(0, flat_index // self._width)
+        second = other.reshape(-1).index_select(0, flat_index)
         lower, higher = torch.minimum(first, second), torch.maximum(first, second)
-        return places, near.indices, lower.long() * self._num_regions + higher
+        return flat_index, near.indices, lower.long() * self._num_regions + higher
 
     def map_contacts(self, work: Callable[[_Contacts], Result]) -> Iterator[Result]:
         """Yield the results of ``work`` for all edges in order, one chunk of points at a time."""
 
         def find(rows: Tensor) -> Result:
-            places, targets, keys = self._edges_of(rows)
-            source, column = places // self._width, places % self._width
-            targets = targets.reshape(-1).index_select(0, places)
+            flat_index, targets, keys = self._boundary_edges(rows)
+            source, column = flat_index // self._width, flat_index % self._width
+            targets = targets.reshape(-1).index_select(0, flat_index)
             pair = torch.searchsorted(self._keys, keys)
             return work(_Contacts(pair, rows.index_select(0, source), targets, column))
 
         chunks = torch.split(self._rows, ROWS_IN_CACHE)
-        for some in chunks_of(len(chunks), _CHUNKS_AT_ONCE):
-            yield from map_tasks(find, chunks[some], self._rows.device)
+        for batch in chunks_of(len(chunks), _CHUNKS_AT_ONCE):
+            yield from map_tasks(find, chunks[batch], self._rows.device)
 
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
@@ -252,13 +252,13 @@ def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
     return _Contacts(*(values.index_select(0, rows) for values in contacts))
 
 
-def _edges(points: Tensor, contacts: _Contacts) -> Tensor:
+def _edge_vectors(points: Tensor, contacts: _Contacts) -> Tensor:
     """Return the edges as vectors ``(n, 3)`` in float64."""
     start, end = (points.index_select(0, rows) for rows in (contacts.source, contacts.target))
     return end.double() - start.double()
 
 
-def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Tensor) -> Tensor:
+def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing: Tensor) -> Tensor:
     """Return the length of each pair's line covered by edge midpoints, shape ``(E,)``."""
     origin = points[:1].double()
     cells = array("q"), array("q")
@@ -267,14 +267,14 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
-        place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
-        cell = place.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
-        return _each_once(contacts.pair, cell)
+        position = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
+        cell = position.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
+        return _unique_cells(contacts.pair, cell)
 
-    for found in border.map_contacts(find_cells):
+    for found in edges.map_contacts(find_cells):
         for numbers, values in zip(cells, found, strict=True):
             numbers.frombytes(values.cpu().numpy().tobytes())
-    pair, cell = _each_once(
+    pair, cell = _unique_cells(
         *(torch.from_numpy(np.array(numbers)).to(points.device) for numbers in cells)
     )
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
@@ -283,7 +283,7 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
     return steps * torch.where(spacing.isfinite(), spacing, 0.0)
 
 
-def _each_once(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+def _unique_cells(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distinct cells of each pair, ascending."""
     if len(cell) == 0:
         return pair, cell

@@ -11,12 +11,12 @@ from torch import Tensor
 from torchrg._checks import made_on_cpu
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few, unit_direction
-from torchrg.regions.fit import with_table_sign
+from torchrg.regions.fit import canonicalize_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
 _MAX_TILT_DEG = 30.0
 """Maximum tilt of a room: a larger one could mistake a wall for the floor."""
-_NEAR_DEG = 3.0
+_MAX_ANGLE_DEG = 3.0
 """Maximum angle between planes of one direction: walls are built to within one degree and scanned
 to within two."""
 _NUM_FITS = 5
@@ -73,8 +73,8 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
     heading = _find_heading(normals, areas, axis)
     if heading is None:
         warnings.warn(
-            "align_axes: expected upright planes for the directions of x and y, got none of some "
-            "size; it is turned upright only.",
+            "align_axes: expected upright planes (walls) to define x and y, got none large "
+            "enough. Only the up axis is aligned.",
             stacklevel=3,
         )
         heading = _horizontal(torch.eye(3, dtype=torch.float64)[upwards.abs().argmin()], axis)
@@ -104,28 +104,28 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
     rotation, shift = motion[:3, :3].to(planes.normal.device), motion[:3, 3]
     shift = shift.to(planes.normal.device)
 
-    def turned(vectors: Tensor) -> Tensor:
+    def rotate(vectors: Tensor) -> Tensor:
         return vectors.double() @ rotation.T
 
-    def moved(points: Tensor) -> Tensor:
-        return (turned(points) + shift).to(dtype)
+    def transform(points: Tensor) -> Tensor:
+        return (rotate(points) + shift).to(dtype)
 
-    normal = with_table_sign(turned(planes.normal))
-    center = turned(planes.center) + shift
+    normal = canonicalize_sign(rotate(planes.normal))
+    center = rotate(planes.center) + shift
     # A nearby point of the plane keeps precision if the origin is far away.
     foot = planes.center.double() - planes.normal.double() * (
         (planes.center.double() * planes.normal.double()).sum(dim=1) - planes.offset.double()
     ).unsqueeze(1)
     outline = planes.outline
     if outline is not None:
-        outline = tuple(tuple(moved(ring) for ring in rings) for rings in outline)
+        outline = tuple(tuple(transform(ring) for ring in rings) for rings in outline)
     return replace(
         planes,
         normal=normal.to(dtype),
-        offset=((turned(foot) + shift) * normal).sum(dim=1).to(dtype),
-        centroid=moved(planes.centroid),
+        offset=((rotate(foot) + shift) * normal).sum(dim=1).to(dtype),
+        centroid=transform(planes.centroid),
         center=center.to(dtype),
-        axes=turned(planes.axes).to(dtype),
+        axes=rotate(planes.axes).to(dtype),
         outline=outline,
     )
 
@@ -167,11 +167,10 @@ def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
         if not bool(values[1] > _MIN_FRACTION * values[2]) or values[2] == 0:
             raise ConfigError(
                 "align_axes: expected a floor, a ceiling, or walls in two directions, got none "
-                f"within {_MAX_TILT_DEG:g} degrees of that; segment the cloud first, or say where "
-                "up is."
+                f"within {_MAX_TILT_DEG:g} degrees of up. Segment the cloud first, or pass up."
             )
         candidates = vectors[:, 0][None]
-    agreeing = [_agreement(normals, areas, axis) for axis in candidates]
+    agreeing = [_agreeing_area(normals, areas, axis) for axis in candidates]
     axis = candidates[int(torch.stack(agreeing).argmax())]
     for _ in range(_NUM_FITS):
         lengths = (normals @ axis).abs().clamp(max=1)
@@ -183,7 +182,7 @@ def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
     return axis
 
 
-def _agreement(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor:
+def _agreeing_area(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor:
     """Return the area of planes that are level or upright if this direction is up."""
     lengths = (normals @ axis).abs().clamp(max=1)
     return (areas * (_bisquare(lengths.acos()) + _bisquare(lengths.asin()))).sum()
@@ -191,7 +190,7 @@ def _agreement(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor:
 
 def _bisquare(angles: Tensor) -> Tensor:
     """Return Tukey weights of angles in radians, 0 beyond the same-direction limit."""
-    return (1 - (angles / math.radians(_NEAR_DEG)) ** 2).clamp(min=0) ** 2
+    return (1 - (angles / math.radians(_MAX_ANGLE_DEG)) ** 2).clamp(min=0) ** 2
 
 
 def _find_heading(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor | None:
@@ -203,18 +202,18 @@ def _find_heading(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor | None
     second = torch.linalg.cross(axis, first)
     angles = torch.atan2(normals @ second, normals @ first)
     candidates = angles[across > 0]
-    agreeing = [(across * _bisquare(_off_square(angles - angle))).sum() for angle in candidates]
+    agreeing = [(across * _bisquare(_modulo_90(angles - angle))).sum() for angle in candidates]
     angle = candidates[int(torch.stack(agreeing).argmax())]
     for _ in range(_NUM_FITS):
-        off = _off_square(angles - angle)
+        off = _modulo_90(angles - angle)
         weights = across * _bisquare(off)
         angle = angle + (weights * off).sum() / weights.sum()
-    angle = _off_square(angle)
+    angle = _modulo_90(angle)
     heading: Tensor = angle.cos() * first + angle.sin() * second
     return heading
 
 
-def _off_square(angles: Tensor) -> Tensor:
+def _modulo_90(angles: Tensor) -> Tensor:
     """Return angles in radians modulo 90 degrees, within 45 degrees of 0."""
     return angles - (angles / (math.pi / 2)).round() * (math.pi / 2)
 
@@ -222,7 +221,7 @@ def _off_square(angles: Tensor) -> Tensor:
 def _horizontal(direction: Tensor, axis: Tensor) -> Tensor:
     """Return the unit vector perpendicular to an axis that is closest to a direction."""
     across = direction - (direction @ axis) * axis
-    if bool(across.norm() < math.sin(math.radians(_NEAR_DEG))):
+    if bool(across.norm() < math.sin(math.radians(_MAX_ANGLE_DEG))):
         across = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[axis.abs().argmin()])
     unit: Tensor = across / across.norm()
     return unit
@@ -231,15 +230,15 @@ def _horizontal(direction: Tensor, axis: Tensor) -> Tensor:
 def _origin(planes: Planes, rotation: Tensor) -> Tensor:
     """Return the new origin in rotated coordinates: center in x and y, floor in z."""
     axes = planes.axes.cpu().double() @ rotation.T
-    reach = (planes.extent.cpu().double()[:, :, None] * axes).abs().sum(dim=1) / 2
+    half_extent = (planes.extent.cpu().double()[:, :, None] * axes).abs().sum(dim=1) / 2
     center = planes.center.cpu().double() @ rotation.T
     # The bounding box of a diagonal rectangle exceeds its content.
-    straight = (axes.abs().amax(dim=2) > math.cos(math.radians(_NEAR_DEG))).all(dim=1)
-    used = straight if bool(straight.any()) else torch.ones_like(straight)
-    low, high = (center - reach)[used].amin(dim=0), (center + reach)[used].amax(dim=0)
+    axis_aligned = (axes.abs().amax(dim=2) > math.cos(math.radians(_MAX_ANGLE_DEG))).all(dim=1)
+    used = axis_aligned if bool(axis_aligned.any()) else torch.ones_like(axis_aligned)
+    low, high = (center - half_extent)[used].amin(dim=0), (center + half_extent)[used].amax(dim=0)
     upright = (planes.normal.cpu().double() @ rotation[2]).abs().clamp(max=1)
     area = planes.area.cpu().double()
-    level = (upright.acos() < math.radians(_NEAR_DEG)) & (area > _MIN_FRACTION * area.sum())
+    level = (upright.acos() < math.radians(_MAX_ANGLE_DEG)) & (area > _MIN_FRACTION * area.sum())
     if bool(level.any()):
         low[2] = center[level, 2].amin()
     return torch.stack([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])

@@ -55,17 +55,17 @@ _MAX_POSITIONS = 2**20
 """Maximum number of sampling positions on all planes, by area; 1 to 2 cm wide in a room. Dense
 points near a scanner count once, and a sparse facade outside counts little."""
 
-_VOXELS = 48
+_NUM_VOXELS = 48
 """Voxels per wall height: 6 cm in a room, less than the thickness of a slab."""
 
-_COLUMN = 8
+_COLUMN_WIDTH = 8
 """Voxels along the side of a column: 45 cm in a room."""
 
 _REACH = 2
 """Columns on each side in the neighborhood of a column: 2.2 m in total, wider than a bed or table,
 narrower than a room."""
 
-_OUTSIDE = 0.02
+_MAX_OUTSIDE_FRACTION = 0.02
 """Maximum fraction of a room's voxels below its floor or above its ceiling: reflections."""
 
 _MIN_ROOM = 0.5
@@ -74,10 +74,10 @@ _MIN_ROOM = 0.5
 _MAX_SLAB = 0.25
 """Maximum thickness of the slab between storeys, in wall heights."""
 
-_WALLS_IN_SLAB = 0.25
+_MAX_WALLS_IN_SLAB = 0.25
 """Maximum ratio of walls in a slab to walls above and below it: only stairwells continue."""
 
-_TOUCHING = 2
+_MAX_SLAB_GAP = 2
 """Maximum gap between a slab and the broad plane below or above it, in voxels."""
 
 _BITS = 20
@@ -98,7 +98,7 @@ def classify_planes(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) 
         labels: Plane ID of each point, shape ``(N,)``, negative if unlabeled.
         up: Upward direction, shape ``(3,)``.
     """
-    kinds = {name: place for place, name in enumerate(PLANE_KINDS)}
+    kinds = {name: index for index, name in enumerate(PLANE_KINDS)}
     kind = torch.full_like(planes.count, kinds["other"])
     up = functional.normalize(up.to(planes.normal.device).double(), dim=0)
     steepness = _along(planes.normal.double(), up).abs()
@@ -113,14 +113,14 @@ def classify_planes(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) 
         return kind
 
     is_level = horizontal & (steepness >= math.cos(math.radians(_LEVEL_DEG)))
-    owner, up = labels[rows], _upward(planes, is_level, up)
-    bottom, top, width, area, places = _in_voxels(planes, points[rows], owner, up, vertical)
-    broad = horizontal & (area >= _MIN_AREA * _VOXELS**2) & (width >= _MIN_WIDTH * _VOXELS)
-    plane, x, y, z = _distinct(owner, *places)
+    owner, up = labels[rows], _refine_up(planes, is_level, up)
+    bottom, top, width, area, positions = _voxelize(planes, points[rows], owner, up, vertical)
+    broad = horizontal & (area >= _MIN_AREA * _NUM_VOXELS**2) & (width >= _MIN_WIDTH * _NUM_VOXELS)
+    plane, x, y, z = _distinct_voxels(owner, *positions)
     length = area / (top - bottom).clamp(min=1)
     levels, walls = ((bottom + top) / 2)[broad], (bottom[vertical], top[vertical])
     storey = torch.bucketize(z, _find_slabs(*walls, length[vertical], levels))
-    keys = (storey << 2 * _BITS) | (x // _COLUMN << _BITS) | (y // _COLUMN)
+    keys = (storey << 2 * _BITS) | (x // _COLUMN_WIDTH << _BITS) | (y // _COLUMN_WIDTH)
     columns, column = torch.unique(keys, return_inverse=True)
     low, high = _room_heights(columns, column, z)
     counts = torch.bincount(plane, minlength=len(kind)).clamp(min=1)
@@ -129,14 +129,14 @@ def classify_planes(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) 
         """Return the planes for which a condition holds in at least half of the voxels."""
         return 2 * torch.bincount(plane[holds], minlength=len(kind)) >= counts
 
-    room = (high - low)[column].clamp(_MIN_ROOM * _VOXELS, _VOXELS)
+    room = (high - low)[column].clamp(_MIN_ROOM * _NUM_VOXELS, _NUM_VOXELS)
     floor = broad & mostly(z <= low[column] + _END_FRACTION * room)
     ceiling = broad & ~floor & mostly(z >= high[column] - _END_FRACTION * room)
     # Next to a higher or lower room, walls end at their own ceiling and floor.
     on_floor, on_ceiling = floor[plane], ceiling[plane]
     low = low.scatter_reduce(0, column[on_floor], z[on_floor], "amax", include_self=False)
     high = high.scatter_reduce(0, column[on_ceiling], z[on_ceiling], "amin", include_self=False)
-    room = (high - low)[column].clamp(min=_MIN_ROOM * _VOXELS)
+    room = (high - low)[column].clamp(min=_MIN_ROOM * _NUM_VOXELS)
     reach = (top - bottom)[plane]
     is_wide = vertical & mostly(width[plane] >= _MIN_WIDTH * room)
     is_high = mostly(top[plane] >= high[column] - _TOP_FRACTION * room)
@@ -148,7 +148,7 @@ def classify_planes(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) 
     return kind
 
 
-def _upward(planes: Planes, is_level: Tensor, up: Tensor) -> Tensor:
+def _refine_up(planes: Planes, is_level: Tensor, up: Tensor) -> Tensor:
     """Return the area-weighted mean normal of level planes on the side of ``up``, or ``up``."""
     normal = planes.normal.double()
     weighted = normal * (planes.area.double() * _along(normal, up).sign())[:, None]
@@ -156,7 +156,7 @@ def _upward(planes: Planes, is_level: Tensor, up: Tensor) -> Tensor:
     return functional.normalize(mean, dim=0) if mean.any() else up
 
 
-def _in_voxels(
+def _voxelize(
     planes: Planes, points: Tensor, owner: Tensor, up: Tensor, vertical: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, list[Tensor]]:
     """Return the lowest and highest point, width and area of planes, and the voxel of each point.
@@ -165,30 +165,30 @@ def _in_voxels(
     axes, the last of them upwards.
     """
     middle = planes.center.double().median(dim=0).values
-    places = [_along(points.double() - middle, axis) for axis in _upright_axes(up)]
+    coords = [_along(points.double() - middle, axis) for axis in _upright_axes(up)]
     area, counts = planes.area.double(), torch.bincount(owner, minlength=len(planes))
     bottom, top = (
-        area.new_zeros(len(planes)).scatter_reduce(0, owner, places[2], end, include_self=False)
+        area.new_zeros(len(planes)).scatter_reduce(0, owner, coords[2], end, include_self=False)
         for end in ("amin", "amax")
     )
     positions = torch.minimum(area / area.sum() * _MAX_POSITIONS, counts) * vertical
     height = _weighted_median(top - bottom, positions)
-    size = (height or float(top.amax() - bottom.amin()) or 1.0) / _VOXELS
+    size = (height or float(top.amax() - bottom.amin()) or 1.0) / _NUM_VOXELS
     half = 1 << (_BITS - 1)
 
-    def within(lengths: Tensor) -> Tensor:
+    def to_voxels(lengths: Tensor) -> Tensor:
         return (lengths / size + half).clamp(0, 2 * half - 1)
 
-    width, voxels = planes.extent[:, 1].double() / size, [within(place).long() for place in places]
-    return within(bottom), within(top), width, area / size**2, voxels
+    width, voxels = planes.extent[:, 1].double() / size, [to_voxels(x).long() for x in coords]
+    return to_voxels(bottom), to_voxels(top), width, area / size**2, voxels
 
 
-def _distinct(owner: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
+def _distinct_voxels(owner: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
     """Return the distinct voxels of each plane: the plane ID, and the three coordinates."""
     voxels, voxel = torch.unique((x << 2 * _BITS) | (y << _BITS) | z, return_inverse=True)
-    plane, voxel = _divided(torch.unique(owner * len(voxels) + voxel), len(voxels))
-    across, z = _divided(voxels[voxel], 1 << _BITS)
-    return plane, *_divided(across, 1 << _BITS), z
+    plane, voxel = _divmod(torch.unique(owner * len(voxels) + voxel), len(voxels))
+    across, z = _divmod(voxels[voxel], 1 << _BITS)
+    return plane, *_divmod(across, 1 << _BITS), z
 
 
 def _upright_axes(up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -206,7 +206,7 @@ def _along(vectors: Tensor, axis: Tensor) -> Tensor:
     return x * axis[0] + y * axis[1] + z * axis[2]
 
 
-def _divided(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
+def _divmod(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
     """Return quotients and remainders."""
     return numbers // divisor, numbers % divisor
 
@@ -231,7 +231,7 @@ def _find_slabs(bottom: Tensor, top: Tensor, length: Tensor, levels: Tensor) -> 
     """
     if len(bottom) == 0:
         return levels[:0]
-    first, half = int(bottom.amin()), _VOXELS // 2
+    first, half = int(bottom.amin()), _NUM_VOXELS // 2
     starts, ends = ((end.long() - first).cpu().numpy() for end in (bottom, top))
     weights = length.cpu().numpy()
     steps = np.bincount(starts, weights, ends.max() + 2) - np.bincount(ends + 1, weights)
@@ -239,11 +239,11 @@ def _find_slabs(bottom: Tensor, top: Tensor, length: Tensor, levels: Tensor) -> 
     totals = np.pad(np.concatenate([np.zeros(half + 1), cover.cumsum()]), (0, half), mode="edge")
     below = totals[half : -half - 1] - totals[: -2 * half - 1]
     above = totals[2 * half + 1 :] - totals[half + 1 : -half]
-    in_slab = cover * half < _WALLS_IN_SLAB * np.minimum(below, above)
+    in_slab = cover * half < _MAX_WALLS_IN_SLAB * np.minimum(below, above)
     slabs = np.flatnonzero(np.diff(np.pad(in_slab, 1).astype(np.int8))).reshape(-1, 2)
     distance = np.abs(levels.cpu().numpy()[:, None, None] - first - slabs)
-    is_bounded = (distance <= _TOUCHING).any(axis=(0, 2))
-    is_thin = slabs[:, 1] - slabs[:, 0] <= _MAX_SLAB * _VOXELS
+    is_bounded = (distance <= _MAX_SLAB_GAP).any(axis=(0, 2))
+    is_thin = slabs[:, 1] - slabs[:, 0] <= _MAX_SLAB * _NUM_VOXELS
     return levels.new_tensor(slabs[is_bounded & is_thin].mean(axis=1) + first)
 
 
@@ -258,27 +258,27 @@ def _room_heights(columns: Tensor, column: Tensor, z: Tensor) -> tuple[Tensor, T
     """
     levels, level = torch.unique(z, return_inverse=True)
     held, counts = torch.unique(column * len(levels) + level, return_counts=True)
-    column, level = _divided(held, len(levels))
-    across, y = _divided(columns, 1 << _BITS)
-    storey, x = _divided(across, 1 << _BITS)
+    column, level = _divmod(held, len(levels))
+    across, y = _divmod(columns, 1 << _BITS)
+    storey, x = _divmod(across, 1 << _BITS)
     low = high = torch.zeros_like(columns)
     known, num_storeys = torch.zeros_like(columns, dtype=torch.bool), len(set(storey.tolist()))
     while True:
         keys = (storey << 2 * _BITS) | ((x + _REACH) << _BITS) | (y + _REACH)
-        wide, place = torch.unique(keys, return_inverse=True)
-        held = place[column] * len(levels) + level
+        wide, index = torch.unique(keys, return_inverse=True)
+        held = index[column] * len(levels) + level
         below = torch.bincount(held, counts.double(), minlength=len(wide) * len(levels))
         below = below.view(len(wide), -1).cumsum(dim=1)
-        around = torch.zeros_like(below)
+        neighborhood = torch.zeros_like(below)
         for right, ahead in product(range(-_REACH, _REACH + 1), repeat=2):
             wanted = wide + (right << _BITS) + ahead
             near = torch.searchsorted(wide, wanted).clamp(max=len(wide) - 1)
-            around += below[near] * (wide[near] == wanted)[:, None]
-        outside = _OUTSIDE * around[:, -1:]
-        first = levels[(around <= outside).sum(dim=1)][place]
-        last = levels[(around < around[:, -1:] - outside).sum(dim=1)][place]
+            neighborhood += below[near] * (wide[near] == wanted)[:, None]
+        outside = _MAX_OUTSIDE_FRACTION * neighborhood[:, -1:]
+        first = levels[(neighborhood <= outside).sum(dim=1)][index]
+        last = levels[(neighborhood < neighborhood[:, -1:] - outside).sum(dim=1)][index]
         low, high = torch.where(known, low, first), torch.where(known, high, last)
-        known |= high - low >= _MIN_ROOM * _VOXELS
+        known |= high - low >= _MIN_ROOM * _NUM_VOXELS
         if bool(known.all()) or len(wide) == num_storeys:
             return low, high
         x, y = x // 2, y // 2

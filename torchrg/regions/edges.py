@@ -54,13 +54,13 @@ class GrowingCloud(NamedTuple):
     angle_fraction: float = 1.0
 
 
-def is_order_free(config: GrowingConfig) -> bool:
+def is_order_independent(config: GrowingConfig) -> bool:
     """Return whether the seed test of a claimed point depends on the point alone."""
-    of_cloud = config.curvature_scope == "cloud"
-    return config.seed_rule == "curvature" and of_cloud and not promotes_late(config)
+    is_global = config.curvature_scope == "cloud"
+    return config.seed_rule == "curvature" and is_global and not has_late_promotion(config)
 
 
-def promotes_late(config: GrowingConfig) -> bool:
+def has_late_promotion(config: GrowingConfig) -> bool:
     """Return whether any edge of its region, not only the claiming one, can promote a point."""
     return config.connectivity is not None and config.connectivity_scope == "seed"
 
@@ -73,20 +73,20 @@ def mark_edges(
     The bits are in 64-bit words, ``(N, words)``, int64. If the seed test is order-independent, the
     second value is None. ``limit`` is the curvature limit.
     """
-    shared, free = _shared_neighbors(cloud, config), is_order_free(config)
+    shared, order_independent = _shared_neighbors(cloud, config), is_order_independent(config)
     num_points, k = cloud.neighbors.indices.shape
     joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
-    seeds = joins if free else np.zeros_like(joins)
+    seeds = joins if order_independent else np.zeros_like(joins)
 
     def mark(rows: slice) -> None:
         accepted, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
         _write_bits(joins[rows], accepted)
-        if not free:
+        if not order_independent:
             _write_bits(seeds[rows], _become_seeds(cloud, config, rows, limit, connected))
 
     map_chunks(mark, num_points, chunk_size, cloud.points.device)
-    bits, of_seeds = (torch.from_numpy(marks.view(np.int64)) for marks in (joins, seeds))
-    return bits, None if free else of_seeds
+    bits, seed_bits = (torch.from_numpy(marks.view(np.int64)) for marks in (joins, seeds))
+    return bits, None if order_independent else seed_bits
 
 
 def _write_bits(into: NDArray[np.uint8], flags: Tensor) -> None:
@@ -119,8 +119,8 @@ def _become_seeds(
 def _curvature_limits(curvature: Tensor, counted: Tensor, quantile: float) -> Tensor:
     """Return the lower quantile of the counted values of each row ``(n, K)``, shape ``(n, 1)``."""
     ascending = curvature.where(counted, torch.inf).sort(dim=1).values
-    places = (quantile * (counted.sum(dim=1, keepdim=True) - 1).double()).long()
-    return ascending.gather(1, places.clamp_min(0))
+    index = (quantile * (counted.sum(dim=1, keepdim=True) - 1).double()).long()
+    return ascending.gather(1, index.clamp_min(0))
 
 
 def accept_edges(
@@ -158,7 +158,7 @@ def accept_edges(
         if distance is not None:
             joins &= within_distance(near, ids, columns[0], distance)
         if cloud.reach is not None:
-            joins &= on_planes(near, ids, *columns, cloud.reach)
+            joins &= within_reach(near, ids, *columns, cloud.reach)
     if cloud.colors is not None:
         limit = cloud.points.new_tensor(cloud.max_color_distance**2)
         joins &= within_distance(near, ids, cloud.colors.T, limit)
@@ -166,8 +166,8 @@ def accept_edges(
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
             connected = connect(cloud.neighbors.counted(rows))
-        asked = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
-        joins &= ~asked | are_coplanar(cloud, rows, asked, connected, config.coplanarity_floor)
+        mask = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
+        joins &= ~mask | are_coplanar(cloud, rows, mask, connected, config.coplanarity_floor)
     if connect is not None:
         if connected is None:
             connected = connect(joins)
@@ -216,23 +216,23 @@ def within_distance(
     return total <= max_sq_distance
 
 
-def on_planes(
+def within_reach(
     near: Neighbors, rows: Tensor, points: Tensor, normals: Tensor, reach: Tensor
 ) -> Tensor:
     """Return a mask of edges whose ends lie within ``reach`` ``(N,)`` of each other's planes."""
     ours = theirs = points.new_zeros(())
-    for place, normal in zip(points.unbind(), normals.unbind(), strict=True):
-        away = near.of(place) - place[rows][:, None]
-        ours = (away * normal[rows][:, None]).add_(ours)
-        theirs = away.mul_(near.of(normal)).add_(theirs)
-    on_own = ours.abs_() <= reach[rows][:, None]
-    return on_own & (theirs.abs_() <= near.of(reach))
+    for position, normal in zip(points.unbind(), normals.unbind(), strict=True):
+        offset = near.of(position) - position[rows][:, None]
+        ours = (offset * normal[rows][:, None]).add_(ours)
+        theirs = offset.mul_(near.of(normal)).add_(theirs)
+    on_plane = ours.abs_() <= reach[rows][:, None]
+    return on_plane & (theirs.abs_() <= near.of(reach))
 
 
 def are_coplanar(
     cloud: GrowingCloud,
     rows: Rows,
-    asked: Tensor,
+    mask: Tensor,
     compared: Tensor | None,
     floor_fraction: float,
 ) -> Tensor:
@@ -241,14 +241,14 @@ def are_coplanar(
     The limit is computed over the neighbors ``compared``, shape ``(n, K)``, default all. Its floor
     is a fraction of the distance to the farthest neighbor.
     """
-    needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
-    indices, counted = cloud.neighbors.at(rows).at(needed)
+    tested = (mask.sum(dim=1) > 0).nonzero().squeeze(-1)
+    indices, counted = cloud.neighbors.at(rows).at(tested)
     patches = gather_patches(cloud.points, indices)
-    residuals = plane_residuals(patches, cloud.normals[rows][needed])
+    residuals = plane_residuals(patches, cloud.normals[rows][tested])
     floor = floor_fraction * patch_radii(patches, counted)
-    limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[needed])
-    result = torch.zeros_like(asked)
-    result[needed] = residuals <= limits[:, None]
+    limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[tested])
+    result = torch.zeros_like(mask)
+    result[tested] = residuals <= limits[:, None]
     return result
 
 

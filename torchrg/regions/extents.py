@@ -12,7 +12,7 @@ from torchrg import kernels
 from torchrg._parallel import places_of
 from torchrg.linalg.moments import Segments, reduce_runs
 
-_TIE = 1e-9
+_REL_TOL = 1e-9
 """Relative area difference below which rectangles count as equal (rounding)."""
 
 _COMPASS = np.array([[1.0, 0], [1, 1], [0, 1], [-1, 1]])
@@ -21,7 +21,7 @@ _COMPASS = np.array([[1.0, 0], [1, 1], [0, 1], [-1, 1]])
 _ROUNDING = 1e-12
 """Relative margin by which a discarded point must be inside the octagon (rounding)."""
 
-_TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
+_SIDE_TURNS = np.array([[1.5], [2.0], [2.5]])
 """Angles, in units of pi, from an edge to the front, opposite and back edges of its rectangle: 0.5,
 1 and 1.5, plus 1 because angles start at -pi."""
 
@@ -31,7 +31,7 @@ _POINTS_PER_CELL = 9.0
 _NUM_DOUBLINGS = 4
 """Maximum number of times the cell width is doubled."""
 
-_WIDE_ENOUGH = 1.05
+_MAX_AREA_GROWTH = 1.05
 """Cells are wide enough if doubling their width gives less than this times the area."""
 
 _CELL_ANGLE = math.radians(28.0)
@@ -61,7 +61,7 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
         closed curve. Communications of the ACM 18(7), 1975.
     """
-    rectangles = [_min_rectangle(places) for places in outer_places(segments, u, v)]
+    rectangles = [_min_rectangle(positions) for positions in outer_places(segments, u, v)]
     cosine, sine, *ends = u.new_tensor(rectangles).view(-1, 6).unbind(dim=1)
     low, high = torch.stack(ends[:2], dim=1), torch.stack(ends[2:], dim=1)
     directions = torch.stack([cosine, sine, -sine, cosine], dim=1).view(-1, 2, 2)
@@ -74,45 +74,45 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
     )
 
 
-def _min_rectangle(places: NDArray[np.float64]) -> list[float]:
+def _min_rectangle(positions: NDArray[np.float64]) -> list[float]:
     """Return cosine and sine of the minimum-area rectangle of points ``(n, 2)``, and its bounds.
 
     The bounds are the minimum coordinates along its two directions, then the maximum ones.
     """
-    angle = _min_area_angle(places)
+    angle = _min_area_angle(positions)
     cosine, sine = math.cos(angle), math.sin(angle)
-    u, v = places.T
+    u, v = positions.T
     along = np.stack([u * cosine + v * sine, v * cosine - u * sine])
     return [cosine, sine, *along.min(axis=1).tolist(), *along.max(axis=1).tolist()]
 
 
-def _min_area_angle(places: NDArray[np.float64]) -> float:
+def _min_area_angle(positions: NDArray[np.float64]) -> float:
     """Return the angle of the minimum-area rectangle of points ``(n, 2)``, in [0, 90) degrees.
 
     The farthest corner in a direction lies between the two hull edges whose angles enclose the
     perpendicular, so it is found by a search among the edge angles.
     """
-    corners = places[_hull_corners(places)] @ [1, 1j]
+    corners = positions[_hull_corners(positions)] @ [1, 1j]
     angles = np.angle(np.roll(corners, -1) - corners)
     order = np.argsort(angles)
     corners, angles = corners[order], angles[order]
-    across = (angles + np.pi * _TO_OTHER_SIDES) % (2 * np.pi) - np.pi
+    across = (angles + np.pi * _SIDE_TURNS) % (2 * np.pi) - np.pi
     front, top, back = corners[np.searchsorted(angles, across) % len(corners)]
     to_edge = np.exp(-1j * angles)
     length, height = ((front - back) * to_edge).real, ((top - corners) * to_edge).imag
     area = (length * height).clip(min=0)
-    smallest = angles[area <= area.min() * (1 + _TIE)] % (np.pi / 2)
-    return float(np.where(smallest < np.pi / 2 - _TIE, smallest, smallest - np.pi / 2).min())
+    smallest = angles[area <= area.min() * (1 + _REL_TOL)] % (np.pi / 2)
+    return float(np.where(smallest < np.pi / 2 - _REL_TOL, smallest, smallest - np.pi / 2).min())
 
 
-def _hull_corners(places: NDArray[np.float64]) -> NDArray[np.integer]:
+def _hull_corners(positions: NDArray[np.float64]) -> NDArray[np.integer]:
     """Return the corners of the convex hull, counterclockwise; the two ends of a line."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        corners: NDArray[np.integer] = ConvexHull(places).vertices
+        corners: NDArray[np.integer] = ConvexHull(positions).vertices
     except QhullError:
-        corners = np.lexsort(places.T)[[0, -1]]
+        corners = np.lexsort(positions.T)[[0, -1]]
     return corners
 
 
@@ -124,29 +124,29 @@ def outer_places(segments: Segments, u: Tensor, v: Tensor) -> list[NDArray[np.fl
     """
     if not segments.is_served(u):
         regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
-        return [_outside_of_octagon(places.numpy().astype(np.float64)) for places in regions]
+        return [_outside_octagon(positions.numpy().astype(np.float64)) for positions in regions]
     (outer,) = kernels.call("outer_places", u, v, segments.counts, _ROUNDING)
     chosen = places_of(outer)
     ends = torch.searchsorted(chosen, segments.counts.cumsum(0)).tolist()
-    places = torch.stack([u[chosen], v[chosen]], dim=1).numpy()
-    return [places[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+    positions = torch.stack([u[chosen], v[chosen]], dim=1).numpy()
+    return [positions[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def _outside_of_octagon(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _outside_octagon(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Apply :func:`outer_places` to the points of one region."""
     # Avoids BLAS, which would start its own threads.
-    along = _COMPASS[:, :1] * places[:, 0] + _COMPASS[:, 1:] * places[:, 1]
+    along = _COMPASS[:, :1] * positions[:, 0] + _COMPASS[:, 1:] * positions[:, 1]
     ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
-    octagon = places[ends[ends != np.roll(ends, 1)]]
+    octagon = positions[ends[ends != np.roll(ends, 1)]]
     if len(octagon) < 3:
-        return places
+        return positions
     edges = np.roll(octagon, -1, axis=0) - octagon
     inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
     offsets = (inward * octagon).sum(axis=1)
-    rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(places).max()
-    heights = inward[:, :1] * places[:, 0] + inward[:, 1:] * places[:, 1]
+    rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(positions).max()
+    heights = inward[:, :1] * positions[:, 0] + inward[:, 1:] * positions[:, 1]
     inside = (heights > (offsets + rounding)[:, None]).all(axis=0)
-    outside: NDArray[np.float64] = places[~inside]
+    outside: NDArray[np.float64] = positions[~inside]
     return outside
 
 
@@ -177,30 +177,30 @@ def covered_areas(
     cosine, sine = boxes.directions[:, 0].unbind(dim=1)
     c = segments.spread(cosine * math.cos(_CELL_ANGLE) - sine * math.sin(_CELL_ANGLE))
     s = segments.spread(sine * math.cos(_CELL_ANGLE) + cosine * math.sin(_CELL_ANGLE))
-    row = _numbered(segments, u * c + v * s, size)
-    column = _numbered(segments, v * c - u * s, size)
-    cells = _occupied(segments.labels, row, column, segments.counts)
-    area, width = _corrected(cells, segments.counts, size), size
+    row = _cell_indices(segments, u * c + v * s, size)
+    column = _cell_indices(segments, v * c - u * s, size)
+    cells = _occupied_cells(segments.labels, row, column, segments.counts)
+    area, width = _corrected_area(cells, segments.counts, size), size
     wide_enough = torch.zeros_like(size, dtype=torch.bool)
     for _ in range(_NUM_DOUBLINGS):
-        cells = _occupied(cells.owner, cells.row // 2, cells.column // 2, cells.num_cells)
+        cells = _occupied_cells(cells.owner, cells.row // 2, cells.column // 2, cells.num_cells)
         size = size * 2
-        wider = _corrected(cells, segments.counts, size)
-        wide_enough |= wider <= _WIDE_ENOUGH * area
+        wider = _corrected_area(cells, segments.counts, size)
+        wide_enough |= wider <= _MAX_AREA_GROWTH * area
         area, width = torch.where(wide_enough, area, wider), torch.where(wide_enough, width, size)
     return torch.minimum(area, box), width
 
 
-def _numbered(segments: Segments, x: Tensor, size: Tensor) -> Tensor:
+def _cell_indices(segments: Segments, x: Tensor, size: Tensor) -> Tensor:
     """Return the cell index of each point along one axis, from 0 in each region."""
     low = segments.spread(reduce_runs(x, segments.counts, "min"))
     return ((x - low) / segments.spread(torch.where(size > 0, size, 1.0))).long()
 
 
-def _occupied(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Cells:
+def _occupied_cells(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Cells:
     """Return the distinct occupied cells of consecutive regions with ``counts`` points each."""
     # Pad each region by one empty row and column, so that regions share no cell sides.
-    heights, widths = (reduce_runs(place, counts, "max") + 3 for place in (row, column))
+    heights, widths = (reduce_runs(position, counts, "max") + 3 for position in (row, column))
     num_regions, ends = len(counts), (heights * widths).cumsum(0)
     starts = ends - heights * widths
     keys = (starts + widths + 1).index_select(0, owner) + row * widths.index_select(0, owner)
@@ -221,7 +221,7 @@ def _occupied(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Ce
     )
 
 
-def _corrected(cells: _Cells, counts: Tensor, size: Tensor) -> Tensor:
+def _corrected_area(cells: _Cells, counts: Tensor, size: Tensor) -> Tensor:
     """Return the cell area less the expected overshoot at the boundary.
 
     A convex shape of area A meets A + E/2 - 1 cells on average, areas in cells, E their open sides.

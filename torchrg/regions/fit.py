@@ -39,7 +39,7 @@ than a fiftieth of their noise."""
 MIN_FITTED = 10
 """Minimum number of points of a plane that assigns boundary points: any three are coplanar."""
 
-_BENT = 0.5
+_BENT_FRACTION = 0.5
 """A region is bent if its thickness exceeds this fraction of the median reach of its points. Reach
 is four residuals, so this is twice the noise."""
 
@@ -115,18 +115,18 @@ class RegionPlanes(NamedTuple):
 
     def distances(self, points: Tensor, regions: Tensor) -> Tensor:
         """Return the distance of each point ``(n, 3)`` to the plane of a region ``(n,)``."""
-        away = points.new_zeros(len(points), dtype=torch.float64)
+        offset = points.new_zeros(len(points), dtype=torch.float64)
         columns = [values.unbind(dim=1) for values in (points, self.center, self.normal)]
         for chunk in chunks_of(len(points), ROWS_AT_ONCE):
             owner = regions[chunk]
-            for place, center, normal in zip(*columns, strict=True):
-                away[chunk] += (place[chunk].double() - center[owner]) * normal[owner]
-        return away.abs_()
+            for position, center, normal in zip(*columns, strict=True):
+                offset[chunk] += (position[chunk].double() - center[owner]) * normal[owner]
+        return offset.abs_()
 
     def signed_distances(self, points: Tensor, regions: Tensor) -> Tensor:
         """Return signed distances of points ``(n, 3)`` to planes of regions ``(n, C)``."""
-        away = points.double()[:, None] - self.center[regions]
-        return (away * self.normal[regions]).sum(dim=2)
+        offset = points.double()[:, None] - self.center[regions]
+        return (offset * self.normal[regions]).sum(dim=2)
 
 
 def fit_planes(
@@ -145,16 +145,16 @@ def fit_planes(
     """
     chunks = segments.chunks(POINTS_AT_ONCE)
     sizes = [len(chunk.counts) for chunk in chunks]
-    own = torch.split(normals, sizes) if shared else [None] * len(chunks)
+    chunk_normals = torch.split(normals, sizes) if shared else [None] * len(chunks)
     parts = map_tasks(
-        lambda task: _fit_together(task[0], points, normals, task[1]),
-        list(zip(chunks, own, strict=True)),
+        lambda task: _fit_chunk(task[0], points, normals, task[1]),
+        list(zip(chunks, chunk_normals, strict=True)),
         points.device,
     )
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _shared_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
+def _mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean normal of each region, up to sign, and its spread in degrees."""
     columns = segments.take_about(normals, normals.new_zeros(len(segments.counts), 3).double())
     _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
@@ -162,14 +162,14 @@ def _shared_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor
     return directions[:, :, 2], (1 - eigenvalues[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
 
 
-def _fit_together(
+def _fit_chunk(
     segments: Segments, points: Tensor, normals: Tensor, shared: Tensor | None
 ) -> RegionPlanes:
     """Fit planes to one chunk of regions; see :func:`fit_planes`."""
     if shared is None:
-        usual, spread = _shared_normals(segments, normals)
+        mean_normal, spread = _mean_normals(segments, normals)
     else:
-        usual, spread = shared.double(), torch.zeros_like(shared[:, 0])
+        mean_normal, spread = shared.double(), torch.zeros_like(shared[:, 0])
     origin = segments.first(points).double()
     local = segments.take_about(points, origin)
     weights = torch.ones_like(local[0])
@@ -177,14 +177,14 @@ def _fit_together(
     for _ in range(_NUM_FITS):
         mean, covariance = segments.moments(local, weights)
         variances, axes = eigh3_of_few(covariance)
-        normal = with_table_sign(_plane_normals(variances, axes, usual))
+        normal = canonicalize_sign(_plane_normals(variances, axes, mean_normal))
         factors = (MAD_FACTOR, BISQUARE_CUT)
         weights, median, squares = segments.reweigh(local, mean, normal, resolution, factors)
     thickness = MAD_FACTOR * median
     # The height of an arc is its angle times its width, which is at least the middle axis.
     height = _MIN_HEIGHT * spread.deg2rad() * variances[:, 1].clamp(min=0).sqrt()
     # An arc without width lies in its own plane, which does not show its thickness.
-    crosses = (usual * normal).sum(dim=1).abs() > math.sqrt(0.5)
+    crosses = (mean_normal * normal).sum(dim=1).abs() > math.sqrt(0.5)
     return RegionPlanes(
         normal,
         origin + mean,
@@ -229,7 +229,7 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     if cloud.reach is None:
         return planes
     reach = segments.median(segments.take(cloud.reach)).double()
-    explained = torch.where(reach.isfinite(), torch.maximum(_BENT * reach, floor), floor)
+    explained = torch.where(reach.isfinite(), torch.maximum(_BENT_FRACTION * reach, floor), floor)
     bent = planes.thickness > explained
     return planes._replace(curved=planes.curved & bent, reach=reach, bent=bent)
 
@@ -239,29 +239,29 @@ class RegionFits:
 
     def __init__(self, cloud: GrowingCloud, config: GrowingConfig) -> None:
         self._cloud, self._config = cloud, config
-        self._known: tuple[Tensor, RegionPlanes] | None = None
+        self._cached: tuple[Tensor, RegionPlanes] | None = None
 
-    def of(self, labels: Tensor) -> RegionPlanes:
+    def get(self, labels: Tensor) -> RegionPlanes:
         """Return the result of :func:`fit_regions`."""
-        if self._known is None or not torch.equal(self._known[0], labels):
-            self._known = labels, fit_regions(self._cloud, labels, self._config)
-        return self._known[1]
+        if self._cached is None or not torch.equal(self._cached[0], labels):
+            self._cached = labels, fit_regions(self._cloud, labels, self._config)
+        return self._cached[1]
 
 
-def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
+def _plane_normals(variances: Tensor, axes: Tensor, mean_normal: Tensor) -> Tensor:
     """Return plane normals, using the mean normals where the points are degenerate."""
     low, middle, high = variances.unbind(dim=1)
     along = axes[:, :, 2]
     is_line = high > _FLAT_RATIO * middle
-    component = (usual * along).sum(dim=1, keepdim=True) * along
-    across = usual - torch.where(is_line[:, None], component, 0.0)
+    component = (mean_normal * along).sum(dim=1, keepdim=True) * along
+    across = mean_normal - torch.where(is_line[:, None], component, 0.0)
     length = across.norm(dim=1, keepdim=True)
     across = torch.where(length > 0, across / length, axes[:, :, 0])
     is_flat = middle > _FLAT_RATIO * low
     return torch.where(is_flat[:, None], axes[:, :, 0], across)
 
 
-def with_table_sign(normals: Tensor) -> Tensor:
+def canonicalize_sign(normals: Tensor) -> Tensor:
     """Flip normals so that the component of largest magnitude (the last among ties) is positive."""
     magnitudes = normals.abs()
     near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)

@@ -21,7 +21,7 @@ from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
-from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
+from torchrg.regions.edges import GrowingCloud, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
@@ -117,7 +117,7 @@ def grow_regions(
     cloud = checked_cloud(settings, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
     if max_color_distance < math.inf:
-        cloud = _with_colors(cloud, colors, max_color_distance)
+        cloud = _add_colors(cloud, colors, max_color_distance)
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
@@ -139,15 +139,15 @@ def label_regions(
     cloud: GrowingCloud, roots: Tensor, config: GrowingConfig, chunk_size: int
 ) -> Tensor:
     """Return region labels after the enabled split and refinement steps."""
-    least = int(config.min_size)
+    min_points = int(config.min_size)
     if config.absorb:
         # A region may reach ``min_size`` only after boundary assignment.
-        least = min(least, max(least // 2, MIN_FITTED))
+        min_points = min(min_points, max(min_points // 2, MIN_FITTED))
     # Facets of any size can be merged into a large surface.
-    fitted = least if config.facet_tolerance is None else min(least, MIN_FITTED)
+    fitted = min_points if config.facet_tolerance is None else min(min_points, MIN_FITTED)
     labels, fits = number_by_size(roots, fitted), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
-        mixed = find_mixed_regions(cloud, labels, fits.of(labels), config, chunk_size)
+        mixed = find_mixed_regions(cloud, labels, fits.get(labels), config, chunk_size)
         if mixed is not None:
             cores = number_by_size(grow(mixed.part, config, chunk_size), int(config.min_size))
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
@@ -155,10 +155,10 @@ def label_regions(
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
         contacts = NearestPoints(cloud.neighbors).contacts(labels)
         tolerance = float(config.facet_tolerance)
-        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=tolerance)
-        labels = number_by_size(labels, least)
+        labels = merge_facets(labels, contacts, fits.get(labels), tolerance=tolerance)
+        labels = number_by_size(labels, min_points)
     if config.cut_bridges and bool((labels >= 0).any()):
-        split = split_levels(cloud, labels, fits.of(labels), config)
+        split = split_levels(cloud, labels, fits.get(labels), config)
         labels = labels if split is labels else number_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = number_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
@@ -195,8 +195,8 @@ def checked_cloud(
     if config.plane_reach is not None:
         if residual_rms is None:
             raise ConfigError(
-                f"{caller}: expected residual_rms, which plane_reach needs, got None; pass that of "
-                "the normals or set plane_reach to None."
+                f"{caller}: expected residual_rms (required by plane_reach), got None. Pass "
+                "residual_rms of the normals, or set plane_reach to None."
             )
         residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
         check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
@@ -210,7 +210,7 @@ def checked_cloud(
     return GrowingCloud(*columns, curvature, neighbors, valid, reach)
 
 
-def _with_colors(
+def _add_colors(
     cloud: GrowingCloud, colors: Tensor | NDArray[np.generic] | None, max_distance: float
 ) -> GrowingCloud:
     """Return the cloud with colors and the maximum color difference."""
@@ -255,18 +255,18 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     old = regions.cpu().numpy()
     # Count runs of equal labels at once: many are long.
     starts = np.append(0, np.flatnonzero(old[1:] != old[:-1]) + 1)[: len(old)]
-    lengths, of_run = np.diff(starts, append=len(old)), old[starts]
-    num = int(of_run.max(initial=UNLABELED)) + 1
-    sizes = np.bincount(of_run + 1, lengths, minlength=num + 1)[1:]
+    lengths, run_labels = np.diff(starts, append=len(old)), old[starts]
+    num = int(run_labels.max(initial=UNLABELED)) + 1
+    sizes = np.bincount(run_labels + 1, lengths, minlength=num + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))
     firsts = np.empty(num + 1, dtype=np.int32)
     # The last of several writes to an index wins: in reverse order, the first.
-    firsts[of_run[::-1]] = starts[::-1]
+    firsts[run_labels[::-1]] = starts[::-1]
     large = large[np.lexsort((firsts[large], -sizes[large]))]
     # The last entry is selected by -1.
     numbers = np.full(num + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
-    return torch.from_numpy(np.repeat(numbers[of_run], lengths)).to(regions.device)
+    return torch.from_numpy(np.repeat(numbers[run_labels], lengths)).to(regions.device)
 
 
 def number_by_count(labels: Tensor) -> Tensor:
@@ -297,13 +297,13 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
         order = order[: int(torch.count_nonzero(growing <= limit))]
-    tables, late = (indices, joins, makes_seed, is_seed, valid), promotes_late(config)
+    tables, late = (indices, joins, makes_seed, is_seed, valid), has_late_promotion(config)
     if kernels.serve(indices, valid):
         roots = torch.full(valid.shape, UNLABELED, dtype=torch.int32, device="cpu")
         queue = torch.empty_like(roots)
         at_once = _ROOTS_AT_ONCE if scratch.is_active() else max(len(order), 1)
-        for some in torch.split(order, at_once):
-            kernels.call("grow_regions", *tables, some, late, roots, queue)
+        for batch in torch.split(order, at_once):
+            kernels.call("grow_regions", *tables, batch, late, roots, queue)
             scratch.release()
     else:
         roots = grow_first_in_first_out(*tables, order, late=late)
@@ -356,7 +356,7 @@ def grow_first_in_first_out(
         new: NDArray[np.integer] = targets[becomes_seed & (slots[targets] == numbers)]
         return new
 
-    for root in _still_free(order.numpy(), free):
+    for root in _unassigned(order.numpy(), free):
         if not free[root]:
             continue
         free[root], roots[root] = False, root
@@ -375,7 +375,7 @@ def _flags(bits: Tensor, rows: NDArray[np.integer], near: NDArray[np.integer]) -
     return flags.view(np.bool_)
 
 
-def _still_free(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
+def _unassigned(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
     """Yield points unassigned when their chunk starts; a full list takes 36 bytes each."""
     for rows in chunks_of(len(order), ROWS_AT_ONCE):
         chunk = order[rows]

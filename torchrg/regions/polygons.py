@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torchrg._optional import require
 
 
-def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
+def trace_polygon(positions: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
     """Return the boundary polygons of points in a plane, as rings through some of the points.
 
     Points near an edge, found with square cells, are triangulated. Triangles over empty cells are
@@ -25,19 +25,19 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.
     shapely = require("shapely", extra="outline", purpose="trace outlines")
     if width <= 0:
         return []
-    cells = np.floor((places - places.min(axis=0)) / width).astype(np.int64) + 1
+    cells = np.floor((positions - positions.min(axis=0)) / width).astype(np.int64) + 1
     occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
     occupied[tuple(cells.T)] = True
     inside = binary_erosion(occupied, np.ones((3, 3), dtype=bool))
-    corners = places[~inside[tuple(cells.T)]]
+    corners = positions[~inside[tuple(cells.T)]]
     try:
         triangles = corners[Delaunay(corners).simplices]
     except (QhullError, ValueError):
         return []
     ends = np.roll(triangles, 1, axis=1)
-    tried = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
-    reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
-    covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
+    probes = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
+    sampled_cells = np.floor((probes - positions.min(axis=0)) / width).astype(np.int64) + 1
+    covered = occupied[sampled_cells[..., 0], sampled_cells[..., 1]].all(axis=1)
     # Triangles sharing complete edges form a coverage, whose union is twenty times faster.
     shape = shapely.coverage_union_all(shapely.polygons(triangles[covered]))
     return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
@@ -50,7 +50,7 @@ def _rings(shapely: Any, shape: Any, min_area: float) -> list[NDArray[np.float64
     parts = [polygon for polygon in parts if polygon.area >= min(min_area, largest)]
     rings: list[NDArray[np.float64]] = []
     for polygon in sorted(parts, key=lambda polygon: -polygon.area):
-        turned = shapely.geometry.polygon.orient(polygon)
-        holes = [hole for hole in turned.interiors if shapely.Polygon(hole).area >= min_area]
-        rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *holes)]
+        oriented = shapely.geometry.polygon.orient(polygon)
+        holes = [hole for hole in oriented.interiors if shapely.Polygon(hole).area >= min_area]
+        rings += [np.asarray(ring.coords)[:-1] for ring in (oriented.exterior, *holes)]
     return rings

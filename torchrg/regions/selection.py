@@ -58,14 +58,14 @@ def select_planes(
         >>> seg.planes.area.round().tolist(), len(select_planes(seg, min_area=150).planes)
         ([209.0, 133.0], 1)
     """
-    given = {"min_area": min_area, "kinds": kinds, "sort": sort}
-    settings = settings_of("select_planes", SelectionConfig, None, given)
+    values = {"min_area": min_area, "kinds": kinds, "sort": sort}
+    settings = settings_of("select_planes", SelectionConfig, None, values)
     if up is not None or (settings.kinds is not None and seg.planes.kind is None):
         direction = unit_direction("select_planes", "z" if up is None else up)
         if seg.points is None:
             raise ConfigError(
-                "select_planes: expected a segmentation with points to classify planes, got none; "
-                "pass up to segment_depth."
+                "select_planes: expected points in the segmentation to classify planes, got None. "
+                "Pass up to segment_depth."
             )
         kind = classify_planes(seg.planes, seg.points, seg.labels, direction)
         seg = replace(seg, planes=replace(seg.planes, kind=kind))
@@ -97,7 +97,7 @@ def keep_planes(seg: Segmentation, rows: Tensor) -> Segmentation:
     if planes.outline is not None:
         columns["outline"] = tuple(planes.outline[row] for row in rows.tolist())
     if planes.adjacency is not None:
-        columns["adjacency"] = _kept_pairs(planes.adjacency, rows, len(planes))
+        columns["adjacency"] = _select_pairs(planes.adjacency, rows, len(planes))
     labels = renumber_planes(seg.labels, rows, len(planes))
     return replace(seg, labels=labels, planes=replace(planes, **columns))
 
@@ -109,12 +109,12 @@ def renumber_planes(labels: Tensor, rows: Tensor, num_planes: int) -> Tensor:
         >>> renumber_planes(torch.tensor([0, 1, 2, -1]), torch.tensor([2, 0]), 3).tolist()
         [1, -1, 0, -1]
     """
-    places = labels.new_full((num_planes + 1,), UNLABELED)
-    places[rows] = torch.arange(len(rows), device=labels.device, dtype=labels.dtype)
-    return places[labels.long()]
+    index_of = labels.new_full((num_planes + 1,), UNLABELED)
+    index_of[rows] = torch.arange(len(rows), device=labels.device, dtype=labels.dtype)
+    return index_of[labels.long()]
 
 
-def _kept_pairs(adjacency: PlaneAdjacency, rows: Tensor, num_planes: int) -> PlaneAdjacency:
+def _select_pairs(adjacency: PlaneAdjacency, rows: Tensor, num_planes: int) -> PlaneAdjacency:
     """Return the pairs of planes that are both in ``rows``, renumbered and sorted."""
     pairs = renumber_planes(adjacency.pairs, rows, num_planes).sort(dim=1).values
     is_kept = pairs[:, 0] >= 0

@@ -48,22 +48,22 @@ class SharedNeighbors:
         self._min_shared = min_shared
         self._buffers: list[Tensor] = []
 
-    def connected(self, rows: slice, asked: Tensor) -> Tensor:
+    def connected(self, rows: slice, candidates: Tensor) -> Tensor:
         """Return a mask of the block's edges that join connected points, eq. (10).
 
         Only edges in the mask ``candidates`` from the points ``rows`` are tested, shape ``(n, K)``,
         bool; the others are False.
         """
         if self._min_shared <= 0:
-            return asked.clone()
-        k = asked.shape[1]
-        if k <= _MAX_IN_KERNEL and kernels.serve(*self._neighbors, asked, k=k):
-            numbers = self._buffer()
-            edges = *self._neighbors, asked, numbers, rows.start, self._min_shared
+            return candidates.clone()
+        k = candidates.shape[1]
+        if k <= _MAX_IN_KERNEL and kernels.serve(*self._neighbors, candidates, k=k):
+            column_of = self._buffer()
+            edges = *self._neighbors, candidates, column_of, rows.start, self._min_shared
             (joined,) = kernels.call("connected", *edges)
-            self._buffers.append(numbers)
+            self._buffers.append(column_of)
             return joined
-        result = asked.clone()
+        result = candidates.clone()
 
         def test(block: slice) -> None:
             if bool(result[block].any()):
@@ -71,26 +71,26 @@ class SharedNeighbors:
                 shared = self._count(first, first + len(result[block]))
                 result[block] &= shared >= self._min_shared
 
-        map_tasks(test, chunks_of(len(result), _BLOCK_SIZE), asked.device)
+        map_tasks(test, chunks_of(len(result), _BLOCK_SIZE), candidates.device)
         return result
 
     def _count(self, start: int, stop: int) -> Tensor:
         """Return the number of common neighbors along all edges of a block, shape ``(n, K)``."""
-        lists, numbers = self._neighbors.indices[start:stop].long(), self._buffer()
+        lists, column_of = self._neighbors.indices[start:stop].long(), self._buffer()
         members = lists.flatten()
-        places = torch.arange(len(members), dtype=numbers.dtype, device=numbers.device)
-        numbers[members] = places
-        members = members[numbers[members] == places]
-        numbers[members] = places[: len(members)]
-        theirs = self._neighbors.at(members)
-        columns = numbers[theirs.indices.long()].long().clamp(max=len(members) - 1)
-        counted = (members[columns] == theirs.indices) & theirs.counted()
+        new_columns = torch.arange(len(members), dtype=column_of.dtype, device=column_of.device)
+        column_of[members] = new_columns
+        members = members[column_of[members] == new_columns]
+        column_of[members] = new_columns[: len(members)]
+        near = self._neighbors.at(members)
+        columns = column_of[near.indices.long()].long().clamp(max=len(members) - 1)
+        counted = (members[columns] == near.indices) & near.counted()
         occurs = torch.zeros(len(members), len(members) + 1, device=members.device)
         # Non-members are scattered into an extra last column.
         occurs.scatter_(1, torch.where(counted, columns, len(members)), 1.0)
         occurs = occurs[:, :-1]
-        shared = (occurs[numbers[start:stop]] @ occurs.T).gather(1, numbers[lists].long())
-        self._buffers.append(numbers)
+        shared = (occurs[column_of[start:stop]] @ occurs.T).gather(1, column_of[lists].long())
+        self._buffers.append(column_of)
         return shared
 
     def _buffer(self) -> Tensor:

@@ -19,62 +19,62 @@ from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, NearestPoints
 from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
 from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
-from torchrg.regions.repair import misfit_of_pairs, renumber
+from torchrg.regions.repair import pairwise_misfit, remap_labels
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import UNLABELED, Neighbors
 
 _CORE_FRACTION = 0.5
 """Fraction of the angle and distance limits within which the core of a surface is connected."""
 
-_SMOOTH_ANGLE = 0.3
+_SMOOTH_FRACTION = 0.3
 """A surface is smooth where neighboring normals differ by less than this fraction of the maximum
 angle."""
 
-_MIN_SMOOTH = 0.7
+_MIN_SMOOTH_RATIO = 0.7
 """Cores grow only through points whose fraction of smooth neighbors is at least 0.7 of the median
 in their region; at other points noise may hide an edge."""
 
-_MAX_OFF_PLANE = 0.1
+_MAX_OFF_PLANE_FRACTION = 0.1
 """Maximum fraction of a region's points off its plane for which the plane is one surface."""
 
 _EXACT_REACH = 4.0
 """Maximum distance of the points of an exact surface to its plane, in minimum thicknesses."""
 
-_MIN_FLAT = 0.5
+_MIN_FLAT_FRACTION = 0.5
 """Minimum fraction of points in flat cores of a piecewise planar region: a noisy column breaks into
 few, curved cores."""
 
-_MIN_FACE = 0.05
+_MIN_FACE_FRACTION = 0.05
 """Minimum fraction of the region's points in a flat core next to curved ones, such as a panel
 framed by a molding. Smaller ones belong to the bend."""
 
-_OPEN_FRACTION = 0.1
+_MIN_OPEN_FRACTION = 0.1
 """Minimum fraction of edges between two cores of one surface that pass the criteria; few do across
 a bridge."""
 
-_MIN_MISFIT = 2.0
+_MAX_MISFIT = 2.0
 """Two cores are coplanar if their misfit is below this many thicknesses, as for parts of a surface
 bent by noise."""
 
-_MAX_TURNED_DEG = 30.0
+_MAX_DIHEDRAL_DEG = 30.0
 """Maximum angle between the planes of joined cores, in degrees. ``_MAX_MISFIT`` alone would join
 narrow strips on both sides of an edge."""
 
 _NUM_AVERAGED = 16
 """Nearest neighbors whose residuals are averaged, which reduces white noise to a quarter."""
 
-_MIN_POINTS = 3
+_MIN_SIZE_FACTOR = 3
 """Minimum size of a region that may contain two surfaces, in multiples of ``min_size``."""
 
 _NOISE_QUANTILE, _NOISE_FACTOR = 0.33, 2.345
 """Quantile of the absolute residuals and its ratio to a standard deviation of normal noise. The
 lower third belongs to the main level even if a second one has nearly half of the points."""
 
-_SEED_NOISES = 1.5
+_SEED_NOISE_FACTOR = 1.5
 """Minimum averaged residual of a candidate, in standard deviations; equals six of the average's
 own."""
 
-_STEP_NOISES = 2.0
+_STEP_NOISE_FACTOR = 2.0
 """Minimum step between two levels, in standard deviations of the residuals."""
 
 _MAX_THICKNESS = 0.6
@@ -145,26 +145,26 @@ def find_mixed_regions(
     region, has_region = labels.clamp(min=0), labels >= 0
     off = has_region & (planes.distances(cloud.points, region) > limit[region])
     num_off = torch.bincount(labels[off], minlength=len(limit))
-    on_plane = num_off <= _MAX_OFF_PLANE * planes.num_points
+    on_plane = num_off <= _MAX_OFF_PLANE_FRACTION * planes.num_points
     mixed = num_off >= int(config.min_size)
     rows = (torch.where(on_plane[region], off, has_region) & mixed[region]).nonzero().squeeze(1)
     if len(rows) == 0:
         return None
-    others = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
+    remaining = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
     turns = [
         sq_chords(
             cloud.normals[chunk].double().unbind(dim=1),
             planes.normal[labels[chunk]].unbind(dim=1),
         )
-        for chunk in torch.split(others, ROWS_AT_ONCE)
+        for chunk in torch.split(remaining, ROWS_AT_ONCE)
     ]
     turn = torch.cat(turns)
     near, aligned = (
-        torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
+        torch.zeros_like(off).index_fill_(0, remaining[turn <= deg_to_sq_chord(limit)], True)
         for limit in (config.max_angle_deg, _CORE_FRACTION * config.max_angle_deg)
     )
-    faces = _part_of(cloud, labels, rows)
-    smooth = _are_smooth(faces, labels[rows], _SMOOTH_ANGLE * config.max_angle_deg, chunk_size)
+    faces = _subset(cloud, labels, rows)
+    smooth = _are_smooth(faces, labels[rows], _SMOOTH_FRACTION * config.max_angle_deg, chunk_size)
     faces = faces._replace(
         valid=faces.valid & smooth,
         reach=None if faces.reach is None else _CORE_FRACTION * faces.reach,
@@ -195,24 +195,24 @@ def cut_bridges(
     if len(rows) == 0:
         return labels
     cores = torch.full_like(labels, UNLABELED).index_copy_(0, mixed.rows, grown)
-    cores, on_core_plane = _add_planes(labels, cores, mixed)
-    around = cloud.neighbors.of(cores.to(torch.int32), rows)
-    rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
+    cores, on_core_plane = _add_plane_cores(labels, cores, mixed)
+    near_cores = cloud.neighbors.of(cores.to(torch.int32), rows)
+    rows = rows[((near_cores >= 0) & (near_cores != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
     cores = _join_curved(cloud, labels, cores, mixed.on_plane)
-    split = torch.bincount(_owners(labels, cores), minlength=len(mixed.on_plane)) > 1
+    split = torch.bincount(_core_regions(labels, cores), minlength=len(mixed.on_plane)) > 1
     free = (labels >= 0) & split[labels.clamp(min=0)]
     # Only points aligned with the plane show which cores it meets.
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
     plane_of[labels[on_core_plane]] = cores[on_core_plane]
     cores = torch.where(mixed.near & free & (cores < 0), plane_of[labels.clamp(min=0)], cores)
-    waiting = (free & (cores < 0)).nonzero().squeeze(1)
-    cores = _propagate(cores, _find_edges(cloud, labels, config, waiting, chunk_size))
+    unassigned = (free & (cores < 0)).nonzero().squeeze(1)
+    cores = _propagate(cores, _find_edges(cloud, labels, config, unassigned, chunk_size))
     new = torch.where(cores >= 0, cores + len(split), UNLABELED)
     return torch.where(free, new, labels)
 
 
-def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
+def _add_plane_cores(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
     """Add the planes of regions with other cores as cores; also return a mask of their points."""
     has_core = torch.zeros_like(mixed.on_plane)
     has_core[labels[cores >= 0]] = True
@@ -224,12 +224,12 @@ def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Ten
 
 def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
     """Merge the cores ``(N,)`` of each curved region, except its flat surfaces."""
-    flat, owner = ~_planes_of(cloud, cores).curved, _owners(labels, cores)
+    flat, owner = ~_fit_cores(cloud, cores).curved, _core_regions(labels, cores)
     num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
     of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
     covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
-    curved = ~(on_plane | (covered >= _MIN_FLAT * of_region))
-    is_face = flat & (num_points >= _MIN_FACE * of_region[owner])
+    curved = ~(on_plane | (covered >= _MIN_FLAT_FRACTION * of_region))
+    is_face = flat & (num_points >= _MIN_FACE_FRACTION * of_region[owner])
     joined = curved[owner] & ~is_face
     numbers = torch.arange(len(owner) + 1, device=cores.device)
     numbers[-1] = UNLABELED
@@ -239,14 +239,14 @@ def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: T
     return numbers[cores]
 
 
-def _owners(labels: Tensor, cores: Tensor) -> Tensor:
+def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
     """Return the region of each non-empty core, ascending."""
     points = (cores >= 0).nonzero().squeeze(1)
     numbers, rows = torch.unique(cores[points], return_inverse=True)
     return labels.new_zeros(len(numbers)).index_copy_(0, rows, labels[points])
 
 
-def _planes_of(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
+def _fit_cores(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
     """Fit planes to cores."""
     return fit_planes(Segments(cores, most=MAX_FITTED), cloud.points, cloud.normals)
 
@@ -262,28 +262,28 @@ def _are_smooth(
     )
     for chunk in chunks_of(len(fractions), chunk_size):
         near, counted = cloud.neighbors.at(chunk), cloud.neighbors.counted(chunk)
-        alike = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
-        fractions[chunk] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
+        smooth = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
+        fractions[chunk] = smooth.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
     segments = Segments(regions)
-    usual = segments.median(segments.take(fractions))
-    return fractions >= _MIN_SMOOTH * usual[regions]
+    typical = segments.median(segments.take(fractions))
+    return fractions >= _MIN_SMOOTH_RATIO * typical[regions]
 
 
-def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
+def _subset(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
     """Return a subset of points as a cloud, with neighbors limited to the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
     near = cloud.neighbors.at(rows)
-    places = near.of(row_of)
-    counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (places >= 0)
+    local_rows = near.of(row_of)
+    counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (local_rows >= 0)
     counted &= near.counted()
     itself = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
     return cloud._replace(
         points=cloud.points.T[:, rows].T,
         normals=cloud.normals.T[:, rows].T,
         curvature=cloud.curvature[rows],
-        neighbors=Neighbors(torch.where(counted, places, itself), counted),
+        neighbors=Neighbors(torch.where(counted, local_rows, itself), counted),
         valid=cloud.valid[rows],
         reach=None if cloud.reach is None else cloud.reach[rows],
         colors=None if cloud.colors is None else cloud.colors[rows],
@@ -316,11 +316,11 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(numbers, minlength=len(pairs))
     num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
-    planes = _planes_of(cloud, cores)
+    planes = _fit_cores(cloud, cores)
     one, other = planes.normal[pairs].unbind(dim=1)
     turn = unsigned_angle_deg(one, other)
-    joined = (misfit_of_pairs(planes, pairs) < _MIN_MISFIT) & (turn <= _MAX_TURNED_DEG)
-    joined |= num_open >= _OPEN_FRACTION * num_edges
+    joined = (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
+    joined |= num_open >= _MIN_OPEN_FRACTION * num_edges
     ends = pairs[joined].T.cpu().numpy()
     ones = np.ones(ends.shape[1], dtype=np.int8)
     graph = coo_array((ones, (ends[0], ends[1])), shape=(num_cores, num_cores))
@@ -331,16 +331,16 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
 def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
     """Assign points between cores to the core of the nearest neighbor they have an edge to."""
     cores = cores.clone()
-    waiting = torch.arange(len(edges.rows), device=cores.device)
-    while len(waiting):
-        targets = edges.targets[waiting]
-        reached = edges.passed[waiting] & (cores[targets] >= 0)
-        nearest = reached.to(torch.uint8).argmax(dim=1, keepdim=True)
-        joined = reached.any(dim=1)
+    unassigned = torch.arange(len(edges.rows), device=cores.device)
+    while len(unassigned):
+        targets = edges.targets[unassigned]
+        connected = edges.passed[unassigned] & (cores[targets] >= 0)
+        nearest = connected.to(torch.uint8).argmax(dim=1, keepdim=True)
+        joined = connected.any(dim=1)
         if not bool(joined.any()):
             break
-        cores[edges.rows[waiting[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
-        waiting = waiting[~joined]
+        cores[edges.rows[unassigned[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
+        unassigned = unassigned[~joined]
     return cores
 
 
@@ -372,10 +372,10 @@ def split_levels(
     for search in range(_MAX_LEVELS):
         if search:
             planes = fit_regions(cloud, searched, config)
-        large = (planes.num_points >= _MIN_POINTS * int(config.min_size)) & ~planes.curved
+        large = (planes.num_points >= _MIN_SIZE_FACTOR * int(config.min_size)) & ~planes.curved
         if not bool(large.any()):
             break
-        region = renumber(searched, _numbers(large))
+        region = remap_labels(searched, _compact_numbers(large))
         level, owner = _find_levels(
             cloud, region, RegionPlanes(*(v[large] for v in planes)), config
         )
@@ -394,24 +394,24 @@ def _find_levels(
 ) -> tuple[Tensor, Tensor]:
     """Return the second level of each point ``(N,)``, -1 for none, and the region of each level."""
     residual, average, noise = _measure_residuals(cloud, region, planes)
-    beside = NearestPoints(cloud.neighbors)
-    limit = _SEED_NOISES * torch.cat([noise, noise.new_tensor([torch.inf])])
-    level = _components(average.abs() > limit[region], 2 * region + (average > 0), beside)
-    step = _steps(level, residual)
-    level = _components(average.abs() > step[level] / 2, level, beside)
-    step, owner = _steps(level, residual)[:-1], Segments(level).first(region)
-    min_step = (_STEP_NOISES * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
+    adjacency = NearestPoints(cloud.neighbors)
+    limit = _SEED_NOISE_FACTOR * torch.cat([noise, noise.new_tensor([torch.inf])])
+    level = _components(average.abs() > limit[region], 2 * region + (average > 0), adjacency)
+    step = _median_steps(level, residual)
+    level = _components(average.abs() > step[level] / 2, level, adjacency)
+    step, owner = _median_steps(level, residual)[:-1], Segments(level).first(region)
+    min_step = (_STEP_NOISE_FACTOR * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
     num_points = torch.bincount(level + 1, minlength=1)[1:]
     kept = (num_points >= int(config.min_size)) & (step >= min_step)
-    level, step, owner = renumber(level, _numbers(kept)), step[kept], owner[kept]
+    level, step, owner = remap_labels(level, _compact_numbers(kept)), step[kept], owner[kept]
     fits = fit_planes(Segments(level), cloud.points, cloud.normals)
     turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
     kept = (turn <= PARALLEL_DEG) & (fits.thickness <= _MAX_THICKNESS * step)
-    kept &= _have_valleys(level, step, average, region, beside)
-    return renumber(level, _numbers(kept)), owner[kept]
+    kept &= _have_valleys(level, step, average, region, adjacency)
+    return remap_labels(level, _compact_numbers(kept)), owner[kept]
 
 
-def _numbers(kept: Tensor) -> Tensor:
+def _compact_numbers(kept: Tensor) -> Tensor:
     """Return consecutive numbers of the kept regions ``(M,)``, -1 for removed ones."""
     return torch.where(kept, kept.cumsum(0) - 1, UNLABELED)
 
@@ -446,21 +446,21 @@ def _measure_residuals(
 def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
     """Return the mode of the averaged residuals of each region, as the mean around their peak."""
     middle = segments.median(average)
-    away = average - segments.spread(middle)
-    width = torch.maximum(MAD_FACTOR * segments.median(away.abs()), floor)
+    offset = average - segments.spread(middle)
+    width = torch.maximum(MAD_FACTOR * segments.median(offset.abs()), floor)
     width = torch.where(width > 0, width, 1.0)
-    bins = (2 * away / segments.spread(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
+    bins = (2 * offset / segments.spread(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
     bins += segments.labels * _BINS + _BINS // 2
     counts = torch.bincount(bins, minlength=len(width) * _BINS).view(-1, 1, _BINS)
     window = counts.new_tensor(_WINDOW).view(1, 1, -1)
     peak = torch.conv1d(counts, window, padding=len(_WINDOW) // 2).argmax(dim=2).squeeze(1)
     peak = (peak - _BINS // 2 + 0.5) * width / 2
-    near = (away - segments.spread(peak)).abs() <= _PEAK_WIDTH * segments.spread(width)
-    total = segments.sum(torch.where(near, away, 0.0).double())
+    near = (offset - segments.spread(peak)).abs() <= _PEAK_WIDTH * segments.spread(width)
+    total = segments.sum(torch.where(near, offset, 0.0).double())
     return (middle + total / segments.sum(near.double()).clamp(min=1)).float()
 
 
-def _components(chosen: Tensor, groups: Tensor, beside: NearestPoints) -> Tensor:
+def _components(chosen: Tensor, groups: Tensor, adjacency: NearestPoints) -> Tensor:
     """Label the connected components of chosen points within each group, -1 for other points."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -469,16 +469,16 @@ def _components(chosen: Tensor, groups: Tensor, beside: NearestPoints) -> Tensor
     number = torch.full_like(groups, UNLABELED).index_copy_(
         0, rows, torch.arange(len(rows), device=rows.device)
     )
-    near = beside.around(rows).long()
+    near = adjacency.neighbor_rows(rows).long()
     joined = (number[near] >= 0) & (groups[near] == groups[rows, None])
     ends = number[rows, None].expand_as(near)[joined].cpu(), number[near][joined].cpu()
     ones = torch.ones(len(ends[0]), dtype=torch.int8)
     graph = coo_array((ones.numpy(), ends), shape=(len(rows), len(rows)))
-    found = torch.from_numpy(connected_components(graph, directed=False)[1]).to(groups)
-    return number.index_copy_(0, rows, found)
+    components = torch.from_numpy(connected_components(graph, directed=False)[1]).to(groups)
+    return number.index_copy_(0, rows, components)
 
 
-def _steps(level: Tensor, residual: Tensor) -> Tensor:
+def _median_steps(level: Tensor, residual: Tensor) -> Tensor:
     """Return the median absolute residual of each level, plus infinity for unlabeled points."""
     segments = Segments(level)
     steps = segments.median(segments.take(residual.abs()))
@@ -486,13 +486,13 @@ def _steps(level: Tensor, residual: Tensor) -> Tensor:
 
 
 def _have_valleys(
-    level: Tensor, step: Tensor, average: Tensor, region: Tensor, beside: NearestPoints
+    level: Tensor, step: Tensor, average: Tensor, region: Tensor, adjacency: NearestPoints
 ) -> Tensor:
     """Return a mask of levels with fewer points halfway to them than on them, in rings around."""
     ring = places_of(level >= 0)
     owner, side = level.clone(), Segments(level).first(average).sign()
     for _ in range(_NUM_RINGS):
-        near = beside.around(ring).long()
+        near = adjacency.neighbor_rows(ring).long()
         source = owner[ring, None].expand_as(near)
         is_new = (owner[near] < 0) & (region[near] == region[ring, None])
         # If several levels reach a point, the first wins, independent of the point order.

@@ -19,10 +19,10 @@ from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
-from torchrg.regions.polygons import trace_outline
+from torchrg.regions.polygons import trace_polygon
 from torchrg.structures import Neighbors, PlaneAdjacency, Planes, Rows
 
-_Outlines = tuple[tuple[Tensor, ...], ...]
+_Polygons = tuple[tuple[Tensor, ...], ...]
 
 
 def summarize_planes(
@@ -77,14 +77,14 @@ def summarize_planes(
     check_floating("summarize_planes", points=points, normals=normals)
     if neighbors is not None and not canonical:
         check_neighbors("summarize_planes", neighbors, points)
-    rows = _distinct_members(points, labels, canonical=canonical)
-    segments, places = Segments(labels[rows]), points[rows]
-    fit = fit_planes(segments, places, normals[rows]).flattened(facet_tolerance)
-    planes = measure_planes(segments, places, fit, outline=outline)
+    rows = _distinct_rows(points, labels, canonical=canonical)
+    segments, positions = Segments(labels[rows]), points[rows]
+    fit = fit_planes(segments, positions, normals[rows]).flattened(facet_tolerance)
+    planes = measure_planes(segments, positions, fit, outline=outline)
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
         direction = unit_direction("summarize_planes", up)
-        planes = replace(planes, kind=classify_planes(planes, places, labels[rows], direction))
+        planes = replace(planes, kind=classify_planes(planes, positions, labels[rows], direction))
     if neighbors is not None:
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
@@ -95,17 +95,17 @@ def summarize_planes(
     return planes
 
 
-def _distinct_members(points: Tensor, labels: Tensor, *, canonical: bool) -> Rows:
+def _distinct_rows(points: Tensor, labels: Tensor, *, canonical: bool) -> Rows:
     """Return the rows of the distinct points of each region, in canonical order."""
     if canonical:
         is_first = mark_first(*points.unbind(dim=1), labels)
         return slice(None) if bool(is_first.all()) else places_of(is_first)
     members = places_of(labels >= 0)
-    num_bad = int(torch.count_nonzero(~points[members].isfinite().all(dim=1)))
-    if num_bad:
+    num_nonfinite = int(torch.count_nonzero(~points[members].isfinite().all(dim=1)))
+    if num_nonfinite:
         raise ShapeError(
-            f"summarize_planes: expected finite points in regions, got {num_bad:,} that are not; "
-            "label them -1."
+            f"summarize_planes: expected finite labeled points, got {num_nonfinite:,} non-finite. "
+            "Label them -1."
         )
     return members[distinct_rows(points[members], labels[members])]
 
@@ -124,31 +124,31 @@ def measure_planes(
         list(zip(chunks, frames, strict=True)),
         points.device,
     )
-    numbers, outlines = zip(*measures, strict=True)
+    numbers, polygons = zip(*measures, strict=True)
     mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
 
-    def as_given(values: Tensor) -> Tensor:
+    def to_input_dtype(values: Tensor) -> Tensor:
         return values.to(points.dtype)
 
     return Planes(
-        normal=as_given(fit.normal),
-        offset=as_given((fit.center * fit.normal).sum(dim=1)),
-        centroid=as_given(fit.center + mean),
-        area=as_given(area),
+        normal=to_input_dtype(fit.normal),
+        offset=to_input_dtype((fit.center * fit.normal).sum(dim=1)),
+        centroid=to_input_dtype(fit.center + mean),
+        area=to_input_dtype(area),
         count=fit.num_points,
-        rms=as_given(fit.rms),
-        extent=as_given(sides),
-        axes=as_given(axes),
-        center=as_given(fit.center + (middle[:, None] @ axes).squeeze(1)),
+        rms=to_input_dtype(fit.rms),
+        extent=to_input_dtype(sides),
+        axes=to_input_dtype(axes),
+        center=to_input_dtype(fit.center + (middle[:, None] @ axes).squeeze(1)),
         curved=fit.curved,
-        outline=sum(outlines, ()) if outline else None,
+        outline=sum(polygons, ()) if outline else None,
     )
 
 
 def _measure(
     points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor], *, outline: bool
-) -> tuple[list[Tensor], _Outlines]:
+) -> tuple[list[Tensor], _Polygons]:
     """Return mean, area, rectangle and polygons of regions, given their plane frames.
 
     A frame is the centers ``(M, 3)`` and the axes ``(M, 3, 3)``: two in the plane, then its normal.
@@ -160,43 +160,43 @@ def _measure(
     del height
     boxes = fit_rectangles(segments, u, v)
     area, width = covered_areas(segments, u, v, boxes)
-    rings = _outlines(segments, u, v, width, frame, points.dtype) if outline else ()
+    rings = _trace_polygons(segments, u, v, width, frame, points.dtype) if outline else ()
     return [mean, area, *boxes], rings
 
 
 def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
     """Return two unit directions that span each plane, the first along the region."""
-    first = _without(eigh3_of_few(fit.covariance)[1][:, :, 2], fit.normal)
+    first = _reject(eigh3_of_few(fit.covariance)[1][:, :, 2], fit.normal)
     # A region at a single position has no direction: any direction in the plane will do.
-    least = fit.normal.abs().argmin(dim=1)
-    other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
+    min_axis = fit.normal.abs().argmin(dim=1)
+    other = _reject(torch.eye(3, dtype=first.dtype, device=first.device)[min_axis], fit.normal)
     first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
     first = first / first.norm(dim=1, keepdim=True)
     return first, torch.linalg.cross(fit.normal, first)
 
 
-def _without(vectors: Tensor, normals: Tensor) -> Tensor:
+def _reject(vectors: Tensor, normals: Tensor) -> Tensor:
     """Return vectors without their component along the normals."""
     return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
 
 
-def _outlines(
+def _trace_polygons(
     segments: Segments,
     u: Tensor,
     v: Tensor,
     width: Tensor,
     frame: tuple[Tensor, Tensor],
     dtype: torch.dtype,
-) -> _Outlines:
+) -> _Polygons:
     """Trace the polygons of each region, and lift them into space."""
-    outlines = []
+    polygons = []
     counts = segments.counts.tolist()
     parts = torch.split(torch.stack([u, v], dim=1), counts)
-    for places, size, center, axes in zip(parts, width.tolist(), *frame, strict=True):
+    for positions, size, center, axes in zip(parts, width.tolist(), *frame, strict=True):
         rings = (
             torch.from_numpy(ring).to(u.device)
-            for ring in trace_outline(places.cpu().numpy(), size)
+            for ring in trace_polygon(positions.cpu().numpy(), size)
         )
         lifted = (center + ring[:, :1] * axes[0] + ring[:, 1:] * axes[1] for ring in rings)
-        outlines.append(tuple(ring.to(dtype) for ring in lifted))
-    return tuple(outlines)
+        polygons.append(tuple(ring.to(dtype) for ring in lifted))
+    return tuple(polygons)
