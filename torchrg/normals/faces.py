@@ -1,8 +1,8 @@
-"""Faces of a cloud: planes, the two sides of thin plates, and smooth patches between them.
+"""One-sided faces of a cloud: planes, sides of thin plates, and smooth patches.
 
-A double cover tells how normals of a face agree. Each node of a graph is there twice, with its
+A double cover makes the normals of a face consistent. Each node of a graph occurs twice, with its
 normal and with the opposite one, and a link joins the copies that agree. A connected component
-holds one copy of each of its nodes, and is a face.
+contains one copy of each of its nodes and is a face.
 """
 
 import numpy as np
@@ -15,32 +15,32 @@ from torchrg._parallel import ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
-"""Neighbors, by rank, over which faces spread. Noise tilts the links to nearer ones."""
+"""Neighbor ranks over which faces spread. Noise tilts the links to nearer ones."""
 
 _MIN_BEND, _MAX_BEND, _BENDS = 0.01, 0.05, 4.0
-"""Largest bend within a smooth patch: a multiple of the median bend, but at least that between
-normals 8 degrees apart, and at most that between normals 18 degrees apart."""
+"""Maximum bend within a smooth patch: a multiple of the median bend, clamped to the bends of
+normals 8 and 18 degrees apart."""
 
 _TRUST_POWER = 4
-"""Power of ``1 - bend / 2`` that weighs a link: 1 on a plane, 1/16 over a right-angled edge, 0
+"""Power of ``1 - bend / 2`` that weights a link: 1 on a plane, 1/16 over a right-angled edge, 0
 through a plate."""
 
 _FEW_POINTS = 10
 """A face of fewer points joins its neighbor. Noise tilts its normals, or an edge bends them."""
 
 _STRONG_AGREEMENT = 0.5
-"""Agreement for each of its points above which a face joins its neighbor. The median is 0.5 to 1
-for patches that noise cuts from one surface, and 0.05 for faces that meet at an edge of a room."""
+"""Minimum agreement per point at which a face joins its neighbor. The median is 0.5 to 1 for
+patches of one surface split by noise, and 0.05 for faces that meet at an edge of a room."""
 
 _TWO_SIDES = 0.73
-"""Squared mean height about the middle by mean squared height, above which a thin face is a plate.
-Noise about one side has 0.70, a slab with points all through it 0.75, and a plate 0.8 to 1."""
+"""Minimum ratio of squared mean height to mean squared height, about the middle, of a plate among
+thin faces. One side with noise has 0.70, a filled slab 0.75, and a plate 0.8 to 1."""
 
 _FAR_OFF = 2.0
-"""Multiple of the mean height at which heights are cut off, so that stray points do not matter."""
+"""Multiple of the mean height at which heights are clamped, to limit stray points."""
 
 _MIN_COSINE = 0.5
-"""Cosine between a normal and its plane, 60 degrees, below which the point is on an edge."""
+"""Minimum cosine between a normal and its plane, 60 degrees; other points are on an edge."""
 
 
 def find_faces(
@@ -51,17 +51,18 @@ def find_faces(
     axes: Tensor,
     max_thickness: float,
 ) -> tuple[Tensor, Tensor]:
-    """Find faces, each of which looks to one side: planes, and smooth patches between them.
+    """Find one-sided faces: planes, and smooth patches between them.
 
-    1. A thin plane is a face. A plate, with points at both ends of its heights, is two.
-    2. The remaining points form smooth patches. A patch joins the face that it agrees with most if
-       it has few points, or if the agreement is large for its size.
-    3. Plates among the patches are two faces, too.
+    1. A thin plane is a face. A plate, with points at both ends of its heights, is two faces.
+    2. The remaining points form smooth patches. A patch joins the face with the highest agreement
+       if it has few points, or if the agreement is large for its size.
+    3. Plates among the patches are also two faces.
 
     Points ``(N, 3)`` are in canonical order, ``near`` ``(N, K)`` are rows of their neighbors,
-    ``labels`` ``(N,)`` those of planes or negative, with unit normals ``axes`` ``(M, 3)``. Thin is
-    a face up to a root mean square height. Returns the face of each point, and the sign by which
-    its normal agrees with others of the face, ``(N,)`` each. Some numbers of faces have no point.
+    ``labels`` ``(N,)`` are plane IDs or negative, with unit normals ``axes`` ``(M, 3)``.
+    ``max_thickness`` is the maximum RMS height of a thin face. Returns the face of each point, and
+    the sign that makes its normal consistent within the face, ``(N,)`` each. Some face IDs are
+    unused.
     """
     faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
     rows = places_of(labels >= 0)
@@ -85,7 +86,7 @@ def find_faces(
 
 
 def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
-    """Return the neighbors of some points at some ranks; lists on a disk leave the memory again."""
+    """Return the neighbors of points at the given ranks; releases memory-mapped lists."""
     parts = []
     for chunk in torch.split(rows, ROWS_IN_CACHE):
         parts.append(near[chunk][:, ranks])
@@ -96,7 +97,7 @@ def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
 def find_surfaces(points: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
     """Find connected surfaces, over edges and across thin plates; see :func:`find_faces`.
 
-    Smooth patches join the one that they agree with most until none has a neighbor.
+    Smooth patches join the patch with the highest agreement until none has a neighbor.
     """
     none = torch.full((len(points),), -1)
     return _join_patches(points, normals, near, none, normals.new_ones(len(points)), 0.0)
@@ -105,7 +106,7 @@ def find_surfaces(points: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor
 def _split_plates(
     points: Tensor, faces: Tensor, axes: Tensor, max_thickness: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the side of each point ``(n,)``, 0 or 1 on a plate, and which faces are thin ``(M,)``.
+    """Return the side of each point ``(n,)``, 0 or 1 on a plate, and a mask of thin faces ``(M,)``.
 
     Faces ``(n,)`` are rows of their axes ``(M, 3)``.
     """
@@ -129,14 +130,13 @@ def _split_plates(
 def _join_patches(
     points: Tensor, normals: Tensor, near: Tensor, faces: Tensor, signs: Tensor, strong: float
 ) -> tuple[Tensor, Tensor]:
-    """Grow smooth patches where there is no face, negative, and join them and the faces.
+    """Grow smooth patches of points without a face (negative), and join patches and faces.
 
-    Two normals agree if one and the mirror image of the other in the plane halfway between the two
-    points form less than a right angle [1]: so they do on a sphere, on both sides of a sharp edge,
-    and on the two faces of a thin plate, each pointing away from the other. How far a link can be
-    trusted is its bend ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle
-    and ``u`` the direction of the link: 0 on a plane, 1 over a right-angled edge, 2 through a
-    plate.
+    Two normals agree if one and the mirror image of the other in the bisecting plane of the two
+    points form less than a right angle [1]. This holds on a sphere, on both sides of a sharp edge,
+    and for the opposite normals of a thin plate. The bend of a link measures how reliable it is:
+    ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle and ``u`` the
+    direction of the link. It is 0 on a plane, 1 over a right-angled edge, and 2 through a plate.
 
     References:
         [1] H. Xie et al. Piecewise C1 continuous surface reconstruction of noisy point clouds via
@@ -194,11 +194,11 @@ def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tup
 def _join_faces(
     low: Tensor, high: Tensor, agreement: Tensor, sizes: Tensor, strong: float
 ) -> tuple[Tensor, Tensor]:
-    """Let each face join the one that it agrees with most, again and again.
+    """Repeatedly join each face to the face it agrees with most.
 
-    The agreement of two faces is the sum over the links ``(L,)`` between them; where it is
-    negative, one is turned. Faces of many points join where it is ``strong`` for their ``sizes``
-    ``(M,)``. Returns the new number of each face, and its sign there, ``(M,)``.
+    The agreement of two faces is the sum over the links ``(L,)`` between them; if it is negative,
+    one is flipped. Faces of many points join if it is ``strong`` for their ``sizes`` ``(M,)``.
+    Returns the new index of each face and its sign, ``(M,)``.
     """
     from scipy.sparse import coo_array
 
@@ -213,7 +213,7 @@ def _join_faces(
         strength, owner = np.abs(both.data), np.repeat(np.arange(len(sizes)), np.diff(both.indptr))
         most = torch.where(sizes < _FEW_POINTS, 0.0, strong * sizes).double().numpy()
         np.maximum.at(most, owner, strength)
-        # Of equal ones the first, so that no more than two faces choose each other in a circle.
+        # Ties go to the first, so that only two faces can choose each other in a cycle.
         chosen = np.flatnonzero((strength == most[owner]) & (strength > 0))
         chosen = chosen[np.unique(owner[chosen], return_index=True)[1]]
         joined, turns = _find_components(
@@ -235,10 +235,10 @@ def _find_components(
     ends: NDArray[np.integer],
     is_turned: NDArray[np.bool_],
 ) -> tuple[Tensor, Tensor]:
-    """Return the component of each node, and its sign there, by links ``(L,)`` ascending by start.
+    """Return the component and sign of each node, by links ``(L,)`` sorted by start.
 
-    Signs differ along links that are turned, else they agree. Where that cannot be, as a component
-    holds both copies of its nodes, each of these is left alone.
+    Signs differ along flipped links, otherwise they agree. If this is contradictory, because a
+    component contains both copies of its nodes, each node remains single.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components

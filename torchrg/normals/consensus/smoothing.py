@@ -1,4 +1,4 @@
-"""Bilateral smoothing of normals, and the choice among the planes of the neighbours."""
+"""Bilateral smoothing of normals, and plane choice among neighbors."""
 
 import torch
 from torch import Tensor
@@ -34,16 +34,16 @@ def smooth_planes(
     *,
     chunk_size: int,
 ) -> TangentPlanes:
-    r"""Smooth normals bilaterally: average the planes of the neighbours that agree with a point's.
+    """Smooth normals bilaterally: average the neighbors' planes that agree with the point's.
 
-    Neighbour j agrees with point i as far as its plane passes through i, within 2.5 times the
-    noise, and the chord ``c_ij`` between the normals is within 4.2 times its standard error
-    ``a_ij = (a_i^2 + a_j^2)^(1/2)``. The weights are
-    ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 - d_ij^2 / (2 d_max^2)) / a_j^2``,
-    each factor at least 0. On a curved surface a mere average would lean towards the denser side;
-    the weights are therefore tilted by a linear function of the position, such that the weighted
-    mean of the positions is the point (local linear regression). ``errors`` are the ``a_i`` in
-    radians, ``(N,)``, positive; ``rows`` are the points to treat, ``(n,)``. Returns all planes.
+    Neighbor j agrees with point i if its plane passes within 2.5 times the noise of i, and the
+    chord ``c_ij`` between the normals is within 4.2 times its standard error ``a_ij = (a_i^2 +
+    a_j^2)^(1/2)``. The weights are ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 -
+    d_ij^2 / (2 d_max^2)) / a_j^2``, each factor at least 0. On a curved surface a plain average
+    would lean towards the denser side. The weights are therefore tilted by a linear function of the
+    position so that the weighted mean position is the point (local linear regression). ``errors``
+    are the ``a_i`` in radians, ``(N,)``, positive; ``rows`` are the points to smooth, ``(n,)``.
+    Returns all planes.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
@@ -73,7 +73,7 @@ def smooth_planes(
 
 
 def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
-    """Return rows of point, normal, offset and value ``(N, 8)``: one place in memory for each."""
+    """Return rows of point, normal, offset and value ``(N, 8)``, contiguous per point."""
     return torch.cat([points, planes.normals, planes.offsets[:, None], values[:, None]], dim=1)
 
 
@@ -87,7 +87,7 @@ def _smoothed(
     errors: Tensor,
     rows: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the smoothed planes of some points; ``parts`` are the columns of all normals."""
+    """Return the smoothed planes of points; ``parts`` are the columns of all normals."""
     near = Neighbors(indices, valid).at(rows)
     columns = gather_columns(points, near.indices)
     x, y, z = (near.of(column) for column in parts.unbind())
@@ -124,12 +124,12 @@ def choose_planes(
     *,
     chunk_size: int,
 ) -> TangentPlanes:
-    """Give points the plane, among those of their neighbours, that their neighbourhood supports.
+    """Assign to points the neighboring plane with the most support in their neighborhood.
 
-    The score of a plane is that of :func:`torchrg.normals.consensus.hypotheses.vote_planes` per
-    weight, less a tenth of the square of the point's own residual in units of the noise; planes
-    from which the point is farther than three times the noise do not qualify. ``rows`` ``(n,)`` are
-    the points to treat; planes of all are returned.
+    The score is that of :func:`torchrg.normals.consensus.hypotheses.vote_planes` per weight, minus
+    a tenth of the point's squared residual in units of the noise; planes farther from the point
+    than three times the noise are excluded. ``rows`` ``(n,)`` are the points to update. Returns all
+    planes.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
@@ -171,7 +171,7 @@ def _chosen(
     rows: Tensor,
     ranks: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the best planes for some points among those of their neighbours of some ranks."""
+    """Return the best planes of points among the planes of their neighbors at ``ranks``."""
     near = Neighbors(indices, valid).at(rows)
     columns = gather_columns(points, near.indices)
     weights = _falling(columns, constants.VOTE_FALLOFF)
@@ -208,7 +208,7 @@ def standard_errors(
     """Return the standard error of the normals in radians, shape ``(N,)``.
 
     For a plane through ``n`` points it is the noise divided by ``(n l_1)^(1/2)``, where ``l_1`` is
-    the middle eigenvalue of their covariance, a quarter of the squared radius if they fill a disc.
+    the middle eigenvalue of their covariance, a quarter of the squared radius for a filled disk.
     """
     radius = torch.where(survey.radius > 0, survey.radius, 1.0)
     num_points: Tensor | int = neighbors.indices.shape[1]
@@ -236,7 +236,7 @@ def describe_inliers(
     *,
     chunk_size: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return curvature and residual of all points: at sharp ones those of the inliers alone."""
+    """Return curvature and residual of all points, at sharp points from the inliers only."""
     curvature, residual_rms = fit.curvature.clone(), fit.residual_rms.clone()
 
     def work(rows: Tensor) -> None:
@@ -259,7 +259,7 @@ def _inliers(
     noise: Tensor,
     rows: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
+    """Return the number and covariance eigenvalues of neighbors near the planes of points."""
     arguments = points, indices, valid, normals, offsets, noise
     if kernels.serve(*arguments, k=indices.shape[1]):
         return kernels.call("inliers", *arguments, rows, constants.INLIER_REACH)
@@ -271,14 +271,14 @@ def _inliers(
 
 
 def _falling(columns: Columns, fraction: float) -> Tensor:
-    """Return weights that fall with the squared distance, by a share at the farthest neighbour."""
+    """Return weights that decrease with the squared distance, by ``fraction`` at the farthest."""
     sq_distances = sq_lengths(columns)
     farthest = sq_distances.amax(dim=1, keepdim=True)
     return 1 - fraction * sq_distances / torch.where(farthest > 0, farthest, 1.0)
 
 
 def _balanced(columns: Columns, weights: Tensor) -> Tensor:
-    """Return weights tilted such that the weighted mean of the positions is nearly the point."""
+    """Return weights tilted so that the weighted mean position is nearly the point."""
     radius = square_root(sq_lengths(columns).amax(dim=1, keepdim=True))
     x, y, z = (column / torch.where(radius > 0, radius, 1.0) for column in columns)
     wx, wy, wz = weights * x, weights * y, weights * z
