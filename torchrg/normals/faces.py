@@ -17,7 +17,7 @@ from torchrg.linalg.moments import dot
 _RANKS = (2, 4, 6, 9, 12, 15)
 """Neighbor ranks over which faces spread. Noise tilts the links to nearer ones."""
 
-_MIN_BEND, _MAX_BEND, _BENDS = 0.01, 0.05, 4.0
+_MIN_BEND, _MAX_BEND, _BEND_FACTOR = 0.01, 0.05, 4.0
 """Maximum bend within a smooth patch: a multiple of the median bend, clamped to the bends of
 normals 8 and 18 degrees apart."""
 
@@ -25,18 +25,18 @@ _TRUST_POWER = 4
 """Power of ``1 - bend / 2`` that weights a link: 1 on a plane, 1/16 over a right-angled edge, 0
 through a plate."""
 
-_FEW_POINTS = 10
+_MIN_FACE_POINTS = 10
 """A face of fewer points joins its neighbor. Noise tilts its normals, or an edge bends them."""
 
-_STRONG_AGREEMENT = 0.5
+_MIN_AGREEMENT = 0.5
 """Minimum agreement per point at which a face joins its neighbor. The median is 0.5 to 1 for
 patches of one surface split by noise, and 0.05 for faces that meet at an edge of a room."""
 
-_TWO_SIDES = 0.73
+_MIN_TWO_SIDED = 0.73
 """Minimum ratio of squared mean height to mean squared height, about the middle, of a plate among
 thin faces. One side with noise has 0.70, a filled slab 0.75, and a plate 0.8 to 1."""
 
-_FAR_OFF = 2.0
+_MAX_HEIGHT_FACTOR = 2.0
 """Multiple of the mean height at which heights are clamped, to limit stray points."""
 
 _MIN_COSINE = 0.5
@@ -72,7 +72,7 @@ def find_faces(
     is_on_plane = is_thin[label] & (cosine.abs() > _MIN_COSINE)
     rows = rows[is_on_plane]
     faces[rows], signs[rows] = (2 * label + side)[is_on_plane], cosine[is_on_plane].sign()
-    joined, signs = _join_patches(points, normals, near, faces, signs, _STRONG_AGREEMENT)
+    joined, signs = _join_patches(points, normals, near, faces, signs, _MIN_AGREEMENT)
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
     has_plane[joined[rows]] = True
     rows = places_of(~has_plane[joined])
@@ -118,12 +118,12 @@ def _split_plates(
     height = dot(points, axes[faces]).double()
     middle = height - mean(height)[faces]
     for _ in range(2):
-        reach = _FAR_OFF * mean(middle.abs())[faces]
+        reach = _MAX_HEIGHT_FACTOR * mean(middle.abs())[faces]
         middle = torch.minimum(torch.maximum(middle, -reach), reach)
         middle -= mean(middle)[faces]
     squares = mean(middle * middle)
     is_thin = squares <= max_thickness * max_thickness
-    is_plate = is_thin & (mean(middle.abs()) ** 2 > _TWO_SIDES * squares)
+    is_plate = is_thin & (mean(middle.abs()) ** 2 > _MIN_TWO_SIDED * squares)
     return ((middle > 0) & is_plate[faces]).long(), is_thin
 
 
@@ -145,11 +145,11 @@ def _join_patches(
     rows, num_faces = places_of(faces < 0), int(faces.max()) + 1
     ends = gather_lists(near, rows, [rank for rank in _RANKS if rank < near.shape[1]])
     cosine, bend = _compare(points, normals, rows, ends)
-    usual = float(bend[::8].median()) if bend.numel() else 0.0
+    typical = float(bend[::8].median()) if bend.numel() else 0.0
     node = torch.full((len(points),), -1, dtype=torch.int32)
     node[rows] = torch.arange(len(rows), dtype=torch.int32)
     there = node[ends]
-    is_smooth = (bend <= min(max(_BENDS * usual, _MIN_BEND), _MAX_BEND)) & (there >= 0)
+    is_smooth = (bend <= min(max(_BEND_FACTOR * typical, _MIN_BEND), _MAX_BEND)) & (there >= 0)
     starts = torch.repeat_interleave(is_smooth.sum(dim=1, dtype=torch.int32))
     smooth = (values.numpy() for values in (starts, there[is_smooth], cosine[is_smooth] < 0))
     patch, sign = _find_components(len(rows), *smooth)
@@ -161,8 +161,8 @@ def _join_patches(
     cosine, trust = cosine[is_between], (1 - bend[is_between] / 2).clamp(min=0) ** _TRUST_POWER
     agreement = trust * cosine.sign() * signs[starts] * signs[ends]
     sizes = torch.bincount(faces)
-    joined, turns = _join_faces(faces[starts], faces[ends], agreement, sizes, strong)
-    return joined[faces], signs * turns[faces].to(signs)
+    joined, flips = _join_faces(faces[starts], faces[ends], agreement, sizes, strong)
+    return joined[faces], signs * flips[faces].to(signs)
 
 
 def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,17 +171,17 @@ def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tup
     def compare(chunk: slice) -> tuple[Tensor, Tensor]:
         at, shape = rows[chunk], ends[chunk].shape
         cosine, here, there, squares = (points.new_zeros(shape) for _ in range(4))
-        for place, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
-            arm, other = (
+        for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
+            offset, other = (
                 values.index_select(0, ends[chunk].reshape(-1)).view(shape)
-                for values in (place, normal)
+                for values in (position, normal)
             )
-            arm -= place[at, None]
-            own = normal[at, None]
-            cosine += other * own
-            here += arm * own
-            there += arm * other
-            squares += arm * arm
+            offset -= position[at, None]
+            normal_here = normal[at, None]
+            cosine += other * normal_here
+            here += offset * normal_here
+            there += offset * other
+            squares += offset * offset
         squares = torch.where(squares > 0, squares, 1.0)
         cosine -= 2 * here * there / squares
         return cosine, 1 - cosine.abs() + (here * here + there * there) / squares
@@ -211,21 +211,21 @@ def _join_faces(
         both = (half + half.T).tocsr()
         both.sort_indices()
         strength, owner = np.abs(both.data), np.repeat(np.arange(len(sizes)), np.diff(both.indptr))
-        most = torch.where(sizes < _FEW_POINTS, 0.0, strong * sizes).double().numpy()
-        np.maximum.at(most, owner, strength)
+        limit = torch.where(sizes < _MIN_FACE_POINTS, 0.0, strong * sizes).double().numpy()
+        np.maximum.at(limit, owner, strength)
         # Ties go to the first, so that only two faces can choose each other in a cycle.
-        chosen = np.flatnonzero((strength == most[owner]) & (strength > 0))
+        chosen = np.flatnonzero((strength == limit[owner]) & (strength > 0))
         chosen = chosen[np.unique(owner[chosen], return_index=True)[1]]
-        joined, turns = _find_components(
+        joined, flips = _find_components(
             len(sizes), owner[chosen], both.indices[chosen], both.data[chosen] < 0
         )
         if int(joined.max()) + 1 == len(sizes):
             return numbers, signs
-        numbers, signs = joined[numbers], signs * turns[numbers]
+        numbers, signs = joined[numbers], signs * flips[numbers]
         sizes = torch.bincount(joined, sizes).long()
         half = half.tocoo()
         low, high = (torch.from_numpy(end).long() for end in half.coords)
-        agreement = torch.from_numpy(half.data) * turns[low] * turns[high]
+        agreement = torch.from_numpy(half.data) * flips[low] * flips[high]
         low, high = joined[low], joined[high]
 
 
@@ -233,7 +233,7 @@ def _find_components(
     num_nodes: int,
     starts: NDArray[np.integer],
     ends: NDArray[np.integer],
-    is_turned: NDArray[np.bool_],
+    is_flipped: NDArray[np.bool_],
 ) -> tuple[Tensor, Tensor]:
     """Return the component and sign of each node, by links ``(L,)`` sorted by start.
 
@@ -245,7 +245,7 @@ def _find_components(
 
     num_links = np.cumsum(np.bincount(starts, minlength=num_nodes))
     bounds = np.concatenate([[0], num_links, num_links[-1:] + num_links])
-    other = np.int32(num_nodes) * is_turned
+    other = np.int32(num_nodes) * is_flipped
     ends = ends.astype(np.int32, copy=False)
     copies = np.concatenate([ends + other, ends + (np.int32(num_nodes) - other)])
     links = np.ones(len(copies), np.int8), copies, bounds.astype(np.int32)

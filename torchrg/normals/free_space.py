@@ -23,7 +23,7 @@ _MAX_CELLS = 2**19
 _NUM_OBSTACLES = 12
 """Nearest neighbors that can be an obstacle."""
 
-_PARALLEL, _ABOVE = 0.99, 0.5
+_MIN_PARALLEL_COSINE, _MIN_ELEVATION_SINE = 0.99, 0.5
 """Minimum cosine (8 degrees) between parallel normals, and minimum sine (30 degrees) of the
 elevation of such a neighbor on another face. On one smooth surface the elevation is at most half
 the angle between the normals."""
@@ -31,7 +31,7 @@ the angle between the normals."""
 _OPEN_WEIGHT = 0.5
 """Weight of a free path that leaves the bounding box of the cloud."""
 
-_HALF_WORTH = 8
+_HALF_PATH = 8
 """Free cells at which a path gets half of the maximum weight. A gap thus counts less than a room,
 and a hall no more than a room."""
 
@@ -65,14 +65,14 @@ def vote_free_side(
     x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
     at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell])
     cell = np.searchsorted(cells, codes[rows].numpy())
-    own = normals[rows]
+    normal = normals[rows]
     front, back = _find_obstacles(points, normals, near, rows, width)
 
     def vote(steps: tuple[int, ...]) -> Tensor:
         stride = math.sqrt(sum(step * step for step in steps))
-        cosine = dot(own, own.new_tensor(steps)) / stride
+        cosine = dot(normal, normal.new_tensor(steps)) / stride
         ahead, behind = (
-            torch.from_numpy(worth[cell]).to(own) for worth in _free_paths(at, steps, stride)
+            torch.from_numpy(score[cell]).to(normal) for score in _free_paths(at, steps, stride)
         )
         is_front = cosine > 0
         ahead = torch.minimum(ahead, torch.where(is_front, front, back))
@@ -88,9 +88,9 @@ def cell_width(points: Tensor, near: Tensor) -> float:
     if rank == 0:
         return 1.0
     rows = torch.arange(0, len(points), max(len(points) // ROWS_AT_ONCE, 1))
-    arms = points[gather_lists(near, rows, [rank])[:, 0]] - points[rows]
+    offsets = points[gather_lists(near, rows, [rank])[:, 0]] - points[rows]
     # A disk of that radius holds ``rank`` points, one per squared spacing.
-    spacing = dot(arms, arms).sqrt() * math.sqrt(math.pi / rank)
+    spacing = dot(offsets, offsets).sqrt() * math.sqrt(math.pi / rank)
     at = math.ceil(_SPACING_QUANTILE * len(rows)) - 1
     width = _SPACINGS_PER_CELL * float(kth_smallest(spacing, at))
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
@@ -102,16 +102,16 @@ def _find_obstacles(
 ) -> list[Tensor]:
     """Return the weights of paths to the nearest neighboring faces ahead and behind."""
     ranks = list(range(min(_NUM_OBSTACLES, near.shape[1])))
-    ends, own = gather_lists(near, rows, ranks), normals[rows, None]
-    arms = points[ends] - points[rows, None]
-    height = dot(arms, own)
-    is_face = dot(normals[ends], own).abs() > _PARALLEL
-    is_face &= height * height > _ABOVE * _ABOVE * dot(arms, arms)
+    ends, normal = gather_lists(near, rows, ranks), normals[rows, None]
+    offsets = points[ends] - points[rows, None]
+    height = dot(offsets, normal)
+    is_face = dot(normals[ends], normal).abs() > _MIN_PARALLEL_COSINE
+    is_face &= height * height > _MIN_ELEVATION_SINE * _MIN_ELEVATION_SINE * dot(offsets, offsets)
     nearest = (
         torch.where(is_face & (above > 0), above, torch.inf).amin(dim=1)
         for above in (height, -height)
     )
-    return [1 / (1 + _HALF_WORTH * width / path) for path in nearest]
+    return [1 / (1 + _HALF_PATH * width / path) for path in nearest]
 
 
 def _free_paths(
@@ -130,7 +130,7 @@ def _free_paths(
     is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
     gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)
 
-    def worth(gap: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
+    def score(gap: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
         free = np.empty(len(order), np.int64)
         free[order] = gap
         to_ends = [
@@ -140,6 +140,6 @@ def _free_paths(
         ]
         path = stride * np.where(free < 0, np.minimum.reduce(to_ends), free).astype(np.float32)
         weight = np.where(free < 0, np.float32(_OPEN_WEIGHT), np.float32(1))
-        return weight * (path / (path + np.float32(_HALF_WORTH)))
+        return weight * (path / (path + np.float32(_HALF_PATH)))
 
-    return worth(np.append(gaps, -1), 1), worth(np.insert(gaps, 0, -1), -1)
+    return score(np.append(gaps, -1), 1), score(np.insert(gaps, 0, -1), -1)

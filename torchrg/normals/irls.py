@@ -15,7 +15,7 @@ from torchrg.linalg import second_moments
 from torchrg.linalg.eigen import principal_frame
 from torchrg.normals.consensus.noise import survey_noise
 from torchrg.normals.pca import (
-    about_first,
+    center_on_first,
     check_patches,
     fit_normals_pca,
     fit_points,
@@ -23,16 +23,16 @@ from torchrg.normals.pca import (
 )
 from torchrg.structures import Neighbors, NormalFit
 
-_HEAVY = 0.25
+_MIN_HEAVY_WEIGHT = 0.25
 """Weight above which a point belongs to the plane."""
 
 _MIN_STEPS = 5
 """Minimum number of steps, even if the start is close to the limit."""
 
-_CLOSE_TO_PCA = 0.996
+_UNTURNED_COSINE = 0.996
 """Cosine of 5 degrees. A normal within this angle of the PCA normal has no nearby edge."""
 
-_SAME_SOLUTION = 0.95
+_SAME_COSINE = 0.95
 """Cosine of 18 degrees. Two solutions with normals within this angle are one."""
 
 _SECOND_START = 0.35
@@ -192,10 +192,10 @@ def _fit_rows(
 ) -> NormalFit:
     """Fit patches with one leading axis."""
     itself = mask & (mask.cumsum(dim=-1) == 1)
-    others = mask & ~itself
+    neighbor_mask = mask & ~itself
     plane = fit_normals_pca(patches, mask, resolution=resolution)
-    start = fit_normals_pca(patches, others, resolution=resolution)
-    _, offsets = about_first(patches, mask)
+    start = fit_normals_pca(patches, neighbor_mask, resolution=resolution)
+    _, offsets = center_on_first(patches, mask)
     radius = (offsets * offsets).sum(dim=-1).amax(dim=-1).detach().sqrt()
     noise = torch.maximum(noise, _MIN_NOISE * radius)
     is_flat = start.residual_rms <= noise
@@ -204,7 +204,7 @@ def _fit_rows(
 
     rows = (start.valid & ~is_flat).nonzero().squeeze(-1)
     x, y, z = offsets[rows].unbind(dim=-1)
-    points = _Offsets(x, y, z, others[rows].to(patches.dtype))
+    points = _Offsets(x, y, z, neighbor_mask[rows].to(patches.dtype))
     normals, heavy = _fit_edges(points, start.normals[rows], noise[rows, None], decay)
     resolution = None if resolution is None else resolution[rows]
     inliers = fit_normals_pca(patches[rows], heavy | itself[rows], resolution=resolution)
@@ -222,14 +222,14 @@ def _fit_edges(
     first = _fit_twice(points, start, largest, largest / 4, limit, decay)
     normals, heavy = first.normal, first.heavy
 
-    rows = (_cosine(start, normals) < _CLOSE_TO_PCA).nonzero().squeeze(-1)
-    turned, ours, limit = points.take(rows), normals[rows], limit[rows]
-    axis = torch.linalg.cross(torch.linalg.cross(start[rows], ours), ours)
+    rows = (_cosine(start, normals) < _UNTURNED_COSINE).nonzero().squeeze(-1)
+    turned, current, limit = points.take(rows), normals[rows], limit[rows]
+    axis = torch.linalg.cross(torch.linalg.cross(start[rows], current), current)
     across = axis / (axis * axis).sum(dim=-1, keepdim=True).sqrt()
     mu = _low_quantile(_sq_distances(turned, across), turned.counted)
     second = _fit_twice(turned, across, mu, mu / 2, limit, decay)
     firsts = _Solution(*(field[rows] for field in first))
-    better = (_cosine(firsts.through, second.through) < _SAME_SOLUTION) & ~_first_wins(
+    better = (_cosine(firsts.through, second.through) < _SAME_COSINE) & ~_first_wins(
         firsts, second, turned
     )
     rows = rows[better]
@@ -256,7 +256,7 @@ def _fit_twice(
     height = (near.center * near.normal).sum(dim=-1)
     above = (points.distances(near.normal) * points.counted).sum(dim=-1) > 0
     error = torch.where(above, -height, height)
-    return _Solution(near.normal, through.normal, error, weights > _HEAVY)
+    return _Solution(near.normal, through.normal, error, weights > _MIN_HEAVY_WEIGHT)
 
 
 def _first_wins(first: _Solution, second: _Solution, points: _Offsets) -> Tensor:
@@ -309,10 +309,10 @@ def _fit_graduated(
     for done in range(remaining[0] if remaining else 0):
         while remaining[active - 1] <= done:
             active -= 1
-        moving = slice(0, active)
-        moved = step(points.take(moving), plane.take(moving), decay, shift)
-        arrived = plane.take(slice(active, None))
-        plane = _Plane(*map(torch.cat, zip(moved, arrived, strict=True)))
+        active_rows = slice(0, active)
+        updated = step(points.take(active_rows), plane.take(active_rows), decay, shift)
+        finished = plane.take(slice(active, None))
+        plane = _Plane(*map(torch.cat, zip(updated, finished, strict=True)))
     return plane.take(order.argsort())
 
 
@@ -328,7 +328,7 @@ def _step(points: _Offsets, plane: _Plane, decay: float, shift: bool) -> _Plane:
     if shift:
         points = points.about(center)
         weights = _weigh(points.distances(plane.weighed_normal), plane.weighed_mu, points.counted)
-        heavy = weights * (weights > _HEAVY)
+        heavy = weights * (weights > _MIN_HEAVY_WEIGHT)
         total = heavy.sum(dim=-1, keepdim=True)
         heights = (heavy * points.distances(plane.normal)).sum(dim=-1, keepdim=True)
         move = plane.normal * (heights / torch.where(total > 0, total, 1.0))
@@ -347,8 +347,8 @@ def _count_steps(mu: Tensor, limit: Tensor, decay: float, *, stay_above: bool) -
     num_steps = torch.zeros(len(mu), dtype=torch.int64, device=mu.device)
     while True:
         following = mu / decay
-        goes_on = following >= limit if stay_above else mu > limit
-        if not bool(goes_on.any()):
+        continues = following >= limit if stay_above else mu > limit
+        if not bool(continues.any()):
             return num_steps.clamp(min=_MIN_STEPS)
-        num_steps += goes_on.squeeze(-1)
-        mu = torch.where(goes_on, following, mu)
+        num_steps += continues.squeeze(-1)
+        mu = torch.where(continues, following, mu)

@@ -16,7 +16,7 @@ from torchrg._checks import in_own_precision
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root, square_root
 from torchrg.linalg.moments import Columns, along, sq_lengths, sum_neighbors
-from torchrg.normals.pca import about_first, check_patches, fit_plane, patch_resolution
+from torchrg.normals.pca import center_on_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
 _NUM_TERMS = 6
@@ -103,7 +103,7 @@ def fit_jet(
     """
     check_patches("fit_jet", patches, mask, resolution)
     plane, frame = fit_plane(patches, mask, resolution)
-    place, offsets = about_first(patches, mask)
+    position, offsets = center_on_first(patches, mask)
     axes = _tangent_axes(frame)
     u, v, w = (offsets @ axes).unbind(dim=-1)
     rounding = patch_resolution(patches, mask) if resolution is None else resolution
@@ -113,7 +113,7 @@ def fit_jet(
     valid = plane.valid
     return JetFit(
         torch.where(valid[..., None], (axes @ normal[..., None]).squeeze(-1), 0.0),
-        torch.where(valid[..., None], place + height[..., None] * axes[..., 2], 0.0),
+        torch.where(valid[..., None], position + height[..., None] * axes[..., 2], 0.0),
         torch.where(valid[..., None], curvatures, 0.0),
         torch.where(valid[..., None, None], directions @ axes.mT, 0.0),
         plane.curvature,
@@ -178,16 +178,16 @@ def _fit_height(
     ones = torch.ones_like(u) if mask is None else mask.to(u.dtype)
     sides = [_mean_size(u), _mean_size(v)]
     # Coordinate rounding, relative to the column size, hides dependent columns.
-    rough = [rounding[..., None] / side for side in sides]
+    rounding_ratio = [rounding[..., None] / side for side in sides]
     exact = rank_tolerance(u.shape[-1], u.dtype)
     quadratic = torch.where(torch.as_tensor(count, device=u.device) < _NUM_TERMS, torch.inf, exact)
     fractions = (
         exact,
-        exact + rough[0],
-        exact + rough[1],
-        quadratic + 2 * rough[0],
-        quadratic + rough[0] + rough[1],
-        quadratic + 2 * rough[1],
+        exact + rounding_ratio[0],
+        exact + rounding_ratio[1],
+        quadratic + 2 * rounding_ratio[0],
+        quadratic + rounding_ratio[0] + rounding_ratio[1],
+        quadratic + 2 * rounding_ratio[1],
     )
     terms = _quadratic_terms(ones, u / sides[0], v / sides[1])
     coefficients, residual = least_squares(list(zip(terms, fractions, strict=True)), w)
@@ -225,9 +225,9 @@ def least_squares(
         for direction in basis:
             mix.append((direction * residual).sum(dim=-1, keepdim=True))
             residual = residual - mix[-1] * direction
-        sq_rest = (residual * residual).sum(dim=-1, keepdim=True)
-        is_independent = sq_rest > fraction * fraction * (column * column).sum(dim=-1, keepdim=True)
-        length = torch.where(is_independent, sq_rest, 1.0).sqrt()
+        square = (residual * residual).sum(dim=-1, keepdim=True)
+        is_independent = square > fraction * fraction * (column * column).sum(dim=-1, keepdim=True)
+        length = torch.where(is_independent, square, 1.0).sqrt()
         basis.append(torch.where(is_independent, residual / length, 0.0))
         mixing.append([*mix, length])
     projections = []

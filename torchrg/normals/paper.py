@@ -32,7 +32,7 @@ def fit_normals_robust(
     *,
     estimator: Callable[..., RobustFit] = fit_detmcd,
     resolution: Tensor | None = None,
-    **settings: Any,  # noqa: ANN401 - of the estimator, which knows them
+    **settings: Any,  # noqa: ANN401 - passed to the estimator
 ) -> NormalFit:
     """Fit a plane to the inliers of each patch's robust location and scatter.
 
@@ -110,8 +110,8 @@ def find_sharp_points(
     def classify(block: slice) -> None:
         near = neighbors.at(block)
         counted = near.valid if valid is None else near.counted() & near.of(valid)
-        around = [near.of(column) for column in columns]
-        chords = sq_chords([component[:, :1] for component in around], around)
+        near_columns = [near.of(column) for column in columns]
+        chords = sq_chords([component[:, :1] for component in near_columns], near_columns)
         exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
         sharp[block] = exceeds(chords, counted, angle_deg)
 

@@ -33,7 +33,7 @@ FitPatches = Callable[..., NormalFit]
 Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 """Points, neighbors, configuration, chunk size -> fit."""
 
-_NARROW = 0.03
+_MIN_RATIO = 0.03
 """Minimum ratio of width to length of a patch resolved by its covariance; below it is rounding."""
 
 
@@ -91,7 +91,7 @@ def _decompose_for_normals(patches: Tensor, mask: Tensor | None) -> _Decompositi
     """Decompose bit-identically to the kernels if only values and normals are needed."""
     if patches.dtype != torch.float32 or patches.requires_grad or not has_values(patches, mask):
         return _decompose(patches, mask)
-    columns = about_first(patches, mask)[1].unbind(dim=-1)
+    columns = center_on_first(patches, mask)[1].unbind(dim=-1)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(patches.dtype)
     _, matrix = weighted_moments(columns, counted)
     values, normals = smallest_eigenvector3(matrix)
@@ -132,12 +132,12 @@ def fit_points_pca(
     num_neighbors = neighbors.indices.shape[1]
     if not kernels.serve(points, *neighbors, k=num_neighbors):
         return fit_points(points, neighbors, _fit_normals, chunk_size=chunk_size)
-    places, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
+    positions, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
 
     def work(rows: slice) -> tuple[Tensor, ...]:
         resolution = coordinate_resolution(points[rows])
         near = neighbors.at(rows)
-        return kernels.call("fit_normals_pca", places, *near, resolution, tolerance, _NARROW)
+        return kernels.call("fit_normals_pca", positions, *near, resolution, tolerance, _MIN_RATIO)
 
     parts = map_chunks(work, len(points), chunk_size, points.device)
     normals, curvature, rms, valid, narrow = map(torch.cat, zip(*parts, strict=True))
@@ -145,8 +145,8 @@ def fit_points_pca(
     rows = places_of(narrow)
     if len(rows) == 0:
         return fit
-    again = fit_points(points, neighbors, _fit_normals, rows=rows, chunk_size=chunk_size)
-    return replace_rows(fit, rows, again)
+    refitted = fit_points(points, neighbors, _fit_normals, rows=rows, chunk_size=chunk_size)
+    return replace_rows(fit, rows, refitted)
 
 
 def check_patches(
@@ -170,7 +170,7 @@ def _spans_plane(
         resolution = patch_resolution(patches, mask)
     lengths, widths = (square_root(values[..., axis].clamp(min=0)) for axis in (2, 1))
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
-    narrow = widths < _NARROW * lengths
+    narrow = widths < _MIN_RATIO * lengths
     if not has_values(patches, mask, values):
         widths = torch.where(narrow, _width(patches, mask), widths)
     elif bool(narrow.any()):
@@ -203,7 +203,7 @@ def fit_points(
     *,
     rows: Tensor | None = None,
     chunk_size: int = CHUNK_SIZE,
-    **of_points: Tensor,
+    **point_arguments: Tensor,
 ) -> NormalFit:
     """Fit the neighborhoods of the given points of a cloud ``(N, 3)``, default all.
 
@@ -216,7 +216,7 @@ def fit_points(
         chosen = chunk if rows is None else rows[chunk]
         indices, mask = neighbors.at(chosen)
         patches = gather_patches(points, indices)
-        extra = {name: values[chosen] for name, values in of_points.items()}
+        extra = {name: values[chosen] for name, values in point_arguments.items()}
         return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **extra)
 
     num_rows = len(points) if rows is None else len(rows)
@@ -239,7 +239,7 @@ def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
     return estimate
 
 
-def about_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+def center_on_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the first counted point of each patch, and all points relative to it.
 
     Zero if no point counts, and for masked points, which may be NaN.
@@ -247,9 +247,9 @@ def about_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     if mask is None:
         return patches[..., 0, :], patches - patches[..., :1, :]
     first = mask.to(torch.uint8).argmax(dim=-1)[..., None, None]
-    place = patches.gather(-2, first.expand(*first.shape[:-1], 3))
-    place = torch.where(mask.any(dim=-1)[..., None, None], place, 0.0)
-    return place.squeeze(-2), torch.where(mask[..., None], patches - place, 0.0)
+    origin = patches.gather(-2, first.expand(*first.shape[:-1], 3))
+    origin = torch.where(mask.any(dim=-1)[..., None, None], origin, 0.0)
+    return origin.squeeze(-2), torch.where(mask[..., None], patches - origin, 0.0)
 
 
 def replace_rows(fit: NormalFit, rows: Tensor, refined: NormalFit) -> NormalFit:

@@ -69,7 +69,7 @@ def estimate_consensus(
         return fit._replace(sharp=torch.zeros_like(fit.valid))
     survey = survey_noise(points, neighbors, fit, chunk_size=size)
     if config.adaptive_k is not None:
-        count = wanted_neighbors(_noise_fraction(survey), neighbors.indices.shape[1], config)
+        count = adapted_count(_noise_fraction(survey), neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
             fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
@@ -86,10 +86,10 @@ def estimate_consensus(
 
     errors = standard_errors(points, neighbors, planes, survey, sharp, chunk_size=size)
     uncertain = (fit.valid & (errors > constants.MIN_ERROR)).nonzero().squeeze(-1)
-    voters = voted.nonzero().squeeze(-1)
+    voted_rows = voted.nonzero().squeeze(-1)
     for _ in range(constants.NUM_PASSES):
         planes = smooth_planes(points, neighbors, planes, noise, errors, uncertain, chunk_size=size)
-        planes = choose_planes(points, neighbors, planes, noise, voters, chunk_size=size)
+        planes = choose_planes(points, neighbors, planes, noise, voted_rows, chunk_size=size)
     curvature, residual_rms = describe_inliers(
         points, neighbors, planes, noise, fit, sharp, chunk_size=size
     )
@@ -98,11 +98,11 @@ def estimate_consensus(
 
 def _noise_fraction(survey: Survey) -> Tensor:
     """Return the ratio of noise to neighborhood radius, shape ``(N,)``; NaN if unknown."""
-    is_told = survey.noise.isfinite() & (survey.radius > 0)
-    return torch.where(is_told, survey.noise / survey.radius, torch.nan)
+    is_known = survey.noise.isfinite() & (survey.radius > 0)
+    return torch.where(is_known, survey.noise / survey.radius, torch.nan)
 
 
-def wanted_neighbors(fractions: Tensor, count: int, config: NormalsConfig) -> int:
+def adapted_count(fractions: Tensor, count: int, config: NormalsConfig) -> int:
     """Return the number of neighbors for which noise is a small fraction of the radius.
 
     ``fractions`` are the ratios of noise to radius of all points with ``count`` neighbors, NaN if
@@ -116,5 +116,5 @@ def wanted_neighbors(fractions: Tensor, count: int, config: NormalsConfig) -> in
     finite = fractions[~fractions.isnan()]
     if config.adaptive_k is None or len(finite) == 0:
         return count
-    wanted = round(count * (float(finite.median()) / constants.ADAPTIVE_NOISE) ** 2)
-    return min(max(count, wanted), config.adaptive_k, len(fractions))
+    adapted = round(count * (float(finite.median()) / constants.ADAPTIVE_NOISE) ** 2)
+    return min(max(count, adapted), config.adaptive_k, len(fractions))

@@ -53,45 +53,45 @@ def vote_planes(
     normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
     for chunk in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(ranks)), 1)):
         near = columns[0][chunk], columns[1][chunk], columns[2][chunk]
-        normals[chunk] = _most_supported(near, weights[chunk], start[chunk], reach[chunk], ranks)
+        normals[chunk] = _best_normals(near, weights[chunk], start[chunk], reach[chunk], ranks)
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach)
+        normals, offsets = _refit(*columns, weights, normals, offsets, reach)
     weights = (1 - constants.FIT_FALLOFF * nearness) * counted
     reach = constants.FIT_REACH * noise
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, bisquare=True)
+        normals, offsets = _refit(*columns, weights, normals, offsets, reach, bisquare=True)
     return normals, offsets
 
 
-def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
+def support_scores(distances: Tensor, weights: Tensor) -> Tensor:
     """Return the scores ``(*, n)`` of planes from residuals ``(*, n, K)`` in units of the reach."""
-    support = sum_neighbors((1 - rests * rests).clamp_(min=0).mul_(weights))
-    over = sum_neighbors(above(rests, 1).mul_(weights))
-    under = sum_neighbors(above(-rests, 1).mul_(weights))
+    support = sum_neighbors((1 - distances * distances).clamp_(min=0).mul_(weights))
+    over = sum_neighbors(above(distances, 1).mul_(weights))
+    under = sum_neighbors(above(-distances, 1).mul_(weights))
     return support - torch.minimum(over, under)
 
 
-def _most_supported(
+def _best_normals(
     columns: Columns, weights: Tensor, start: Tensor, reach: Tensor, ranks: Tensor
 ) -> Tensor:
     """Return the normals of the best planes through the points: ``start``, or by ranks."""
     candidates, spanned = _planes_through(columns, ranks)
     candidates = torch.cat([start[:, None], candidates], dim=1)
     x, y, z = columns
-    rests = along((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
-    scores = support_scores(rests, weights[:, None])
+    distances = along((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
+    scores = support_scores(distances, weights[:, None])
     spanned = torch.cat([torch.ones_like(spanned[:, :1]), spanned], dim=1)
     best = torch.where(spanned, scores, -torch.inf).argmax(dim=1, keepdim=True)
     return candidates.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
 
 
-def _within(rests: Tensor, reach: Tensor) -> Tensor:
+def _parabolic_weights(distances: Tensor, reach: Tensor) -> Tensor:
     """Return ``max(0, 1 - (r / reach)^2)``."""
-    rests = rests / reach[:, None]
-    return (1 - rests * rests).clamp_(min=0)
+    distances = distances / reach[:, None]
+    return (1 - distances * distances).clamp_(min=0)
 
 
-def _refitted(
+def _refit(
     x: Tensor,
     y: Tensor,
     z: Tensor,
@@ -103,12 +103,12 @@ def _refitted(
     bisquare: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return planes fitted to the points near planes; unchanged if these points span none."""
-    near = _within(residuals((x, y, z), normals, offsets), reach)
+    near = _parabolic_weights(residuals((x, y, z), normals, offsets), reach)
     if bisquare:
         near *= near
-    fitted, moved, values = fit_weighted_planes((x, y, z), weights * near)
+    fitted, shifted, values = fit_weighted_planes((x, y, z), weights * near)
     spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
-    return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
+    return torch.where(spread[:, None], fitted, normals), torch.where(spread, shifted, offsets)
 
 
 def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
@@ -180,20 +180,20 @@ def fit_meeting_planes(
     rows = (two.deviations > constants.CORNER_LIMIT * noise).nonzero().squeeze(-1)
     corners = (columns[0][rows], columns[1][rows], columns[2][rows])
     start = MeetingPlanes(*(values[rows] for values in two))
-    least = constants.CORNER_FRACTION * start.deviations
-    best = start._replace(deviations=least)
+    limit = constants.CORNER_FRACTION * start.deviations
+    best = start._replace(deviations=limit)
     for groups in (
         split_off(wedge.first[rows], wedge.outer[rows], noise[rows]),
         split_by_votes(corners, normals[rows], offsets[rows], noise[rows]),
     ):
-        best = _better(best, fit_corners(corners, groups))
-    improved = best.deviations < least
+        best = _select_better(best, fit_corners(corners, groups))
+    improved = best.deviations < limit
     rows = rows[improved]
     merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(two, best, strict=True)]
     return MeetingPlanes(*merged)
 
 
-def _better(one: MeetingPlanes, other: MeetingPlanes) -> MeetingPlanes:
+def _select_better(one: MeetingPlanes, other: MeetingPlanes) -> MeetingPlanes:
     """Return the fit with the smaller deviation for each point."""
     less = other.deviations < one.deviations
     return MeetingPlanes(
@@ -214,8 +214,8 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
     the nearest of two unbounded planes, this is correct for points that noise has moved out of the
     solid. For arguments see :func:`fit_meeting_planes`.
     """
-    rests = residuals(columns, normals, offsets)
-    second, first = _beyond(rests, noise), _near(rests, noise)
+    distances = residuals(columns, normals, offsets)
+    second, first = _off_surface(distances, noise), _near(distances, noise)
     present = torch.ones_like(noise, dtype=torch.bool)
     for _ in range(constants.NUM_ALTERNATIONS):
         first, second, outer, present, *planes = _wedge(*columns, first, second, present)
@@ -274,9 +274,9 @@ def _corner(
     columns = x, y, z
     present = present & _all_present((first, second, third))
     planes = fit_planes_to_each(columns, (first, second, third))
-    rests = [residuals(columns, *plane) for plane in planes]
-    inside = _inside(rests[0], second), _inside(rests[1], first)
-    wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
+    distances = [residuals(columns, *plane) for plane in planes]
+    inside = _inside(distances[0], second), _inside(distances[1], first)
+    wedge, added = torch.minimum(*inside), _inside(distances[2], first + second)
     side = torch.where(side == 0, _side(sum_neighbors(wedge * third)).squeeze(1), side)
     wedge *= side[:, None]
     outer = torch.minimum(added, wedge) * side[:, None]
@@ -288,7 +288,7 @@ def _corner(
 
 def split_off(first: Tensor, outer: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the two groups of a wedge, and the points off it on its fuller side as a third."""
-    third = _beyond(outer, noise)
+    third = _off_surface(outer, noise)
     return first * (1 - third), (1 - first) * (1 - third), third
 
 
@@ -300,31 +300,31 @@ def split_by_votes(
     The voted plane passes through the nearest of the remaining points.
     """
     first = _near(residuals(columns, normals, offsets), noise)
-    others = 1 - first
-    anchor = others.argmax(dim=1, keepdim=True)
-    moved = tuple(column - column.gather(1, anchor) for column in columns)
-    about: Columns = (moved[0], moved[1], moved[2])
-    plane = vote_planes(about, noise, fit_weighted_planes(about, others)[0], others)
-    second = _near(residuals(about, *plane), noise) * others
-    return first, second, others - second
+    remaining = 1 - first
+    anchor = remaining.argmax(dim=1, keepdim=True)
+    shifted = tuple(column - column.gather(1, anchor) for column in columns)
+    about: Columns = (shifted[0], shifted[1], shifted[2])
+    plane = vote_planes(about, noise, fit_weighted_planes(about, remaining)[0], remaining)
+    second = _near(residuals(about, *plane), noise) * remaining
+    return first, second, remaining - second
 
 
-def _near(rests: Tensor, noise: Tensor) -> Tensor:
+def _near(distances: Tensor, noise: Tensor) -> Tensor:
     """Return a mask of points within twice the noise of a plane, as 0 or 1."""
-    return at_most(rests.abs(), (constants.MEETING_GAP * noise)[:, None])
+    return at_most(distances.abs(), (constants.MEETING_GAP * noise)[:, None])
 
 
-def _beyond(rests: Tensor, noise: Tensor) -> Tensor:
+def _off_surface(distances: Tensor, noise: Tensor) -> Tensor:
     """Return the points off a surface by more than twice the noise, on the side with more."""
     gap = constants.MEETING_GAP * noise[:, None]
-    over, under = above(rests, gap), above(-rests, gap)
+    over, under = above(distances, gap), above(-distances, gap)
     more = at_most(under.sum(dim=1), over.sum(dim=1))[:, None]
     return over.mul_(more).add_(under.mul_(1 - more))
 
 
-def _inside(rests: Tensor, others: Tensor) -> Tensor:
+def _inside(distances: Tensor, others: Tensor) -> Tensor:
     """Return distances to a plane, positive on the side of ``others``."""
-    return rests * _side(sum_neighbors(rests * others))
+    return distances * _side(sum_neighbors(distances * others))
 
 
 def _side(totals: Tensor) -> Tensor:

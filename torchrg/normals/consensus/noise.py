@@ -67,21 +67,21 @@ def survey_noise(
 
     def work(block: slice) -> None:
         near = neighbors.at(block)
-        offsets[block], radius[block], whole, layered, again, *nearest = _survey(
+        offsets[block], radius[block], single, layered, repeats, *nearest = _survey(
             points, near, fit.normals[block], fit.valid[block]
         )
-        if len(rows := places_of(again)):
-            patches, counted = _each_place_once(points, near.at(rows))
+        if len(rows := places_of(repeats)):
+            patches, counted = _move_duplicates(points, near.at(rows))
             for values, size in zip(nearest, constants.NOISE_COUNTS, strict=True):
                 values[rows] = _small_deviations(patches, counted, size)
-        torch.stack([whole, layered, *nearest], dim=1, out=deviations[block])
+        torch.stack([single, layered, *nearest], dim=1, out=deviations[block])
 
     map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
-    whole, layered, *small = _neighbor_quantiles(
+    single, layered, *small = _neighbor_quantiles(
         deviations, neighbors, constants.NOISE_QUANTILE
     ).unbind(dim=1)
-    noise = constants.NOISE_FACTOR_OF_ALL * torch.minimum(whole, layered)
+    noise = constants.NOISE_FACTOR_OF_ALL * torch.minimum(single, layered)
     count: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
         count = neighbors.valid.sum(dim=1)
@@ -146,12 +146,12 @@ def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> 
             constants.NUM_REFITS,
             constants.MIN_PLANE_POINTS,
         )
-    offsets, radius, whole, looks_layered, again = _deviations(points, *near, normals, valid)
-    layered = torch.full_like(whole, torch.inf)
+    offsets, radius, single, looks_layered, repeats = _deviations(points, *near, normals, valid)
+    layered = torch.full_like(single, torch.inf)
     if len(rows := places_of(looks_layered)):
-        layered[rows] = _layered_deviations(points, near.at(rows), normals[rows], whole[rows])
-    of_nearest = [_of_nearest(points, near, count) for count in counts]
-    return offsets, radius, whole, layered, again, *of_nearest
+        layered[rows] = _layered_deviations(points, near.at(rows), normals[rows], single[rows])
+    nearest = [_nearest_deviations(points, near, count) for count in counts]
+    return offsets, radius, single, layered, repeats, *nearest
 
 
 def _deviations(
@@ -163,19 +163,19 @@ def _deviations(
     count = counted.sum(dim=1)
     center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
     offsets = dot(normals, torch.stack(center, dim=-1))
-    rests = residuals(columns, normals, offsets)
-    squares = rests * rests * counted
+    distances = residuals(columns, normals, offsets)
+    squares = distances * distances * counted
     second, fourth = sum_neighbors(squares), sum_neighbors(squares.square())
     deviations = square_root(second / (count - 3).clamp(min=1))
-    whole = torch.where(valid & (count > 3), deviations, torch.inf)
+    single = torch.where(valid & (count > 3), deviations, torch.inf)
     radius = square_root((sq_lengths(columns) * counted).amax(dim=1))
     low = fourth * count < constants.MAX_LAYERED_KURTOSIS * second * second
     moves = sum((column[:, 1:] - column[:, :-1]).abs_() for column in columns)
     assert isinstance(moves, Tensor)  # noqa: S101
-    return offsets, radius, whole, low & whole.isfinite(), (moves == 0).any(dim=1)
+    return offsets, radius, single, low & single.isfinite(), (moves == 0).any(dim=1)
 
 
-def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole: Tensor) -> Tensor:
+def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, single: Tensor) -> Tensor:
     """Return deviations from two parallel planes, the faces of a plate; inf if there are none."""
     columns = gather_columns(points, near.indices)
     counted = near.counted().to(points.dtype)
@@ -189,21 +189,21 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole:
     num_upper = upper.sum(dim=1)
     deviations = square_root(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
-    layered &= deviations <= constants.MAX_LAYERED_FRACTION * whole
+    layered &= deviations <= constants.MAX_LAYERED_FRACTION * single
     return torch.where(layered, deviations, torch.inf)
 
 
-def _each_place_once(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
+def _move_duplicates(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
     """Move duplicates of the previous neighbor to the end, where they do not count."""
     patches, counted = gather_patches(points, near.indices), near.counted()
-    again = torch.zeros_like(counted)
-    again[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=-1)
-    order = again.to(torch.uint8).argsort(dim=1, stable=True)
-    once = (counted & ~again).gather(1, order).to(points.dtype)
+    repeats = torch.zeros_like(counted)
+    repeats[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=-1)
+    order = repeats.to(torch.uint8).argsort(dim=1, stable=True)
+    once = (counted & ~repeats).gather(1, order).to(points.dtype)
     return patches.gather(1, order[:, :, None].expand(-1, -1, 3)), once
 
 
-def _of_nearest(points: Tensor, near: Neighbors, count: int) -> Tensor:
+def _nearest_deviations(points: Tensor, near: Neighbors, count: int) -> Tensor:
     """Return deviations of the ``count`` nearest points from their plane."""
     patches = gather_patches(points, near.indices[:, :count])
     return _small_deviations(patches, near.counted()[:, :count].to(points.dtype), count)
@@ -219,8 +219,8 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     columns = split_columns(patches[:, :count])
     counted = counted[:, :count]
     normals, offsets, values = fit_weighted_planes(columns, counted)
-    rests = residuals(columns, normals, offsets)
-    spread = sum_neighbors(rests * rests) / (count - 3)
+    distances = residuals(columns, normals, offsets)
+    spread = sum_neighbors(distances * distances) / (count - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
     return torch.where(broad, square_root(spread), torch.inf)
 
@@ -235,19 +235,19 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
         if kernels.serve(values, *near, k=k):
             (quantiles[block],) = kernels.call("neighbor_quantiles", values, *near, quantile, rank)
             return
-        for column, into in zip(values.unbind(dim=1), quantiles[block].unbind(dim=1), strict=True):
-            of_neighbors = near.of(column)
+        for column, out in zip(values.unbind(dim=1), quantiles[block].unbind(dim=1), strict=True):
+            near_values = near.of(column)
             if near.valid is None and values.device.type == "cpu":
                 # Ten times faster than torch.
-                of_neighbors.numpy().partition(rank - 1, axis=1)
-                into[:] = of_neighbors[:, rank - 1]
+                near_values.numpy().partition(rank - 1, axis=1)
+                out[:] = near_values[:, rank - 1]
                 continue
             if near.valid is None:
-                into[:] = of_neighbors.kthvalue(rank, dim=1).values
+                out[:] = near_values.kthvalue(rank, dim=1).values
                 continue
             ranks = (quantile * near.valid.sum(dim=1, keepdim=True)).ceil().clamp(min=1)
-            ascending = torch.where(near.valid, of_neighbors, torch.inf).sort(dim=1).values
-            into[:] = ascending.gather(1, ranks.long() - 1).squeeze(1)
+            ascending = torch.where(near.valid, near_values, torch.inf).sort(dim=1).values
+            out[:] = ascending.gather(1, ranks.long() - 1).squeeze(1)
 
     map_chunks(work, len(values), ROWS_IN_CACHE, values.device)
     return quantiles

@@ -94,25 +94,25 @@ def _smoothed(
     a, b, c = (column.index_select(0, rows)[:, None] for column in parts.unbind())
     cosines = x * a + y * b + z * c
     sign = signs(cosines)
-    rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
+    distances = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
     sq_chords = 2 * (1 - cosines.abs())
     sq_error = near.of(errors).square()
     sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
     reach = constants.SMOOTHING_REACH * noise[rows][:, None]
     weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
-    weights *= (1 - (rests / reach).square_()).clamp_(min=0)
-    weights *= _falling(columns, constants.FIT_FALLOFF)
+    weights *= (1 - (distances / reach).square_()).clamp_(min=0)
+    weights *= _distance_weights(columns, constants.FIT_FALLOFF)
     if near.valid is not None:
         weights *= near.valid
     weights = _balanced(columns, weights) * sign
     mean = torch.stack([sum_neighbors(weights * column) for column in (x, y, z)], dim=-1)
     length = square_root(dot(mean, mean))
     has_mean = length > 0
-    safe = torch.where(has_mean, length, 1.0)
-    normals = torch.where(has_mean[:, None], mean / safe[:, None], torch.cat([a, b, c], dim=1))
+    divisor = torch.where(has_mean, length, 1.0)
+    normals = torch.where(has_mean[:, None], mean / divisor[:, None], torch.cat([a, b, c], dim=1))
     total = torch.where(has_mean, sum_neighbors(weights * sign), 1.0)
-    moved = -sum_neighbors(weights * rests) / total
-    return normals, torch.where(has_mean, moved, offsets[rows])
+    new_offsets = -sum_neighbors(weights * distances) / total
+    return normals, torch.where(has_mean, new_offsets, offsets[rows])
 
 
 def choose_planes(
@@ -174,25 +174,25 @@ def _chosen(
     """Return the best planes of points among the planes of their neighbors at ``ranks``."""
     near = Neighbors(indices, valid).at(rows)
     columns = gather_columns(points, near.indices)
-    weights = _falling(columns, constants.VOTE_FALLOFF)
+    weights = _distance_weights(columns, constants.VOTE_FALLOFF)
     if near.valid is not None:
         weights *= near.valid
     scale = noise[rows][:, None]
     other = near.indices.index_select(1, ranks).long()
     axes = normals[other]
-    places = torch.stack([column.index_select(1, ranks) for column in columns], dim=-1)
-    moved = offsets[other] + dot(axes, places)
+    positions = torch.stack([column.index_select(1, ranks) for column in columns], dim=-1)
+    new_offsets = offsets[other] + dot(axes, positions)
     reach = constants.VOTE_REACH * scale
     x, y, z = (column[:, None] for column in columns)
-    rests = along((x, y, z), axes / reach[:, :, None]) - (moved / reach)[:, :, None]
-    away = moved / scale
-    support = support_scores(rests, weights[:, None]) / sum_neighbors(weights)[:, None]
-    score = support - constants.CHOICE_COST * away * away
-    usable = (away.abs() < constants.INLIER_REACH) & (dot(axes, axes) > 0)
+    distances = along((x, y, z), axes / reach[:, :, None]) - (new_offsets / reach)[:, :, None]
+    offset_ratio = new_offsets / scale
+    support = support_scores(distances, weights[:, None]) / sum_neighbors(weights)[:, None]
+    score = support - constants.CHOICE_COST * offset_ratio * offset_ratio
+    usable = (offset_ratio.abs() < constants.INLIER_REACH) & (dot(axes, axes) > 0)
     best = torch.where(usable, score, -torch.inf).argmax(dim=1, keepdim=True)
     has_choice = usable.gather(1, best)
     normal = axes.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
-    offset = torch.where(has_choice, moved.gather(1, best), offsets[rows][:, None])
+    offset = torch.where(has_choice, new_offsets.gather(1, best), offsets[rows][:, None])
     return torch.where(has_choice, normal, normals[rows]), offset.squeeze(1)
 
 
@@ -264,13 +264,13 @@ def _inliers(
     if kernels.serve(*arguments, k=indices.shape[1]):
         return kernels.call("inliers", *arguments, rows, constants.INLIER_REACH)
     columns = gather_columns(points, indices[rows])
-    rests = residuals(columns, normals[rows], offsets[rows]).abs()
-    near = rests <= (constants.INLIER_REACH * noise[rows])[:, None]
+    distances = residuals(columns, normals[rows], offsets[rows]).abs()
+    near = distances <= (constants.INLIER_REACH * noise[rows])[:, None]
     weights = (near & Neighbors(indices, valid).counted(rows)).to(points.dtype)
     return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 
-def _falling(columns: Columns, fraction: float) -> Tensor:
+def _distance_weights(columns: Columns, fraction: float) -> Tensor:
     """Return weights that decrease with the squared distance, by ``fraction`` at the farthest."""
     sq_distances = sq_lengths(columns)
     farthest = sq_distances.amax(dim=1, keepdim=True)

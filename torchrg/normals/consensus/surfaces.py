@@ -52,17 +52,17 @@ def fit_surfaces(
     """
     noise, points = survey.noise, points.contiguous()
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
-    bent = survey.deviations.clone()
+    deviations = survey.deviations.clone()
 
-    def bend(rows: Tensor) -> None:
+    def fit_curved(rows: Tensor) -> None:
         fitted = _paraboloids(points, *neighbors, fit.normals, rows)
-        normals[rows], offsets[rows], bent[rows] = fitted
+        normals[rows], offsets[rows], deviations[rows] = fitted
 
     not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
-    map_chosen(bend, not_flat, chunk_size)
-    broken = not_flat & (bent > constants.CURVED_LIMIT * noise)
-    broken &= bent > constants.CURVED_FRACTION * survey.deviations
-    far_off = bent > constants.FAR_OFF * noise
+    map_chosen(fit_curved, not_flat, chunk_size)
+    broken = not_flat & (deviations > constants.CURVED_LIMIT * noise)
+    broken &= deviations > constants.CURVED_FRACTION * survey.deviations
+    far_off = deviations > constants.FAR_OFF * noise
     gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
     by_votes, meeting = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
 
@@ -75,17 +75,17 @@ def fit_surfaces(
         has_planes = planes.deviations.isfinite()
         residual = torch.where(has_planes, planes.deviations, scale)
         unit = torch.maximum(scale, residual)
-        drop = (bent[rows] / unit).square() - (residual / unit).square()
+        drop = (deviations[rows] / unit).square() - (residual / unit).square()
         num_neighbors: int | Tensor = neighbors.indices.shape[1]
         if neighbors.valid is not None:
             num_neighbors = neighbors.valid[rows].sum(dim=1)
         drop *= num_neighbors - _PARABOLOID_PARAMETERS
-        most = constants.MAX_GAIN
-        gain[rows] = torch.where(has_planes, drop, -most).clamp_(-most, most)
+        upper = constants.MAX_GAIN
+        gain[rows] = torch.where(has_planes, drop, -upper).clamp_(-upper, upper)
 
-    asked = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
-    for same in _by_count(asked, neighbors):
-        map_chosen(split, same, chunk_size)
+    candidates = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
+    for group in _group_by_count(candidates, neighbors):
+        map_chosen(split, group, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meets = broken & explained & (gain > constants.MIN_GAIN) & (pooled > constants.MIN_POOLED_GAIN)
     voted = broken & ~meets & far_off
@@ -107,7 +107,7 @@ def broken_planes(
     if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
         count = near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
         fits = kernels.call(
-            "broken_planes", points, *near, noise, normals, candidate_ranks(count), _numbers()
+            "broken_planes", points, *near, noise, normals, candidate_ranks(count), _kernel_args()
         )
         return TangentPlanes(*fits[:2]), MeetingPlanes(*fits[2:])
     columns = _gather_counted(points, near)
@@ -115,7 +115,7 @@ def broken_planes(
     return TangentPlanes(*voted), fit_meeting_planes(columns, *voted, noise)
 
 
-def _numbers() -> Tensor:
+def _kernel_args() -> Tensor:
     """Return the constants for the kernel of :func:`broken_planes`, in its order."""
     return torch.tensor(
         [
@@ -145,7 +145,7 @@ def _paraboloids(
     return fit_paraboloids(gather_columns(points, indices[rows]), normals[rows], counted)
 
 
-def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
+def _group_by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
     """Return the chosen points grouped by their number of counted neighbors."""
     if neighbors.valid is None:
         return [chosen]
@@ -166,9 +166,9 @@ def _gather_counted(points: Tensor, near: Neighbors) -> Columns:
 
 def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
     """Return points whose gain can make an average large enough; spares most of the fits."""
-    most = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
-    open_points = broken & (most > constants.MIN_POOLED_GAIN)
-    pooled = neighbors.indices[open_points, : constants.NUM_POOLED].reshape(-1)
+    upper = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
+    candidates = broken & (upper > constants.MIN_POOLED_GAIN)
+    pooled = neighbors.indices[candidates, : constants.NUM_POOLED].reshape(-1)
     return torch.zeros_like(broken).index_fill_(0, pooled.long(), True)
 
 
