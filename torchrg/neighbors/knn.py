@@ -1,4 +1,4 @@
-"""Exact nearest neighbours, by cells or a tree, and the patches they make."""
+"""Exact nearest-neighbor search, by grid cells or a tree, and patches."""
 
 import itertools
 import math
@@ -26,19 +26,20 @@ from torchrg.neighbors.order import canonical_order, distinct_rows, mark_first
 from torchrg.structures import MAX_POINTS, Neighbors, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
-"""Points that tell how far the k-th neighbour is."""
+"""Number of sampled points that estimate the distance of the k-th neighbor."""
 
 _MIN_FOR_CELLS = 2000
-"""Points below which a tree is as fast as cells."""
+"""Minimum number of points for which cells are faster than a tree."""
 
 _SIZE_STEP = 1.5
-"""Cells of one size answer for points whose k-th neighbour is from 1 / 1.75 to 1 size away."""
+"""Ratio of consecutive cell sizes: one size serves points whose k-th neighbor is 1 / 1.75 to 1 size
+away."""
 
 _MIN_FRACTION = 0.03
-"""Share of the points for which another size of cells is worth its sort."""
+"""Minimum fraction of the points for which another cell size is worth its sort."""
 
 _CELLS_A_POINT = 8
-"""Cells of the box about a cloud, empty ones too, that are worth their memory, 4 bytes each."""
+"""Maximum number of cells per point in the bounding box, including empty ones, 4 bytes each."""
 
 
 @of_clouds
@@ -51,21 +52,21 @@ def search_knn(
     offset: Tensor | None = None,
     canonical: bool = False,
 ) -> Neighbors:
-    """Find the ``k`` nearest points of every point, exactly.
+    """Find the exact ``k`` nearest neighbors of every point.
 
     Convention:
-        ``k`` counts the point itself, which always stands first, duplicates or not. The others are
-        sorted by distance; equal distances by :func:`canonical_order`, never by the input order.
+        ``k`` includes the point itself, which always comes first, even with duplicates. Other
+        neighbors are sorted by distance, ties by :func:`canonical_order`, never by the input order.
         The search runs on the CPU with as many threads as torch uses.
 
     Args:
         points: Points, shape ``(N, 3)``, finite.
-        k: Number of neighbours, the point itself included.
-        max_distance: Neighbours farther than this do not count (``valid`` False, index: the point
-            itself): a hybrid search. In the unit of the cloud. Default: no limit.
+        k: Number of neighbors, including the point itself.
+        max_distance: Maximum distance of a neighbor, in coordinate units (hybrid search); farther
+            ones have ``valid`` False and the index of the point itself. Default: no limit.
         offset: Ends of the clouds of a ragged batch, shape ``(B,)``, ascending, the last one ``N``
-            (Pointcept's convention); no neighbour crosses clouds. Default: one cloud.
-        canonical: Whether the points already are in canonical order; saves two passes.
+            (Pointcept's convention); neighbors are from the same cloud. Default: one cloud.
+        canonical: Whether the points are already in canonical order; saves two passes.
 
     Returns:
         Indices of shape ``(N, k)``, int32, on the device of the points.
@@ -127,10 +128,10 @@ def search_knn(
 
 
 def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
-    """Check the lists that a user passes: one for each point, itself first, of rows of the points.
+    """Validate input neighbor lists: one per point, itself first, of rows of the points.
 
     Raises:
-        ShapeError: If they are not as :class:`torchrg.structures.Neighbors` says.
+        ShapeError: If they do not match :class:`torchrg.structures.Neighbors`.
     """
     indices: object = getattr(neighbors, "indices", None)
     if not is_tensor(indices):
@@ -176,15 +177,15 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
 def keep_within(
     neighbors: Neighbors, groups: Tensor, chunk_size: int, places: Rows = slice(None)
 ) -> Neighbors:
-    """Return those neighbors of each point that are of its group, the nearest first.
+    """Restrict the neighbors of each point to its group, nearest first.
 
-    Points of several groups may share a place. They are ascending by place, then by group.
+    Points of different groups may share a position. They are sorted by position, then by group.
 
     Args:
-        neighbors: Neighbors of each place.
-        groups: Group of each point, shape ``(N,)``, from 0 where places are passed.
-        chunk_size: Points handled at a time.
-        places: Place of each point, shape ``(N,)``. Default: each has one point.
+        neighbors: Neighbors of each position.
+        groups: Group of each point, shape ``(N,)``, from 0 if ``places`` are passed.
+        chunk_size: Points processed at a time.
+        places: Index of each point's position, shape ``(N,)``. Default: one point per position.
 
     Example:
         >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
@@ -223,10 +224,10 @@ def keep_within(
 def search_nearest(
     points: NDArray[np.floating], queries: NDArray[np.floating], max_distance: float
 ) -> NDArray[np.int64]:
-    """Return the row of the nearest point of each query ``(M,)``, -1 where none is near enough.
+    """Return the row of the nearest point of each query ``(M,)``, -1 if none is within range.
 
-    Points and queries are finite, ``(N, 3)`` and ``(M, 3)`` in the same coordinates. Of points at
-    equal distances the first in :func:`canonical_order` is taken.
+    Points and queries are finite, ``(N, 3)`` and ``(M, 3)`` in the same coordinates. Ties go to the
+    first point in :func:`canonical_order`.
 
     Example:
         >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
@@ -240,7 +241,7 @@ def search_nearest(
         return nearest
     first = distinct_rows(as_tensor("search_nearest", "points", points)).numpy()
     tree = cKDTree(points[first], balanced_tree=False, compact_nodes=False)
-    # Those close to each other find the same parts of the tree in the cache.
+    # Consecutive close queries use the same cached parts of the tree.
     asked = canonical_order(queries).numpy()
     for chunk in chunks_of(len(asked), ROWS_AT_ONCE):
         distances, places = _query(tree, queries[asked[chunk]], 1)
@@ -249,7 +250,7 @@ def search_nearest(
 
 
 def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int]]:
-    """Return first and last row of each cloud of a ragged batch."""
+    """Return start and stop row of each cloud of a ragged batch."""
     if offset is None:
         return [(0, num_points)]
     ends = [int(end) for end in offset]
@@ -264,7 +265,7 @@ def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int
 
 @sequential_operations()
 def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np.int32]:
-    """Do as :func:`search_knn` for some rows of points in canonical order, at least ``k``."""
+    """Apply :func:`search_knn` to some rows of at least ``k`` points in canonical order."""
     indices = np.empty((len(points), k), dtype=np.int32)
     _search_cloud(points, rows, None, 0, math.inf, indices, None)
     return indices[rows]
@@ -281,8 +282,8 @@ def _search_cloud(
 ) -> None:
     """Search one cloud in canonical order and write results in the caller's order.
 
-    Rows that are not ``asked`` may be answered or not. The tree holds each distinct place once, so
-    that a place with many points costs no more than a place with one.
+    Rows outside ``queries`` may be searched or not. The tree holds each distinct position once, so
+    that duplicates cost nothing.
     """
     from scipy.spatial import cKDTree
 
@@ -340,22 +341,22 @@ def search_cells(
     order: NDArray[np.int64] | None = None,
     first_row: int = 0,
 ) -> NDArray[np.int64]:
-    """Find the k nearest of distinct points ``(N, 3)`` for rows that cells of some size answer for.
+    """Find the k nearest of distinct points ``(N, 3)`` for the rows that grid cells can resolve.
 
-    A cell and the 26 around it hold a few hundred points, whose distances a kernel takes. A result
-    counts only if no point outside the cells can be nearer. The grid is that of the box about the
-    cloud, empty cells too. The point itself counts. This is for where kernels serve.
+    A cell and its 26 neighbors hold a few hundred points, whose distances a kernel computes. A
+    result counts only if no point outside these cells can be nearer. The grid covers the bounding
+    box, including empty cells. The point itself counts. Requires the kernels.
 
     Args:
         points: Distinct points.
-        rows: Those that are asked for, ascending.
-        reach: Distances of the k-th neighbour of a sample of the points.
-        found: Where the neighbours of each point go, ``(N, k)``, sorted by distance, then by row.
-        order: Row of ``found`` for each point, and its number there. Default: its own.
-        first_row: What is added to each number.
+        rows: Query rows, ascending.
+        reach: Distances of the k-th neighbor for a sample of the points.
+        found: Output neighbors of each point, ``(N, k)``, sorted by distance, then by row.
+        order: Row of ``found`` for each point, and its index there. Default: the point's row.
+        first_row: Offset added to each index.
 
     Returns:
-        The rows that are left, ascending. What is in ``found`` for them means nothing.
+        The unresolved rows, ascending. Their values in ``found`` are undefined.
     """
     low, high = bounding_box(points)
     extent = high - low
@@ -374,7 +375,7 @@ def search_cells(
         shape = width, height, *low.tolist(), size
         of_place, _, sorted_places = kernels.call("fill_cells", places, starts, *shape)
         asked.zero_()[torch.from_numpy(rows)] = True
-        # Tasks of about so many points each.
+        # Tasks of about this many points each.
         ends = np.arange(ROWS_IN_CACHE, len(points), ROWS_IN_CACHE)
         bounds = [1, *np.searchsorted(starts.numpy(), ends, side="right").tolist(), len(starts) - 1]
 
@@ -392,7 +393,7 @@ def search_cells(
 
 
 def _cell_sizes(reach: NDArray[np.float64]) -> list[float]:
-    """Return ascending sizes of cells that together answer for nearly all of a sample."""
+    """Return ascending cell sizes that together resolve nearly all of a sample."""
     sizes: list[float] = []
     reach = np.sort(reach[reach > 0])
     few = int(_MIN_FRACTION * len(reach))
@@ -407,7 +408,7 @@ def _query(
     queries: NDArray[np.floating],
     k: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the k nearest of distinct points by (distance, row), ties at the last place too."""
+    """Return the k nearest distinct points by (distance, row), also for ties at the last rank."""
     distances = np.empty((len(queries), k))
     rows = np.empty((len(queries), k), dtype=np.int64)
     left, width = np.arange(len(queries)), k + 1
@@ -431,7 +432,7 @@ def _restore_duplicates(
     counts: NDArray[np.int64],
     k: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-    """Replace places by all their points: their rows, and the nearest k, the point itself first."""
+    """Expand positions to their points: query rows, and the k nearest, the point itself first."""
     before = np.minimum(np.cumsum(counts[nearest], axis=1), k)
     taken = np.diff(before, axis=1, prepend=0).ravel()
     position = np.arange(len(nearest) * k) - np.repeat(np.cumsum(taken) - taken, taken)
@@ -450,10 +451,10 @@ def _restore_duplicates(
 
 
 def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
-    """Return the coordinates of neighbours about the point itself, shape ``(n, K, 3)``.
+    """Return the coordinates of neighbors relative to the point itself, shape ``(n, K, 3)``.
 
-    ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. In memory each
-    coordinate is contiguous, so that ``patches.unbind(-1)`` gives fast columns.
+    ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. Each
+    coordinate is contiguous in memory, so that ``patches.unbind(-1)`` gives fast columns.
 
     Example:
         >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])

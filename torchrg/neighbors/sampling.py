@@ -1,4 +1,4 @@
-"""How a cloud samples its surfaces: what tells a mesh from a scan, and noise from form."""
+"""Surface sampling statistics that distinguish meshes from scans."""
 
 import math
 
@@ -11,39 +11,39 @@ from torchrg.structures import Neighbors, Sampling
 Array = NDArray[np.float64]
 
 _NUM_SAMPLES = 600
-"""Points whose neighbourhoods are measured; medians of so many are within some hundredths."""
+"""Number of measured neighborhoods; their medians are accurate to a few hundredths."""
 _NUM_FOR_HEIGHT = 20_000
-"""Points that the height is measured on."""
+"""Number of points used to measure the height."""
 _SMALL, _LARGE = 16, 100
-"""Points of the two neighbourhoods whose deviations from a plane are compared."""
+"""Sizes of the two neighborhoods whose deviations from a plane are compared."""
 _NEAREST, _EXACT = 9, 1e-3
-"""Points of the neighbourhood that is in a plane, and the deviation by its radius up to which."""
+"""Size of the neighborhood tested for planarity, and its maximum ratio of deviation to radius."""
 _LENDERS = 3
-"""Every third neighbour of a point lends its neighbours to the larger neighbourhood."""
+"""Every third neighbor of a point contributes its neighbors to the larger neighborhood."""
 _OUTLIERS = 0.001
-"""Share of the points that the height leaves out on either side."""
+"""Fraction of the points excluded from the height on either side."""
 _DIGITS = 3
-"""Digits of a measure: fewer than what another unit or origin rounds."""
+"""Significant digits of a measure: fewer than another unit or origin changes by rounding."""
 
 
 def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
-    """Measure how a cloud samples its surfaces, on 600 points evenly along their canonical order.
+    """Measure how a cloud samples its surfaces, on 600 points spread along the canonical order.
 
-    The deviation ``s_k`` of the k nearest points from their own plane, of k - 3 degrees of freedom,
-    is the same at every k where noise is independent from point to point, and grows with k where
-    surfaces are bent, made of facets, or smoothed by a reconstruction. Whiteness is the ratio of
-    the medians of ``s_16`` and ``s_100`` over the flatter half of the neighbourhoods: 0.05 to 0.35
-    for points of S3DIS-like meshes and scans of real offices, 0.6 to 1 for laser scanners, depth
-    cameras and the vertices of noisy meshes. It is 1 where both deviations are 0, and for clouds
-    of so few points that there are no two neighbourhoods to compare.
+    The deviation ``s_k`` of the k nearest points from their plane, with k - 3 degrees of freedom,
+    is the same for every k if noise is independent per point. It grows with k if surfaces are
+    curved, faceted, or smoothed by a reconstruction. Whiteness is the ratio of the medians of
+    ``s_16`` and ``s_100`` over the flatter half of the neighborhoods: 0.05 to 0.35 for points of
+    S3DIS-like meshes and scans of real offices, 0.6 to 1 for laser scanners, depth cameras and the
+    vertices of noisy meshes. It is 1 if both deviations are 0, and for clouds with too few points
+    for two neighborhood sizes.
 
     Args:
         points: Finite points in canonical order, shape ``(N, 3)``.
-        neighbors: Neighbours of each, as :func:`torchrg.search_knn` finds them.
+        neighbors: Neighbors of each point from :func:`torchrg.search_knn`.
 
     Returns:
-        The measures, in three digits. They do not depend on the order of the points, on threads,
-        chunks or unit; on origin and rotation no more than rounding does.
+        The measures, to three digits. They do not depend on the point order, threads, chunks or
+        unit, and on origin and rotation only through rounding.
 
     Example:
         >>> import torch
@@ -76,17 +76,17 @@ def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
 
 
 def _evenly(count: int, most: int) -> NDArray[np.int64]:
-    """Return up to so many of the first numbers, evenly apart."""
+    """Return up to ``max_count`` evenly spaced integers below ``count``."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64))
 
 
 def _nearest(
     points: Tensor, rows: NDArray[np.int64], lists: NDArray[np.int32], most: int
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return the nearest of the different places in lists ``(n, L)``, from the point itself on.
+    """Return the nearest distinct positions in lists ``(n, L)``, starting with the point itself.
 
-    These are the rows that have as many places as half of them have, up to ``most``, the distances,
-    which ascend, and the places relative to the point.
+    Returns the rows with at least the median number of positions, up to ``max_count``, the
+    ascending distances, and the positions relative to the point.
     """
     lists = np.sort(lists, axis=1)
     cpu = points.detach().cpu()
@@ -108,7 +108,7 @@ def _nearest(
 
 
 def _deviations(patches: Array) -> Array:
-    """Return how far points ``(n, k, 3)`` are from their plane, with k - 3 degrees of freedom."""
+    """RMS distances of points ``(n, k, 3)`` to their plane, with k - 3 degrees of freedom."""
     centered = patches - patches.mean(axis=1, keepdims=True)
     moments = np.linalg.eigvalsh(centered.swapaxes(1, 2) @ centered)
     lowest: Array = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))
@@ -116,7 +116,7 @@ def _deviations(patches: Array) -> Array:
 
 
 def _height(points: Tensor) -> float:
-    """Return the least extent of a cloud along its principal axes, without outliers."""
+    """Return the minimum extent of a cloud along its principal axes, without outliers."""
     places = points.detach().cpu()[_evenly(len(points), _NUM_FOR_HEIGHT)].double().numpy()
     centered = places - places.mean(axis=0)
     along = centered @ np.linalg.eigh(centered.T @ centered)[1]

@@ -1,4 +1,4 @@
-"""One point of each voxel, and the way back to every point."""
+"""Voxel sampling with the inverse map to all points."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,19 +13,18 @@ from torchrg.errors import ConfigError
 from torchrg.structures import UNLABELED
 
 _MAX_VOXELS = 2**53
-"""Most voxels along one axis: float64 counts no further."""
+"""Maximum number of voxels along one axis: float64 counts no further."""
 
 _MAX_KEYS = 2**62
-"""Most cells with numbers of their own in int64; the square of the number of points is below it."""
+"""Maximum number of cells with distinct int64 keys; above the squared number of points."""
 
 
 class Voxels(NamedTuple):
-    """The points that stand for the voxels of a cloud.
+    """Representative points of the voxels of a cloud.
 
     Attributes:
-        rows: Row of one point of each voxel, ascending, shape ``(V,)``, int64.
-        inverse: Place in ``rows`` of the voxel of each point, shape ``(N,)``, int64; -1 for a point
-            that is not finite.
+        rows: Row of one point per voxel, ascending, shape ``(V,)``, int64.
+        inverse: Index in ``rows`` of each point's voxel, shape ``(N,)``, int64; -1 if not finite.
     """
 
     rows: Tensor
@@ -33,10 +32,10 @@ class Voxels(NamedTuple):
 
 
 def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
-    """Choose one point of each occupied cell of a cubic grid of side ``size``.
+    """Select one point of each occupied cell of a cubic grid with cell width ``size``.
 
-    The point nearest to the middle of its cell is chosen, so the result is made of points of the
-    cloud ``(N, 3)`` and does not depend on their order. The grid begins at the least coordinates.
+    The point nearest to the center of its cell is selected, so the result consists of points of the
+    cloud ``(N, 3)`` and does not depend on their order. The grid begins at the minimum coordinates.
 
     Raises:
         ShapeError: If ``points`` has another shape or dtype.
@@ -79,7 +78,7 @@ def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
 
 
 def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: list[Tensor]) -> Tensor:
-    """Return of the chosen points, voxel by voxel, the one of least x, then y, then z in each."""
+    """Return the chosen point of lowest x, then y, then z in each voxel, in voxel order."""
     x, y, z = (column[chosen].cpu().numpy() for column in columns)
     order = torch.from_numpy(np.lexsort((z, y, x, voxel[chosen].cpu().numpy()))).to(voxel.device)
     chosen = chosen[order]
@@ -89,9 +88,9 @@ def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: list[Tensor]) 
 
 
 def cell_keys(cells: Sequence[Tensor]) -> Tensor:
-    """Return a number for each point that is the same in a cell of a grid and another elsewhere.
+    """Return an integer key per point, equal for points of the same grid cell only.
 
-    ``cells`` are whole numbers from 0, shape ``(N,)`` each: which cell along each axis.
+    ``cells`` are the cell indices along each axis, integers from 0, shape ``(N,)`` each.
     """
     keys = torch.zeros_like(cells[0], dtype=torch.int64)
     num_keys = 1
