@@ -19,7 +19,7 @@ BLOCK_SIZE = 300_000
 """Points per block. Smaller blocks search more surrounding points in vain, larger ones take more
 memory."""
 _MIN_CANDIDATES = 65536
-_CANDIDATES = 2
+_NUM_BLOCKS = 2
 """Maximum number of rows searched at a time: those of two blocks, but at least ``_MIN_CANDIDATES``,
 so that a small block is not fragmented."""
 
@@ -48,7 +48,7 @@ class Boxes(NamedTuple):
     high: NDArray[np.float64]
 
 
-def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxes:
+def find_boxes(points: NDArray[np.floating], max_points: int = POINTS_PER_BOX) -> Boxes:
     """Return boxes of at most ``max_points`` points ``(N, 3)`` in canonical order.
 
     Only a cell of the finest level may hold more: nearly equal points.
@@ -59,13 +59,13 @@ def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxe
     for level in range(MORTON_BITS - 1, -1, -1):
         starts = np.flatnonzero(is_start)
         counts = np.diff(starts)
-        full = counts > most
+        full = counts > max_points
         if not full.any():
             break
         changes = codes >> (3 * level)
         is_start[1:-1] |= (changes[1:] != changes[:-1]) & np.repeat(full, counts)[1:]
     starts = np.flatnonzero(is_start)
-    low, high = (how.reduceat(points, starts[:-1], axis=0) for how in (np.minimum, np.maximum))
+    low, high = (ufunc.reduceat(points, starts[:-1], axis=0) for ufunc in (np.minimum, np.maximum))
     return Boxes(starts, low.astype(np.float64), high.astype(np.float64))
 
 
@@ -74,26 +74,26 @@ def near_boxes(
 ) -> NDArray[np.bool_]:
     """Return a mask of boxes within ``reach`` ``(n,)`` of one of the chosen boxes ``(n,)``."""
     is_near = np.zeros(len(boxes.low), dtype=bool)
-    about = _about(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
-    all_low, all_high = boxes.low[about], boxes.high[about]
+    nearby = _near_bounding_box(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
+    all_low, all_high = boxes.low[nearby], boxes.high[nearby]
     for chunk in chunks_of(len(chosen), _BOXES_AT_ONCE):
         low, high = boxes.low[chosen[chunk]], boxes.high[chosen[chunk]]
-        near = _about(all_low, all_high, low, high, reach[chunk])
+        near = _near_bounding_box(all_low, all_high, low, high, reach[chunk])
         within = _gaps(all_low[near], all_high[near], low, high) <= reach[chunk, None] * _ROUNDING
-        is_near[about[near[within.any(axis=0)]]] = True
+        is_near[nearby[near[within.any(axis=0)]]] = True
     return is_near
 
 
-def _about(
+def _near_bounding_box(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
-    own_low: NDArray[np.float64],
-    own_high: NDArray[np.float64],
+    query_low: NDArray[np.float64],
+    query_high: NDArray[np.float64],
     reach: NDArray[np.float64],
 ) -> NDArray[np.int64]:
     """Return the boxes within the maximum reach of the bounding box of the query boxes."""
     far = reach.max() * _ROUNDING
-    inside = (low <= own_high.max(axis=0) + far) & (high >= own_low.min(axis=0) - far)
+    inside = (low <= query_high.max(axis=0) + far) & (high >= query_low.min(axis=0) - far)
     return np.flatnonzero(inside.all(axis=1))
 
 
@@ -110,11 +110,11 @@ def farthest_neighbor(boxes: Boxes, box: int, k: int) -> float:
 def _gaps(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
-    own_low: NDArray[np.float64],
-    own_high: NDArray[np.float64],
+    query_low: NDArray[np.float64],
+    query_high: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the distances between query boxes and others, shape ``(queries, others)``."""
-    gap = np.maximum(low - own_high[:, None], own_low[:, None] - high).clip(min=0)
+    gap = np.maximum(low - query_high[:, None], query_low[:, None] - high).clip(min=0)
     distance: NDArray[np.float64] = np.sqrt((gap * gap).sum(axis=2))
     return distance
 
@@ -140,7 +140,7 @@ def search_block(
     block: slice,
     k: int,
     search: SearchRows,
-    most: int | None = None,
+    max_rows: int | None = None,
 ) -> NDArray[np.int32]:
     """Return the rows of the ``k`` nearest points of each point of a block, shape ``(n, k)``.
 
@@ -150,27 +150,27 @@ def search_block(
     first, last = np.searchsorted(boxes.starts, (block.start, block.stop))
     reach = _reach_of_boxes(points[block], boxes, slice(first, last), k)
     nearest = np.empty((block.stop - block.start, k), dtype=np.int32)
-    most = max(_CANDIDATES * len(nearest), _MIN_CANDIDATES) if most is None else most
-    waiting = [slice(first, last)]
-    while waiting:
-        run = waiting.pop()
+    max_rows = max(_NUM_BLOCKS * len(nearest), _MIN_CANDIDATES) if max_rows is None else max_rows
+    pending = [slice(first, last)]
+    while pending:
+        run = pending.pop()
         numbers = np.arange(run.start, run.stop)
         rows = _rows_near(boxes, numbers, reach[numbers - first])
-        if len(rows) > most and len(numbers) > 1:
+        if len(rows) > max_rows and len(numbers) > 1:
             middle = (run.start + run.stop) // 2
-            waiting += [slice(run.start, middle), slice(middle, run.stop)]
+            pending += [slice(run.start, middle), slice(middle, run.stop)]
             continue
-        if len(rows) > most:
+        if len(rows) > max_rows:
             bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, run.start, k))
             rows = _rows_near(boxes, numbers, bound)
-        asked = slice(boxes.starts[run.start], boxes.starts[run.stop])
-        into = nearest[asked.start - block.start : asked.stop - block.start]
-        if len(rows) > most:
-            into[:] = _search_each(points, rows, np.arange(asked.start, asked.stop), k)
+        queries = slice(boxes.starts[run.start], boxes.starts[run.stop])
+        out = nearest[queries.start - block.start : queries.stop - block.start]
+        if len(rows) > max_rows:
+            out[:] = _search_each(points, rows, np.arange(queries.start, queries.stop), k)
             continue
-        start = int(np.searchsorted(rows, asked.start))
-        local = slice(start, start + asked.stop - asked.start)
-        np.take(rows.astype(np.int32), search(points[rows], local, k), out=into, mode="clip")
+        start = int(np.searchsorted(rows, queries.start))
+        local = slice(start, start + queries.stop - queries.start)
+        np.take(rows.astype(np.int32), search(points[rows], local, k), out=out, mode="clip")
     return nearest
 
 
@@ -205,25 +205,25 @@ def _rows_near(
 def _search_each(
     points: NDArray[np.floating],
     rows: NDArray[np.int64],
-    asked: NDArray[np.int64],
+    queries: NDArray[np.int64],
     k: int,
 ) -> NDArray[np.int64]:
     """Return the nearest of many candidates for a few points, such as far outliers."""
-    places = points[asked].astype(np.float64)
-    nearest = [np.empty(0, dtype=np.int64)] * len(asked)
-    keys = [np.empty(0)] * len(asked)
+    positions = points[queries].astype(np.float64)
+    nearest = [np.empty(0, dtype=np.int64)] * len(queries)
+    keys = [np.empty(0)] * len(queries)
     for chunk in chunks_of(len(rows), ROWS_AT_ONCE):
         numbers = rows[chunk]
         candidates = points[numbers].astype(np.float64)
-        for i, (number, place) in enumerate(zip(asked, places, strict=True)):
-            away = candidates - place
-            sq_distances = away[:, 0] ** 2 + away[:, 1] ** 2 + away[:, 2] ** 2
+        for i, (number, position) in enumerate(zip(queries, positions, strict=True)):
+            offset = candidates - position
+            sq_distances = offset[:, 0] ** 2 + offset[:, 1] ** 2 + offset[:, 2] ** 2
             # The point itself comes first.
             distances = np.where(numbers == number, -1.0, np.sqrt(sq_distances))
             limit = keys[i][-1] if len(keys[i]) == k else np.inf
             near = distances <= limit
-            joined = np.append(nearest[i], numbers[near])
+            merged = np.append(nearest[i], numbers[near])
             distances = np.append(keys[i], distances[near])
-            order = np.lexsort((joined, distances))[:k]
-            nearest[i], keys[i] = joined[order], distances[order]
+            order = np.lexsort((merged, distances))[:k]
+            nearest[i], keys[i] = merged[order], distances[order]
     return np.stack(nearest)

@@ -38,7 +38,7 @@ away."""
 _MIN_FRACTION = 0.03
 """Minimum fraction of the points for which another cell size is worth its sort."""
 
-_CELLS_A_POINT = 8
+_MAX_CELLS_PER_POINT = 8
 """Maximum number of cells per point in the bounding box, including empty ones, 4 bytes each."""
 
 
@@ -84,35 +84,35 @@ def search_knn(
     check_floating("search_knn", points=tensor)
     if len(tensor) > MAX_POINTS:
         raise ShapeError(
-            f"search_knn: expected at most {MAX_POINTS:,} points, got {len(tensor):,}; cut the "
-            "cloud into parts."
+            f"search_knn: expected at most {MAX_POINTS:,} points, got {len(tensor):,}. Split "
+            "the cloud."
         )
     if max_distance is not None and not max_distance >= 0:
         raise ConfigError(f"search_knn: expected max_distance >= 0, got {max_distance!r}.")
     coordinates = tensor.detach().cpu().numpy()
     if not np.isfinite(coordinates).all():
-        num_bad = int((~np.isfinite(coordinates)).any(axis=1).sum())
+        num_nonfinite = int((~np.isfinite(coordinates)).any(axis=1).sum())
         raise ShapeError(
-            f"search_knn: expected finite points, got {num_bad:,} of {len(coordinates):,} with NaN "
-            "or Inf; leave them out first."
+            f"search_knn: expected finite points, got {num_nonfinite:,} of {len(coordinates):,} with "
+            "NaN or Inf. Remove them first."
         )
     bounds = _cloud_bounds(offset, len(coordinates))
-    least = min((stop - start for start, stop in bounds), default=MAX_POINTS)
-    if not 1 <= k <= least:
+    min_points = min((stop - start for start, stop in bounds), default=MAX_POINTS)
+    if not 1 <= k <= min_points:
         raise ShapeError(
-            f"search_knn: expected k from 1 to the number of points ({least:,}), got {k}; lower k "
-            "or pass a larger cloud."
+            f"search_knn: expected k from 1 to the number of points ({min_points:,}), got {k}. "
+            "Lower k or pass a larger cloud."
         )
     indices = scratch.empty((len(coordinates), k), np.int32)
-    outside = None if max_distance is None else np.empty(indices.shape, dtype=bool)
+    is_far = None if max_distance is None else np.empty(indices.shape, dtype=bool)
     for start, stop in bounds:
         cloud = coordinates[start:stop]
         order = None if canonical else canonical_order(cloud).numpy()
         cloud = cloud if order is None else cloud[order]
         if scratch.is_active() and max_distance is None:
             for rows, near in search_blocks(cloud, k, search_rows):
-                into = rows if order is None else order[rows]
-                indices[start:stop][into] = (near if order is None else order[near]) + start
+                target = rows if order is None else order[rows]
+                indices[start:stop][target] = (near if order is None else order[near]) + start
             continue
         _search_cloud(
             cloud,
@@ -121,9 +121,9 @@ def search_knn(
             start,
             math.inf if max_distance is None else max_distance,
             indices[start:stop],
-            None if outside is None else outside[start:stop],
+            None if is_far is None else is_far[start:stop],
         )
-    valid = None if outside is None else torch.from_numpy(~outside).to(tensor.device)
+    valid = None if is_far is None else torch.from_numpy(~is_far).to(tensor.device)
     return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
 
 
@@ -136,8 +136,8 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     indices: object = getattr(neighbors, "indices", None)
     if not is_tensor(indices):
         raise ShapeError(
-            f"{caller}: expected neighbors as torchrg.structures.Neighbors of a tensor, got "
-            f"{type(neighbors).__name__}; pass Neighbors(torch.as_tensor(rows))."
+            f"{caller}: expected torchrg.structures.Neighbors with a tensor, got "
+            f"{type(neighbors).__name__}. Pass Neighbors(torch.as_tensor(rows))."
         )
     num_points = len(points)
     check_shapes(
@@ -148,7 +148,7 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     )
     if indices.dtype not in (torch.int32, torch.int64):
         raise ShapeError(
-            f"{caller}: expected neighbors of int32 or int64, got {indices.dtype}; convert them."
+            f"{caller}: expected neighbors of int32 or int64, got {indices.dtype}. Convert them."
         )
     if indices.device != points.device:
         raise ShapeError(
@@ -158,19 +158,19 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     if num_points == 0:
         return
     if indices.shape[1] == 0:
-        raise ShapeError(f"{caller}: expected neighbors of each point, got none; pass k of them.")
+        raise ShapeError(f"{caller}: expected at least 1 neighbor per point, got 0.")
     low, high = (int(end) for end in torch.aminmax(indices))
     if not 0 <= low <= high < num_points:
         raise ShapeError(
             f"{caller}: expected neighbors to be rows of {num_points:,} points, got {low:,} to "
-            f"{high:,}; search them among these points."
+            f"{high:,}. Search them among these points."
         )
-    is_own = indices[:, 0] == torch.arange(num_points, device=points.device)
-    if not bool(is_own.all()):
+    is_self = indices[:, 0] == torch.arange(num_points, device=points.device)
+    if not bool(is_self.all()):
         raise ShapeError(
-            f"{caller}: expected each point to be the first of its own neighbors, got others for "
-            f"{num_points - int(torch.count_nonzero(is_own)):,} of {num_points:,} points; put the "
-            "row of the point before its neighbors, as search_knn does."
+            f"{caller}: expected each point as its own first neighbor, got other points in "
+            f"{num_points - int(torch.count_nonzero(is_self)):,} of {num_points:,} rows. Put the "
+            "row of the point first, as search_knn does."
         )
 
 
@@ -208,9 +208,9 @@ def keep_within(
             same &= neighbors.counted(rows)
         else:
             at = places[rows]
-            wanted = neighbors.indices[at].long() * width + groups[rows, None]
-            near = torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)
-            same = (keys[near] == wanted) & neighbors.counted(at)
+            requested = neighbors.indices[at].long() * width + groups[rows, None]
+            near = torch.searchsorted(keys, requested).clamp(max=len(keys) - 1)
+            same = (keys[near] == requested) & neighbors.counted(at)
         order = same.byte().argsort(dim=1, descending=True, stable=True)
         near, same = near.gather(1, order), same.gather(1, order)
         indices[rows] = torch.where(same, near, near[:, :1]).numpy(force=True)
@@ -242,10 +242,10 @@ def search_nearest(
     first = distinct_rows(as_tensor("search_nearest", "points", points)).numpy()
     tree = cKDTree(points[first], balanced_tree=False, compact_nodes=False)
     # Consecutive close queries use the same cached parts of the tree.
-    asked = canonical_order(queries).numpy()
-    for chunk in chunks_of(len(asked), ROWS_AT_ONCE):
-        distances, places = _query(tree, queries[asked[chunk]], 1)
-        nearest[asked[chunk]] = np.where(distances <= max_distance, first[places], -1)[:, 0]
+    query_rows = canonical_order(queries).numpy()
+    for chunk in chunks_of(len(query_rows), ROWS_AT_ONCE):
+        distances, places = _query(tree, queries[query_rows[chunk]], 1)
+        nearest[query_rows[chunk]] = np.where(distances <= max_distance, first[places], -1)[:, 0]
     return nearest
 
 
@@ -273,17 +273,17 @@ def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np
 
 def _search_cloud(
     points: NDArray[np.floating],
-    asked: slice,
+    query_rows: slice,
     order: NDArray[np.int64] | None,
     first_row: int,
     max_distance: float,
     indices: NDArray[np.int32],
-    outside: NDArray[np.bool_] | None,
+    is_far: NDArray[np.bool_] | None,
 ) -> None:
     """Search one cloud in canonical order and write results in the caller's order.
 
-    Rows outside ``queries`` may be searched or not. The tree holds each distinct position once, so
-    that duplicates cost nothing.
+    Rows outside ``query_rows`` may be searched or not. The tree holds each distinct position once,
+    so that duplicates cost nothing.
     """
     from scipy.spatial import cKDTree
 
@@ -301,36 +301,36 @@ def _search_cloud(
             rows, distances, nearest = _restore_duplicates(
                 queried, distances, nearest, starts, counts, k
             )
-        if outside is not None:
+        if is_far is not None:
             too_far = distances > max_distance
             nearest = np.where(too_far, rows[:, None], nearest)
-        into = rows if order is None else order[rows]
-        indices[into] = (nearest if order is None else order[nearest]) + first_row
-        if outside is not None:
-            outside[into] = too_far
+        target = rows if order is None else order[rows]
+        indices[target] = (nearest if order is None else order[nearest]) + first_row
+        if is_far is not None:
+            is_far[target] = too_far
 
     width = min(k, len(places))
     tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
-    first, last = np.searchsorted(starts, (asked.start, asked.stop - 1), side="right") - 1
-    left = np.arange(first, last + 1)
+    first, last = np.searchsorted(starts, (query_rows.start, query_rows.stop - 1), side="right") - 1
+    pending = np.arange(first, last + 1)
     if len(places) >= _MIN_FOR_CELLS and kernels.serve(k=k):
-        sample = places[left[:: -(-len(left) // _SAMPLE_SIZE)]]
+        sample = places[pending[:: -(-len(pending) // _SAMPLE_SIZE)]]
         reach = tree.query(sample, [k])[0][:, 0]
-        if len(places) == len(points) and outside is None:
-            left = search_cells(places, left, reach, indices, order, first_row)
+        if len(places) == len(points) and is_far is None:
+            pending = search_cells(places, pending, reach, indices, order, first_row)
         else:
-            found, wanted = np.empty((len(places), k), dtype=np.int32), left
-            left = search_cells(places, wanted, reach, found)
-            answered = np.setdiff1d(wanted, left, assume_unique=True)
-            for chunk in chunks_of(len(answered), ROWS_IN_CACHE):
-                rows = answered[chunk]
+            found, requested = np.empty((len(places), k), dtype=np.int32), pending
+            pending = search_cells(places, requested, reach, found)
+            resolved = np.setdiff1d(requested, pending, assume_unique=True)
+            for chunk in chunks_of(len(resolved), ROWS_IN_CACHE):
+                rows = resolved[chunk]
                 near = found[rows]
                 distances = np.broadcast_to(0.0, near.shape)
-                if outside is not None:
+                if is_far is not None:
                     distances = np.linalg.norm(places[near] - places[rows, None], axis=2)
                 store(rows, distances, near)
-    for chunk in chunks_of(len(left), ROWS_AT_ONCE):
-        store(left[chunk], *_query(tree, places[left[chunk]], width))
+    for chunk in chunks_of(len(pending), ROWS_AT_ONCE):
+        store(pending[chunk], *_query(tree, places[pending[chunk]], width))
 
 
 def search_cells(
@@ -361,20 +361,20 @@ def search_cells(
     low, high = bounding_box(points)
     extent = high - low
     places = torch.from_numpy(np.ascontiguousarray(points))
-    into, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
+    target, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
     certain = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-    asked = torch.zeros_like(certain)
+    is_query = torch.zeros_like(certain)
     for size in _cell_sizes(reach):
         if len(rows) < _MIN_FOR_CELLS:
             break
         counts = extent / size + 4
-        if counts.prod() > min(max(_CELLS_A_POINT * len(points), 2**20), MAX_POINTS - 1):
+        if counts.prod() > min(max(_MAX_CELLS_PER_POINT * len(points), 2**20), MAX_POINTS - 1):
             continue
         _, width, height = (int(count) for count in counts)
         starts = torch.empty(int(counts[0]) * width * height + 1, dtype=torch.int32, device="cpu")
         shape = width, height, *low.tolist(), size
         of_place, _, sorted_places = kernels.call("fill_cells", places, starts, *shape)
-        asked.zero_()[torch.from_numpy(rows)] = True
+        is_query.zero_()[torch.from_numpy(rows)] = True
         # Tasks of about this many points each.
         ends = np.arange(ROWS_IN_CACHE, len(points), ROWS_IN_CACHE)
         bounds = [1, *np.searchsorted(starts.numpy(), ends, side="right").tolist(), len(starts) - 1]
@@ -385,7 +385,7 @@ def search_cells(
             grid: tuple[Tensor, ...] = (sorted_places, of_place, starts),
         ) -> None:
             numbers = *cells, *shape[:2], first_row, *shape[2:]
-            kernels.call("search_cells", *grid, asked, by_row, into, certain, *numbers)
+            kernels.call("search_cells", *grid, is_query, by_row, target, certain, *numbers)
 
         map_tasks(work, list(itertools.pairwise(bounds)), torch.device("cpu"))
         rows = rows[~certain.numpy()[rows]]
@@ -396,9 +396,9 @@ def _cell_sizes(reach: NDArray[np.float64]) -> list[float]:
     """Return ascending cell sizes that together resolve nearly all of a sample."""
     sizes: list[float] = []
     reach = np.sort(reach[reach > 0])
-    few = int(_MIN_FRACTION * len(reach))
-    while len(reach) > few:
-        sizes.append(_SIZE_STEP * float(reach[few]))
+    min_count = int(_MIN_FRACTION * len(reach))
+    while len(reach) > min_count:
+        sizes.append(_SIZE_STEP * float(reach[min_count]))
         reach = reach[reach > sizes[-1]]
     return sizes
 
@@ -411,16 +411,16 @@ def _query(
     """Return the k nearest distinct points by (distance, row), also for ties at the last rank."""
     distances = np.empty((len(queries), k))
     rows = np.empty((len(queries), k), dtype=np.int64)
-    left, width = np.arange(len(queries)), k + 1
-    while len(left):
+    pending, width = np.arange(len(queries)), k + 1
+    while len(pending):
         ranks = np.arange(1, min(width, tree.n) + 1)
-        near, rows_near = tree.query(queries[left], ranks, workers=allowed_threads())
+        near, rows_near = tree.query(queries[pending], ranks, workers=allowed_threads())
         tied = np.flatnonzero((near[:, 1:] == near[:, :-1]).any(axis=1))
-        by_both = np.lexsort((rows_near[tied], near[tied]))
-        rows_near[tied] = np.take_along_axis(rows_near[tied], by_both, axis=1)
-        distances[left], rows[left] = near[:, :k], rows_near[:, :k]
-        is_open = (near[:, k - 1] == near[:, -1]) & (width < tree.n)
-        left, width = left[is_open], 2 * width
+        order = np.lexsort((rows_near[tied], near[tied]))
+        rows_near[tied] = np.take_along_axis(rows_near[tied], order, axis=1)
+        distances[pending], rows[pending] = near[:, :k], rows_near[:, :k]
+        is_tied = (near[:, k - 1] == near[:, -1]) & (width < tree.n)
+        pending, width = pending[is_tied], 2 * width
     return distances, rows
 
 

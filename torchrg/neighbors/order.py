@@ -56,15 +56,15 @@ def canonical_order(points: Tensor | NDArray[np.floating], ties: Sequence[Tensor
     # Six times faster than a stable sort; ties are sorted below.
     order = np.argsort(codes)
     codes = codes[order]
-    same = codes[1:] == codes[:-1]
-    if same.any():
-        tied = np.zeros(len(order), dtype=bool)
-        tied[1:] |= same
-        tied[:-1] |= same
-        rows = order[tied]
+    is_equal = codes[1:] == codes[:-1]
+    if is_equal.any():
+        is_tied = np.zeros(len(order), dtype=bool)
+        is_tied[1:] |= is_equal
+        is_tied[:-1] |= is_equal
+        rows = order[is_tied]
         x, y, z = coordinates[rows].T
         columns = [column.detach().cpu().numpy()[rows] for column in reversed(ties)]
-        order[tied] = rows[np.lexsort((rows, *columns, z, y, x, codes[tied]))]
+        order[is_tied] = rows[np.lexsort((rows, *columns, z, y, x, codes[is_tied]))]
     return torch.from_numpy(order).to(tensor.device)
 
 

@@ -18,9 +18,9 @@ _SMALL, _LARGE = 16, 100
 """Sizes of the two neighborhoods whose deviations from a plane are compared."""
 _NEAREST, _EXACT = 9, 1e-3
 """Size of the neighborhood tested for planarity, and its maximum ratio of deviation to radius."""
-_LENDERS = 3
+_STRIDE = 3
 """Every third neighbor of a point contributes its neighbors to the larger neighborhood."""
-_OUTLIERS = 0.001
+_OUTLIER_FRACTION = 0.001
 """Fraction of the points excluded from the height on either side."""
 _DIGITS = 3
 """Significant digits of a measure: fewer than another unit or origin changes by rounding."""
@@ -68,20 +68,20 @@ def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
     flat = flatness <= np.median(flatness)
     small = np.median(_deviations(patches[flat, :_SMALL]))
     rows = rows[flat]
-    lent = indices[indices[rows, ::_LENDERS]].reshape(len(rows), -1)
-    large = np.median(_deviations(_nearest(points, rows, lent, _LARGE)[-1]))
+    extended = indices[indices[rows, ::_STRIDE]].reshape(len(rows), -1)
+    large = np.median(_deviations(_nearest(points, rows, extended, _LARGE)[-1]))
     whiteness = min(float(small / large), 1.0) if large > 0 else 1.0
     measures = whiteness, variation, float(exact.mean()), density, _height(points)
     return Sampling(*(float(f"{measure:.{_DIGITS}g}") for measure in measures))
 
 
-def _evenly(count: int, most: int) -> NDArray[np.int64]:
+def _evenly(count: int, max_count: int) -> NDArray[np.int64]:
     """Return up to ``max_count`` evenly spaced integers below ``count``."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64))
+    return np.unique(np.linspace(0, count - 1, min(max_count, count)).astype(np.int64))
 
 
 def _nearest(
-    points: Tensor, rows: NDArray[np.int64], lists: NDArray[np.int32], most: int
+    points: Tensor, rows: NDArray[np.int64], lists: NDArray[np.int32], max_count: int
 ) -> tuple[NDArray[np.int64], Array, Array]:
     """Return the nearest distinct positions in lists ``(n, L)``, starting with the point itself.
 
@@ -91,19 +91,19 @@ def _nearest(
     lists = np.sort(lists, axis=1)
     cpu = points.detach().cpu()
     centers = cpu[rows].double().numpy()
-    places = cpu[lists.ravel()].double().numpy().reshape(*lists.shape, 3) - centers[:, None]
-    distances = np.sqrt((places * places).sum(axis=2))
-    is_double = (distances == 0) & (lists != rows[:, None])
-    is_double[:, 1:] |= lists[:, 1:] == lists[:, :-1]
-    distances[is_double] = np.inf
+    positions = cpu[lists.ravel()].double().numpy().reshape(*lists.shape, 3) - centers[:, None]
+    distances = np.sqrt((positions * positions).sum(axis=2))
+    is_duplicate = (distances == 0) & (lists != rows[:, None])
+    is_duplicate[:, 1:] |= lists[:, 1:] == lists[:, :-1]
+    distances[is_duplicate] = np.inf
     counts = np.isfinite(distances).sum(axis=1)
-    count = min(most, int(np.median(counts))) if len(rows) else 0
+    count = min(max_count, int(np.median(counts))) if len(rows) else 0
     order = distances.argsort(axis=1, kind="stable")[counts >= count, :count]
     chosen = rows[counts >= count]
     return (
         chosen,
         np.take_along_axis(distances[counts >= count], order, axis=1),
-        np.take_along_axis(places[counts >= count], order[..., None], axis=1),
+        np.take_along_axis(positions[counts >= count], order[..., None], axis=1),
     )
 
 
@@ -111,14 +111,14 @@ def _deviations(patches: Array) -> Array:
     """RMS distances of points ``(n, k, 3)`` to their plane, with k - 3 degrees of freedom."""
     centered = patches - patches.mean(axis=1, keepdims=True)
     moments = np.linalg.eigvalsh(centered.swapaxes(1, 2) @ centered)
-    lowest: Array = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))
-    return lowest
+    deviation: Array = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))
+    return deviation
 
 
 def _height(points: Tensor) -> float:
     """Return the minimum extent of a cloud along its principal axes, without outliers."""
-    places = points.detach().cpu()[_evenly(len(points), _NUM_FOR_HEIGHT)].double().numpy()
-    centered = places - places.mean(axis=0)
+    positions = points.detach().cpu()[_evenly(len(points), _NUM_FOR_HEIGHT)].double().numpy()
+    centered = positions - positions.mean(axis=0)
     along = centered @ np.linalg.eigh(centered.T @ centered)[1]
-    low, high = np.quantile(along, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+    low, high = np.quantile(along, [_OUTLIER_FRACTION, 1 - _OUTLIER_FRACTION], axis=0)
     return float((high - low).min())

@@ -59,21 +59,21 @@ def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
     scaled = [(column - column.min()) / size for column in columns]
     if max(float(column.max()) for column in scaled) >= _MAX_VOXELS:
         raise ConfigError(
-            f"sample_voxels: expected size to divide the cloud's extent into less than 2^53 "
-            f"cells, got {size!r}; choose a larger one."
+            f"sample_voxels: expected size to divide the extent of the cloud into fewer than 2^53 "
+            f"cells, got {size!r}. Choose a larger size."
         )
     cells = [column.floor() for column in scaled]
     x, y, z = ((s - cell - 0.5).square() for s, cell in zip(scaled, cells, strict=True))
-    keys, by_voxel = cell_keys(cells).sort(stable=True)
+    keys, order = cell_keys(cells).sort(stable=True)
     voxel, counts = torch.unique_consecutive(keys, return_inverse=True, return_counts=True)[1:]
-    sq_distance = (x + y + z)[by_voxel]
-    least = torch.segment_reduce(sq_distance, "min", lengths=counts)
-    nearest = (sq_distance == least[voxel]).nonzero().squeeze(1)
+    sq_distance = (x + y + z)[order]
+    minimum = torch.segment_reduce(sq_distance, "min", lengths=counts)
+    nearest = (sq_distance == minimum[voxel]).nonzero().squeeze(1)
     if len(nearest) > len(counts):
-        nearest = _first_by_coordinates(nearest, voxel, [c[by_voxel] for c in columns])
-    rows = finite[by_voxel[nearest]]
-    places = rows.argsort().argsort()
-    inverse[finite[by_voxel]] = places[voxel]
+        nearest = _first_by_coordinates(nearest, voxel, [c[order] for c in columns])
+    rows = finite[order[nearest]]
+    ranks = rows.argsort().argsort()
+    inverse[finite[order]] = ranks[voxel]
     return Voxels(rows.sort().values, inverse)
 
 
@@ -95,11 +95,11 @@ def cell_keys(cells: Sequence[Tensor]) -> Tensor:
     keys = torch.zeros_like(cells[0], dtype=torch.int64)
     num_keys = 1
     for cell in cells:
-        number, count = cell.long(), int(cell.max()) + 1
+        index, count = cell.long(), int(cell.max()) + 1
         if num_keys * count > _MAX_KEYS:
-            values, number = torch.unique(number, return_inverse=True)
+            values, index = torch.unique(index, return_inverse=True)
             used, keys = torch.unique(keys, return_inverse=True)
             num_keys, count = len(used), len(values)
-        keys = keys.mul(count).add_(number)
+        keys = keys.mul(count).add_(index)
         num_keys *= count
     return keys
