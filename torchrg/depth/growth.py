@@ -1,4 +1,4 @@
-"""Regions of a depth image: growth from pixel to pixel, then absorption, merging, sharp creases."""
+"""Region growing in depth images, with boundary assignment, merging and creases."""
 
 from typing import NamedTuple
 
@@ -18,45 +18,45 @@ from torchrg.regions.repair import absorb_points, merge_coplanar
 from torchrg.robust.scale import MAD_FACTOR
 
 _AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
-"""Steps in rows and columns to those around a pixel that come after it."""
+"""Row and column steps to the adjacent pixels that come later."""
 
 _AROUND = (*_AHEAD, *((-down, -right) for down, right in _AHEAD))
 
 _NUM_PASSES = 2
-"""Absorption and merging go on twice: pixels that a region absorbed may make it touch another."""
+"""Passes of boundary assignment and merging: assigned pixels may make regions adjacent."""
 
 _ABSORB_REACH = 3.0
-"""Standard deviations of the noise: a pixel this near to the plane of the flat region beside it is
-on it, as 99.7 % of its pixels are."""
+"""Maximum distance of a pixel to the plane of the adjacent flat region, in standard deviations of
+the noise: 99.7 % of its pixels are within."""
 
 _MERGE_TOLERANCE = 1.2
-"""One plane explains two flat regions that touch when neither is farther from it than this many
-times its distance from its own: that of clouds, see :class:`torchrg.config.GrowingConfig`."""
+"""Maximum ratio of the RMS distances to the joint plane and to the own plane of two merged flat
+regions, as for clouds; see :class:`torchrg.config.GrowingConfig`."""
 
 _CURVED = 3.0
-"""Thickness of a region in units of the noise up to which it is a plane, however it is bent."""
+"""Maximum thickness of a planar region in units of the noise, regardless of its bend."""
 
 _BENT = 0.03
-"""Thickness of a region as a share of its extent up to which it is a plane, whatever the noise is.
-A slightly bent face is a face, and a column is 0.4 of its extent thick."""
+"""Maximum thickness of a planar region as a fraction of its extent, regardless of the noise. A
+slightly bent surface is one plane; a column is 0.4 of its extent thick."""
 
 _NUM_FITS = 2
-"""Fits of a region's plane, a plain one and a reweighted one: its pixels are near the plane
-already."""
+"""Fits of a region's plane, a plain and a reweighted one: its pixels are already near the plane."""
 
 _MAX_MOVES = 16
-"""Pixels by which a border may move: windows hardly reach farther from their middle."""
+"""Maximum displacement of a boundary, in pixels: windows hardly reach farther from their center."""
 
 _STRAIGHT = 0.85
-"""Cosine of the largest angle between a step straight away from a crease and one that counts."""
+"""Minimum cosine of the angle between a step perpendicular to a crease and one that counts."""
 
 
 class InverseCloud(NamedTuple):
-    """A depth image as a cloud where planes stay planes and noise is the same near and far.
+    """A depth image as a cloud in which planes stay planes and noise does not depend on depth.
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
-    the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are of float64, in
-    columns; ``noise`` ``(H * W,)`` is that of the last coordinate; ``seen`` ``(H, W)`` have depth.
+    the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are float64, in
+    columns; ``noise`` ``(H * W,)`` is the noise of the last coordinate; ``seen`` ``(H, W)`` masks
+    pixels with depth.
     """
 
     points: Tensor
@@ -67,15 +67,15 @@ class InverseCloud(NamedTuple):
 def grow_pixels(
     cloud: InverseCloud, flat: Tensor, joins: tuple[Tensor, Tensor], config: DepthConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Grow regions over a depth image, and give border pixels and parts of one face to them.
+    """Grow regions over a depth image, assign boundary pixels, and merge coplanar regions.
 
-    Regions are the connected components of the flat pixels, by the ``joins`` to the right and down
-    of :class:`torchrg.depth.pixels.Pixels`.
+    Regions are the connected components of the flat pixels, connected by the ``joins`` to the right
+    and down from :class:`torchrg.depth.pixels.Pixels`.
 
     Returns:
         Labels ``(H * W,)``, 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; unit normals
-        of the regions' planes towards the camera, in space, ``(M, 3)``; and whether a region is
-        thicker than noise and a slight bend can make it, ``(M,)``, bool.
+        of the regions' planes towards the camera, in space, ``(M, 3)``; and a mask of regions
+        thicker than noise and a slight bend explain, ``(M,)``, bool.
     """
     labels = number_by_size(connect_pixels(flat, *joins), config.min_size)
     if not bool((labels >= 0).any()):
@@ -128,16 +128,16 @@ class PixelGrid:
         return candidates[is_near[candidates]]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pairs of regions that touch, and the number of contacts of each pair."""
+        """Return the pairs of adjacent regions, and the number of contacts of each pair."""
         first, second = (labels[pixels] for pixels in self.borders(labels))
         num_regions = int(labels.max()) + 1
         keys = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
         keys, counts = torch.unique(keys, return_counts=True)
-        # Either pixel is beside the other.
+        # Contacts are symmetric.
         return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
 
     def borders(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pairs of pixels of two regions side by side, each once."""
+        """Return the pairs of adjacent pixels of two regions, each once."""
         pairs = borders(labels.view(self.height, self.width), _AHEAD)
         first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
         touch = (labels[first] >= 0) & (labels[second] >= 0)
@@ -147,11 +147,11 @@ class PixelGrid:
 def _refine(
     cloud: InverseCloud, labels: Tensor, config: DepthConfig
 ) -> tuple[Tensor, RegionPlanes]:
-    """Give border pixels and parts of one face to the regions of a depth image.
+    """Refine the regions of a depth image: boundary assignment, merging, strips, and creases.
 
-    Twice, pixels without a region join the one beside them whose plane they are on, and flat
-    regions that touch and lie on one plane are merged. Then borders between regions move to the
-    lines where their planes meet. Returns labels by descending size, and the planes of the regions.
+    Twice, unlabeled pixels join the adjacent region whose plane they are on, and adjacent coplanar
+    flat regions are merged. Then boundaries move to the intersection lines of the planes. Returns
+    labels by descending size, and the planes of the regions.
     """
     beside = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
@@ -179,7 +179,7 @@ def _refine(
 def absorb_pixels(
     cloud: InverseCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    """Do as :func:`torchrg.regions.repair.absorb_points` for the pixels of an image."""
+    """Apply :func:`torchrg.regions.repair.absorb_points` to the pixels of an image."""
     seen = cloud.seen
     if not serves(cloud.points):
         beside = PixelGrid(seen.shape)
@@ -192,7 +192,7 @@ def absorb_pixels(
 
 
 def _planes_over_rays(fit: RegionPlanes) -> Tensor:
-    """Return planes ``(M, 3)`` that times a ray ``(x, y, 1)`` are the last coordinate."""
+    """Return planes ``(M, 3)`` whose product with a ray ``(x, y, 1)`` is the last coordinate."""
     offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
     return torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
 
@@ -200,12 +200,12 @@ def _planes_over_rays(fit: RegionPlanes) -> Tensor:
 def fit_inverse_planes(
     cloud: InverseCloud, labels: Tensor, *, most: int = MAX_FITTED
 ) -> RegionPlanes:
-    """Fit planes to regions by least squares along the last coordinate, which alone has noise.
+    """Fit planes to regions by least squares along the last coordinate, the only noisy one.
 
-    A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.fit.fit_planes` has; the
-    thickness, along the normals, is never taken for less than the mean noise of the region. Curved
-    is what is thicker than noise and a slight bend can make it. Fits are to ``most`` pixels of each
-    region, in even steps.
+    A second fit uses Tukey's bisquare weights, as in :func:`torchrg.regions.fit.fit_planes`. The
+    thickness, along the normals, is at least the mean noise of the region. Regions thicker than
+    noise and a slight bend explain are curved. Each fit uses up to ``most`` evenly spaced pixels
+    per region.
     """
     chunks = Segments(labels, most=most).chunks(len(labels) + 1)
     parts = map_tasks(lambda chunk: _fit_together(cloud, chunk), chunks, labels.device)
@@ -213,7 +213,7 @@ def fit_inverse_planes(
 
 
 def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
-    """Fit planes to the regions of a share; see :func:`fit_inverse_planes`."""
+    """Fit planes to one chunk of regions; see :func:`fit_inverse_planes`."""
     noise = segments.mean(segments.take(cloud.noise))
     columns = segments.take_columns(cloud.points)
     weights = torch.ones_like(columns[0])
@@ -226,7 +226,7 @@ def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
         weights, median, squares = segments.reweigh(columns, center, normal, noise, factors)
     thickness = MAD_FACTOR * median
     length = normal.norm(dim=1, keepdim=True)
-    # In the distance d of a plane from the camera, w is 1 / d of the cosine along a ray.
+    # For a plane at distance d from the camera, w is the cosine along a ray over d.
     offset = (normal * center).sum(dim=1, keepdim=True)
     nearness = torch.cat([slopes, offset], dim=1).norm(dim=1)
     extent = torch.linalg.eigvalsh(covariance[:, :2, :2])[:, 0].clamp(min=0).sqrt()
@@ -248,15 +248,15 @@ def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
 def move_to_creases(
     cloud: InverseCloud, labels: Tensor, fit: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    """Move borders between flat regions to where their planes meet.
+    """Move boundaries between flat regions to the intersection lines of their planes.
 
-    Within the noise of a crease a pixel lies on both planes, and which region took it is chance.
-    Where the middles of two regions are on opposite sides of the line in which their planes meet,
-    each off the other's plane, a pixel on the other's side goes to the other region, if it is on
-    its plane and next to a pixel of it that is straight behind, as seen from the crease: borders
-    move across to the crease, never along it. Pixels that went are followed by those beside them.
+    Within the noise of a crease a pixel lies on both planes, and its region is arbitrary. Two
+    regions form a crease if their centers are on opposite sides of the intersection line, each off
+    the other's plane. A pixel on the other side then joins the other region if it is on its plane
+    and next to one of its pixels straight behind it, as seen from the crease: boundaries move
+    towards the crease, never along it. Neighbors of changed pixels are revisited.
 
-    ``reach`` is the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
+    ``reach`` is the maximum distance of a point on the plane along the last coordinate, ``(M,)``.
     """
     planes, middles = _planes_over_rays(fit), fit.center[:, :2]
     labels = labels.clone()
@@ -291,7 +291,7 @@ def _regions_across(
     rows: Tensor,
     around: Tensor,
 ) -> Tensor:
-    """Return the region ``(n,)`` that pixels belong to by the creases beside them."""
+    """Return the region ``(n,)`` of pixels according to the adjacent creases."""
     x, y, inverse = cloud.points.unbind(dim=1)
     label, near = labels[rows][:, None], labels[around]
     other, near = (near >= 0) & (near != label), near.clamp(min=0)

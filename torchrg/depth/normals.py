@@ -1,4 +1,4 @@
-"""The plane at each pixel of a depth image: that of the largest flat window around it."""
+"""Plane of each depth pixel, from the largest flat window around it."""
 
 import math
 from collections.abc import Mapping
@@ -26,31 +26,31 @@ from torchrg.depth.windows import (
 )
 
 FLAT = 1.35
-"""A flat window deviates from its plane by at most this many times the tolerance."""
+"""Maximum deviation of a flat window from its plane, in tolerances."""
 _OWN_REACH = 3.5
-"""A pixel is on the plane of a window within this many times the noise."""
+"""Maximum distance of a pixel on the plane of a window, in units of the noise."""
 _SAME_NOISE = 2.0
 """A flat window deviates from its plane at most by a factor of 1 plus this over its side in pixels
-more than its quarters do from planes of their own."""
+more than its quarters do from their own planes."""
 _MIN_QUARTERS = 0.7
-"""Least deviation of the quarters of a window that is counted, in units of the tolerance."""
+"""Minimum counted deviation of the quarters of a window, in units of the tolerance."""
 _BEND = 0.005
-"""Share of half its side by which a flat window may bend, however little noise there is."""
+"""Maximum bend of a flat window as a fraction of half its side, regardless of the noise."""
 _MAX_BEND = 0.03
-"""Share of half its side by which a window of the smallest size may bend where none is flat. Twice
-as much would hide creases of 20 degrees."""
+"""Maximum bend of a smallest window as a fraction of half its side, if none is flat. Twice this
+value would hide creases of 20 degrees."""
 _STEEPEST = 4.0
-"""Inverse of the cosine of the steepest angle at which a surface may bend. Seen at a steeper angle,
-a step looks like a bend."""
+"""Inverse cosine of the maximum angle at which a surface may bend. At a steeper angle, a step looks
+like a bend."""
 _STEEP_SIZE = 2
-"""Width of the cells of the windows that jitter is read from, in pixels."""
+"""Cell width of the windows used to measure jitter, in pixels."""
 
 
 class Choice(NamedTuple):
-    """The window of each pixel ``(H, W)``, by its number among those of all sizes.
+    """The window index of each pixel ``(H, W)``, among the windows of all sizes.
 
-    ``flat`` tells whether that is flat, ``edge`` whether it is but could not lie around the pixel.
-    Others have the smallest square around them.
+    ``flat`` marks pixels with a flat window, ``edge`` flat windows that are not centered on the
+    pixel. Other pixels have the smallest square around them.
     """
 
     window: Tensor
@@ -59,11 +59,11 @@ class Choice(NamedTuple):
 
 
 class PixelPlanes(NamedTuple):
-    """Windows of an image, and which of them each pixel chose.
+    """Windows of an image, and the window chosen by each pixel.
 
-    Windows are numbered from the smallest squares to the largest, then the lying narrow ones around
-    ``pixels`` ``(n,)``, then the upright ones. ``squares`` are tables of :class:`Windows` by the
-    size of cells, ``narrow`` is one ``(9, 2, n)``; ``noise`` is that of the largest windows.
+    Windows are numbered from the smallest squares to the largest, then the horizontal narrow ones
+    around ``pixels`` ``(n,)``, then the vertical ones. ``squares`` are tables of :class:`Windows`
+    by cell size, ``narrow`` is one ``(9, 2, n)``; ``noise`` is the noise of the largest windows.
     """
 
     choice: Choice
@@ -74,20 +74,20 @@ class PixelPlanes(NamedTuple):
 
     @property
     def tables(self) -> list[Tensor]:
-        """All windows as kernels take them: squares, narrow ones, their pixels."""
+        """All windows in kernel format: squares, narrow windows, and their pixels."""
         size = sum(table.numel() for table in self.squares.values())
         squares = self.squares[1].as_strided((size,), (1,))
         return [squares, self.narrow.flatten(), self.pixels]
 
     def take(self, places: Tensor) -> Windows:
-        """Return the windows of pixels at row-major places."""
+        """Return the windows of pixels at row-major indices."""
         numbers = self.choice.window.flatten()[places]
         every = (*self.squares.values(), self.narrow)
         columns = zip(*every, strict=True)
         return Windows(*(torch.cat([values.flatten() for values in c])[numbers] for c in columns))
 
     def sides_and_middles(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return rows and columns of the windows of pixels, and the places of their middles.
+        """Return sides (rows, columns) and centers (row, column) of the windows of pixels.
 
         Both have the shape ``(2, n)``.
         """
@@ -112,21 +112,21 @@ def fit_pixels(
     noise: tuple[float, float] | None,
     dtype: torch.dtype,
 ) -> PixelPlanes:
-    r"""Choose for each pixel the largest flat window that holds it.
+    """Select for each pixel the largest flat window that contains it.
 
-    In inverse depth ``w = 1 / z`` a plane of space is a plane over the image [1],
-    ``w = (n_x x + n_y y + n_z) / d`` with the ray ``(x, y, 1)``, and the noise of a triangulating
-    sensor is the same everywhere, so that plain least squares is right. A window is flat when it
-    deviates from its plane by hardly more than the noise, or than a slight bend, and than its four
-    quarters do from planes of their own; one across a step or an edge is not. For each size, the
-    largest first, a pixel takes the window around its cell if that is flat; else the flattest
-    window that holds it [2]; in both cases only if the pixel itself is on the plane. Where none is
-    flat but the smallest is smooth, as on a column without noise, it takes that. What is left then,
-    on faces seen at a grazing angle or a few pixels wide, is seen again by itself, with narrow
-    windows. Pixels in no flat window have the smallest square around them.
+    In inverse depth ``w = 1 / z`` a plane in space is a plane over the image [1], ``w = (n_x x +
+    n_y y + n_z) / d`` with the ray ``(x, y, 1)``. The noise of a triangulating sensor is uniform in
+    ``w``, so ordinary least squares applies. A window is flat if its deviation from its plane is
+    hardly above the noise (or a slight bend) and the deviation of its four quarters from their own
+    planes, unlike a window across a step or an edge. For each size, largest first, a pixel takes
+    the window around its cell if it is flat, otherwise the flattest window that contains it [2],
+    provided that the pixel itself is on the plane. If none is flat but the smallest is smooth, as
+    on a noise-free column, it is taken. The remaining pixels, on surfaces at a grazing angle or a
+    few pixels wide, are processed separately with narrow windows. Pixels in no flat window have the
+    smallest square around them.
 
-    ``focal`` are the focal lengths along columns and rows, ``noise`` is that of
-    :class:`torchrg.config.DepthConfig`, ``dtype`` that of the depth.
+    ``focal`` are the focal lengths along columns and rows, ``noise`` is from
+    :class:`torchrg.config.DepthConfig`, ``dtype`` is the dtype of the depth.
 
     References:
         [1] D. Gallup, J.-M. Frahm, M. Pollefeys. Piecewise planar and non-planar stereo for urban
@@ -171,12 +171,12 @@ def rate_windows(
     quarters: int | None = None,
     jitter: float = 0.0,
 ) -> None:
-    """Fill in what windows of a size may deviate by; jitter is that of the rays, in pixels.
+    """Compute the deviation limits of windows of a size; ``jitter`` of the rays is in pixels.
 
-    A bend is a share of half a window's side on the surface. On a plane at a distance d from the
+    A bend is a fraction of half a window's side on the surface. On a plane at a distance d from the
     camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
-    depth is one of ``d z e`` from the plane. Windows that deviate by more than their ``quarters``,
-    the windows of half the size, are not flat.
+    depth equals a distance of ``d z e`` to the plane. Windows that deviate by more than their
+    ``quarters``, the windows of half the size, are not flat.
     """
     table, noise, half = tables[size], noises[size], SIDE * size / 2 / max(map(abs, focal))
     if serves(table):
@@ -196,7 +196,7 @@ def rate_windows(
     is_flat = relative <= FLAT
     if quarters is not None:
         usual = _deviation_of_quarters(tables[quarters][3], relative.shape)
-        # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
+        # Errors of adjacent pixels are correlated, so parts of a flat window deviate less, too.
         usual = usual * (by_noise / noises[quarters].at(mean))
         usual = torch.maximum(usual, _MIN_QUARTERS * tolerance)
         is_flat &= deviation <= (1 + _SAME_NOISE / (SIDE * size)) * usual
@@ -205,7 +205,7 @@ def rate_windows(
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
-    """Return the root mean square deviation of the windows of half the size that cover windows."""
+    """Return the RMS deviation of the half-size windows that cover each window."""
     height, width = shape
     corner = SIDE
     padded = deviation.new_full((2 * height + corner, 2 * width + corner), torch.inf)
@@ -221,10 +221,10 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
 
 
 def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first: int) -> None:
-    """Offer pixels without a window those of a size, numbered from ``first`` on.
+    """Offer windows of a size, numbered from ``first``, to pixels without a window.
 
-    They take the window around their cell if it is flat, of the smallest size also if it is smooth,
-    else the flattest that holds them.
+    A pixel takes the window around its cell if it is flat (or, for the smallest size, smooth),
+    otherwise the flattest window that contains it.
     """
     windows = Windows(*table)
     if serves(table):
@@ -253,10 +253,10 @@ def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first:
 def choose_narrow(
     image: Image, numbers: Tensor, pixels: Tensor, table: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Choose for pixels the flatter narrow window around them, else the flattest that holds them.
+    """Select the flatter narrow window around each pixel, otherwise the flattest containing it.
 
-    A pixel must be on its plane, too. The arguments are those of :func:`fit_narrow_windows`.
-    Returns places in the table, row by row, -1 for none, and whether they are the latter.
+    A pixel must also be on its plane. For the arguments see :func:`fit_narrow_windows`. Returns
+    row-major indices into the table, -1 for none, and a mask of the latter case.
     """
     if serves(table):
         chosen, beside = torch.empty_like(pixels), torch.empty_like(pixels, dtype=torch.bool)
@@ -286,7 +286,7 @@ def choose_narrow(
 
 
 def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach: Tensor) -> Tensor:
-    """Tell which pixels are within the reach of windows, both by place."""
+    """Return a mask of pixels within reach of windows, both by index."""
     u_slope, v_slope, origin = (values.flatten()[places] for values in table[:3])
     row, column = pixels // len(image.u), pixels % len(image.u)
     on_plane = u_slope * image.u[column] + v_slope * image.v[row]
@@ -296,7 +296,7 @@ def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach
 
 
 def min_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Return the least value within reach of each cell along both axes, and its row-major place."""
+    """Return the minimum within reach of each cell along both axes, and its row-major index."""
     best, place = -image[None, None], torch.arange(image.numel(), device=image.device)
     for axis in (1, 0):
         size, pad = [1, 1], [0, 0]

@@ -1,4 +1,4 @@
-"""What the windows of pixels say of them, and which pixels are on one surface with the next."""
+"""Per-pixel normals, curvature and noise, and connectivity of adjacent pixels."""
 
 from typing import NamedTuple
 
@@ -13,21 +13,21 @@ from torchrg.depth.windows import Image, Windows
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 
 _ALIKE = 1.75
-"""Factor of the largest angle between normals of two windows that both hold both pixels. On a
-column, large windows turn by more than the angle from one cell to the next."""
+"""Factor of the maximum angle between the normals of two windows that both contain both pixels. On
+a column, large windows turn by more than the angle from one cell to the next."""
 
 _SLOPE_NOISE = 1.0
-"""Standard deviations by which the slopes of two windows that both hold both pixels may differ,
-whatever the angle is. The small windows of a narrow face turn by noise alone."""
+"""Maximum slope difference, in standard deviations, of two windows that both contain both pixels,
+at any angle. The small windows of a narrow surface turn by noise alone."""
 
 
 class Pixels(NamedTuple):
-    """What the windows of pixels say, ``(H, W)``; normals are unit ones ``(H, W, 3)``.
+    """Per-pixel measurements ``(H, W)``; normals are unit vectors ``(H, W, 3)``.
 
-    ``curvature`` is the fraction of a window's variance across its plane; ``noise`` is the noise
-    of inverse depth in large windows. ``valid`` marks pixels that have a plane; normals and
-    curvature are 0 at the others. ``right`` and ``down`` mark pixels that lie on one surface with
-    the next.
+    ``curvature`` is the fraction of a window's variance perpendicular to its plane; ``noise`` is
+    the noise of inverse depth in large windows. ``valid`` marks pixels that have a plane; normals
+    and curvature are 0 at other pixels. ``right`` and ``down`` mark pixels on one surface with the
+    next.
     """
 
     normals: Tensor
@@ -41,15 +41,15 @@ class Pixels(NamedTuple):
 def describe_pixels(
     image: Image, planes: PixelPlanes, focal: tuple[float, float], config: DepthConfig
 ) -> Pixels:
-    """Return normals towards the camera, curvature, noise, and what is one surface.
+    """Return normals towards the camera, curvature, noise, and surface connectivity.
 
-    A deviation e of inverse depth is one of ``distance * z * e`` from the plane; a step of a column
-    is one of ``(x_step - x_slope * z * ray) z`` along it.
+    A deviation e of inverse depth equals a distance of ``distance * z * e`` to the plane; a column
+    step equals ``(x_step - x_slope * z * ray) z`` along it.
 
-    Pixels are on one surface if both have a flat window, their normals in space are within the
-    angle, and at both pixels their two planes differ by at most ``max_step`` times what a flat
-    window may deviate by: no region crosses a step. Where both windows hold both pixels the angle
-    may be larger: a crease between the pixels would lie within two flat windows.
+    Two pixels are on one surface if both have a flat window, their normals in space are within the
+    angle, and at both pixels their planes differ by at most ``max_step`` times the allowed
+    deviation of a flat window: no region crosses a step. If both windows contain both pixels the
+    angle may be larger: a crease between the pixels would lie within two flat windows.
     """
     values, seen, choice = image.values, image.seen, planes.choice
     x, y = image.u / focal[0], image.v / focal[1]
@@ -104,10 +104,10 @@ def _join(
     limits: tuple[float, float, float],
     axis: int,
 ) -> Tensor:
-    """Return which pixels are on one surface with the next along an axis, ``(H, W)``.
+    """Return a mask of pixels on one surface with the next along an axis, ``(H, W)``.
 
-    The tolerance ``(H, W)`` is what their windows may deviate by; the limits are of step, angle and
-    wider angle.
+    ``tolerance`` ``(H, W)`` is the allowed deviation of the windows; ``limits`` are the step, the
+    angle and the wider angle.
     """
     max_step, max_sq_chord, wider_sq_chord = limits
     flat, numbers, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
@@ -136,9 +136,9 @@ def _join(
 
 
 def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
-    """Return the variance of the slopes of windows of so many rows and columns, ``(2, n)``.
+    """Return the slope variance of windows with the given rows and columns, ``(2, n)``.
 
-    That of least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, the mean of both
+    For least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, averaged over the
     axes.
     """
     rows, columns = sides.unbind()
@@ -147,9 +147,10 @@ def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
 
 
 def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
-    """Tell whether windows hold pixels, by row-major place in an image of so many columns.
+    """Return a mask of windows that contain pixels, by row-major index; ``width`` is in pixels.
 
-    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` row and column of their middles.
+    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` the row and column of their
+    centers.
     """
     (rows, columns), (row, column) = sides.unbind(), middles.unbind()
     down, right = (pixels // width - row).abs(), (pixels % width - column).abs()

@@ -93,8 +93,8 @@ def search_knn(
     if not np.isfinite(coordinates).all():
         num_nonfinite = int((~np.isfinite(coordinates)).any(axis=1).sum())
         raise ShapeError(
-            f"search_knn: expected finite points, got {num_nonfinite:,} of {len(coordinates):,} with "
-            "NaN or Inf. Remove them first."
+            f"search_knn: expected finite points, got {num_nonfinite:,} of {len(coordinates):,} "
+            "with NaN or Inf. Remove them first."
         )
     bounds = _cloud_bounds(offset, len(coordinates))
     min_points = min((stop - start for start, stop in bounds), default=MAX_POINTS)
