@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchrg.depth.normals import fit_pixels, min_in_windows
-from torchrg.depth.pixels import holds
+from torchrg.depth.pixels import contain
 from torchrg.depth.windows import CELL_SIZES, Image, Windows, fit_windows, noise_by_size
 
 FOCAL = (525.0, 525.0)
@@ -114,7 +114,7 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         for column in range(-(-width // size))
     ]
     pixels, others = torch.randint(height * width, (2, 400), generator=rng)
-    sides, middles = found.sides_and_middles(pixels)
+    sides, middles = found.sides_and_centers(pixels)
     expected, lengths = [], []
     for pixel, other in zip(pixels.tolist(), others.tolist(), strict=True):
         top, bottom, left, right = squares[int(found.choice.window.flatten()[pixel])]
@@ -122,6 +122,6 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         expected.append(top <= row < bottom and left <= column < right)
         lengths.append([bottom - top, right - left])
     assert sides.T.tolist() == lengths
-    assert holds(sides, middles, others, width).tolist() == expected
+    assert contain(sides, middles, others, width).tolist() == expected
     assert any(expected)
     assert not all(expected)

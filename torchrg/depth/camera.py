@@ -126,9 +126,9 @@ def check_camera(caller: str, intrinsics: Tensor) -> None:
     """
     matrices = intrinsics.detach().reshape(-1, 3, 3).double().cpu()
     focal = matrices.diagonal(dim1=1, dim2=2)[:, :2]
-    others = matrices[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+    constants = matrices[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
     is_camera = (matrices.abs() <= FARTHEST).all() and focal.reciprocal().isfinite().all()
-    if not (is_camera and (others == others.new_tensor([0, 0, 0, 0, 1])).all()):
+    if not (is_camera and (constants == constants.new_tensor([0, 0, 0, 0, 1])).all()):
         raise ConfigError(
             f"{caller}: expected intrinsics of rows (fx, 0, cx), (0, fy, cy), (0, 0, 1), finite, "
             f"with fx and fy not 0, got {intrinsics.tolist()}."
@@ -172,17 +172,17 @@ def doubt_view(
     rows = list(zip(focal, axis, size, strict=True))
     angle = math.degrees(math.atan(max(max(c + 0.5, side - 0.5 - c) / f for f, c, side in rows)))
     view = math.degrees(2 * math.atan(max(side / (2 * f) for f, _, side in rows)))
-    off = _off_center(axis, size)
+    error = _off_center(axis, size)
     if angle > _WIDE_ANGLE_DEG:
-        doubt = f"with pixels {angle:.3g} degrees off the optical axis; give pixels, not fractions"
+        doubt = f"with pixels {angle:.3g} degrees off the optical axis; use pixels, not fractions"
     elif view < _NARROW_VIEW_DEG:
-        doubt = f"with a field of view of {view:.2g} degrees; give focal lengths in pixels"
+        doubt = f"with a field of view of {view:.2g} degrees; use focal lengths in pixels"
     elif max(focal) > _MAX_ASPECT * min(focal):
-        doubt = "with pixels that are not square; check the order of the numbers"
-    elif off > _MAX_OFF_CENTER:
-        doubt = "with an optical axis off the center; give the camera of images of this size"
-    elif off > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
-        doubt = "which fit better with cx and cy in the other order; exchange them"
+        doubt = "with non-square pixels; check the order of the numbers"
+    elif error > _MAX_OFF_CENTER:
+        doubt = "with an optical axis off the center; pass the camera of images of this size"
+    elif error > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
+        doubt = "which fit better with cx and cy exchanged; swap them"
     else:
         return ""
     numbers = ",".join(f"{value:g}" for value in camera[:4])
@@ -279,8 +279,8 @@ class Pinhole(NamedTuple):
             return make_intrinsics(fx, fy, cx, cy)
         (width, height), (old_width, old_height) = size, calibrated or size
         if abs(width * old_height - height * old_width) > max(old_width, old_height):
-            is_turned = abs(height * old_height - width * old_width) <= max(old_width, old_height)
-            repair = "turn the images back, or " if is_turned else ""
+            is_rotated = abs(height * old_height - width * old_width) <= max(old_width, old_height)
+            repair = "rotate the images back, or " if is_rotated else ""
             raise ConfigError(
                 f"{caller}: expected images of {old_width} x {old_height} pixels, as its camera's, "
                 f"or in their ratio, got {width} x {height}; {repair}pass the camera of the depth "
@@ -293,8 +293,8 @@ class Pinhole(NamedTuple):
         if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
             raise ConfigError(
                 f"{caller}: expected an optical axis within images of {width} x {height} pixels, "
-                f"got {cx:g},{cy:g}; pass the camera of the depth images, or a file that names its "
-                "width and height."
+                f"got {cx:g},{cy:g}; pass the camera of the depth images, or a file with its width "
+                "and height."
             )
         return make_intrinsics(fx, fy, cx, cy)
 
@@ -321,7 +321,7 @@ def find_intrinsics(points: Tensor) -> Tensor | None:
     check_shapes("find_intrinsics", points=(points, "H W 3"))
     check_floating("find_intrinsics", points=points)
     seen = points.isfinite().all(dim=-1) & (points[..., 2] > 0)
-    rows, columns = (place.double() for place in seen.nonzero().unbind(dim=1))
+    rows, columns = (indices.double() for indices in seen.nonzero().unbind(dim=1))
     x, y, z = points[seen].double().unbind(dim=1)
     lines = [_fit_line(x / z, columns), _fit_line(y / z, rows)]
     if any(line is None for line in lines):
@@ -336,22 +336,22 @@ def find_misfit(points: Tensor, intrinsics: Tensor) -> float:
     ``points`` ``(H, W, 3)`` are in camera coordinates. It is 0 if no point is in front.
     """
     seen = points.isfinite().all(dim=-1) & (points[..., 2] > 0)
-    rows, columns = (place.double() for place in seen.nonzero().unbind(dim=1))
+    rows, columns = (indices.double() for indices in seen.nonzero().unbind(dim=1))
     projected = points[seen].double() @ intrinsics.to(points.device, torch.float64).T
     across, down = (projected[:, axis] / projected[:, 2] for axis in (0, 1))
-    off = torch.hypot(across - columns, down - rows)
-    return float(off.median()) if len(off) else 0.0
+    error = torch.hypot(across - columns, down - rows)
+    return float(error.median()) if len(error) else 0.0
 
 
-def _fit_line(slopes: Tensor, places: Tensor) -> tuple[float, float] | None:
+def _fit_line(slopes: Tensor, positions: Tensor) -> tuple[float, float] | None:
     """Return the line ``position = focal * slope + center`` through nearly all points, or None."""
     if len(slopes) < 2:
         return None
-    mean_slope, mean_place = slopes.mean(), places.mean()
+    mean_slope, mean_position = slopes.mean(), positions.mean()
     spread = ((slopes - mean_slope) ** 2).sum()
-    focal = ((slopes - mean_slope) * (places - mean_place)).sum() / spread
-    middle = mean_place - focal * mean_slope
-    off = (focal * slopes + middle - places).abs() > 0.1
-    if not bool(focal.isfinite()) or float(focal) == 0 or float(off.double().mean()) > 0.01:
+    focal = ((slopes - mean_slope) * (positions - mean_position)).sum() / spread
+    center = mean_position - focal * mean_slope
+    error = (focal * slopes + center - positions).abs() > 0.1
+    if not bool(focal.isfinite()) or float(focal) == 0 or float(error.double().mean()) > 0.01:
         return None
-    return float(focal), float(middle)
+    return float(focal), float(center)

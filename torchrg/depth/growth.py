@@ -9,18 +9,18 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import map_tasks
 from torchrg.config import DepthConfig
-from torchrg.depth.faces import borders, hidden_contacts, join_strips
-from torchrg.depth.passes import serves
+from torchrg.depth.faces import boundaries, hidden_contacts, join_strips
+from torchrg.depth.passes import has_kernels
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MAX_FITTED, RegionPlanes
 from torchrg.regions.growth import number_by_size
 from torchrg.regions.repair import absorb_points, merge_coplanar
 from torchrg.robust.scale import MAD_FACTOR
 
-_AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
+_FORWARD_STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
 """Row and column steps to the adjacent pixels that come later."""
 
-_AROUND = (*_AHEAD, *((-down, -right) for down, right in _AHEAD))
+_ALL_STEPS = (*_FORWARD_STEPS, *((-down, -right) for down, right in _FORWARD_STEPS))
 
 _NUM_PASSES = 2
 """Passes of boundary assignment and merging: assigned pixels may make regions adjacent."""
@@ -33,10 +33,10 @@ _MERGE_TOLERANCE = 1.2
 """Maximum ratio of the RMS distances to the joint plane and to the own plane of two merged flat
 regions, as for clouds; see :class:`torchrg.config.GrowingConfig`."""
 
-_CURVED = 3.0
+_MAX_NOISE = 3.0
 """Maximum thickness of a planar region in units of the noise, regardless of its bend."""
 
-_BENT = 0.03
+_MAX_BEND = 0.03
 """Maximum thickness of a planar region as a fraction of its extent, regardless of the noise. A
 slightly bent surface is one plane; a column is 0.4 of its extent thick."""
 
@@ -46,7 +46,7 @@ _NUM_FITS = 2
 _MAX_MOVES = 16
 """Maximum displacement of a boundary, in pixels: windows hardly reach farther from their center."""
 
-_STRAIGHT = 0.85
+_MIN_COSINE = 0.85
 """Minimum cosine of the angle between a step perpendicular to a crease and one that counts."""
 
 
@@ -94,7 +94,7 @@ def _normals_in_space(fit: RegionPlanes) -> Tensor:
 
 def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:
     """Return the connected components of an image ``(H * W,)``, -1 where it is not flat."""
-    if serves(flat):
+    if has_kernels(flat):
         return kernels.call("connect_pixels", flat, right, down)[0].flatten()
     from scipy.ndimage import label
 
@@ -115,11 +115,11 @@ class PixelGrid:
 
     def neighbor_rows(self, rows: Tensor) -> Tensor:
         """Return the neighbors of pixels ``(n, 8)``, clamped to the image."""
-        down, right = torch.tensor(_AROUND, device=rows.device).T
+        down, right = torch.tensor(_ALL_STEPS, device=rows.device).T
         row = (rows[:, None] // self.width + down).clamp(0, self.height - 1)
         column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)
-        around: Tensor = row * self.width + column
-        return around
+        near_rows: Tensor = row * self.width + column
+        return near_rows
 
     def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
         """Return the candidates that have a changed neighbor."""
@@ -129,19 +129,19 @@ class PixelGrid:
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of adjacent regions, and the number of contacts of each pair."""
-        first, second = (labels[pixels] for pixels in self.borders(labels))
+        first, second = (labels[pixels] for pixels in self.boundaries(labels))
         num_regions = int(labels.max()) + 1
         keys = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
         keys, counts = torch.unique(keys, return_counts=True)
         # Contacts are symmetric.
         return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
 
-    def borders(self, labels: Tensor) -> tuple[Tensor, Tensor]:
+    def boundaries(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of adjacent pixels of two regions, each once."""
-        pairs = borders(labels.view(self.height, self.width), _AHEAD)
+        pairs = boundaries(labels.view(self.height, self.width), _FORWARD_STEPS)
         first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
-        touch = (labels[first] >= 0) & (labels[second] >= 0)
-        return first[touch], second[touch]
+        adjacent = (labels[first] >= 0) & (labels[second] >= 0)
+        return first[adjacent], second[adjacent]
 
 
 def _refine(
@@ -153,19 +153,19 @@ def _refine(
     flat regions are merged. Then boundaries move to the intersection lines of the planes. Returns
     labels by descending size, and the planes of the regions.
     """
-    beside = PixelGrid(cloud.seen.shape)
+    grid = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
         planes = fit_inverse_planes(cloud, labels)
         reach = planes.times_thickness(_ABSORB_REACH)
         labels = absorb_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
-        pairs = zip(beside.contacts(labels), hidden, strict=True)
+        pairs = zip(grid.contacts(labels), hidden, strict=True)
         contacts, counts = (torch.cat(ends) for ends in pairs)
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
     width, (x, y, _) = cloud.seen.shape[1], cloud.points.unbind(dim=1)
-    tables = _planes_over_rays(planes), _normals_in_space(planes), planes.num_points
+    tables = _ray_planes(planes), _normals_in_space(planes), planes.num_points
     joined = join_strips(labels, (x[:width], y[::width]), cloud.noise, *tables)
     if joined is not labels:
         labels = number_by_size(joined, config.min_size)
@@ -181,17 +181,17 @@ def absorb_pixels(
 ) -> Tensor:
     """Apply :func:`torchrg.regions.repair.absorb_points` to the pixels of an image."""
     seen = cloud.seen
-    if not serves(cloud.points):
-        beside = PixelGrid(seen.shape)
-        return absorb_points(cloud.points, labels, beside, planes, reach, valid=seen.flatten())
+    if not has_kernels(cloud.points):
+        grid = PixelGrid(seen.shape)
+        return absorb_points(cloud.points, labels, grid, planes, reach, valid=seen.flatten())
     image = labels.view(seen.shape).clone()
-    room = [torch.empty_like(image) for _ in range(3)]
+    buffers = [torch.empty_like(image) for _ in range(3)]
     tables = planes.normal, planes.center, reach
-    kernels.call("absorb_pixels", cloud.points.T, seen, image, *tables, *room)
+    kernels.call("absorb_pixels", cloud.points.T, seen, image, *tables, *buffers)
     return image.flatten()
 
 
-def _planes_over_rays(fit: RegionPlanes) -> Tensor:
+def _ray_planes(fit: RegionPlanes) -> Tensor:
     """Return planes ``(M, 3)`` whose product with a ray ``(x, y, 1)`` is the last coordinate."""
     offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
     return torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
@@ -208,11 +208,11 @@ def fit_inverse_planes(
     per region.
     """
     chunks = Segments(labels, most=most).chunks(len(labels) + 1)
-    parts = map_tasks(lambda chunk: _fit_together(cloud, chunk), chunks, labels.device)
+    parts = map_tasks(lambda chunk: _fit_chunk(cloud, chunk), chunks, labels.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
+def _fit_chunk(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
     """Fit planes to one chunk of regions; see :func:`fit_inverse_planes`."""
     noise = segments.mean(segments.take(cloud.noise))
     columns = segments.take_columns(cloud.points)
@@ -237,7 +237,7 @@ def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
         torch.maximum(thickness / length.squeeze(1), noise),
         rms=squares.sqrt() / length.squeeze(1),
         num_points=segments.sizes,
-        curved=thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
+        curved=thickness > torch.maximum(_MAX_NOISE * noise, _MAX_BEND * extent * nearness),
         floor=noise,
         reach=torch.full_like(noise, torch.inf),
         bent=torch.zeros_like(noise, dtype=torch.bool),
@@ -258,61 +258,61 @@ def move_to_creases(
 
     ``reach`` is the maximum distance of a point on the plane along the last coordinate, ``(M,)``.
     """
-    planes, middles = _planes_over_rays(fit), fit.center[:, :2]
+    planes, middles = _ray_planes(fit), fit.center[:, :2]
     labels = labels.clone()
-    if serves(cloud.points):
+    if has_kernels(cloud.points):
         image = labels.view(cloud.seen.shape)
-        room = [torch.empty_like(image) for _ in range(3)]
-        limits = _MAX_MOVES, _STRAIGHT
+        buffers = [torch.empty_like(image) for _ in range(3)]
+        limits = _MAX_MOVES, _MIN_COSINE
         kernels.call(
-            "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *room
+            "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *buffers
         )
         return labels
     grid = PixelGrid(cloud.seen.shape)
-    rows = torch.unique(torch.cat(grid.borders(labels)))
+    rows = torch.unique(torch.cat(grid.boundaries(labels)))
     for _ in range(_MAX_MOVES):
-        around = grid.neighbor_rows(rows)
-        across = _regions_across(cloud, labels, planes, middles, reach, rows, around)
-        moved = across != labels[rows]
+        near_rows = grid.neighbor_rows(rows)
+        regions = _crease_regions(cloud, labels, planes, middles, reach, rows, near_rows)
+        moved = regions != labels[rows]
         if not bool(moved.any()):
             break
-        labels[rows[moved]] = across[moved]
-        rows = torch.unique(torch.cat([rows[moved], around[moved].flatten()]))
+        labels[rows[moved]] = regions[moved]
+        rows = torch.unique(torch.cat([rows[moved], near_rows[moved].flatten()]))
         rows = rows[labels[rows] >= 0]
     return labels
 
 
-def _regions_across(
+def _crease_regions(
     cloud: InverseCloud,
     labels: Tensor,
     planes: Tensor,
     middles: Tensor,
     reach: Tensor,
     rows: Tensor,
-    around: Tensor,
+    near_rows: Tensor,
 ) -> Tensor:
     """Return the region ``(n,)`` of pixels according to the adjacent creases."""
     x, y, inverse = cloud.points.unbind(dim=1)
-    label, near = labels[rows][:, None], labels[around]
+    label, near = labels[rows][:, None], labels[near_rows]
     other, near = (near >= 0) & (near != label), near.clamp(min=0)
-    ray, around_rays = (x[rows][:, None], y[rows][:, None]), (x[around], y[around])
-    apart = planes[label] - planes[near]
-    a, b, _ = apart.unbind(dim=2)
-    here, there = _over_rays(apart, *ray), _over_rays(apart, *around_rays)
-    mine, theirs = (_over_rays(apart, *middles[which].unbind(dim=2)) for which in (label, near))
+    ray, near_rays = (x[rows][:, None], y[rows][:, None]), (x[near_rows], y[near_rows])
+    gap = planes[label] - planes[near]
+    a, b, _ = gap.unbind(dim=2)
+    here, there = _evaluate(gap, *ray), _evaluate(gap, *near_rays)
+    side, other_side = (_evaluate(gap, *middles[which].unbind(dim=2)) for which in (label, near))
     slope = (a.square() + b.square()).sqrt()
-    step = ((around_rays[0] - ray[0]).square() + (around_rays[1] - ray[1]).square()).sqrt()
-    straight = there.abs() - here.abs() >= _STRAIGHT * slope * step
-    away = (inverse[rows][:, None] - _over_rays(planes[near], *ray)).abs()
-    goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
-    goes = goes & (mine.abs() > reach[near]) & (theirs.abs() > reach[label])
-    away = torch.where(goes, away, torch.inf)
-    least = away.amin(dim=1, keepdim=True)
-    nearest = torch.where(goes & (away == least), near, len(planes)).amin(dim=1)
+    step = ((near_rays[0] - ray[0]).square() + (near_rays[1] - ray[1]).square()).sqrt()
+    straight = there.abs() - here.abs() >= _MIN_COSINE * slope * step
+    away = (inverse[rows][:, None] - _evaluate(planes[near], *ray)).abs()
+    moves = other & straight & (here * side < 0) & (side * other_side < 0) & (away <= reach[near])
+    moves = moves & (side.abs() > reach[near]) & (other_side.abs() > reach[label])
+    away = torch.where(moves, away, torch.inf)
+    minimum = away.amin(dim=1, keepdim=True)
+    nearest = torch.where(moves & (away == minimum), near, len(planes)).amin(dim=1)
     return torch.where(nearest < len(planes), nearest, label.squeeze(1))
 
 
-def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def _evaluate(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Return the last coordinates ``(*)`` of planes ``(*, 3)`` at rays ``(x, y, 1)``."""
     a, b, c = planes.unbind(dim=-1)
     return a * x + b * y + c

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import places_of
-from torchrg.depth.passes import pass_over_rows, serves
+from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import (
     CELL_SIZES,
     NARROW,
@@ -21,25 +21,25 @@ from torchrg.depth.windows import (
     find_jitter,
     fit_narrow_windows,
     fit_windows,
-    held_pixels,
     noise_by_size,
+    window_pixels,
 )
 
 FLAT = 1.35
 """Maximum deviation of a flat window from its plane, in tolerances."""
-_OWN_REACH = 3.5
+_MAX_PIXEL_NOISE = 3.5
 """Maximum distance of a pixel on the plane of a window, in units of the noise."""
-_SAME_NOISE = 2.0
+_QUARTER_MARGIN = 2.0
 """A flat window deviates from its plane at most by a factor of 1 plus this over its side in pixels
 more than its quarters do from their own planes."""
 _MIN_QUARTERS = 0.7
 """Minimum counted deviation of the quarters of a window, in units of the tolerance."""
-_BEND = 0.005
+_BEND_FRACTION = 0.005
 """Maximum bend of a flat window as a fraction of half its side, regardless of the noise."""
-_MAX_BEND = 0.03
+_MAX_BEND_FRACTION = 0.03
 """Maximum bend of a smallest window as a fraction of half its side, if none is flat. Twice this
 value would hide creases of 20 degrees."""
-_STEEPEST = 4.0
+_MAX_STEEPNESS = 4.0
 """Inverse cosine of the maximum angle at which a surface may bend. At a steeper angle, a step looks
 like a bend."""
 _STEEP_SIZE = 2
@@ -79,29 +79,29 @@ class PixelPlanes(NamedTuple):
         squares = self.squares[1].as_strided((size,), (1,))
         return [squares, self.narrow.flatten(), self.pixels]
 
-    def take(self, places: Tensor) -> Windows:
+    def take(self, index: Tensor) -> Windows:
         """Return the windows of pixels at row-major indices."""
-        numbers = self.choice.window.flatten()[places]
-        every = (*self.squares.values(), self.narrow)
-        columns = zip(*every, strict=True)
+        numbers = self.choice.window.flatten()[index]
+        tables = (*self.squares.values(), self.narrow)
+        columns = zip(*tables, strict=True)
         return Windows(*(torch.cat([values.flatten() for values in c])[numbers] for c in columns))
 
-    def sides_and_middles(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def sides_and_centers(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """Return sides (rows, columns) and centers (row, column) of the windows of pixels.
 
         Both have the shape ``(2, n)``.
         """
-        width, double, parts = self.choice.window.shape[1], self.narrow.dtype, []
+        width, dtype, parts = self.choice.window.shape[1], self.narrow.dtype, []
         for size, table in self.squares.items():
-            rows, columns = (torch.arange(n, dtype=double) for n in table.shape[1:])
+            rows, columns = (torch.arange(n, dtype=dtype) for n in table.shape[1:])
             grid = torch.cartesian_prod(rows, columns).T * size + (size - 1) / 2
             parts.append(torch.cat([torch.full_like(grid, SIDE * size), grid]))
         for sides in NARROW:
-            middles = torch.stack([self.pixels // width, self.pixels % width]).to(double).cpu()
+            middles = torch.stack([self.pixels // width, self.pixels % width]).to(dtype).cpu()
             parts.append(
                 torch.cat([middles.new_tensor(sides)[:, None].expand_as(middles), middles])
             )
-        windows = torch.cat(parts, dim=1).to(places.device)[:, self.choice.window.flatten()[places]]
+        windows = torch.cat(parts, dim=1).to(index.device)[:, self.choice.window.flatten()[index]]
         return windows[:2], windows[2:]
 
 
@@ -153,12 +153,12 @@ def fit_pixels(
     rate_windows(
         {1: narrow}, 1, noises, focal, jitter=find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)
     )
-    chosen, beside = choose_narrow(image, numbers, pixels, narrow)
-    taken = chosen >= 0
-    pixel = pixels[taken]
-    choice.window.view(-1)[pixel] = num_squares + chosen[taken]
+    chosen, off_center = choose_narrow(image, numbers, pixels, narrow)
+    is_taken = chosen >= 0
+    pixel = pixels[is_taken]
+    choice.window.view(-1)[pixel] = num_squares + chosen[is_taken]
     choice.flat.view(-1)[pixel] = True
-    choice.edge.view(-1)[pixel] = beside[taken]
+    choice.edge.view(-1)[pixel] = off_center[is_taken]
     return PixelPlanes(choice, squares, narrow, pixels, noises[CELL_SIZES[0]])
 
 
@@ -179,7 +179,7 @@ def rate_windows(
     ``quarters``, the windows of half the size, are not flat.
     """
     table, noise, half = tables[size], noises[size], SIDE * size / 2 / max(map(abs, focal))
-    if serves(table):
+    if has_kernels(table):
         finer = tables[size][0, :0] if quarters is None else tables[quarters][3]
         numbers = *noise, noises[quarters or size].factor, *focal, half, jitter
         pass_over_rows("rate_windows", table.shape[1], table, finer, *numbers, size)
@@ -188,20 +188,20 @@ def rate_windows(
     sq_blur = jitter * jitter * (u_slope.square() + v_slope.square())
     by_noise = (noise.at(mean).square() + sq_blur).sqrt()
     sq_nearness = (u_slope * focal[0]).square() + (v_slope * focal[1]).square() + origin.square()
-    is_steep = sq_nearness > (_STEEPEST * mean).square()
+    is_steep = sq_nearness > (_MAX_STEEPNESS * mean).square()
     bend = half * torch.where(is_steep, 0.0, sq_nearness) / mean
     bend = torch.where(mean > 0, bend, 0.0)
-    tolerance = torch.maximum(by_noise, _BEND * bend)
+    tolerance = torch.maximum(by_noise, _BEND_FRACTION * bend)
     relative = deviation / tolerance
     is_flat = relative <= FLAT
     if quarters is not None:
-        usual = _deviation_of_quarters(tables[quarters][3], relative.shape)
+        typical = _deviation_of_quarters(tables[quarters][3], relative.shape)
         # Errors of adjacent pixels are correlated, so parts of a flat window deviate less, too.
-        usual = usual * (by_noise / noises[quarters].at(mean))
-        usual = torch.maximum(usual, _MIN_QUARTERS * tolerance)
-        is_flat &= deviation <= (1 + _SAME_NOISE / (SIDE * size)) * usual
+        typical = typical * (by_noise / noises[quarters].at(mean))
+        typical = torch.maximum(typical, _MIN_QUARTERS * tolerance)
+        is_flat &= deviation <= (1 + _QUARTER_MARGIN / (SIDE * size)) * typical
     relative = torch.where(is_flat, relative, torch.inf)
-    table[NUM_PLANE:] = torch.stack([by_noise, tolerance, _MAX_BEND * bend, relative])
+    table[NUM_PLANE:] = torch.stack([by_noise, tolerance, _MAX_BEND_FRACTION * bend, relative])
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
@@ -227,27 +227,27 @@ def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first:
     otherwise the flattest window that contains it.
     """
     windows = Windows(*table)
-    if serves(table):
+    if has_kernels(table):
         pass_over_rows("offer_windows", table.shape[1], *image, table, *choice, size, first)
         return
     itself = torch.arange(windows.mean.numel(), device=table.device).view_as(windows.mean)
-    least, flattest = min_in_windows(windows.relative, REACH)
-    beside = torch.where(least.isfinite(), flattest, -1)
-    reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
+    minimum, flattest = min_in_windows(windows.relative, REACH)
+    off_center = torch.where(minimum.isfinite(), flattest, -1)
+    reach = torch.maximum(_MAX_PIXEL_NOISE * windows.noise, windows.tolerance)
     flat = torch.where(windows.relative.isfinite(), itself, -1)
-    offers = [(flat, _OWN_REACH * windows.tolerance), (beside, reach)]
+    offers = [(flat, _MAX_PIXEL_NOISE * windows.tolerance), (off_center, reach)]
     if size == 1:
-        smooth = torch.where(windows.deviation <= windows.most, itself, -1)
+        smooth = torch.where(windows.deviation <= windows.max_bend, itself, -1)
         offers.insert(1, (smooth, torch.full_like(reach, torch.inf)))
-    for places, reach in offers:
+    for index, reach in offers:
         pixels = places_of(image.seen & ~choice.flat)
         row, column = pixels // len(image.u), pixels % len(image.u)
-        offered = places[row // size, column // size]
-        taken = (offered >= 0) & _are_near(image, pixels, offered, table, reach)
-        pixels = pixels[taken]
-        choice.window.view(-1)[pixels] = first + offered[taken]
+        offered = index[row // size, column // size]
+        is_taken = (offered >= 0) & _are_near(image, pixels, offered, table, reach)
+        pixels = pixels[is_taken]
+        choice.window.view(-1)[pixels] = first + offered[is_taken]
         choice.flat.view(-1)[pixels] = True
-        choice.edge.view(-1)[pixels] = places is beside
+        choice.edge.view(-1)[pixels] = index is off_center
 
 
 def choose_narrow(
@@ -258,49 +258,49 @@ def choose_narrow(
     A pixel must also be on its plane. For the arguments see :func:`fit_narrow_windows`. Returns
     row-major indices into the table, -1 for none, and a mask of the latter case.
     """
-    if serves(table):
-        chosen, beside = torch.empty_like(pixels), torch.empty_like(pixels, dtype=torch.bool)
-        fixed = image.values, image.u, image.v, numbers, pixels, table, chosen, beside
+    if has_kernels(table):
+        chosen, off_center = torch.empty_like(pixels), torch.empty_like(pixels, dtype=torch.bool)
+        fixed = image.values, image.u, image.v, numbers, pixels, table, chosen, off_center
         pass_over_rows("choose_narrow", len(pixels), *fixed)
-        return chosen, beside
+        return chosen, off_center
     windows, count = Windows(*table), len(pixels)
     relative = windows.relative.flatten()
-    reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
+    reach = torch.maximum(_MAX_PIXEL_NOISE * windows.noise, windows.tolerance)
 
-    def reached(window: Tensor) -> Tensor:
+    def cost_in_reach(window: Tensor) -> Tensor:
         near = (window >= 0) & _are_near(image, pixels, window, table, reach)
         cost: Tensor = torch.where(near, relative[window], torch.inf)
         return cost
 
-    around = torch.arange(count, device=pixels.device)
-    around = torch.where(windows.relative[1] < windows.relative[0], around + count, around)
-    takes_around = reached(around).isfinite()
-    least, flattest = torch.full_like(relative[:count], torch.inf), torch.full_like(pixels, -1)
+    centered = torch.arange(count, device=pixels.device)
+    centered = torch.where(windows.relative[1] < windows.relative[0], centered + count, centered)
+    takes_centered = cost_in_reach(centered).isfinite()
+    minimum, flattest = torch.full_like(relative[:count], torch.inf), torch.full_like(pixels, -1)
     for shape, sides in enumerate(NARROW):
-        for _, number in held_pixels(numbers, pixels, *sides):
+        for _, number in window_pixels(numbers, pixels, *sides):
             window = torch.where(number >= 0, shape * count + number, -1)
-            cost = reached(window)
-            flattest = torch.where(cost < least, window, flattest)
-            least = torch.minimum(least, cost)
-    return torch.where(takes_around, around, flattest), ~takes_around & (flattest >= 0)
+            cost = cost_in_reach(window)
+            flattest = torch.where(cost < minimum, window, flattest)
+            minimum = torch.minimum(minimum, cost)
+    return torch.where(takes_centered, centered, flattest), ~takes_centered & (flattest >= 0)
 
 
-def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach: Tensor) -> Tensor:
+def _are_near(image: Image, pixels: Tensor, index: Tensor, table: Tensor, reach: Tensor) -> Tensor:
     """Return a mask of pixels within reach of windows, both by index."""
-    u_slope, v_slope, origin = (values.flatten()[places] for values in table[:3])
+    u_slope, v_slope, origin = (values.flatten()[index] for values in table[:3])
     row, column = pixels // len(image.u), pixels % len(image.u)
     on_plane = u_slope * image.u[column] + v_slope * image.v[row]
-    away = (image.values[row, column] - (on_plane + origin)).abs()
-    is_near: Tensor = away <= reach.flatten()[places]
+    distance = (image.values[row, column] - (on_plane + origin)).abs()
+    is_near: Tensor = distance <= reach.flatten()[index]
     return is_near
 
 
 def min_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     """Return the minimum within reach of each cell along both axes, and its row-major index."""
-    best, place = -image[None, None], torch.arange(image.numel(), device=image.device)
+    best, index = -image[None, None], torch.arange(image.numel(), device=image.device)
     for axis in (1, 0):
         size, pad = [1, 1], [0, 0]
         size[axis], pad[axis] = 2 * reach + 1, reach
         best, chosen = torch.nn.functional.max_pool2d(best, size, 1, pad, return_indices=True)
-        place = place[chosen.flatten()]
-    return -best[0, 0], place.view(image.shape)
+        index = index[chosen.flatten()]
+    return -best[0, 0], index.view(image.shape)

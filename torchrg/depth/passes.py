@@ -12,7 +12,7 @@ _MIN_ROWS = 32
 """Minimum number of rows per thread that outweighs its start."""
 
 
-def serves(image: Tensor) -> bool:
+def has_kernels(image: Tensor) -> bool:
     """Return whether kernels support a float64 image."""
     return image.device.type == "cpu" and kernels.serve()
 

@@ -8,15 +8,15 @@ from torch import Tensor
 from torchrg._parallel import places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.normals import FLAT, PixelPlanes
-from torchrg.depth.passes import pass_over_rows, serves
+from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import Image, Windows
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 
-_ALIKE = 1.75
+_WIDE_ANGLE_FACTOR = 1.75
 """Factor of the maximum angle between the normals of two windows that both contain both pixels. On
 a column, large windows turn by more than the angle from one cell to the next."""
 
-_SLOPE_NOISE = 1.0
+_MAX_SLOPE_NOISE = 1.0
 """Maximum slope difference, in standard deviations, of two windows that both contain both pixels,
 at any angle. The small windows of a narrow surface turn by noise alone."""
 
@@ -53,9 +53,9 @@ def describe_pixels(
     """
     values, seen, choice = image.values, image.seen, planes.choice
     x, y = image.u / focal[0], image.v / focal[1]
-    wider = min(_ALIKE * config.max_angle_deg, 90.0)
+    wider = min(_WIDE_ANGLE_FACTOR * config.max_angle_deg, 90.0)
     limits = config.max_step, deg_to_sq_chord(config.max_angle_deg), deg_to_sq_chord(wider)
-    if serves(values):
+    if has_kernels(values):
         curvature, noise = torch.empty_like(values), torch.empty_like(values)
         valid, right, down = (torch.empty_like(seen) for _ in range(3))
         normals = values.new_empty(*values.shape, 3)
@@ -64,28 +64,28 @@ def describe_pixels(
         numbers = *focal, *planes.noise, *limits
         pass_over_rows("describe_pixels", len(y), *fixed, *found, *numbers)
         return found
-    places = torch.arange(values.numel(), device=values.device)
-    windows = Windows(*(column.view(values.shape) for column in planes.take(places)))
-    sides = planes.sides_and_middles(places)[0].view(2, *values.shape)
+    index = torch.arange(values.numel(), device=values.device)
+    windows = Windows(*(column.view(values.shape) for column in planes.take(index)))
+    sides = planes.sides_and_centers(index)[0].view(2, *values.shape)
     noise = planes.noise.at(values)
     valid = choice.flat | (seen & windows.deviation.isfinite())
     is_smooth = windows.deviation > FLAT * windows.tolerance
     limit = torch.maximum(windows.tolerance, noise)
     tolerance = torch.where(is_smooth, windows.deviation, limit)
-    away = windows.u_slope * focal[0], windows.v_slope * focal[1], windows.origin
-    length = (away[0].square() + away[1].square() + away[2].square()).sqrt()
+    scaled = windows.u_slope * focal[0], windows.v_slope * focal[1], windows.origin
+    length = (scaled[0].square() + scaled[1].square() + scaled[2].square()).sqrt()
     length = torch.where(length > 0, length, 1.0)
     z = 1 / torch.where(values > 0, values, 1.0)
     across = (z * torch.where(valid, windows.deviation, 0.0) / length).square()
     rays, y = x * x + (y * y)[:, None] + 1, y[:, None]
     along = torch.zeros_like(z)
     slopes = (windows.u_slope, windows.v_slope)
-    for side, slope, f, place in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
+    for side, slope, f, coordinate in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
         step, spread = slope * z, (side * side - 1) / 12
-        along = along + spread * (step * step * rays - 2 / f * step * place + 1 / (f * f))
+        along = along + spread * (step * step * rays - 2 / f * step * coordinate + 1 / (f * f))
     total = across + along * z * z
     variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
-    normals = torch.stack([-column / length for column in away], dim=-1)
+    normals = torch.stack([-column / length for column in scaled], dim=-1)
     joins = [_join(image, planes, normals, tolerance, limits, axis) for axis in (1, 0)]
     return Pixels(
         torch.where(valid[..., None], normals, 0.0),
@@ -123,13 +123,15 @@ def _join(
     tolerance, normals = tolerance.flatten(), normals.view(-1, 3)
     limit = max_step * torch.maximum(tolerance[here], tolerance[there])
     turned = sq_chords(*(normals[at][:, :, None].unbind(dim=1) for at in (here, there))).squeeze(1)
-    sides, middles = planes.sides_and_middles(here)
-    their_sides, their_middles = planes.sides_and_middles(there)
+    sides, middles = planes.sides_and_centers(here)
+    their_sides, their_middles = planes.sides_and_centers(there)
     sq_noise = _sq_slope_noise(sides, tolerance[here])
     sq_noise = sq_noise + _sq_slope_noise(their_sides, tolerance[there])
-    alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
-    both_hold = holds(sides, middles, there, width) & holds(their_sides, their_middles, here, width)
-    accepted = (turned <= max_sq_chord) | ((alike | (turned <= wider_sq_chord)) & both_hold)
+    similar = u_slope.square() + v_slope.square() <= _MAX_SLOPE_NOISE**2 * sq_noise
+    both_hold = contain(sides, middles, there, width) & contain(
+        their_sides, their_middles, here, width
+    )
+    accepted = (turned <= max_sq_chord) | ((similar | (turned <= wider_sq_chord)) & both_hold)
     accepted &= (step.abs() <= limit) & (next_step.abs() <= limit)
     joined.view(-1)[here] = accepted | (numbers[here] == numbers[there])
     return joined
@@ -146,7 +148,7 @@ def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
     return 6 * tolerance.square() * (1 / (rows * rows) + 1 / (columns * columns)) / count
 
 
-def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
+def contain(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
     """Return a mask of windows that contain pixels, by row-major index; ``width`` is in pixels.
 
     ``sides`` ``(2, n)`` are their rows and columns, ``middles`` the row and column of their

@@ -114,7 +114,7 @@ def _segment(
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = has_depth(depth)
     inverse = torch.where(seen, 1 / depth.double(), 0.0)
-    fx, fy, cx, cy = (float(intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx, fy, cx, cy = (float(intrinsics[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     focal = (fx, fy)
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
     v = torch.arange(depth.shape[0], device=depth.device).double() - cy
@@ -127,10 +127,10 @@ def _segment(
     labels, plane_normals, curved = grow_pixels(cloud, flat, joins, config)
     normals, valid = pixels.normals.view(-1, 3), pixels.valid
     # A boundary pixel without a flat window has no normal; use the region's.
-    borders = (~flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
-    borders = borders[~curved[labels[borders]]]
-    normals[borders] = plane_normals[labels[borders]]
-    valid.view(-1)[borders] = True
+    boundary = (~flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
+    boundary = boundary[~curved[labels[boundary]]]
+    normals[boundary] = plane_normals[labels[boundary]]
+    valid.view(-1)[boundary] = True
 
     if pose is not None:
         pose = pose.to(normals)
@@ -146,8 +146,8 @@ def _segment(
         up = unit_direction("segment_depth", config.up)
         table = replace(table, kind=classify_planes(table, points, labels, up))
     if orient not in ("auto", "viewpoint", "none"):
-        places = torch.where(seen.view(-1, 1), points, torch.nan).float()
-        normals = orient_normals(places, normals, orient=orient)
+        positions = torch.where(seen.view(-1, 1), points, torch.nan).float()
+        normals = orient_normals(positions, normals, orient=orient)
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import places_of
-from torchrg.depth.passes import pass_over_rows, serves
+from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
 
@@ -32,7 +32,7 @@ _NUM_MOMENTS = 10
 """Number of moment sums required for the plane of a window."""
 _FLAT_QUANTILE = 0.35
 """Fraction of the windows of an image that deviate by noise alone: at least a third is flat."""
-_PIXELS_APART = 4
+_SAMPLE_STRIDE = 4
 """Stride of the small windows used for the noise, in pixels: because windows overlap, it loses
 nothing."""
 _NUM_BINS = 12
@@ -75,7 +75,7 @@ class Windows(NamedTuple):
     mean: Tensor
     noise: Tensor
     tolerance: Tensor
-    most: Tensor
+    max_bend: Tensor
     relative: Tensor
 
 
@@ -101,21 +101,21 @@ def fit_windows(image: Image) -> dict[int, Tensor]:
         size: numbers.view(-1, *shape)
         for size, numbers, shape in zip(sizes, parts, shapes, strict=True)
     }
-    if not serves(values):
+    if not has_kernels(values):
         ones = seen.to(values.dtype)
         w = torch.where(seen, values, 0.0)
         mu, mv = ones * u, ones * v[:, None]
         cells = torch.stack([ones, mu, mv, w, mu * u, mu * mv, mv * mv, w * mu, w * mv, w * w])
         for size, table in tables.items():
-            cells = _sums_of_pairs(cells) if size > 1 else cells
-            table[:NUM_PLANE] = _planes_of_sums(_sums_around(cells), SIDE * size, SIDE * size)
+            cells = _pool_sums(cells) if size > 1 else cells
+            table[:NUM_PLANE] = _planes_from_sums(_window_sums(cells), SIDE * size, SIDE * size)
         return tables
     cells = values
     for size, table in tables.items():
         height, width = table.shape[1:]
         coarse = values.new_empty(_NUM_MOMENTS, -(-height // 2), -(-width // 2))
         name, source = ("cell", [cells]) if size > 1 else ("pixel", [values, seen, u, v])
-        limits = _least_of(SIDE * size, SIDE * size)
+        limits = _min_moments(SIDE * size, SIDE * size)
         planes = table[:NUM_PLANE]
         pass_over_rows(f"fit_{name}_windows", height, *source, planes, coarse, *limits)
         cells = coarse
@@ -130,24 +130,24 @@ def fit_narrow_windows(image: Image, numbers: Tensor, pixels: Tensor) -> Tensor:
     """
     values, _, u, v = image
     table = values.new_empty(len(Windows._fields), len(NARROW), len(pixels))
-    if serves(values):
-        limits, planes = _least_of(*NARROW[0]), table[:NUM_PLANE]
+    if has_kernels(values):
+        limits, planes = _min_moments(*NARROW[0]), table[:NUM_PLANE]
         fixed = values, u, v, numbers, pixels, *limits, planes
         pass_over_rows("fit_narrow_windows", len(pixels), *fixed)
         return table
     for shape, (rows, columns) in enumerate(NARROW):
         sums = values.new_zeros(_NUM_MOMENTS, len(pixels))
-        for at, _ in held_pixels(numbers, pixels, rows, columns):
+        for at, _ in window_pixels(numbers, pixels, rows, columns):
             ones = (at >= 0).to(values.dtype)
             at = at.clamp(min=0)
             row, column = at // len(u), at % len(u)
             mu, mv, w = u[column] * ones, v[row] * ones, values[row, column] * ones
             sums += torch.stack([ones, mu, mv, w, mu * mu, mu * mv, mv * mv, w * mu, w * mv, w * w])
-        table[:NUM_PLANE, shape] = _planes_of_sums(sums, rows, columns)
+        table[:NUM_PLANE, shape] = _planes_from_sums(sums, rows, columns)
     return table
 
 
-def held_pixels(
+def window_pixels(
     numbers: Tensor, pixels: Tensor, rows: int, columns: int
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield, for each position of a narrow window, the pixels there ``(n,)`` and their indices.
@@ -159,12 +159,12 @@ def held_pixels(
         row = pixels // width + step // columns - rows // 2
         column = pixels % width + step % columns - columns // 2
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        place = torch.where(inside, row * width + column, 0)
-        number = torch.where(inside, numbers.flatten()[place], -1)
-        yield torch.where(number >= 0, place, -1), number
+        index = torch.where(inside, row * width + column, 0)
+        number = torch.where(inside, numbers.flatten()[index], -1)
+        yield torch.where(number >= 0, index, -1), number
 
 
-def _sums_of_pairs(cells: Tensor) -> Tensor:
+def _pool_sums(cells: Tensor) -> Tensor:
     """Return the sums over cells of twice the width, ``(*, ceil(h / 2), ceil(w / 2))``."""
     height, width = cells.shape[1:]
     cells = torch.nn.functional.pad(cells, (0, width % 2, 0, height % 2))
@@ -172,7 +172,7 @@ def _sums_of_pairs(cells: Tensor) -> Tensor:
     return rows[:, :, 0::2] + rows[:, :, 1::2]
 
 
-def _sums_around(cells: Tensor) -> Tensor:
+def _window_sums(cells: Tensor) -> Tensor:
     """Return the sums over the cells of the window around each cell, ``(*, h, w)``."""
     for axis in (1, 2):
         length, total = cells.shape[axis], cells.clone()
@@ -183,13 +183,13 @@ def _sums_around(cells: Tensor) -> Tensor:
     return cells
 
 
-def _least_of(rows: int, columns: int) -> tuple[float, float]:
+def _min_moments(rows: int, columns: int) -> tuple[float, float]:
     """Return the minimum pixel count and spread of a window that has a plane."""
     full = (rows * rows - 1) * (columns * columns - 1) / 144
     return _MIN_FRACTION * rows * columns, _MIN_SPREAD * full
 
 
-def _planes_of_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
+def _planes_from_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
     """Return planes ``(5, *)`` of windows from sums of moments ``(10, *)``."""
     count = sums[0]
     weight = 1 / count.clamp(min=1)
@@ -197,7 +197,7 @@ def _planes_of_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
     uu, uv, vv = uu - u * u, uv - u * v, vv - v * v
     uw, vw, ww = uw - u * w, vw - v * w, ww - w * w
     spread = uu * vv - uv * uv
-    min_count, min_spread = _least_of(rows, columns)
+    min_count, min_spread = _min_moments(rows, columns)
     has_plane = (count >= min_count) & (spread > min_spread)
     spread = torch.where(has_plane, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
@@ -220,9 +220,9 @@ class WindowNoise(NamedTuple):
 
     def at(self, inverse: Tensor) -> Tensor:
         """Return the noise at inverse depths."""
-        least = self.rounding * inverse
-        usual = torch.maximum(self.growth + self.constant * (inverse * inverse), least)
-        return torch.maximum(self.factor * usual, least)
+        minimum = self.rounding * inverse
+        typical = torch.maximum(self.growth + self.constant * (inverse * inverse), minimum)
+        return torch.maximum(self.factor * typical, minimum)
 
 
 def noise_by_size(
@@ -240,24 +240,24 @@ def noise_by_size(
     if noise is not None:
         constant, growth = noise
         return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
-    windows = {size: _windows_apart(tables[size], size) for size in sorted(tables)}
+    windows = {size: _sample_windows(tables[size], size) for size in sorted(tables)}
     middle = windows[sorted(windows)[len(windows) // 2 - 1]]
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0
     for size, (*_, deviation, mean) in windows.items():
         ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
-        usual = float(_low_quantile(ratios)) if len(ratios) else factor
-        factor = usual if factor == 0 else min(max(usual, factor), _MAX_GROWTH * factor)
+        typical = float(_low_quantile(ratios)) if len(ratios) else factor
+        factor = typical if factor == 0 else min(max(typical, factor), _MAX_GROWTH * factor)
         noises[size] = shape._replace(factor=factor)
     return noises
 
 
-def _windows_apart(table: Tensor, size: int) -> Tensor:
+def _sample_windows(table: Tensor, size: int) -> Tensor:
     """Return the planes ``(5, n)`` of valid windows four pixels or a cell apart.
 
     The input is a table ``(9, h, w)`` of windows of one size.
     """
-    step = max(_PIXELS_APART // size, 1)
+    step = max(_SAMPLE_STRIDE // size, 1)
     planes = table[:NUM_PLANE, ::step, ::step].flatten(1)
     return planes.index_select(1, places_of(planes[3].isfinite()))
 
@@ -270,7 +270,7 @@ def find_jitter(table: Tensor, size: int) -> float:
     bins, the one with the smallest deviation of flat windows counts. ``table`` ``(9, h, w)``
     contains windows of one size.
     """
-    u_slope, v_slope, _, deviation, _ = _windows_apart(table, size)
+    u_slope, v_slope, _, deviation, _ = _sample_windows(table, size)
     slope, order = torch.hypot(u_slope, v_slope).sort()
     is_steep = slope > 0
     ratio = deviation[order][is_steep] / slope[is_steep]
