@@ -84,8 +84,8 @@ def _unproject(depth: Tensor, intrinsics: Tensor, poses: Tensor | None) -> Tenso
 def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa: ANN401
     """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)`` of pinhole cameras without skew.
 
-    ``source`` is a tensor or array of such matrices, of kornia's 4 x 4 matrices, or a kornia
-    ``PinholeCamera``, whose image size should match ``depth`` ``(*, H, W)``.
+    ``source`` is a tensor or array of such matrices, or of kornia's 4 x 4 matrices. It may also be
+    a kornia ``PinholeCamera`` with the image size of ``depth`` ``(*, H, W)``.
 
     Raises:
         ShapeError: If it is not a tensor, array or camera.

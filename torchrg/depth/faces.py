@@ -28,7 +28,7 @@ _MAX_NOISE = 3.0
 """Maximum gap without a step, in standard deviations of the noise of a pixel."""
 _MIN_REACH = 2.0
 """Regions meet without a step if their planes intersect within this many pixels of the boundary, or
-within half the width of the strip if that is more."""
+within half the width of the strip."""
 
 _STRIDE = 4
 """Row and column stride of the search for hidden contacts."""
@@ -67,17 +67,17 @@ def join_strips(
 ) -> Tensor:
     """Merge narrow regions into the surface that they bend away from, and return the labels.
 
-    A strip is less than 10 pixels wide, at most 0.4 of the surface, tilted by at most 35 degrees,
-    and meets the surface without a step along at least half of its length: their planes intersect
-    near the boundary, or coincide there within the noise. Among several surfaces, the one with most
-    contact pixels wins, ties go to the larger. Strips of strips are unchanged. The width of a
+    A strip is less than 10 pixels wide, at most 0.4 of the surface, and tilted by at most 35
+    degrees. It meets the surface without a step along at least half of its length: their planes
+    intersect near the boundary, or coincide within the noise. Among several surfaces, the one with
+    most contact pixels wins, ties go to the larger. Strips of strips are unchanged. The width of a
     region is twice its pixel count over its perimeter in pixel sides.
 
     ``labels`` ``(H * W,)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`, and are
     returned unchanged if nothing is merged. The ``rays`` are x of the columns ``(W,)`` and y of the
-    rows ``(H,)``, so that ``(x, y, 1)`` times ``planes`` ``(M, 3)`` are inverse depths, with
-    standard deviation ``noise`` ``(H * W,)``; ``normals`` ``(M, 3)`` are in space, ``count``
-    ``(M,)`` are pixel counts.
+    rows ``(H,)``. Inverse depths are ``(x, y, 1)`` times ``planes`` ``(M, 3)``, with standard
+    deviation ``noise`` ``(H * W,)``; ``normals`` ``(M, 3)`` are in space, ``count`` ``(M,)`` are
+    pixel counts.
     """
     (x, y), num_regions, meetings = rays, len(normals), []
     image = labels.view(len(y), len(x))

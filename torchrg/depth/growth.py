@@ -252,9 +252,10 @@ def move_to_creases(
 
     Within the noise of a crease a pixel lies on both planes, and its region is arbitrary. Two
     regions form a crease if their centers are on opposite sides of the intersection line, each off
-    the other's plane. A pixel on the other side then joins the other region if it is on its plane
-    and next to one of its pixels straight behind it, as seen from the crease: boundaries move
-    towards the crease, never along it. Neighbors of changed pixels are revisited.
+    the other's plane. A pixel on the other side then joins the other region if it is on its plane.
+    It must be next to a pixel of that region straight behind it, as seen from the crease.
+    Boundaries thus move towards the crease, never along it. Neighbors of changed pixels are
+    revisited.
 
     ``reach`` is the maximum distance of a point on the plane along the last coordinate, ``(M,)``.
     """

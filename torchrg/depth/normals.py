@@ -30,8 +30,8 @@ FLAT = 1.35
 _MAX_PIXEL_NOISE = 3.5
 """Maximum distance of a pixel on the plane of a window, in units of the noise."""
 _QUARTER_MARGIN = 2.0
-"""A flat window deviates from its plane at most by a factor of 1 plus this over its side in pixels
-more than its quarters do from their own planes."""
+"""Maximum ratio of the deviation of a flat window to that of its quarters, minus 1, times its side
+in pixels."""
 _MIN_QUARTERS = 0.7
 """Minimum counted deviation of the quarters of a window, in units of the tolerance."""
 _BEND_FRACTION = 0.005
@@ -116,14 +116,13 @@ def fit_pixels(
 
     In inverse depth ``w = 1 / z`` a plane in space is a plane over the image [1], ``w = (n_x x +
     n_y y + n_z) / d`` with the ray ``(x, y, 1)``. The noise of a triangulating sensor is uniform in
-    ``w``, so ordinary least squares applies. A window is flat if its deviation from its plane is
-    hardly above the noise (or a slight bend) and the deviation of its four quarters from their own
-    planes, unlike a window across a step or an edge. For each size, largest first, a pixel takes
-    the window around its cell if it is flat, otherwise the flattest window that contains it [2],
-    provided that the pixel itself is on the plane. If none is flat but the smallest is smooth, as
-    on a noise-free column, it is taken. The remaining pixels, on surfaces at a grazing angle or a
-    few pixels wide, are processed separately with narrow windows. Pixels in no flat window have the
-    smallest square around them.
+    ``w``, so ordinary least squares applies. A window is flat if its deviation is hardly above the
+    noise (or a slight bend) and the deviation of its four quarters. A window across a step or an
+    edge is not. For each size, largest first, a pixel takes the window around its cell if it is
+    flat, otherwise the flattest window that contains it [2]. The pixel itself must be on the plane.
+    If none is flat but the smallest is smooth, as on a noise-free column, it is taken. The
+    remaining pixels, on surfaces at a grazing angle or a few pixels wide, are processed separately
+    with narrow windows. Pixels in no flat window have the smallest square around them.
 
     ``focal`` are the focal lengths along columns and rows, ``noise`` is from
     :class:`torchrg.config.DepthConfig`, ``dtype`` is the dtype of the depth.
@@ -173,10 +172,10 @@ def rate_windows(
 ) -> None:
     """Compute the deviation limits of windows of a size; ``jitter`` of the rays is in pixels.
 
-    A bend is a fraction of half a window's side on the surface. On a plane at a distance d from the
-    camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
-    depth equals a distance of ``d z e`` to the plane. Windows that deviate by more than their
-    ``quarters``, the windows of half the size, are not flat.
+    A bend is a fraction of half a window's side on the surface. On a plane at distance d from the
+    camera, a pixel at depth z is up to ``z^2 / (f d)`` long. A deviation e of inverse depth equals
+    a distance of ``d z e`` to the plane. Windows that deviate by more than their ``quarters``, the
+    windows of half the size, are not flat.
     """
     table, noise, half = tables[size], noises[size], SIDE * size / 2 / max(map(abs, focal))
     if has_kernels(table):

@@ -46,8 +46,8 @@ def describe_pixels(
     A deviation e of inverse depth equals a distance of ``distance * z * e`` to the plane; a column
     step equals ``(x_step - x_slope * z * ray) z`` along it.
 
-    Two pixels are on one surface if both have a flat window, their normals in space are within the
-    angle, and at both pixels their planes differ by at most ``max_step`` times the allowed
+    Two pixels are on one surface if both have a flat window and their normals in space are within
+    the angle. At both pixels, their planes must differ by at most ``max_step`` times the allowed
     deviation of a flat window: no region crosses a step. If both windows contain both pixels the
     angle may be larger: a crease between the pixels would lie within two flat windows.
     """

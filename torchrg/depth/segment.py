@@ -39,7 +39,7 @@ def segment_depth(
 ) -> Segmentation:
     """Segment a depth image into planes.
 
-    All decisions use inverse depth, in which planes stay planes and the noise of a triangulating
+    All decisions use inverse depth. In it planes stay planes, and the noise of a triangulating
     sensor does not depend on depth; see :func:`torchrg.depth.normals.fit_pixels` and
     :func:`torchrg.depth.growth.grow_pixels`.
 

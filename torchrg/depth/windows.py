@@ -231,10 +231,11 @@ def noise_by_size(
     """Return the noise of inverse depth in windows of each size.
 
     A standard deviation of ``a + b z^2`` in depth is ``b + a w^2`` in inverse depth ``w = 1 / z``.
-    By default, ``a`` and ``b`` are fitted to the deviations of windows from their planes, i.e. to
-    the 35 % quantiles of twelve depth bins. Errors of adjacent sensor pixels are correlated, and
-    depth is quantized, so large windows deviate more than small ones: the noise has a factor for
-    each size. It is at least the rounding of ``dtype``, the dtype of the depth.
+    Without ``noise``, ``a`` and ``b`` are fitted to the deviations of windows from their planes,
+    i.e. to the 35 % quantiles of twelve depth bins. Errors of adjacent sensor pixels are
+    correlated, and depth is quantized. Large windows thus deviate more than small ones, and the
+    noise has a factor for each size. It is at least the rounding of ``dtype``, the dtype of the
+    depth.
     """
     rounding = max(_ROUNDING * machine_epsilon(dtype), _MIN_ROUNDING)
     if noise is not None:

@@ -26,7 +26,7 @@ so that a small block is not fragmented."""
 SearchRows = Callable[[NDArray[np.floating], slice, int], NDArray[np.int32]]
 """Points in canonical order, query rows, and k -> their neighbors, ``(n, k)``."""
 POINTS_PER_BOX = 256
-"""Points per box, a surface patch about two neighborhoods of 50 wide: few rows are read in vain,
+"""Points per box, a surface patch about two neighborhoods of 50 wide. Few rows are read in vain,
 and boxes take a hundredth of the memory of the points."""
 
 _ROUNDING = 1 + 1e-9
@@ -113,7 +113,7 @@ def _gaps(
     query_low: NDArray[np.float64],
     query_high: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the distances between query boxes and others, shape ``(queries, others)``."""
+    """Return the distances between query boxes and boxes, shape ``(queries, boxes)``."""
     gap = np.maximum(low - query_high[:, None], query_low[:, None] - high).clip(min=0)
     distance: NDArray[np.float64] = np.sqrt((gap * gap).sum(axis=2))
     return distance

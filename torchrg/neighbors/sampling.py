@@ -29,13 +29,13 @@ _DIGITS = 3
 def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
     """Measure how a cloud samples its surfaces, on 600 points spread along the canonical order.
 
-    The deviation ``s_k`` of the k nearest points from their plane, with k - 3 degrees of freedom,
-    is the same for every k if noise is independent per point. It grows with k if surfaces are
-    curved, faceted, or smoothed by a reconstruction. Whiteness is the ratio of the medians of
-    ``s_16`` and ``s_100`` over the flatter half of the neighborhoods: 0.05 to 0.35 for points of
-    S3DIS-like meshes and scans of real offices, 0.6 to 1 for laser scanners, depth cameras and the
-    vertices of noisy meshes. It is 1 if both deviations are 0, and for clouds with too few points
-    for two neighborhood sizes.
+    Let ``s_k`` be the deviation of the k nearest points from their plane, with k - 3 degrees of
+    freedom. It is the same for every k if noise is independent per point. It grows with k if
+    surfaces are curved, faceted, or smoothed by a reconstruction. Whiteness is the ratio of the
+    medians of ``s_16`` and ``s_100`` over the flatter half of the neighborhoods. It is 0.05 to 0.35
+    for points of S3DIS-like meshes and scans of real offices. It is 0.6 to 1 for laser scanners,
+    depth cameras and the vertices of noisy meshes. It is 1 if both deviations are 0, and for clouds
+    with too few points for two neighborhood sizes.
 
     Args:
         points: Finite points in canonical order, shape ``(N, 3)``.

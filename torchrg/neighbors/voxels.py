@@ -34,7 +34,7 @@ class Voxels(NamedTuple):
 def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
     """Select one point of each occupied cell of a cubic grid with cell width ``size``.
 
-    The point nearest to the center of its cell is selected, so the result consists of points of the
+    The point nearest to the center of its cell is selected. The result consists of points of the
     cloud ``(N, 3)`` and does not depend on their order. The grid begins at the minimum coordinates.
 
     Raises:

@@ -132,11 +132,12 @@ def _join_patches(
 ) -> tuple[Tensor, Tensor]:
     """Grow smooth patches of points without a face (negative), and join patches and faces.
 
-    Two normals agree if one and the mirror image of the other in the bisecting plane of the two
-    points form less than a right angle [1]. This holds on a sphere, on both sides of a sharp edge,
-    and for the opposite normals of a thin plate. The bend of a link measures how reliable it is:
-    ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle and ``u`` the
-    direction of the link. It is 0 on a plane, 1 over a right-angled edge, and 2 through a plate.
+    Two normals agree if one and the mirror image of the other form less than a right angle,
+    mirrored in the bisecting plane of the two points [1]. This holds on a sphere, on both sides of
+    a sharp edge, and for the opposite normals of a thin plate. The bend of a link measures how
+    reliable it is: ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle and
+    ``u`` the direction of the link. It is 0 on a plane, 1 over a right-angled edge, and 2 through a
+    plate.
 
     References:
         [1] H. Xie et al. Piecewise C1 continuous surface reconstruction of noisy point clouds via

@@ -36,7 +36,7 @@ _HALF_PATH = 8
 and a hall no more than a room."""
 
 _HALF_DIRECTIONS = [steps for steps in product((-1, 0, 1), repeat=3) if steps > (0, 0, 0)]
-"""Thirteen of the 26 directions to neighboring cells; the others are their opposites."""
+"""Thirteen of the 26 directions to neighboring cells, without their opposites."""
 
 
 def vote_free_side(

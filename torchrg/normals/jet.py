@@ -213,10 +213,10 @@ def least_squares(
 ) -> tuple[list[Tensor], Tensor]:
     """Fit a target ``(*, K)`` by columns, omitting columns that depend on previous ones.
 
-    Modified Gram-Schmidt with the target as the last column: as accurate as Householder QR, but
-    made only of sums of products, so it is batched on any device and differentiable. Each column
-    comes with the minimum fraction of its length that must remain. Returns the coefficient of each
-    column, shape ``(*, 1)``, 0 if omitted, and the residual.
+    Modified Gram-Schmidt with the target as the last column: as accurate as Householder QR. Made
+    only of sums of products, it is batched on any device and differentiable. Each column comes with
+    the minimum fraction of its length that must remain. Returns the coefficient of each column,
+    shape ``(*, 1)``, 0 if omitted, and the residual.
     """
     basis: list[Tensor] = []
     mixing: list[list[Tensor]] = []
@@ -249,9 +249,10 @@ def _principal_curvatures(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit normals of height fields, principal curvatures and their directions.
 
-    From first and second derivatives: normals of positive height ``(*, 3)``; curvatures ``(*, 2)``,
-    larger first, the eigenvalues of the shape operator with entries aa, ab, bb in an orthonormal
-    tangent basis; and directions ``(*, 2, 3)``, without gradient.
+    The inputs are first and second derivatives. Returns normals of positive height ``(*, 3)``,
+    curvatures ``(*, 2)``, larger first, and directions ``(*, 2, 3)``, without gradient. Curvatures
+    are the eigenvalues of the shape operator with entries aa, ab, bb in an orthonormal tangent
+    basis.
     """
     one = torch.ones_like(slope_u)
     gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()

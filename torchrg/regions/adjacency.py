@@ -53,7 +53,7 @@ def find_adjacency(
     Non-parallel flat regions meet along the intersection line of their planes. Edges between their
     points, also across a narrow unlabeled strip, are projected onto it; the covered length without
     gaps is the boundary length. For parallel or curved regions only the 8 nearest neighbors count.
-    Their length is that of a curve crossed by the edges: with density :math:`\rho` and n edges per
+    Their length is that of a curve crossed by the edges. With density :math:`\rho` and n edges per
     point, a curve of length L crosses edges with :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy
     and Crofton) [1].
 

@@ -1,8 +1,8 @@
 """Plane classification: floors, ceilings and walls, from the surrounding room.
 
 A cloud may contain several rooms and storeys, and points seen through windows.
-:func:`classify_planes` therefore compares each plane with its surrounding room, not with the whole
-cloud. It counts voxels, so density and duplicates do not matter. Unlabeled points, such as
+:func:`classify_planes` therefore compares each plane with its surrounding room, not with the
+complete cloud. It counts voxels, so density and duplicates do not matter. Unlabeled points, such as
 outliers, are ignored.
 """
 

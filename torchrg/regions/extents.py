@@ -90,7 +90,7 @@ def _min_area_angle(positions: NDArray[np.float64]) -> float:
     """Return the angle of the minimum-area rectangle of points ``(n, 2)``, in [0, 90) degrees.
 
     The farthest corner in a direction lies between the two hull edges whose angles enclose the
-    perpendicular, so it is found by a search among the edge angles.
+    perpendicular. It is found by a search among the edge angles.
     """
     corners = positions[_hull_corners(positions)] @ [1, 1j]
     angles = np.angle(np.roll(corners, -1) - corners)
@@ -165,10 +165,11 @@ def covered_areas(
 ) -> tuple[Tensor, Tensor]:
     """Return the area covered by points, without gaps, holes and dents, and the cell width.
 
-    The plane is divided into square cells, initially three times the mean point spacing, then wider
-    until the area hardly grows, so that sparse parts have no holes. Cells along the boundary are
-    only partly covered: the expected excess is subtracted. Areas ``(M,)`` are 0 for collinear
-    points and at most the rectangle areas. The cell width ``(M,)`` leaves no holes between points.
+    The plane is divided into square cells, initially three times the mean point spacing. They are
+    widened until the area hardly grows, so that sparse parts have no holes. Cells along the
+    boundary are only partly covered: the expected excess is subtracted. Areas ``(M,)`` are 0 for
+    collinear points and at most the rectangle areas. The cell width ``(M,)`` leaves no holes
+    between points.
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()

@@ -29,8 +29,8 @@ _SAME_MAGNITUDE = 1e-6
 """Relative difference below which components of a normal count as equal (rounding)."""
 
 _CURVED_SPREAD_DEG = 8.0
-"""RMS angle of a region's normals to their mean direction above which it is curved: a smooth bend
-by three to four times this angle has this spread, a full column 45 degrees."""
+"""Minimum RMS angle of the normals of a curved region to their mean direction. A smooth bend by
+three to four times this angle has this spread, a full column 45 degrees."""
 
 MAX_FITTED = 4096
 """Maximum number of points for plane fits while regions change: more points move the plane by less
@@ -135,8 +135,8 @@ def fit_planes(
     """Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
 
     The weight of a point falls to 0 at 4.685 robust standard deviations of the residuals (1.4826
-    times their median), so points of another surface do not tilt the plane. ``normals`` of any sign
-    decide for degenerate regions: one or two points, or collinear points. For the sign see
+    times their median). Points of another surface thus do not tilt the plane. ``normals`` of any
+    sign decide for degenerate regions: one or two points, or collinear points. For the sign see
     :func:`canonicalize_sign`. The floor is 0 because the noise is unknown. With ``shared``,
     ``normals`` are one per region, ``(M, 3)``, and no region is curved.
 
@@ -205,7 +205,7 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
 
     The floor of the thickness is a fraction of the median neighborhood radius, as in the
     coplanarity test. A region is curved if its normals are spread and noise alone does not explain
-    its thickness: in surfaces a few centimeters wide, noise also spreads normals. ``labels``
+    its thickness. In surfaces a few centimeters wide, noise also spreads normals. ``labels``
     ``(N,)`` are 0 to M-1, each at least once, or negative.
     """
     segments = Segments(labels, most=MAX_FITTED)

@@ -23,8 +23,8 @@ from torchrg.structures import UNLABELED, Neighbors
 
 _NORMAL_AGREEMENT = 0.3
 """Fraction of ``max_angle_deg``. A region below ``min_size`` is kept before boundary assignment if
-the RMS angle of its normals is smaller, since about half of a small surface is boundary. Other
-small regions are clutter."""
+the RMS angle of its normals is smaller. About half of a small surface is boundary. Other small
+regions are clutter."""
 
 _MAX_PASSES = 10
 """Maximum number of boundary passes. Each pass revisits the neighbors of changed points, so narrow
@@ -158,8 +158,8 @@ def absorb_points(
 ) -> Tensor:
     """Assign unlabeled points to adjacent regions until nothing changes.
 
-    A point joins an adjacent region if its distance to the region's plane is at most ``reach`` and
-    the angle between its normal (if given) and the plane normal is at most ``max_angle_deg``. The
+    A point joins an adjacent region if its distance to the region's plane is at most ``reach``. The
+    angle between its normal, if any, and the plane normal must be at most ``max_angle_deg``. The
     nearest plane wins. Newly labeled points can admit their neighbors.
 
     ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` belong to a cloud or an image, matching
@@ -224,10 +224,10 @@ def merge_coplanar(
     """Greedily merge adjacent coplanar regions, best fit first.
 
     Two regions are merged if the RMS distance of each to their joint plane is at most ``tolerance``
-    times its RMS distance to its own plane (or the floor). Merged regions use the mean square
-    distance of their parts, so a thick region across a step does not join both sides. For the
-    smaller region, the noise of the larger one is used if it is higher: fragments that noise splits
-    off a surface are thinner than the surface, or curved. Other curved regions are not merged.
+    times that to its plane (or the floor). Merged regions use the mean square distance of their
+    parts, so a thick region across a step does not join both sides. For the smaller region, the
+    noise of the larger one is used if it is higher. Fragments that noise splits off a surface are
+    thinner than the surface, or curved. Other curved regions are not merged.
 
     ``contacts`` are adjacent pairs ``(E, 2)`` and their edge counts, as returned by
     :meth:`torchrg.regions.adjacency.NearestPoints.contacts`. A merged region takes the smallest
@@ -250,9 +250,9 @@ def merge_facets(
     A reconstructed mesh represents a flat surface by facets. Each facet is exactly planar, so its
     thickness does not show how far it may be from the surface. Two regions are merged, smallest
     distance first, if the RMS distance of each to their joint plane is at most ``tolerance`` (in
-    coordinate units) and the joint plane is tilted by at most 25 degrees against both, since a
+    coordinate units). The joint plane must be tilted by at most 25 degrees against both, since a
     strip narrower than the tolerance is close to any adjacent plane. The tilt alone must not move
-    the points of either by more than two thirds of the tolerance, so the facets of a bend are
+    the points of either by more than two thirds of the tolerance. The facets of a bend are thus
     merged only as far as they are coplanar. For ``contacts`` and labels see :func:`merge_coplanar`.
     """
     pairs, num_contacts = contacts
@@ -406,14 +406,14 @@ def refine_borders(
 ) -> Tensor:
     """Reassign boundary points to the region that explains them best.
 
-    Candidates are the flat regions of a point and of its 8 nearest neighbors; the two with the
-    smallest distance in units of their thickness are compared, if within ``reach``. Let :math:`r`
-    be the point-to-plane distance and :math:`e` the distance by which the projected point lies
-    beyond the intersection line with the other plane. The point goes to the region with the smaller
-    :math:`r^2 + e^2`, because noise moves points off their plane, not along it. A region is taken
-    to end at the other plane if its points in the neighborhood lie on one side of that plane.
-    Points of nearly parallel planes keep their label. Changed points and their neighbors are
-    revisited in the next pass.
+    Candidates are the flat regions of a point and of its 8 nearest neighbors within ``reach``. The
+    two with the smallest distance in units of their thickness are compared. Let :math:`r` be the
+    point-to-plane distance and :math:`e` the distance by which the projected point lies beyond the
+    intersection line with the other plane. The point goes to the region with the smaller :math:`r^2
+    + e^2`, because noise moves points off their plane, not along it. A region is taken to end at
+    the other plane if its points in the neighborhood lie on one side of that plane. Points of
+    nearly parallel planes keep their label. Changed points and their neighbors are revisited in the
+    next pass.
 
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
     which are left unchanged.
@@ -447,7 +447,7 @@ def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> 
 
     The planes must be 1.5 thicknesses apart at the point, so that parts of one surface are
     unchanged. A point moves if it is nearer to the other plane, and so is the mean of the points of
-    both regions among its 8 nearest: a single residual is noise. Changed points and their neighbors
+    both regions among its 8 nearest. A single residual is noise. Changed points and their neighbors
     are revisited in the next pass.
     """
     adjacency = NearestPoints(cloud.neighbors)

@@ -31,10 +31,10 @@ class SharedNeighbors:
     """Connectivity test: whether two points share at least ``min_shared`` neighbors.
 
     The lists of a block of points are rows of a matrix with one column per member, i.e. per point
-    in any of the lists; the product of two rows counts their common neighbors. Lists of points
-    outside the block lose only members that are in no list of the block, so the counts are exact.
-    Points should be in canonical order: a block is then a surface patch with few members. Each
-    point is in its own list.
+    in any list. The product of two rows counts their common neighbors. Lists of points outside the
+    block lose only members that are in no list of the block, so the counts are exact. Points should
+    be in canonical order: a block is then a surface patch with few members. Each point is in its
+    own list.
 
     Example:
         >>> lists = torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 3], [3, 2, 1]])
@@ -52,7 +52,7 @@ class SharedNeighbors:
         """Return a mask of the block's edges that join connected points, eq. (10).
 
         Only edges in the mask ``candidates`` from the points ``rows`` are tested, shape ``(n, K)``,
-        bool; the others are False.
+        bool; all other edges are False.
         """
         if self._min_shared <= 0:
             return candidates.clone()

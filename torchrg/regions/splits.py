@@ -31,8 +31,8 @@ _SMOOTH_FRACTION = 0.3
 angle."""
 
 _MIN_SMOOTH_RATIO = 0.7
-"""Cores grow only through points whose fraction of smooth neighbors is at least 0.7 of the median
-in their region; at other points noise may hide an edge."""
+"""Cores grow only through points whose fraction of smooth neighbors is at least 0.7 of the region's
+median. At other points noise may hide an edge."""
 
 _MAX_OFF_PLANE_FRACTION = 0.1
 """Maximum fraction of a region's points off its plane for which the plane is one surface."""
@@ -71,8 +71,7 @@ _NOISE_QUANTILE, _NOISE_FACTOR = 0.33, 2.345
 lower third belongs to the main level even if a second one has nearly half of the points."""
 
 _SEED_NOISE_FACTOR = 1.5
-"""Minimum averaged residual of a candidate, in standard deviations; equals six of the average's
-own."""
+"""Minimum averaged residual of a candidate, in standard deviations; six of the average itself."""
 
 _STEP_NOISE_FACTOR = 2.0
 """Minimum step between two levels, in standard deviations of the residuals."""

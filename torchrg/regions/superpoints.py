@@ -29,7 +29,7 @@ _RADIUS_SPACINGS = 1.6
 """Radius, in spacings, of a circle around 8 points that are one spacing apart."""
 
 _COLOR_WEIGHT = 3.0
-"""Weight of a squared color difference, channels in [0, 1], relative to unit normals: colors a
+"""Weight of a squared color difference, channels in [0, 1], relative to unit normals. Colors a
 third of the range apart in each channel weigh as much as a squared normal difference of 1."""
 
 _PLANE_FRACTION, _MAX_SPREAD_DEG = 0.5, 20.0
@@ -42,7 +42,7 @@ _POSITION_SPACINGS = 150.0
 that are flush with a wall."""
 
 _STEP_WEIGHT = 0.25
-"""Weight of the squared sine of the angle between a contact and the surface: a perpendicular
+"""Weight of the squared sine of the angle between a contact and the surface. A perpendicular
 contact, as at a step, weighs as much as normals that differ by 29 degrees."""
 
 _PLANE_WEIGHT = 0.25
@@ -80,24 +80,24 @@ def partition_points(
 
     .. math:: \frac{n_a n_b}{n_a + n_b} (d_{ab} + \epsilon) / \sqrt{c_{ab}},
 
-    where d is the squared difference of the region features (mean of :math:`n n^T` [1], color, and
-    position in units of 150 spacings) plus the mean difference along their contacts (normals, steps
-    between parallel surfaces, different planes), and c is the number of contacts. The first factor
-    is Ward's [2], the increase of the variance within regions. Divided by the length of the removed
-    boundary, it is the regularization strength at which the Mumford-Shah energy falls [3]. Cut
-    pursuit minimizes this energy [4], and, with positions and normals, so do the supervoxels of [5]
-    and [6]; normals come first as in [7]. Contacts measure the boundary length up to noise, hence
-    the root. Pairs merge up to each configured strength, or until each configured number of
-    superpoints remains. Each round merges mutually cheapest partners, and small regions into a much
-    larger cheapest partner, so no visiting order is needed.
+    where c is the number of contacts and d the difference. The difference is the squared difference
+    of the region features (mean of :math:`n n^T` [1], color, and position in units of 150 spacings)
+    plus the mean difference along contacts (normals, steps between parallel surfaces, different
+    planes). The first factor is Ward's [2], the increase of the variance within regions. Divided by
+    the length of the removed boundary, it is the regularization strength at which the Mumford-Shah
+    energy falls [3]. Cut pursuit minimizes this energy [4], and, with positions and normals, so do
+    the supervoxels of [5] and [6]; normals come first as in [7]. Contacts measure the boundary
+    length up to noise, hence the root. Pairs merge up to each configured strength, or until each
+    configured number of superpoints remains. Each round merges mutually cheapest partners, and
+    small regions into a much larger cheapest partner, so no visiting order is needed.
 
     If the normals of a plane agree, each point normal is moved halfway to the plane normal, which
     gives noise less weight and positions more.
 
     ``labels`` ``(N,)`` are plane IDs, negative if unlabeled; ``colors`` ``(N, 3)`` are in [0, 1],
     floating point and finite. For a mesh with ``faces`` ``(F, 3)`` contacts are its edges,
-    otherwise edges to the 8 nearest points: ``neighbors`` of the distinct finite points in
-    canonical order, searched by default.
+    otherwise edges to the 8 nearest points. These are ``neighbors`` of the distinct finite points
+    in canonical order, searched by default.
 
     References:
         [1] H. Knutsson. Representing local structure using tensors. SCIA, 1989.

@@ -42,8 +42,8 @@ def estimate_consensus(
        off, it takes the voted plane. See :func:`torchrg.normals.consensus.surfaces.fit_surfaces`.
        These points are ``sharp``.
     5. *Smoothing.* Normals with a standard error of at least 0.17 degrees are smoothed bilaterally
-       (:func:`torchrg.normals.consensus.smoothing.smooth_planes`), and points with a voted plane
-       choose again among the planes of their neighbors
+       (:func:`torchrg.normals.consensus.smoothing.smooth_planes`). Points with a voted plane choose
+       again among the planes of their neighbors
        (:func:`torchrg.normals.consensus.smoothing.choose_planes`). Both steps run twice.
 
     With ``config.adaptive_k`` the neighborhoods first grow with the noise: by the factor ``(u /

@@ -23,7 +23,7 @@ NOISE_FACTOR_OF_ALL = 1.04
 """Per deviation. Converts that quantile to noise for the deviations of all neighbors together."""
 NOISE_LIMITS = (0.3425, 0.398)
 """Radii. On planes, as the true noise grows, the noise from each neighborhood size tends to this
-fraction of the radius, so larger noise cannot be measured."""
+fraction of the radius. Larger noise cannot be measured."""
 COMMON_QUANTILE = 0.15
 """Share. Quantile of the neighbors' noise that is their common noise. It is used at corners, where
 no neighborhood is flat."""
@@ -33,10 +33,10 @@ REGIONAL_STEPS = 4
 """Steps. Neighbor-to-neighbor steps that define the region of the regional noise, if requested:
 fewer merge small faces of fused meshes with the one behind them."""
 REGIONAL_QUANTILE = 0.1
-"""Share. Quantile over the neighbors in each of these steps: higher ones do not leave the slope of
-a step, because a neighborhood at its end lies mostly on it."""
+"""Share. Quantile over the neighbors in each of these steps. Higher quantiles do not leave the
+slope of a step, because a neighborhood at its end lies mostly on it."""
 REGIONAL_FRACTION = 0.8
-"""Ratio. Fraction of the regional noise that is used: both faces at a mesh step deviate from one
+"""Ratio. Fraction of the regional noise that is used. Both faces at a mesh step deviate from one
 plane by little more than its bumps do, and a closer test loses nothing."""
 MAX_LAYERED_KURTOSIS = 2.2
 """Ratio. Maximum kurtosis of the residuals from one plane for which two parallel planes are tried.

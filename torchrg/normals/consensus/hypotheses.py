@@ -145,8 +145,8 @@ class MeetingPlanes(NamedTuple):
     """The plane of each point among several planes that explain its neighborhood.
 
     Unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset`` relative to the
-    point, and the standard deviation over all neighbors ``(n,)``, with three degrees of freedom
-    less per plane; infinite if a plane has fewer than five points.
+    point, and the standard deviation over all neighbors ``(n,)``. The latter has three degrees of
+    freedom less per plane and is infinite if a plane has fewer than five points.
     """
 
     normals: Tensor
@@ -243,8 +243,8 @@ def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
 
     These are corners of three faces, rims of plates with both faces among the neighbors, steps and
     reveals. The first two planes are a wedge, see :func:`fit_wedges`. If the third group begins
-    inside the wedge, its half-space cuts it, ``min(e_1, e_2, e_3)``; otherwise it is added,
-    ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is positive on the side of the first two groups.
+    inside the wedge, its half-space cuts it, ``min(e_1, e_2, e_3)``. Otherwise it is added,
+    ``max(min(e_1, e_2), -e_3)``. Here ``e_3`` is positive on the side of the first two groups.
     """
     first, second, third = groups
     present = torch.ones_like(first[:, 0], dtype=torch.bool)
@@ -295,7 +295,7 @@ def split_off(first: Tensor, outer: Tensor, noise: Tensor) -> tuple[Tensor, Tens
 def split_by_votes(
     columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the points near a plane, near the voted plane of the remaining points, and the others.
+    """Return points near a plane, near the voted plane of the remaining ones, and outliers.
 
     The voted plane passes through the nearest of the remaining points.
     """

@@ -30,9 +30,9 @@ _LAYER_PARAMETERS = 4
 class Survey(NamedTuple):
     """Plane residuals and noise of each neighborhood, each of shape ``(N,)``.
 
-    Distance of the plane from the point along the normal; standard deviations of the residuals (3
-    degrees of freedom less) and of the noise, infinite if too few neighbors have a plane; and the
-    distance of the farthest neighbor.
+    Fields: the distance of the plane from the point along the normal; the standard deviation of the
+    residuals (3 degrees of freedom less); the noise, infinite if too few neighbors have a plane;
+    and the distance of the farthest neighbor.
     """
 
     offsets: Tensor
@@ -51,14 +51,14 @@ def survey_noise(
     estimate is the minimum of three, for m = 8, 16 and all neighbors, of ``s_m = c_m q(T_m) /
     sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``. Here ``q`` is the 35th percentile over the neighbors,
     and the factor ``c_m`` makes it unbiased for a plane. The root corrects for planes of few
-    points, which turn with their noise: ``R_m = R (m / K)^(1/2)`` is their radius, from the radius
+    points, which turn with their noise. Their radius is ``R_m = R (m / K)^(1/2)``, from the radius
     of all, and ``a_m`` was measured on noisy planes.
 
     Duplicates count once, and nearly collinear neighborhoods, such as scan lines, do not count. At
     corners, where none of the three finds a face, the noise is at most 3 times the 15th percentile
-    of the neighbors' noise. If points are so sparse that even the nearest lie on both faces of a
-    plate, two parallel planes replace the plane of all neighbors, provided they leave at most 0.35
-    of its deviation. ``fit`` are the planes of all neighbors; noise is at least the coordinate
+    of the neighbors' noise. Points may be so sparse that even the nearest lie on both faces of a
+    plate. Two parallel planes then replace the plane of all neighbors if they leave at most 0.35 of
+    its deviation. ``fit`` are the planes of all neighbors; noise is at least the coordinate
     rounding.
     """
     points = points.contiguous()
@@ -106,9 +106,9 @@ def survey_noise(
 def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
     """Return the noise ``(N,)`` of the region around each point from point-wise noise.
 
-    If a reconstruction has rounded the step between two parallel faces into a ramp, no neighborhood
-    on the ramp lies on one face, and all of them mistake the step for noise. Neighborhoods next to
-    the ramp do not. The regional noise is a low quantile over the neighbors, iterated: each step
+    A reconstruction may round the step between two parallel faces into a ramp. No neighborhood on
+    the ramp lies on one face, and all of them mistake the step for noise. Neighborhoods next to the
+    ramp do not. The regional noise is a low quantile over the neighbors, iterated: each step
     extends the region by one neighborhood.
 
     For scanner noise, which is independent per point, estimates scatter, and this is about three

@@ -36,8 +36,8 @@ def smooth_planes(
 ) -> TangentPlanes:
     """Smooth normals bilaterally: average the neighbors' planes that agree with the point's.
 
-    Neighbor j agrees with point i if its plane passes within 2.5 times the noise of i, and the
-    chord ``c_ij`` between the normals is within 4.2 times its standard error ``a_ij = (a_i^2 +
+    Neighbor j agrees with point i if its plane passes within 2.5 times the noise of i. The chord
+    ``c_ij`` between the normals must be within 4.2 times its standard error ``a_ij = (a_i^2 +
     a_j^2)^(1/2)``. The weights are ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 -
     d_ij^2 / (2 d_max^2)) / a_j^2``, each factor at least 0. On a curved surface a plain average
     would lean towards the denser side. The weights are therefore tilted by a linear function of the
@@ -127,7 +127,7 @@ def choose_planes(
     """Assign to points the neighboring plane with the most support in their neighborhood.
 
     The score is that of :func:`torchrg.normals.consensus.hypotheses.vote_planes` per weight, minus
-    a tenth of the point's squared residual in units of the noise; planes farther from the point
+    a tenth of the point's squared residual in units of the noise. Planes farther from the point
     than three times the noise are excluded. ``rows`` ``(n,)`` are the points to update. Returns all
     planes.
     """
@@ -207,7 +207,7 @@ def standard_errors(
 ) -> Tensor:
     """Return the standard error of the normals in radians, shape ``(N,)``.
 
-    For a plane through ``n`` points it is the noise divided by ``(n l_1)^(1/2)``, where ``l_1`` is
+    For a plane through ``n`` points it is the noise divided by ``(n l_1)^(1/2)``. Here ``l_1`` is
     the middle eigenvalue of their covariance, a quarter of the squared radius for a filled disk.
     """
     radius = torch.where(survey.radius > 0, survey.radius, 1.0)

@@ -37,8 +37,8 @@ def fit_surfaces(
 
     With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. Other points get a
     paraboloid of deviation ``J``, accepted if ``J`` is at most 1.2 s, or at most 0.15 of the
-    plane's deviation. Otherwise two meeting planes are fitted, and if these deviate by more than
-    1.15 s, three, which replace the two if their deviation is below 0.9 times. The point takes its
+    plane's deviation. Otherwise two meeting planes are fitted, and three if these deviate by more
+    than 1.15 s. Three planes replace two if their deviation is below 0.9 times. The point takes its
     plane of these, of deviation ``W``, if ``W <= 1.3 s`` and the gain over the paraboloid, a
     difference of chi-square with equal numbers of parameters,
 
