@@ -81,10 +81,10 @@ class PixelPlanes(NamedTuple):
 
     def take(self, index: Tensor) -> Windows:
         """Return the windows of pixels at row-major indices."""
-        numbers = self.choice.window.flatten()[index]
+        indices = self.choice.window.flatten()[index]
         tables = (*self.squares.values(), self.narrow)
         columns = zip(*tables, strict=True)
-        return Windows(*(torch.cat([values.flatten() for values in c])[numbers] for c in columns))
+        return Windows(*(torch.cat([values.flatten() for values in c])[indices] for c in columns))
 
     def sides_and_centers(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """Return sides (rows, columns) and centers (row, column) of the windows of pixels.
@@ -146,13 +146,13 @@ def fit_pixels(
         first -= math.prod(squares[size].shape[1:])
         offer_windows(choice, image, squares[size], size, first)
     pixels = places_of(image.seen & ~choice.flat)
-    numbers = torch.full_like(choice.window, -1)
-    numbers.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
-    narrow = fit_narrow_windows(image, numbers, pixels)
+    indices = torch.full_like(choice.window, -1)
+    indices.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
+    narrow = fit_narrow_windows(image, indices, pixels)
     rate_windows(
         {1: narrow}, 1, noises, focal, jitter=find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)
     )
-    chosen, off_center = choose_narrow(image, numbers, pixels, narrow)
+    chosen, off_center = choose_narrow(image, indices, pixels, narrow)
     is_taken = chosen >= 0
     pixel = pixels[is_taken]
     choice.window.view(-1)[pixel] = num_squares + chosen[is_taken]
@@ -180,12 +180,12 @@ def rate_windows(
     table, noise, half = tables[size], noises[size], SIDE * size / 2 / max(map(abs, focal))
     if has_kernels(table):
         finer = tables[size][0, :0] if quarters is None else tables[quarters][3]
-        numbers = *noise, noises[quarters or size].factor, *focal, half, jitter
-        pass_over_rows("rate_windows", table.shape[1], table, finer, *numbers, size)
+        parameters = *noise, noises[quarters or size].factor, *focal, half, jitter
+        pass_over_rows("rate_windows", table.shape[1], table, finer, *parameters, size)
         return
     u_slope, v_slope, origin, deviation, mean = table[:NUM_PLANE]
     sq_blur = jitter * jitter * (u_slope.square() + v_slope.square())
-    by_noise = (noise.at(mean).square() + sq_blur).sqrt()
+    by_noise = (noise.evaluate(mean).square() + sq_blur).sqrt()
     sq_nearness = (u_slope * focal[0]).square() + (v_slope * focal[1]).square() + origin.square()
     is_steep = sq_nearness > (_MAX_STEEPNESS * mean).square()
     bend = half * torch.where(is_steep, 0.0, sq_nearness) / mean
@@ -196,7 +196,7 @@ def rate_windows(
     if quarters is not None:
         typical = _deviation_of_quarters(tables[quarters][3], relative.shape)
         # Errors of adjacent pixels are correlated, so parts of a flat window deviate less, too.
-        typical = typical * (by_noise / noises[quarters].at(mean))
+        typical = typical * (by_noise / noises[quarters].evaluate(mean))
         typical = torch.maximum(typical, _MIN_QUARTERS * tolerance)
         is_flat &= deviation <= (1 + _QUARTER_MARGIN / (SIDE * size)) * typical
     relative = torch.where(is_flat, relative, torch.inf)
@@ -250,7 +250,7 @@ def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first:
 
 
 def choose_narrow(
-    image: Image, numbers: Tensor, pixels: Tensor, table: Tensor
+    image: Image, indices: Tensor, pixels: Tensor, table: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Select the flatter narrow window around each pixel, otherwise the flattest containing it.
 
@@ -259,7 +259,7 @@ def choose_narrow(
     """
     if has_kernels(table):
         chosen, off_center = torch.empty_like(pixels), torch.empty_like(pixels, dtype=torch.bool)
-        fixed = image.values, image.u, image.v, numbers, pixels, table, chosen, off_center
+        fixed = image.values, image.u, image.v, indices, pixels, table, chosen, off_center
         pass_over_rows("choose_narrow", len(pixels), *fixed)
         return chosen, off_center
     windows, count = Windows(*table), len(pixels)
@@ -276,7 +276,7 @@ def choose_narrow(
     takes_centered = cost_in_reach(centered).isfinite()
     minimum, flattest = torch.full_like(relative[:count], torch.inf), torch.full_like(pixels, -1)
     for shape, sides in enumerate(NARROW):
-        for _, number in window_pixels(numbers, pixels, *sides):
+        for _, number in window_pixels(indices, pixels, *sides):
             window = torch.where(number >= 0, shape * count + number, -1)
             cost = cost_in_reach(window)
             flattest = torch.where(cost < minimum, window, flattest)

@@ -61,13 +61,13 @@ def describe_pixels(
         normals = values.new_empty(*values.shape, 3)
         found = Pixels(normals, curvature, noise, valid, right, down)
         fixed = *image, x, y, choice.window, choice.flat, *planes.tables
-        numbers = *focal, *planes.noise, *limits
-        pass_over_rows("describe_pixels", len(y), *fixed, *found, *numbers)
+        parameters = *focal, *planes.noise, *limits
+        pass_over_rows("describe_pixels", len(y), *fixed, *found, *parameters)
         return found
     index = torch.arange(values.numel(), device=values.device)
     windows = Windows(*(column.view(values.shape) for column in planes.take(index)))
     sides = planes.sides_and_centers(index)[0].view(2, *values.shape)
-    noise = planes.noise.at(values)
+    noise = planes.noise.evaluate(values)
     valid = choice.flat | (seen & windows.deviation.isfinite())
     is_smooth = windows.deviation > FLAT * windows.tolerance
     limit = torch.maximum(windows.tolerance, noise)
@@ -110,7 +110,7 @@ def _join(
     angle and the wider angle.
     """
     max_step, max_sq_chord, wider_sq_chord = limits
-    flat, numbers, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
+    flat, indices, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
     length, joined = flat.shape[axis] - 1, torch.zeros_like(flat)
     both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
     here = places_of(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
@@ -133,7 +133,7 @@ def _join(
     )
     accepted = (turned <= max_sq_chord) | ((similar | (turned <= wider_sq_chord)) & both_hold)
     accepted &= (step.abs() <= limit) & (next_step.abs() <= limit)
-    joined.view(-1)[here] = accepted | (numbers[here] == numbers[there])
+    joined.view(-1)[here] = accepted | (indices[here] == indices[there])
     return joined
 
 

@@ -98,8 +98,7 @@ def fit_windows(image: Image) -> dict[int, Tensor]:
     flat = values.new_empty(len(Windows._fields) * sum(shape.numel() for shape in shapes))
     parts = torch.split(flat, [len(Windows._fields) * shape.numel() for shape in shapes])
     tables = {
-        size: numbers.view(-1, *shape)
-        for size, numbers, shape in zip(sizes, parts, shapes, strict=True)
+        size: part.view(-1, *shape) for size, part, shape in zip(sizes, parts, shapes, strict=True)
     }
     if not has_kernels(values):
         ones = seen.to(values.dtype)
@@ -122,22 +121,22 @@ def fit_windows(image: Image) -> dict[int, Tensor]:
     return tables
 
 
-def fit_narrow_windows(image: Image, numbers: Tensor, pixels: Tensor) -> Tensor:
+def fit_narrow_windows(image: Image, indices: Tensor, pixels: Tensor) -> Tensor:
     """Fit a plane to the narrow windows of both shapes around the given pixels ``(n,)``.
 
-    Only these pixels count: ``numbers`` ``(H, W)`` are their indices, -1 for other pixels. Returns
+    Only these pixels count: ``indices`` ``(H, W)`` are their indices, -1 for other pixels. Returns
     a table ``(9, 2, n)``; see :func:`fit_windows`.
     """
     values, _, u, v = image
     table = values.new_empty(len(Windows._fields), len(NARROW), len(pixels))
     if has_kernels(values):
         limits, planes = _min_moments(*NARROW[0]), table[:NUM_PLANE]
-        fixed = values, u, v, numbers, pixels, *limits, planes
+        fixed = values, u, v, indices, pixels, *limits, planes
         pass_over_rows("fit_narrow_windows", len(pixels), *fixed)
         return table
     for shape, (rows, columns) in enumerate(NARROW):
         sums = values.new_zeros(_NUM_MOMENTS, len(pixels))
-        for at, _ in window_pixels(numbers, pixels, rows, columns):
+        for at, _ in window_pixels(indices, pixels, rows, columns):
             ones = (at >= 0).to(values.dtype)
             at = at.clamp(min=0)
             row, column = at // len(u), at % len(u)
@@ -148,19 +147,19 @@ def fit_narrow_windows(image: Image, numbers: Tensor, pixels: Tensor) -> Tensor:
 
 
 def window_pixels(
-    numbers: Tensor, pixels: Tensor, rows: int, columns: int
+    indices: Tensor, pixels: Tensor, rows: int, columns: int
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield, for each position of a narrow window, the pixels there ``(n,)`` and their indices.
 
     Row by row; both are -1 where no pixel counts.
     """
-    height, width = numbers.shape
+    height, width = indices.shape
     for step in range(rows * columns):
         row = pixels // width + step // columns - rows // 2
         column = pixels % width + step % columns - columns // 2
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         index = torch.where(inside, row * width + column, 0)
-        number = torch.where(inside, numbers.flatten()[index], -1)
+        number = torch.where(inside, indices.flatten()[index], -1)
         yield torch.where(number >= 0, index, -1), number
 
 
@@ -218,7 +217,7 @@ class WindowNoise(NamedTuple):
     growth: float
     rounding: float
 
-    def at(self, inverse: Tensor) -> Tensor:
+    def evaluate(self, inverse: Tensor) -> Tensor:
         """Return the noise at inverse depths."""
         minimum = self.rounding * inverse
         typical = torch.maximum(self.growth + self.constant * (inverse * inverse), minimum)
@@ -246,7 +245,7 @@ def noise_by_size(
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0
     for size, (*_, deviation, mean) in windows.items():
-        ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
+        ratios = torch.maximum(deviation, rounding * mean) / shape.evaluate(mean)
         typical = float(_low_quantile(ratios)) if len(ratios) else factor
         factor = typical if factor == 0 else min(max(typical, factor), _MAX_GROWTH * factor)
         noises[size] = shape._replace(factor=factor)

@@ -154,15 +154,15 @@ def search_block(
     pending = [slice(first, last)]
     while pending:
         run = pending.pop()
-        numbers = np.arange(run.start, run.stop)
-        rows = _rows_near(boxes, numbers, reach[numbers - first])
-        if len(rows) > max_rows and len(numbers) > 1:
+        indices = np.arange(run.start, run.stop)
+        rows = _rows_near(boxes, indices, reach[indices - first])
+        if len(rows) > max_rows and len(indices) > 1:
             middle = (run.start + run.stop) // 2
             pending += [slice(run.start, middle), slice(middle, run.stop)]
             continue
         if len(rows) > max_rows:
-            bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, run.start, k))
-            rows = _rows_near(boxes, numbers, bound)
+            bound = np.minimum(reach[indices - first], farthest_neighbor(boxes, run.start, k))
+            rows = _rows_near(boxes, indices, bound)
         queries = slice(boxes.starts[run.start], boxes.starts[run.stop])
         out = nearest[queries.start - block.start : queries.stop - block.start]
         if len(rows) > max_rows:
@@ -175,18 +175,18 @@ def search_block(
 
 
 def _reach_of_boxes(
-    inside: NDArray[np.floating], boxes: Boxes, numbers: slice, k: int
+    inside: NDArray[np.floating], boxes: Boxes, indices: slice, k: int
 ) -> NDArray[np.float64]:
     """Return distances within which all points of each box of a block have ``k`` neighbors."""
     from scipy.spatial import cKDTree
 
     if len(inside) < k:
         return np.array(
-            [farthest_neighbor(boxes, i, k) for i in range(numbers.start, numbers.stop)]
+            [farthest_neighbor(boxes, i, k) for i in range(indices.start, indices.stop)]
         )
-    firsts = inside[boxes.starts[numbers] - boxes.starts[numbers.start]]
+    firsts = inside[boxes.starts[indices] - boxes.starts[indices.start]]
     tree = cKDTree(inside, balanced_tree=False, compact_nodes=False)
-    sides = boxes.high[numbers] - boxes.low[numbers]
+    sides = boxes.high[indices] - boxes.low[indices]
     # Each other point of the box is at most its diagonal away from the first.
     reach: NDArray[np.float64] = tree.query(firsts, [k])[0][:, 0] + np.linalg.norm(sides, axis=1)
     return reach
@@ -196,8 +196,8 @@ def _rows_near(
     boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
 ) -> NDArray[np.int64]:
     """Return the rows of all boxes within reach of one of the chosen boxes."""
-    numbers = np.flatnonzero(near_boxes(boxes, chosen, reach))
-    starts, counts = boxes.starts[numbers], np.diff(boxes.starts)[numbers]
+    indices = np.flatnonzero(near_boxes(boxes, chosen, reach))
+    starts, counts = boxes.starts[indices], np.diff(boxes.starts)[indices]
     ends = np.cumsum(counts)
     return np.repeat(starts - ends + counts, counts) + np.arange(ends[-1])
 
@@ -213,16 +213,16 @@ def _search_each(
     nearest = [np.empty(0, dtype=np.int64)] * len(queries)
     keys = [np.empty(0)] * len(queries)
     for chunk in chunks_of(len(rows), ROWS_AT_ONCE):
-        numbers = rows[chunk]
-        candidates = points[numbers].astype(np.float64)
-        for i, (number, position) in enumerate(zip(queries, positions, strict=True)):
+        indices = rows[chunk]
+        candidates = points[indices].astype(np.float64)
+        for i, (index, position) in enumerate(zip(queries, positions, strict=True)):
             offset = candidates - position
             sq_distances = offset[:, 0] ** 2 + offset[:, 1] ** 2 + offset[:, 2] ** 2
             # The point itself comes first.
-            distances = np.where(numbers == number, -1.0, np.sqrt(sq_distances))
+            distances = np.where(indices == index, -1.0, np.sqrt(sq_distances))
             limit = keys[i][-1] if len(keys[i]) == k else np.inf
             near = distances <= limit
-            merged = np.append(nearest[i], numbers[near])
+            merged = np.append(nearest[i], indices[near])
             distances = np.append(keys[i], distances[near])
             order = np.lexsort((merged, distances))[:k]
             nearest[i], keys[i] = merged[order], distances[order]

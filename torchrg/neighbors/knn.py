@@ -244,8 +244,8 @@ def search_nearest(
     # Consecutive close queries use the same cached parts of the tree.
     query_rows = canonical_order(queries).numpy()
     for chunk in chunks_of(len(query_rows), ROWS_AT_ONCE):
-        distances, places = _query(tree, queries[query_rows[chunk]], 1)
-        nearest[query_rows[chunk]] = np.where(distances <= max_distance, first[places], -1)[:, 0]
+        distances, found = _query(tree, queries[query_rows[chunk]], 1)
+        nearest[query_rows[chunk]] = np.where(distances <= max_distance, first[found], -1)[:, 0]
     return nearest
 
 
@@ -291,13 +291,13 @@ def _search_cloud(
     columns = as_tensor("search_knn", "points", points).unbind(dim=1)
     starts = np.flatnonzero(mark_first(*columns).numpy())
     counts = np.diff(starts, append=len(points))
-    places = points[starts].astype(np.float64)
+    positions = points[starts].astype(np.float64)
 
     def store(
         queried: NDArray[np.integer], distances: NDArray[np.float64], nearest: NDArray[np.integer]
     ) -> None:
         rows = queried
-        if len(places) < len(points):
+        if len(positions) < len(points):
             rows, distances, nearest = _restore_duplicates(
                 queried, distances, nearest, starts, counts, k
             )
@@ -309,28 +309,28 @@ def _search_cloud(
         if is_far is not None:
             is_far[target] = too_far
 
-    width = min(k, len(places))
-    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+    width = min(k, len(positions))
+    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
     first, last = np.searchsorted(starts, (query_rows.start, query_rows.stop - 1), side="right") - 1
     pending = np.arange(first, last + 1)
-    if len(places) >= _MIN_FOR_CELLS and kernels.serve(k=k):
-        sample = places[pending[:: -(-len(pending) // _SAMPLE_SIZE)]]
+    if len(positions) >= _MIN_FOR_CELLS and kernels.serve(k=k):
+        sample = positions[pending[:: -(-len(pending) // _SAMPLE_SIZE)]]
         reach = tree.query(sample, [k])[0][:, 0]
-        if len(places) == len(points) and is_far is None:
-            pending = search_cells(places, pending, reach, indices, order, first_row)
+        if len(positions) == len(points) and is_far is None:
+            pending = search_cells(positions, pending, reach, indices, order, first_row)
         else:
-            found, requested = np.empty((len(places), k), dtype=np.int32), pending
-            pending = search_cells(places, requested, reach, found)
+            found, requested = np.empty((len(positions), k), dtype=np.int32), pending
+            pending = search_cells(positions, requested, reach, found)
             resolved = np.setdiff1d(requested, pending, assume_unique=True)
             for chunk in chunks_of(len(resolved), ROWS_IN_CACHE):
                 rows = resolved[chunk]
                 near = found[rows]
                 distances = np.broadcast_to(0.0, near.shape)
                 if is_far is not None:
-                    distances = np.linalg.norm(places[near] - places[rows, None], axis=2)
+                    distances = np.linalg.norm(positions[near] - positions[rows, None], axis=2)
                 store(rows, distances, near)
     for chunk in chunks_of(len(pending), ROWS_AT_ONCE):
-        store(pending[chunk], *_query(tree, places[pending[chunk]], width))
+        store(pending[chunk], *_query(tree, positions[pending[chunk]], width))
 
 
 def search_cells(
@@ -360,7 +360,7 @@ def search_cells(
     """
     low, high = bounding_box(points)
     extent = high - low
-    places = torch.from_numpy(np.ascontiguousarray(points))
+    positions = torch.from_numpy(np.ascontiguousarray(points))
     target, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
     certain = torch.zeros(len(points), dtype=torch.bool, device="cpu")
     is_query = torch.zeros_like(certain)
@@ -373,7 +373,7 @@ def search_cells(
         _, width, height = (int(count) for count in counts)
         starts = torch.empty(int(counts[0]) * width * height + 1, dtype=torch.int32, device="cpu")
         shape = width, height, *low.tolist(), size
-        of_place, _, sorted_places = kernels.call("fill_cells", places, starts, *shape)
+        sorted_rows, _, sorted_positions = kernels.call("fill_cells", positions, starts, *shape)
         is_query.zero_()[torch.from_numpy(rows)] = True
         # Tasks of about this many points each.
         ends = np.arange(ROWS_IN_CACHE, len(points), ROWS_IN_CACHE)
@@ -382,7 +382,7 @@ def search_cells(
         def work(
             cells: tuple[int, int],
             shape: tuple[float, ...] = shape,
-            grid: tuple[Tensor, ...] = (sorted_places, of_place, starts),
+            grid: tuple[Tensor, ...] = (sorted_positions, sorted_rows, starts),
         ) -> None:
             numbers = *cells, *shape[:2], first_row, *shape[2:]
             kernels.call("search_cells", *grid, is_query, by_row, target, certain, *numbers)
@@ -438,10 +438,10 @@ def _restore_duplicates(
     position = np.arange(len(nearest) * k) - np.repeat(np.cumsum(taken) - taken, taken)
     points = (np.repeat(starts[nearest.ravel()], taken) + position).reshape(len(nearest), k)
     far = np.repeat(distances.ravel(), taken).reshape(len(nearest), k)
-    place = np.repeat(np.arange(len(queried)), counts[queried])
-    rank = np.arange(len(place)) - np.searchsorted(place, place)
-    rows = starts[queried][place] + rank
-    points, far = points[place], far[place]
+    owner = np.repeat(np.arange(len(queried)), counts[queried])
+    rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
+    rows = starts[queried][owner] + rank
+    points, far = points[owner], far[owner]
     later = np.flatnonzero(rank)
     if len(later):
         shift = np.arange(k) <= rank[later, None]

@@ -76,8 +76,8 @@ def find_faces(
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
     has_plane[joined[rows]] = True
     rows = places_of(~has_plane[joined])
-    numbers, patch = torch.unique(joined[rows], return_inverse=True)
-    sums = normals.new_zeros(len(numbers), 3)
+    indices, patch = torch.unique(joined[rows], return_inverse=True)
+    sums = normals.new_zeros(len(indices), 3)
     sums.index_add_(0, patch, normals[rows] * signs[rows, None])
     axes = torch.nn.functional.normalize(sums, dim=1)
     side, _ = _split_plates(points[rows], patch, axes, max_thickness)
@@ -203,7 +203,7 @@ def _join_faces(
     """
     from scipy.sparse import coo_array
 
-    numbers, signs = torch.arange(len(sizes)), torch.ones(len(sizes))
+    indices, signs = torch.arange(len(sizes)), torch.ones(len(sizes))
     while True:
         is_between = low != high
         ends = torch.stack([torch.minimum(low, high), torch.maximum(low, high)])[:, is_between]
@@ -221,8 +221,8 @@ def _join_faces(
             len(sizes), owner[chosen], both.indices[chosen], both.data[chosen] < 0
         )
         if int(joined.max()) + 1 == len(sizes):
-            return numbers, signs
-        numbers, signs = joined[numbers], signs * flips[numbers]
+            return indices, signs
+        indices, signs = joined[indices], signs * flips[indices]
         sizes = torch.bincount(joined, sizes).long()
         half = half.tocoo()
         low, high = (torch.from_numpy(end).long() for end in half.coords)
@@ -256,5 +256,5 @@ def _find_components(
     component = np.where(upright == opposite, alone, np.minimum(upright, opposite))
     is_used = np.zeros(3 * num_nodes, dtype=np.int64)
     is_used[component] = 1
-    numbers = np.cumsum(is_used)[component] - 1
-    return torch.from_numpy(numbers), torch.from_numpy(np.where(upright <= opposite, 1.0, -1.0))
+    indices = np.cumsum(is_used)[component] - 1
+    return torch.from_numpy(indices), torch.from_numpy(np.where(upright <= opposite, 1.0, -1.0))

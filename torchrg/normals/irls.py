@@ -58,7 +58,7 @@ class _Offsets(NamedTuple):
         """Return the given rows."""
         return _Offsets(*(column[rows] for column in self))
 
-    def about(self, centers: Tensor) -> "_Offsets":
+    def relative_to(self, centers: Tensor) -> "_Offsets":
         """Return the points relative to other centers, shape ``(n, 3)``."""
         x, y, z = (
             column - center for column, center in zip(self[:3], centers.T[..., None], strict=True)
@@ -251,7 +251,7 @@ def _fit_twice(
         weighed_mu=through.mu,
     )
     near = _fit_graduated(points, restarted, limit, decay, shift=True)
-    points = points.about(near.center)
+    points = points.relative_to(near.center)
     weights = _weigh(points.distances(near.weighed_normal), near.weighed_mu, points.counted)
     height = (near.center * near.normal).sum(dim=-1)
     above = (points.distances(near.normal) * points.counted).sum(dim=-1) > 0
@@ -326,13 +326,13 @@ def _step(points: _Offsets, plane: _Plane, decay: float, shift: bool) -> _Plane:
     """Return the next plane, with the normal along which the weighted points are flattest."""
     center = plane.center
     if shift:
-        points = points.about(center)
+        points = points.relative_to(center)
         weights = _weigh(points.distances(plane.weighed_normal), plane.weighed_mu, points.counted)
         heavy = weights * (weights > _MIN_HEAVY_WEIGHT)
         total = heavy.sum(dim=-1, keepdim=True)
         heights = (heavy * points.distances(plane.normal)).sum(dim=-1, keepdim=True)
         move = plane.normal * (heights / torch.where(total > 0, total, 1.0))
-        points, center = points.about(move), center + move
+        points, center = points.relative_to(move), center + move
     mu = plane.mu / decay
     weights = _weigh(points.distances(plane.normal), mu, points.counted)
     matrix = second_moments(points[:3], weights)

@@ -123,10 +123,10 @@ class NearestPoints:
         near, counted = self.neighbors.at(rows)
         if counted is None:
             return near
-        numbers = rows
-        if isinstance(numbers, slice):
-            numbers = torch.arange(len(self.neighbors.indices), device=near.device)[numbers]
-        return torch.where(counted, near, numbers[:, None].to(near.dtype))
+        indices = rows
+        if isinstance(indices, slice):
+            indices = torch.arange(len(self.neighbors.indices), device=near.device)[indices]
+        return torch.where(counted, near, indices[:, None].to(near.dtype))
 
     def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
         """Return the candidates that have a changed neighbor."""
@@ -272,10 +272,10 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
         return _unique_cells(contacts.pair, cell)
 
     for found in edges.map_contacts(find_cells):
-        for numbers, values in zip(cells, found, strict=True):
-            numbers.frombytes(values.cpu().numpy().tobytes())
+        for indices, values in zip(cells, found, strict=True):
+            indices.frombytes(values.cpu().numpy().tobytes())
     pair, cell = _unique_cells(
-        *(torch.from_numpy(np.array(numbers)).to(points.device) for numbers in cells)
+        *(torch.from_numpy(np.array(indices)).to(points.device) for indices in cells)
     )
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
@@ -296,6 +296,6 @@ def _unique_cells(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distance to the last contact neighbor of each point, and their number."""
     nearest = NearestPoints(neighbors).neighbors.at(rows)
-    number = nearest.counted().sum(dim=1)
-    last = nearest.indices.gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
-    return (points[last].double() - points[rows].double()).norm(dim=1), number
+    count = nearest.counted().sum(dim=1)
+    last = nearest.indices.gather(1, (count - 1).clamp(min=0)[:, None]).squeeze(1)
+    return (points[last].double() - points[rows].double()).norm(dim=1), count

@@ -206,9 +206,9 @@ def _along(vectors: Tensor, axis: Tensor) -> Tensor:
     return x * axis[0] + y * axis[1] + z * axis[2]
 
 
-def _divmod(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
+def _divmod(values: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
     """Return quotients and remainders."""
-    return numbers // divisor, numbers % divisor
+    return values // divisor, values % divisor
 
 
 def _weighted_median(values: Tensor, weights: Tensor) -> float:
@@ -271,9 +271,9 @@ def _room_heights(columns: Tensor, column: Tensor, z: Tensor) -> tuple[Tensor, T
         below = below.view(len(wide), -1).cumsum(dim=1)
         neighborhood = torch.zeros_like(below)
         for right, ahead in product(range(-_REACH, _REACH + 1), repeat=2):
-            wanted = wide + (right << _BITS) + ahead
-            near = torch.searchsorted(wide, wanted).clamp(max=len(wide) - 1)
-            neighborhood += below[near] * (wide[near] == wanted)[:, None]
+            target = wide + (right << _BITS) + ahead
+            near = torch.searchsorted(wide, target).clamp(max=len(wide) - 1)
+            neighborhood += below[near] * (wide[near] == target)[:, None]
         outside = _MAX_OUTSIDE_FRACTION * neighborhood[:, -1:]
         first = levels[(neighborhood <= outside).sum(dim=1)][index]
         last = levels[(neighborhood < neighborhood[:, -1:] - outside).sum(dim=1)][index]

@@ -89,10 +89,10 @@ def mark_edges(
     return bits, None if order_independent else seed_bits
 
 
-def _write_bits(into: NDArray[np.uint8], flags: Tensor) -> None:
+def _write_bits(target: NDArray[np.uint8], flags: Tensor) -> None:
     """Write flags ``(n, K)`` to the bits of bytes, lowest bit first."""
     packed = np.packbits(flags.cpu().numpy(), axis=1, bitorder="little")
-    into[:, : packed.shape[1]] = packed
+    target[:, : packed.shape[1]] = packed
 
 
 def _become_seeds(
@@ -147,9 +147,9 @@ def accept_edges(
         distance = cloud.points.new_tensor(config.max_distance**2)
     columns = cloud.points.T, cloud.normals.T
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
-        numbers = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
+        limits = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
         (joins,) = kernels.call(
-            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids.long(), *numbers, signed
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids.long(), *limits, signed
         )
     else:
         joins = are_valid(near, ids, cloud.valid)

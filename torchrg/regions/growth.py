@@ -343,8 +343,8 @@ def grow_first_in_first_out(
     def claim(root: int, seeds: NDArray[np.integer], *, promoted: bool) -> NDArray[np.integer]:
         """Assign unassigned neighbors of the seeds to a region, and return the new seeds."""
         near = lists[seeds]
-        claims = _flags(joins, seeds, near) & free[near]
-        by_edge = None if makes_seed is None else _flags(makes_seed, seeds, near)
+        claims = _unpack(joins, seeds, near) & free[near]
+        by_edge = None if makes_seed is None else _unpack(makes_seed, seeds, near)
         if promoted:
             claims &= by_edge
         targets = near[claims]
@@ -368,7 +368,9 @@ def grow_first_in_first_out(
     return torch.from_numpy(roots)
 
 
-def _flags(bits: Tensor, rows: NDArray[np.integer], near: NDArray[np.integer]) -> NDArray[np.bool_]:
+def _unpack(
+    bits: Tensor, rows: NDArray[np.integer], near: NDArray[np.integer]
+) -> NDArray[np.bool_]:
     """Return the bits of the given rows, one for each neighbor, shape ``(n, K)``."""
     of_rows = bits.numpy()[rows].view(np.uint8)
     flags = np.unpackbits(of_rows, axis=1, count=near.shape[1], bitorder="little")

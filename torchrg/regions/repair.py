@@ -276,7 +276,7 @@ class _Moments(NamedTuple):
     min_variance: Tensor
     normal: Tensor
 
-    def at(self, rows: Tensor | slice) -> "_Moments":
+    def select(self, rows: Tensor | slice) -> "_Moments":
         """Return the moments of the given regions."""
         return _Moments(*(values[rows] for values in self))
 
@@ -303,7 +303,7 @@ def pairwise_misfit(planes: RegionPlanes, pairs: Tensor) -> Tensor:
     """
     thickness = planes.thickness[pairs].amax(dim=1)
     moments = _region_moments(planes)
-    first, second = (moments.at(side)._replace(scale=thickness) for side in pairs.unbind(dim=1))
+    first, second = (moments.select(side)._replace(scale=thickness) for side in pairs.unbind(dim=1))
     return _misfit(first, second, _combined(first, second))
 
 
@@ -323,7 +323,7 @@ def _merge(
 
     def offer(pairs: Tensor) -> None:
         first, second = pairs.unbind(dim=1)
-        sides = groups.at(first), groups.at(second)
+        sides = groups.select(first), groups.select(second)
         both = _combined(*sides)
         misfits = _misfit(*sides, both)
         if max_tilt is not None:
@@ -340,7 +340,7 @@ def _merge(
         _, a, b, age_a, age_b = heapq.heappop(queue)
         if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
             continue
-        both = _combined(groups.at(slice(a, a + 1)), groups.at(slice(b, b + 1)))
+        both = _combined(groups.select(slice(a, a + 1)), groups.select(slice(b, b + 1)))
         for values, joined in zip(groups, both, strict=True):
             values[a] = joined[0]
         owner[b] = a

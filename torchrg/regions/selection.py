@@ -79,8 +79,8 @@ def choose_planes(planes: Planes, settings: SelectionConfig) -> Tensor:
     """
     is_kept = planes.area >= settings.min_area
     if settings.kinds is not None and planes.kind is not None:
-        wanted = [PLANE_KINDS.index(name) for name in settings.kinds]
-        is_kept &= torch.isin(planes.kind, planes.kind.new_tensor(wanted))
+        selected = [PLANE_KINDS.index(name) for name in settings.kinds]
+        is_kept &= torch.isin(planes.kind, planes.kind.new_tensor(selected))
     rows = is_kept.nonzero().squeeze(1)
     sizes = planes.area if settings.sort == "area" else planes.count
     return rows[sizes[rows].argsort(descending=True, stable=True)]

@@ -230,19 +230,19 @@ def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: T
     curved = ~(on_plane | (covered >= _MIN_FLAT_FRACTION * of_region))
     is_face = flat & (num_points >= _MIN_FACE_FRACTION * of_region[owner])
     joined = curved[owner] & ~is_face
-    numbers = torch.arange(len(owner) + 1, device=cores.device)
-    numbers[-1] = UNLABELED
+    indices = torch.arange(len(owner) + 1, device=cores.device)
+    indices[-1] = UNLABELED
     first = torch.full_like(of_region, len(owner))
-    first.scatter_reduce_(0, owner[joined], numbers[:-1][joined], "amin")
-    numbers[:-1][joined] = first[owner[joined]]
-    return numbers[cores]
+    first.scatter_reduce_(0, owner[joined], indices[:-1][joined], "amin")
+    indices[:-1][joined] = first[owner[joined]]
+    return indices[cores]
 
 
 def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
     """Return the region of each non-empty core, ascending."""
     points = (cores >= 0).nonzero().squeeze(1)
-    numbers, rows = torch.unique(cores[points], return_inverse=True)
-    return labels.new_zeros(len(numbers)).index_copy_(0, rows, labels[points])
+    indices, rows = torch.unique(cores[points], return_inverse=True)
+    return labels.new_zeros(len(indices)).index_copy_(0, rows, labels[points])
 
 
 def _fit_cores(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
@@ -311,10 +311,10 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
     between = edges.inside & (theirs >= 0) & (theirs != ours)
     first, second = ours[between], theirs[between]
     keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
-    keys, numbers = torch.unique(keys, return_inverse=True)
+    keys, indices = torch.unique(keys, return_inverse=True)
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
-    num_edges = torch.bincount(numbers, minlength=len(pairs))
-    num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
+    num_edges = torch.bincount(indices, minlength=len(pairs))
+    num_open = torch.bincount(indices[edges.passed[between]], minlength=len(pairs))
     planes = _fit_cores(cloud, cores)
     one, other = planes.normal[pairs].unbind(dim=1)
     turn = unsigned_angle_deg(one, other)
@@ -374,7 +374,7 @@ def split_levels(
         large = (planes.num_points >= _MIN_SIZE_FACTOR * int(config.min_size)) & ~planes.curved
         if not bool(large.any()):
             break
-        region = remap_labels(searched, _compact_numbers(large))
+        region = remap_labels(searched, _compact_indices(large))
         level, owner = _find_levels(
             cloud, region, RegionPlanes(*(v[large] for v in planes)), config
         )
@@ -402,15 +402,15 @@ def _find_levels(
     min_step = (_STEP_NOISE_FACTOR * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
     num_points = torch.bincount(level + 1, minlength=1)[1:]
     kept = (num_points >= int(config.min_size)) & (step >= min_step)
-    level, step, owner = remap_labels(level, _compact_numbers(kept)), step[kept], owner[kept]
+    level, step, owner = remap_labels(level, _compact_indices(kept)), step[kept], owner[kept]
     fits = fit_planes(Segments(level), cloud.points, cloud.normals)
     turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
     kept = (turn <= PARALLEL_DEG) & (fits.thickness <= _MAX_THICKNESS * step)
     kept &= _have_valleys(level, step, average, region, adjacency)
-    return remap_labels(level, _compact_numbers(kept)), owner[kept]
+    return remap_labels(level, _compact_indices(kept)), owner[kept]
 
 
-def _compact_numbers(kept: Tensor) -> Tensor:
+def _compact_indices(kept: Tensor) -> Tensor:
     """Return consecutive numbers of the kept regions ``(M,)``, -1 for removed ones."""
     return torch.where(kept, kept.cumsum(0) - 1, UNLABELED)
 
@@ -465,16 +465,16 @@ def _components(chosen: Tensor, groups: Tensor, adjacency: NearestPoints) -> Ten
     from scipy.sparse.csgraph import connected_components
 
     rows = places_of(chosen & (groups >= 0))
-    number = torch.full_like(groups, UNLABELED).index_copy_(
+    index = torch.full_like(groups, UNLABELED).index_copy_(
         0, rows, torch.arange(len(rows), device=rows.device)
     )
     near = adjacency.neighbor_rows(rows).long()
-    joined = (number[near] >= 0) & (groups[near] == groups[rows, None])
-    ends = number[rows, None].expand_as(near)[joined].cpu(), number[near][joined].cpu()
+    joined = (index[near] >= 0) & (groups[near] == groups[rows, None])
+    ends = index[rows, None].expand_as(near)[joined].cpu(), index[near][joined].cpu()
     ones = torch.ones(len(ends[0]), dtype=torch.int8)
     graph = coo_array((ones.numpy(), ends), shape=(len(rows), len(rows)))
     components = torch.from_numpy(connected_components(graph, directed=False)[1]).to(groups)
-    return number.index_copy_(0, rows, components)
+    return index.index_copy_(0, rows, components)
 
 
 def _median_steps(level: Tensor, residual: Tensor) -> Tensor:

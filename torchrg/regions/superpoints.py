@@ -113,7 +113,7 @@ def partition_points(
         [7] J. Walczak et al. Normal grouping density separation (NGDS): a novel object-driven
         indoor point cloud partition method. ICCS, 2020.
     """
-    distinct, shades = merge_copies(points, normals, labels, colors)
+    distinct, unique_colors = merge_copies(points, normals, labels, colors)
     edges = None
     if faces is not None:
         edges = _mesh_edges(faces.cpu(), distinct.inverse.cpu())
@@ -122,7 +122,7 @@ def partition_points(
         normals[distinct.rows].detach().cpu(),
         labels[distinct.rows].long().cpu(),
         config,
-        None if shades is None else shades.cpu(),
+        None if unique_colors is None else unique_colors.cpu(),
         edges,
         neighbors,
     )
@@ -146,11 +146,11 @@ def merge_copies(
     distinct = distinct_points(points, ties)
     if colors is None:
         return distinct, None
-    shades = colors.detach()
+    unique_colors = colors.detach()
     if not distinct.num_copies:
-        return distinct, shades[distinct.rows]
+        return distinct, unique_colors[distinct.rows]
     rows = finite_rows(points)
-    counts, columns = torch.bincount(distinct.inverse[rows]), shades[rows].unbind(dim=1)
+    counts, columns = torch.bincount(distinct.inverse[rows]), unique_colors[rows].unbind(dim=1)
     low, high = (
         torch.stack([reduce_runs(column, counts, side) for column in columns], dim=1)
         for side in ("min", "max")
@@ -294,15 +294,15 @@ def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
     links = np.ones(len(targets), dtype=np.int8)
     shape = (len(labels), len(labels))
     edges = csr_array((links, targets.numpy(), starts.numpy()), shape=shape)
-    numbers = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
-    return _by_first_point(numbers)
+    indices = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
+    return _by_first_point(indices)
 
 
-def _by_first_point(numbers: Tensor) -> Tensor:
+def _by_first_point(indices: Tensor) -> Tensor:
     """Number regions by their first points, so that ties do not depend on scipy's numbering."""
-    first = torch.full((int(numbers.max()) + 1,), len(numbers))
-    first = first.scatter_reduce(0, numbers, torch.arange(len(numbers)), "amin")
-    return first.argsort().argsort()[numbers]
+    first = torch.full((int(indices.max()) + 1,), len(indices))
+    first = first.scatter_reduce(0, indices, torch.arange(len(indices)), "amin")
+    return first.argsort().argsort()[indices]
 
 
 def _initial_regions(
@@ -383,8 +383,8 @@ def _contact_differences(
     offset = [b - a for a, b in zip(here[:3], there[:3], strict=True)]
     ends = here[3:], there[3:]
     step = torch.minimum(*(_dot(offset, normal).square() for normal in ends)) / _dot(offset, offset)
-    is_other = (labels[rows, None] != labels[near]).double()
-    return sq_chords(*ends) + _STEP_WEIGHT * step + _PLANE_WEIGHT * is_other
+    is_different = (labels[rows, None] != labels[near]).double()
+    return sq_chords(*ends) + _STEP_WEIGHT * step + _PLANE_WEIGHT * is_different
 
 
 def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
@@ -443,8 +443,8 @@ def _merge_to_count(
         if num_enough >= min(num_large, count):
             num_large, (graph, assignment) = num_enough, state
     graph, merged = _last(_merge_rounds([graph], bound, partial(_is_small, min_size)))
-    graph, again = _last(_merge_rounds([graph], bound, _is_cheap, count))
-    return graph, again[merged[assignment]]
+    graph, remapped = _last(_merge_rounds([graph], bound, _is_cheap, count))
+    return graph, remapped[merged[assignment]]
 
 
 def _last(states: Iterator[tuple[_Graph, Tensor]]) -> tuple[_Graph, Tensor]:

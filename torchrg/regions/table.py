@@ -124,8 +124,8 @@ def measure_planes(
         list(zip(chunks, frames, strict=True)),
         points.device,
     )
-    numbers, polygons = zip(*measures, strict=True)
-    mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
+    measured, polygons = zip(*measures, strict=True)
+    mean, area, sides, directions, middle = map(torch.cat, zip(*measured, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
 
     def to_input_dtype(values: Tensor) -> Tensor:

@@ -49,7 +49,7 @@ def smooth_planes(
     parts = planes.normals.T.contiguous()
     is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
     table = _table(points, planes, errors) if is_served else points
-    numbers = (
+    parameters = (
         constants.SMOOTHING_AGREEMENT,
         constants.SMOOTHING_REACH,
         constants.FIT_FALLOFF,
@@ -61,7 +61,7 @@ def smooth_planes(
         chosen = rows[block]
         if is_served:
             normals[chosen], offsets[chosen] = kernels.call(
-                "smooth_planes", table, *neighbors, noise, chosen, *numbers
+                "smooth_planes", table, *neighbors, noise, chosen, *parameters
             )
             return
         normals[chosen], offsets[chosen] = _smoothed(
@@ -137,7 +137,7 @@ def choose_planes(
     is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
     is_served = is_served and len(rows) > 0
     table = _table(points, planes, noise) if is_served else points
-    numbers = (
+    parameters = (
         constants.CHOICE_STEP,
         constants.VOTE_REACH,
         constants.VOTE_FALLOFF,
@@ -149,7 +149,7 @@ def choose_planes(
         chosen = rows[block]
         if is_served:
             normals[chosen], offsets[chosen] = kernels.call(
-                "choose_planes", table, *neighbors, points, chosen, *numbers
+                "choose_planes", table, *neighbors, points, chosen, *parameters
             )
             return
         normals[chosen], offsets[chosen] = _chosen(
