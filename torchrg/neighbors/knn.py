@@ -32,8 +32,8 @@ _MIN_FOR_CELLS = 2000
 """Minimum number of points for which cells are faster than a tree."""
 
 _SIZE_STEP = 1.5
-"""Ratio of consecutive cell sizes: one size serves points whose k-th neighbor is 1 / 1.75 to 1 size
-away."""
+"""Ratio of a cell size to the smallest remaining distance of a k-th neighbor. Cells of one size
+serve points whose k-th neighbor is 1 / 1.75 to 1 size away."""
 
 _MIN_FRACTION = 0.03
 """Minimum fraction of the points for which another cell size is worth its sort."""
