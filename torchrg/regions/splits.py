@@ -67,8 +67,9 @@ _MIN_SIZE_FACTOR = 3
 """Minimum size of a region that may contain two surfaces, in multiples of ``min_size``."""
 
 _NOISE_QUANTILE, _NOISE_FACTOR = 0.33, 2.345
-"""Quantile of the absolute residuals and its ratio to a standard deviation of normal noise. The
-lower third belongs to the main level even if a second one has nearly half of the points."""
+"""Quantile of the absolute residuals, and the factor that converts it to a standard deviation of
+normal noise. The lower third belongs to the main level even if a second one has nearly half of the
+points."""
 
 _SEED_NOISE_FACTOR = 1.5
 """Minimum averaged residual of a candidate, in standard deviations; six of the average itself."""

@@ -60,8 +60,8 @@ _MERGE_DIVISOR = 8
 round."""
 
 _MIN_SIZE_RATIO = 16
-"""Minimum size ratio at which a region absorbs, in one round, all smaller ones that prefer it: they
-hardly change it. Otherwise a floor would absorb one speck per round."""
+"""Minimum size ratio at which a region merges, in one round, with all smaller ones that prefer it:
+they hardly change it. Otherwise a floor would take one speck per round."""
 
 
 def partition_points(
