@@ -75,7 +75,7 @@ def test_noise_of_depth_is_found_whatever_its_growth(rng):
         noisy = inverse + level * torch.randn(240, 320, generator=rng, dtype=torch.float64)
         noise = noise_by_size(fit_windows(Image(noisy, seen, u, v)), None, torch.float32)
         for size in CELL_SIZES:
-            ratio = (noise[size].at(inverse) / level)[16:-16, 16:-16]
+            ratio = (noise[size].evaluate(inverse) / level)[16:-16, 16:-16]
             assert float(ratio.min()) > 0.7, (constant, growth, size)
             assert float(ratio.max()) < 1.3, (constant, growth, size)
 
@@ -85,7 +85,7 @@ def test_noise_that_is_given_is_taken(rng):
     inverse = 0.5 + torch.rand(20, 20, generator=rng, dtype=torch.float64)
     seen = torch.ones_like(inverse, dtype=torch.bool)
     noise = noise_by_size(fit_windows(Image(inverse, seen, u, v)), (0.01, 0.02), torch.float32)
-    torch.testing.assert_close(noise[2].at(inverse), 0.02 + 0.01 * inverse**2)
+    torch.testing.assert_close(noise[2].evaluate(inverse), 0.02 + 0.01 * inverse**2)
     assert noise[2] == noise[8]
 
 
