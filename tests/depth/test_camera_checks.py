@@ -29,8 +29,8 @@ REAL = {
 DOUBTED = {
     "a wide lens": ((42.0, 42.0, 160.0, 120.0), "with pixels 75.3 degrees off the optical axis"),
     "a long lens": ((4e3, 4e3, 160.0, 120.0), "with a field of view of 4.6 degrees"),
-    "fx, cx, fy, cy": ((300.0, 160.0, 300.0, 120.0), "with pixels that are not square"),
-    "half as high": ((300.0, 150.0, 160.0, 60.0), "with pixels that are not square"),
+    "fx, cx, fy, cy": ((300.0, 160.0, 300.0, 120.0), "with non-square pixels"),
+    "half as high": ((300.0, 150.0, 160.0, 60.0), "with non-square pixels"),
     "cx and cy": ((300.0, 300.0, 120.0, 160.0), "with an optical axis off the center"),
     "of smaller images": ((150.0, 150.0, 80.0, 60.0), "with an optical axis off the center"),
 }
@@ -120,7 +120,7 @@ def test_the_axis_of_a_crop_may_be_outside_of_it():
 
 def test_cx_and_cy_in_the_wrong_order_are_told_from_an_axis_off_the_center():
     # Kinect v2: the axis is off by a tenth of a side alone, and fits in the other order.
-    with pytest.warns(DepthWarning, match="which fit better with cx and cy in the other order"):
+    with pytest.warns(DepthWarning, match="which fit better with cx and cy exchanged"):
         segment_depth(torch.full((424, 512), 2.0), make_intrinsics(365.5, 365.5, 205.2, 257.0))
 
 
@@ -135,7 +135,7 @@ def test_a_batch_is_doubted_once():
 
 
 def test_turned_images_are_told():
-    with pytest.raises(ConfigError, match=r"got 240 x 320; turn the images back, or pass the cam"):
+    with pytest.raises(ConfigError, match=r"got 240 x 320; rotate the images back, or pass the c"):
         Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((240, 320))
 
 

@@ -15,7 +15,7 @@ from torchrg.depth.windows import (
     find_jitter,
     fit_narrow_windows,
     fit_windows,
-    held_pixels,
+    window_pixels,
 )
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 262.5
@@ -51,7 +51,7 @@ def test_narrow_windows_are_those_of_a_literal_least_squares_fit(rng):
     numbers.view(-1)[pixels] = torch.arange(len(pixels))
     planes = Windows(*fit_narrow_windows(Image(image, seen, u, v), numbers, pixels))
     for shape, (rows, columns) in enumerate(NARROW):
-        held = torch.stack([at for at, _ in held_pixels(numbers, pixels, rows, columns)], dim=1)
+        held = torch.stack([at for at, _ in window_pixels(numbers, pixels, rows, columns)], dim=1)
         for pixel in (1, 40, 7 * width + 8, height * width - 1):
             number = int(numbers.view(-1)[pixel])
             row, column = divmod(pixel, width)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchrg.depth.normals import fit_pixels, min_in_windows
-from torchrg.depth.pixels import holds
+from torchrg.depth.pixels import contain
 from torchrg.depth.windows import CELL_SIZES, Image, Windows, fit_windows, noise_by_size
 
 FOCAL = (525.0, 525.0)
@@ -75,7 +75,7 @@ def test_noise_of_depth_is_found_whatever_its_growth(rng):
         noisy = inverse + level * torch.randn(240, 320, generator=rng, dtype=torch.float64)
         noise = noise_by_size(fit_windows(Image(noisy, seen, u, v)), None, torch.float32)
         for size in CELL_SIZES:
-            ratio = (noise[size].at(inverse) / level)[16:-16, 16:-16]
+            ratio = (noise[size].evaluate(inverse) / level)[16:-16, 16:-16]
             assert float(ratio.min()) > 0.7, (constant, growth, size)
             assert float(ratio.max()) < 1.3, (constant, growth, size)
 
@@ -85,7 +85,7 @@ def test_noise_that_is_given_is_taken(rng):
     inverse = 0.5 + torch.rand(20, 20, generator=rng, dtype=torch.float64)
     seen = torch.ones_like(inverse, dtype=torch.bool)
     noise = noise_by_size(fit_windows(Image(inverse, seen, u, v)), (0.01, 0.02), torch.float32)
-    torch.testing.assert_close(noise[2].at(inverse), 0.02 + 0.01 * inverse**2)
+    torch.testing.assert_close(noise[2].evaluate(inverse), 0.02 + 0.01 * inverse**2)
     assert noise[2] == noise[8]
 
 
@@ -114,7 +114,7 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         for column in range(-(-width // size))
     ]
     pixels, others = torch.randint(height * width, (2, 400), generator=rng)
-    sides, middles = found.sides_and_middles(pixels)
+    sides, middles = found.sides_and_centers(pixels)
     expected, lengths = [], []
     for pixel, other in zip(pixels.tolist(), others.tolist(), strict=True):
         top, bottom, left, right = squares[int(found.choice.window.flatten()[pixel])]
@@ -122,6 +122,6 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         expected.append(top <= row < bottom and left <= column < right)
         lengths.append([bottom - top, right - left])
     assert sides.T.tolist() == lengths
-    assert holds(sides, middles, others, width).tolist() == expected
+    assert contain(sides, middles, others, width).tolist() == expected
     assert any(expected)
     assert not all(expected)

@@ -53,7 +53,7 @@ every_function = pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_growth_refuses_lists_without_the_point_itself(
     points, without_self, preset, has_kernels
 ):
-    repair = "put the row of the point before its neighbors, as search_knn does"
+    repair = "Put the row of the point first, as search_knn does"
     around = contextlib.nullcontext() if has_kernels else definitions()
     with around, pytest.raises(ShapeError, match=repair):
         grow(points, Neighbors(without_self), preset)
@@ -63,7 +63,7 @@ def test_every_growth_refuses_lists_without_the_point_itself(
 
 @every_function
 def test_lists_without_the_point_itself_are_refused_by_name(points, without_self, name):
-    words = f"^{name}: expected each point to be the first of its own neighbors, got others for 300"
+    words = f"^{name}: expected each point as its own first neighbor, got other points in 300"
     with pytest.raises(ShapeError, match=words):
         FUNCTIONS[name](points, Neighbors(without_self))
 
@@ -81,10 +81,10 @@ def test_rows_that_are_not_there_are_refused_by_name(points, without_self, name,
 @pytest.mark.parametrize(
     ("lists", "words"),
     [
-        (torch.zeros(COUNT, 0, dtype=torch.int32), "got none; pass k of them"),
+        (torch.zeros(COUNT, 0, dtype=torch.int32), "expected at least 1 neighbor per point, got 0"),
         (torch.zeros(COUNT, 3), "expected neighbors of int32 or int64, got torch.float32"),
         (torch.zeros(9, 3, dtype=torch.int32), r"expected neighbors of shape \(N, K\) with N=300"),
-        (np.zeros((COUNT, 3), np.int32), r"pass Neighbors\(torch.as_tensor\(rows\)\)"),
+        (np.zeros((COUNT, 3), np.int32), r"Pass Neighbors\(torch.as_tensor\(rows\)\)"),
     ],
     ids=["empty", "float", "few", "numpy"],
 )
@@ -95,5 +95,5 @@ def test_lists_of_another_kind_are_refused_by_name(points, name, lists, words):
 
 @every_function
 def test_a_bare_tensor_is_no_neighbors(points, without_self, name):
-    with pytest.raises(ShapeError, match=r"got Tensor; pass Neighbors\(torch.as_tensor\(rows\)\)"):
+    with pytest.raises(ShapeError, match=r"got Tensor. Pass Neighbors\(torch.as_tensor\(rows\)\)"):
         FUNCTIONS[name](points, without_self)

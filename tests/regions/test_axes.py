@@ -106,7 +106,7 @@ def test_up_may_be_any_axis():
 def test_a_cloud_without_walls_is_told():
     # What stands askew on the floor is too small for a wall.
     planes = table([[0, 0.05, 1], [0, 0.05, 1], [1, 1, -0.05]], [9.0, 3, 0.1])
-    with pytest.warns(UserWarning, match="turned upright only"):
+    with pytest.warns(UserWarning, match="Only the up axis"):
         rotation = align_axes(planes)[:3, :3]
     assert torch.allclose(rotation @ planes.normal[0], torch.eye(3).double()[2], atol=1e-9)
     assert float(rotation[0, 0]) > 0.99

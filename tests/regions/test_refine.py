@@ -143,26 +143,26 @@ def test_contacts_of_touching_regions_are_counted():
     neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]]))
     pairs, counts = NearestPoints(neighbors).contacts(torch.tensor([0, 1, 1]))
     assert (pairs.tolist(), counts.tolist()) == ([[0, 1]], [2])
-    assert NearestPoints(neighbors).around(torch.arange(3)).tolist() == [[1], [0], [1]]
+    assert NearestPoints(neighbors).neighbor_rows(torch.arange(3)).tolist() == [[1], [0], [1]]
 
 
 def test_entries_that_are_no_neighbours_are_beside_no_point():
     valid = torch.tensor([[True, True], [True, False], [True, False]])
-    beside = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 2], [2, 0]]), valid))
-    assert beside.around(torch.tensor([0, 1, 2])).tolist() == [[1], [1], [2]]
-    assert beside.around(slice(1, 3)).tolist() == [[1], [2]]
-    assert beside.reached(torch.tensor([0, 1]), torch.tensor([2])).tolist() == []
-    assert beside.contacts(torch.tensor([0, 1, 2]))[0].tolist() == [[0, 1]]
+    adjacency = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 2], [2, 0]]), valid))
+    assert adjacency.neighbor_rows(torch.tensor([0, 1, 2])).tolist() == [[1], [1], [2]]
+    assert adjacency.neighbor_rows(slice(1, 3)).tolist() == [[1], [2]]
+    assert adjacency.frontier(torch.tensor([0, 1]), torch.tensor([2])).tolist() == []
+    assert adjacency.contacts(torch.tensor([0, 1, 2]))[0].tolist() == [[0, 1]]
 
 
 def test_planes_are_fitted_again_only_when_labels_have_changed():
     cloud, _ = flat_cloud(sheet(np.random.default_rng(0)))
     fits = RegionFits(cloud, OFF)
     labels = (cloud.points[:, 0] > 0.5).long()
-    planes = fits.of(labels)
-    assert fits.of(labels.clone()) is planes
+    planes = fits.get(labels)
+    assert fits.get(labels.clone()) is planes
     other = (cloud.points[:, 0] > 0.6).long()
-    assert torch.equal(fits.of(other).center, fit_regions(cloud, other, OFF).center)
+    assert torch.equal(fits.get(other).center, fit_regions(cloud, other, OFF).center)
 
 
 def test_touching_pieces_of_one_plane_are_merged():

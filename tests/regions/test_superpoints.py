@@ -134,7 +134,7 @@ def same_partition(a, b):
 @pytest.mark.parametrize("planes_enter", ["borders", "whole"])
 @pytest.mark.parametrize("seed", range(3))
 def test_merging_is_that_of_literal_loops(seed, planes_enter, monkeypatch):
-    monkeypatch.setattr(superpoints, "_PLACE_SPACINGS", PLACE_SPACINGS)
+    monkeypatch.setattr(superpoints, "_POSITION_SPACINGS", PLACE_SPACINGS)
     rng = torch.Generator().manual_seed(seed)
     points, normals, planes = crumpled(rng, 100, crumple=0.1 + 0.3 * seed)
     config = SuperpointsConfig(

@@ -1,8 +1,8 @@
-"""Planes of depth images, found from pixel to pixel.
+"""Plane segmentation of depth images.
 
-:func:`segment_depth` takes an image and a camera matrix, which :func:`make_intrinsics` makes of
-four numbers and :func:`find_intrinsics` finds for an organised cloud. As a module for loaders it is
-:class:`torchrg.transforms.SegmentDepth`.
+:func:`segment_depth` takes an image and a camera matrix. :func:`make_intrinsics` builds the matrix
+from four numbers; :func:`find_intrinsics` estimates it for an organized cloud. The module for data
+loaders is :class:`torchrg.transforms.SegmentDepth`.
 """
 
 from torchrg.config import DepthConfig

@@ -1,4 +1,4 @@
-"""Pinhole cameras: depth images to points, through kornia, and back from organised clouds."""
+"""Pinhole cameras: unprojection of depth images, and estimation from organized clouds."""
 
 import math
 import warnings
@@ -12,31 +12,31 @@ from torchrg.errors import ConfigError, DepthWarning
 from torchrg.structures import FARTHEST
 
 _MAX_ANGLE_DEG, _WIDE_ANGLE_DEG = 85.0, 75.0
-"""Angles from the optical axis to the farthest pixel, in degrees, that are impossible and
-improbable. A pinhole camera cannot see 90, and lenses beyond 75 bend lines."""
+"""Impossible and improbable angles from the optical axis to the farthest pixel, in degrees. A
+pinhole camera cannot see 90, and lenses beyond 75 bend lines."""
 _MIN_VIEW_DEG, _NARROW_VIEW_DEG = 0.001, 5.0
-"""Fields of view along the longer side, in degrees, that are impossible and improbable. Depth
-cameras see 40 to 120."""
+"""Impossible and improbable fields of view along the longer side, in degrees. Depth cameras see 40
+to 120."""
 _MAX_ASPECT = 1.25
-"""Ratio of the focal lengths beyond which pixels are improbably far from square."""
+"""Ratio of the focal lengths above which pixels are improbably far from square."""
 _MAX_OFF_CENTER, _SLIGHTLY_OFF_CENTER = 0.15, 0.05
-"""Distances of the optical axis from the center, as fractions of a side. Depth cameras reach 0.09.
-The smaller limit holds where ``cx`` and ``cy`` in the other order fit three times as well."""
+"""Maximum distances of the optical axis from the center, as fractions of a side. Depth cameras
+reach 0.09. The smaller limit applies if exchanging ``cx`` and ``cy`` fits three times as well."""
 
 
 def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = None) -> Tensor:
-    """Return the point of each pixel in camera coordinates, or in those of the world.
+    """Unproject depth images to points in camera or world coordinates.
 
     Convention:
-        Camera axes are x to the right, y down, z forwards; ``depth`` is z, not the length of the
-        ray. The middle of the first pixel is at (0, 0). A negative focal length turns an axis over,
-        as in ICL-NUIM.
+        Camera axes are x to the right, y down, z forward; ``depth`` is z, not the length of the
+        ray. The center of the first pixel is at (0, 0). A negative focal length flips an axis, as
+        in ICL-NUIM.
 
     Args:
         depth: Shape ``(B, H, W)``, floating point, in any unit.
         intrinsics: Camera matrices, shape ``(B, 3, 3)``; see :func:`read_intrinsics`.
-        poses: Matrices from camera to world coordinates, shape ``(B, 4, 4)``. Default: the points
-            are in camera coordinates.
+        poses: Camera-to-world matrices, shape ``(B, 4, 4)``. Default: points are in camera
+            coordinates.
 
     Returns:
         Points, shape ``(B, H, W, 3)``, in the unit of ``depth`` and in its dtype, or in that of the
@@ -44,7 +44,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a camera matrix is none, or cannot be of such images.
+        ConfigError: If a camera matrix is invalid, or impossible for such images.
 
     Warns:
         DepthWarning: If a camera is improbable; see :func:`check_view`.
@@ -69,7 +69,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
 
 def _unproject(depth: Tensor, intrinsics: Tensor, poses: Tensor | None) -> Tensor:
-    """Do what :func:`depth_to_points` says."""
+    """Implement :func:`depth_to_points`."""
     from kornia.geometry.depth import depth_to_3d_v2
 
     seen = has_depth(depth)
@@ -84,16 +84,15 @@ def _unproject(depth: Tensor, intrinsics: Tensor, poses: Tensor | None) -> Tenso
 def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa: ANN401
     """Return camera matrices ``(3, 3)`` or ``(B, 3, 3)`` of pinhole cameras without skew.
 
-    ``source`` are such matrices, tensors or arrays, those of 4 x 4 as kornia has them, or its
-    ``PinholeCamera``, of which the intrinsics are taken; its images should have the size of
-    ``depth`` ``(*, H, W)``.
+    ``source`` is a tensor or array of such matrices, or of kornia's 4 x 4 matrices. It may also be
+    a kornia ``PinholeCamera`` with the image size of ``depth`` ``(*, H, W)``.
 
     Raises:
-        ShapeError: If it is no tensor, array or camera.
-        ConfigError: If it is no such matrix.
+        ShapeError: If it is not a tensor, array or camera.
+        ConfigError: If it is not such a matrix.
 
     Warns:
-        DepthWarning: If a ``PinholeCamera`` is of images of another size.
+        DepthWarning: If a ``PinholeCamera`` has another image size.
 
     Example:
         >>> read_intrinsics("f", torch.eye(4)[None], torch.zeros(2, 3)).shape
@@ -117,7 +116,7 @@ def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa:
 
 
 def check_camera(caller: str, intrinsics: Tensor) -> None:
-    """Raise ConfigError where one of some matrices ``(*, 3, 3)`` is that of no camera.
+    """Raise ConfigError if one of the matrices ``(*, 3, 3)`` is not a camera matrix.
 
     Example:
         >>> check_camera("f", torch.diag(torch.tensor([50.0, 0.0, 1.0])))
@@ -127,9 +126,9 @@ def check_camera(caller: str, intrinsics: Tensor) -> None:
     """
     matrices = intrinsics.detach().reshape(-1, 3, 3).double().cpu()
     focal = matrices.diagonal(dim1=1, dim2=2)[:, :2]
-    others = matrices[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+    constants = matrices[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
     is_camera = (matrices.abs() <= FARTHEST).all() and focal.reciprocal().isfinite().all()
-    if not (is_camera and (others == others.new_tensor([0, 0, 0, 0, 1])).all()):
+    if not (is_camera and (constants == constants.new_tensor([0, 0, 0, 0, 1])).all()):
         raise ConfigError(
             f"{caller}: expected intrinsics of rows (fx, 0, cx), (0, fy, cy), (0, 0, 1), finite, "
             f"with fx and fy not 0, got {intrinsics.tolist()}."
@@ -137,13 +136,13 @@ def check_camera(caller: str, intrinsics: Tensor) -> None:
 
 
 def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
-    """Check that cameras ``(*, 3, 3)`` may belong to images of a size, width and height.
+    """Check that cameras ``(*, 3, 3)`` are plausible for images of ``size`` (width, height).
 
     Raises:
-        ConfigError: If one cannot.
+        ConfigError: If a camera is impossible.
 
     Warns:
-        DepthWarning: If one hardly does. Crops and squeezed images are improbable, not wrong.
+        DepthWarning: If a camera is improbable, as for crops and stretched images.
 
     Example:
         >>> check_view("f", make_intrinsics(0.8, 1.1, 0.5, 0.5), (640, 480))
@@ -160,9 +159,9 @@ def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
 def doubt_view(
     caller: str, camera: "Pinhole", size: tuple[int, int], *, name: str = "intrinsics"
 ) -> str:
-    """Return why a camera is improbable for images of a size; nothing where it is probable.
+    """Return a warning if a camera is improbable for an image size, otherwise "".
 
-    ``name`` is the argument or flag that gives the camera.
+    ``name`` is the argument or flag that specifies the camera.
 
     Raises:
         ConfigError: If it is impossible.
@@ -173,17 +172,17 @@ def doubt_view(
     rows = list(zip(focal, axis, size, strict=True))
     angle = math.degrees(math.atan(max(max(c + 0.5, side - 0.5 - c) / f for f, c, side in rows)))
     view = math.degrees(2 * math.atan(max(side / (2 * f) for f, _, side in rows)))
-    off = _off_center(axis, size)
+    error = _off_center(axis, size)
     if angle > _WIDE_ANGLE_DEG:
-        doubt = f"with pixels {angle:.3g} degrees off the optical axis; give pixels, not fractions"
+        doubt = f"with pixels {angle:.3g} degrees off the optical axis; use pixels, not fractions"
     elif view < _NARROW_VIEW_DEG:
-        doubt = f"with a field of view of {view:.2g} degrees; give focal lengths in pixels"
+        doubt = f"with a field of view of {view:.2g} degrees; use focal lengths in pixels"
     elif max(focal) > _MAX_ASPECT * min(focal):
-        doubt = "with pixels that are not square; check the order of the numbers"
-    elif off > _MAX_OFF_CENTER:
-        doubt = "with an optical axis off the center; give the camera of images of this size"
-    elif off > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
-        doubt = "which fit better with cx and cy in the other order; exchange them"
+        doubt = "with non-square pixels; check the order of the numbers"
+    elif error > _MAX_OFF_CENTER:
+        doubt = "with an optical axis off the center; pass the camera of images of this size"
+    elif error > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
+        doubt = "which fit better with cx and cy exchanged; swap them"
     else:
         return ""
     numbers = ",".join(f"{value:g}" for value in camera[:4])
@@ -197,31 +196,31 @@ def doubt_view(
 
 
 def _off_center(axis: tuple[float, ...], size: tuple[int, int]) -> float:
-    """Return the distance of an optical axis from the center of images, as a fraction of a side.
+    """Return the distance of an optical axis from the image center, as a fraction of a side.
 
-    Half a pixel is free: programs differ in where the center of the first pixel is.
+    Half a pixel is tolerated, because programs differ in the center of the first pixel.
     """
     return max((abs(c + 0.5 - side / 2) - 0.5) / side for c, side in zip(axis, size, strict=True))
 
 
 def points_of_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:
-    """Do as :func:`depth_to_points` for one image ``(H, W)``, in float64: ``(H, W, 3)``.
+    """Apply :func:`depth_to_points` to one image ``(H, W)`` in float64: ``(H, W, 3)``.
 
-    The camera is checked already.
+    The camera must already be checked.
     """
     poses = None if pose is None else pose[None]
     return _unproject(depth[None].double(), intrinsics[None].double(), poses)[0]
 
 
 def has_depth(depth: Tensor) -> Tensor:
-    """Return which pixels have a depth: finite and positive, the shape of ``depth``."""
+    """Return a mask of pixels with finite and positive depth, in the shape of ``depth``."""
     return depth.isfinite() & (depth > 0)
 
 
 def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
-    """Return a camera matrix ``(3, 3)``, float64, of focal lengths and optical axis in pixels.
+    """Return a camera matrix ``(3, 3)``, float64, from focal lengths and optical axis in pixels.
 
-    ``fx`` and ``cx`` are along rows, ``fy`` and ``cy`` along columns; the middle of the first pixel
+    ``fx`` and ``cx`` are along rows, ``fy`` and ``cy`` along columns; the center of the first pixel
     is 0.
 
     Raises:
@@ -248,9 +247,9 @@ def numbers_of(intrinsics: Tensor) -> str:
 
 
 class Pinhole(NamedTuple):
-    """A pinhole camera in pixels, of images of a size, width and height, where that is known.
+    """A pinhole camera in pixels, with its image size (width, height) if known.
 
-    ``depth_scale`` is the stored value of one meter in its depth images, where that is known.
+    ``depth_scale`` is the number of depth units per meter in its images, if known.
     """
 
     fx: float
@@ -261,15 +260,15 @@ class Pinhole(NamedTuple):
     depth_scale: float | None = None
 
     def matrix(self, size: tuple[int, int] | None = None, caller: str = "Pinhole") -> Tensor:
-        """Return the camera matrix ``(3, 3)``, float64, for images that are resized to ``size``.
+        """Return the camera matrix ``(3, 3)``, float64, for images resized to ``size``.
 
         Convention:
-            The middle of the first pixel is 0. An image that is resized keeps its outer edges, half
-            a pixel beyond the middles of its outermost pixels: ``cx + 0.5`` grows as ``fx`` does.
+            The center of the first pixel is 0. Resizing keeps the outer edges of the image, half a
+            pixel outside the centers of the outermost pixels: ``cx + 0.5`` scales with ``fx``.
 
         Raises:
-            ConfigError: If the sides of the images are in another ratio, by more than a pixel, or
-                the optical axis is outside of them.
+            ConfigError: If the aspect ratio of the images differs by more than a pixel, or the
+                optical axis is outside them.
 
         Example:
             >>> Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((160, 120))[0].tolist()
@@ -280,8 +279,8 @@ class Pinhole(NamedTuple):
             return make_intrinsics(fx, fy, cx, cy)
         (width, height), (old_width, old_height) = size, calibrated or size
         if abs(width * old_height - height * old_width) > max(old_width, old_height):
-            is_turned = abs(height * old_height - width * old_width) <= max(old_width, old_height)
-            repair = "turn the images back, or " if is_turned else ""
+            is_rotated = abs(height * old_height - width * old_width) <= max(old_width, old_height)
+            repair = "rotate the images back, or " if is_rotated else ""
             raise ConfigError(
                 f"{caller}: expected images of {old_width} x {old_height} pixels, as its camera's, "
                 f"or in their ratio, got {width} x {height}; {repair}pass the camera of the depth "
@@ -294,21 +293,20 @@ class Pinhole(NamedTuple):
         if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
             raise ConfigError(
                 f"{caller}: expected an optical axis within images of {width} x {height} pixels, "
-                f"got {cx:g},{cy:g}; pass the camera of the depth images, or a file that names its "
-                "width and height."
+                f"got {cx:g},{cy:g}; pass the camera of the depth images, or a file with its width "
+                "and height."
             )
         return make_intrinsics(fx, fy, cx, cy)
 
 
 def find_intrinsics(points: Tensor) -> Tensor | None:
-    """Find the camera that an organised cloud was taken with.
+    """Estimate the camera of an organized cloud.
 
-    ``points`` ``(H, W, 3)`` are those of the pixels in camera coordinates, NaN where there is none.
+    ``points`` ``(H, W, 3)`` are the points of the pixels in camera coordinates, NaN where missing.
 
     Returns:
-        The camera matrix, shape ``(3, 3)``, float64; None where no pinhole camera puts nearly all
-        points within a tenth of a pixel of their places: clouds of rotating scanners, or in world
-        coordinates.
+        The camera matrix, shape ``(3, 3)``, float64. None if no pinhole camera projects nearly all
+        points to within a tenth of a pixel: clouds of rotating scanners, or in world coordinates.
 
     Raises:
         ShapeError: If ``points`` has another shape or dtype.
@@ -323,7 +321,7 @@ def find_intrinsics(points: Tensor) -> Tensor | None:
     check_shapes("find_intrinsics", points=(points, "H W 3"))
     check_floating("find_intrinsics", points=points)
     seen = points.isfinite().all(dim=-1) & (points[..., 2] > 0)
-    rows, columns = (place.double() for place in seen.nonzero().unbind(dim=1))
+    rows, columns = (indices.double() for indices in seen.nonzero().unbind(dim=1))
     x, y, z = points[seen].double().unbind(dim=1)
     lines = [_fit_line(x / z, columns), _fit_line(y / z, rows)]
     if any(line is None for line in lines):
@@ -333,27 +331,27 @@ def find_intrinsics(points: Tensor) -> Tensor | None:
 
 
 def find_misfit(points: Tensor, intrinsics: Tensor) -> float:
-    """Return how far a camera puts points from their pixels: the median, in pixels.
+    """Return the median reprojection error of points, in pixels.
 
-    ``points`` ``(H, W, 3)`` are in camera coordinates. It is 0 where none is in front.
+    ``points`` ``(H, W, 3)`` are in camera coordinates. It is 0 if no point is in front.
     """
     seen = points.isfinite().all(dim=-1) & (points[..., 2] > 0)
-    rows, columns = (place.double() for place in seen.nonzero().unbind(dim=1))
+    rows, columns = (indices.double() for indices in seen.nonzero().unbind(dim=1))
     projected = points[seen].double() @ intrinsics.to(points.device, torch.float64).T
     across, down = (projected[:, axis] / projected[:, 2] for axis in (0, 1))
-    off = torch.hypot(across - columns, down - rows)
-    return float(off.median()) if len(off) else 0.0
+    error = torch.hypot(across - columns, down - rows)
+    return float(error.median()) if len(error) else 0.0
 
 
-def _fit_line(slopes: Tensor, places: Tensor) -> tuple[float, float] | None:
-    """Return the line ``place = focal * slope + middle`` through nearly all, or None."""
+def _fit_line(slopes: Tensor, positions: Tensor) -> tuple[float, float] | None:
+    """Return the line ``position = focal * slope + center`` through nearly all points, or None."""
     if len(slopes) < 2:
         return None
-    mean_slope, mean_place = slopes.mean(), places.mean()
+    mean_slope, mean_position = slopes.mean(), positions.mean()
     spread = ((slopes - mean_slope) ** 2).sum()
-    focal = ((slopes - mean_slope) * (places - mean_place)).sum() / spread
-    middle = mean_place - focal * mean_slope
-    off = (focal * slopes + middle - places).abs() > 0.1
-    if not bool(focal.isfinite()) or float(focal) == 0 or float(off.double().mean()) > 0.01:
+    focal = ((slopes - mean_slope) * (positions - mean_position)).sum() / spread
+    center = mean_position - focal * mean_slope
+    error = (focal * slopes + center - positions).abs() > 0.1
+    if not bool(focal.isfinite()) or float(focal) == 0 or float(error.double().mean()) > 0.01:
         return None
-    return float(focal), float(middle)
+    return float(focal), float(center)

@@ -1,7 +1,7 @@
-"""Which regions of a depth image are one face.
+"""Regions of a depth image that belong to one surface.
 
-Strips along rounded edges go to the face beside them; regions of one plane that only something
-nearer parts count as touching.
+Strips along rounded edges are merged into the adjacent surface; coplanar regions separated only by
+a nearer object count as adjacent.
 """
 
 from collections.abc import Iterable, Iterator
@@ -11,43 +11,43 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._parallel import places_of
-from torchrg.depth.passes import serves
+from torchrg.depth.passes import has_kernels
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
-from torchrg.regions.repair import renumber
+from torchrg.regions.repair import remap_labels
 
 _MAX_WIDTH = 10.0
-"""Pixels; a wider strip is a face of its own."""
-_MAX_FRACTION = 0.4
-"""Width of a strip as a share of that of the face beside it."""
+"""Maximum width of a strip in pixels; a wider one is a separate surface."""
+_MAX_WIDTH_RATIO = 0.4
+"""Maximum ratio of the width of a strip to the width of the adjacent surface."""
 _MAX_TURN_DEG = 35.0
-"""Either half of a rounded edge of a right angle is turned by less against its face."""
-_MIN_BESIDE = 0.5
-"""Share of the length of a strip along which it meets the face without a step."""
+"""Maximum angle between strip and surface; half of a rounded right-angled edge has less."""
+_MIN_CONTACT_FRACTION = 0.5
+"""Minimum fraction of the length of a strip along which it meets the surface without a step."""
 _MAX_NOISE = 3.0
-"""A gap of less than this many standard deviations of the noise of a pixel is no step."""
+"""Maximum gap without a step, in standard deviations of the noise of a pixel."""
 _MIN_REACH = 2.0
-"""Regions meet without a step if their planes cross within so many pixels of the border, or within
-half the width of the strip if that is more."""
+"""Regions meet without a step if their planes intersect within this many pixels of the boundary, or
+within half the width of the strip."""
 
-_EVERY = 4
-"""Every fourth row and column is looked at."""
+_STRIDE = 4
+"""Row and column stride of the search for hidden contacts."""
 _MIN_LINES = 2
-"""Rows and columns, of those looked at, that must lead from one region to the other."""
+"""Minimum number of sampled rows and columns that connect two regions."""
 _MAX_OFFSET = 0.5
-"""The middle of the smaller region may be off the plane of the larger by this many of its
+"""Maximum distance of the center of the smaller region from the plane of the larger one, in
 thicknesses."""
 _MIN_NEARER = 0.5
-"""Least share, of the pixels between two regions, in front of their plane. The others may lie on it
-or have no depth, as in the shadow of something nearer."""
+"""Minimum fraction of the pixels between two regions in front of their plane. The remaining ones
+may lie on it or have no depth, as in the shadow of a nearer object."""
 
 
-def borders(labels: Tensor, steps: Iterable[tuple[int, int]]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield for each step in rows and columns the pixels of an image that it takes to others.
+def boundaries(labels: Tensor, steps: Iterable[tuple[int, int]]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield, for each step in rows and columns, pairs of adjacent pixels with different labels.
 
-    That is to those of another label: row-major places of both, ``(n,)`` each.
+    Both are row-major indices, ``(n,)`` each.
     """
-    # Narrow numbers are compared faster.
+    # int32 is compared faster.
     width, flat = labels.shape[1], labels.flatten().to(torch.int32)
     for down, right in steps:
         step = down * width + right
@@ -65,38 +65,37 @@ def join_strips(
     normals: Tensor,
     count: Tensor,
 ) -> Tensor:
-    """Give narrow regions to the face that they bend away from, and return the labels.
+    """Merge narrow regions into the surface that they bend away from, and return the labels.
 
-    A region is a strip of the face beside it if it is less than 10 pixels wide and at most 0.4 of
-    the face, if its plane is turned by at most 35 degrees against the face's, and if along half of
-    its length or more the two meet without a step: their planes cross near the border, or are one
-    within the noise there. Of several faces it goes to the one that it meets at most pixels, of
-    equal ones to the larger. Strips of strips stay. The width of a region is twice its pixels over
-    its circumference in sides of pixels.
+    A strip is less than 10 pixels wide, at most 0.4 of the surface, and tilted by at most 35
+    degrees. It meets the surface without a step along at least half of its length: their planes
+    intersect near the boundary, or coincide within the noise. Among several surfaces, the one with
+    most contact pixels wins, ties go to the larger. Strips of strips are unchanged. The width of a
+    region is twice its pixel count over its perimeter in pixel sides.
 
     ``labels`` ``(H * W,)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`, and are
-    returned themselves if nothing joins. The ``rays`` are x of the columns ``(W,)`` and y of the
-    rows ``(H,)``, so that ``(x, y, 1)`` times ``planes`` ``(M, 3)`` are inverse depths, of standard
-    deviation ``noise`` ``(H * W,)``; ``normals`` ``(M, 3)`` are in space, ``count`` ``(M,)`` tells
-    how many pixels regions have.
+    returned unchanged if nothing is merged. The ``rays`` are x of the columns ``(W,)`` and y of the
+    rows ``(H,)``. Inverse depths are ``(x, y, 1)`` times ``planes`` ``(M, 3)``, with standard
+    deviation ``noise`` ``(H * W,)``; ``normals`` ``(M, 3)`` are in space, ``count`` ``(M,)`` are
+    pixel counts.
     """
     (x, y), num_regions, meetings = rays, len(normals), []
     image = labels.view(len(y), len(x))
     sides = [image[0], image[-1], image[:, 0], image[:, -1]]
-    for here, there in borders(image, [(1, 0), (0, 1)]):
+    for here, there in boundaries(image, [(1, 0), (0, 1)]):
         pair = torch.stack([labels[here], labels[there]], dim=1)
         sides.append(pair.flatten())
         meets = (pair >= 0).all(dim=1)
         here, pair = here[meets], pair[meets]
-        apart = planes[pair[:, 0]] - planes[pair[:, 1]]
-        a, b, c = apart.unbind(dim=1)
+        difference = planes[pair[:, 0]] - planes[pair[:, 1]]
+        a, b, c = difference.unbind(dim=1)
         gap = (a * x[here % len(x)] + b * y[here // len(x)] + c).abs()
-        meetings.append((pair, apart, gap - _MAX_NOISE * noise[here]))
-    pairs, apart, gap = (torch.cat(columns) for columns in zip(*meetings, strict=True))
+        meetings.append((pair, difference, gap - _MAX_NOISE * noise[here]))
+    pairs, difference, gap = (torch.cat(columns) for columns in zip(*meetings, strict=True))
     edges = torch.bincount(torch.cat(sides) + 1, minlength=num_regions + 1)[1:]
     width = 2 * count / edges
-    pitch = torch.stack([(place[-1] - place[0]) / max(len(place) - 1, 1) for place in rays])
-    slope = (apart[:, :2] * pitch).norm(dim=1)
+    pitch = torch.stack([(index[-1] - index[0]) / max(len(index) - 1, 1) for index in rays])
+    slope = (difference[:, :2] * pitch).norm(dim=1)
     smooth = [
         pairs[gap <= slope * (width[pairs[:, 0]] / 2).clamp(min=_MIN_REACH)],
         pairs.flip(1)[gap <= slope * (width[pairs[:, 1]] / 2).clamp(min=_MIN_REACH)],
@@ -105,59 +104,60 @@ def join_strips(
     keys, contacts = torch.unique(strip * num_regions + face, return_counts=True)
     strip, face = keys // num_regions, keys % num_regions
     ours, theirs = (normals[columns][:, :, None].unbind(dim=1) for columns in (strip, face))
-    joins = (width[strip] < _MAX_WIDTH) & (width[strip] <= _MAX_FRACTION * width[face])
+    joins = (width[strip] < _MAX_WIDTH) & (width[strip] <= _MAX_WIDTH_RATIO * width[face])
     joins &= sq_chords(ours, theirs).squeeze(1) <= deg_to_sq_chord(_MAX_TURN_DEG)
-    joins &= contacts >= _MIN_BESIDE * (count / width)[strip]
+    joins &= contacts >= _MIN_CONTACT_FRACTION * (count / width)[strip]
     joins &= ~torch.isin(face, strip[joins])
     if not bool(joins.any()):
         return labels
-    most = contacts.new_zeros(num_regions).scatter_reduce(0, strip[joins], contacts[joins], "amax")
-    joins &= contacts == most[strip]
+    highest = contacts.new_zeros(num_regions).scatter_reduce(
+        0, strip[joins], contacts[joins], "amax"
+    )
+    joins &= contacts == highest[strip]
     unchanged = torch.arange(num_regions, device=labels.device)
-    target = torch.where(most > 0, num_regions, unchanged)
-    return renumber(labels, target.scatter_reduce(0, strip[joins], face[joins], "amin"))
+    target = torch.where(highest > 0, num_regions, unchanged)
+    return remap_labels(labels, target.scatter_reduce(0, strip[joins], face[joins], "amin"))
 
 
 def hidden_contacts(
     points: Tensor, seen: Tensor, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the pairs of regions of one plane that only what is nearer parts, and their contacts.
+    """Return pairs of coplanar regions separated only by nearer objects, and contact counts.
 
-    The middle of the smaller of two regions is on the plane of the larger, and along some rows or
-    columns nothing between the two is behind that plane, and half of it or more is in front.
-    Whatever is seen behind a plane shows that it ends there, as the floor between two tables of one
-    height does.
+    The center of the smaller region is on the plane of the larger one. Along some rows or columns,
+    no pixel between the two is behind that plane, and at least half are in front. A pixel behind a
+    plane shows that the plane ends there, such as the floor between two tables of equal height.
 
-    ``points`` ``(H * W, 3)`` and ``seen`` ``(H, W)`` are those of
-    :class:`torchrg.depth.growth.InverseCloud`; ``reach`` ``(M,)`` is the distance from a plane that
-    counts as on it, NaN for a curved region. The pairs are as
-    :func:`torchrg.regions.repair.merge_coplanar` takes them.
+    ``points`` ``(H * W, 3)`` and ``seen`` ``(H, W)`` are from
+    :class:`torchrg.depth.growth.InverseCloud`; ``reach`` ``(M,)`` is the maximum distance of a
+    point on a plane, NaN for a curved region. The pairs are in the format of
+    :func:`torchrg.regions.repair.merge_coplanar`.
     """
     pairs, tables = _aligned_pairs(planes), (planes.normal, planes.center, reach)
-    if serves(points):
+    if has_kernels(points):
         image = points.T, seen, labels.view(seen.shape)
-        (lines, *_) = kernels.call("count_lines", *image, *tables, pairs, _EVERY, _MIN_NEARER)
+        (lines, *_) = kernels.call("count_lines", *image, *tables, pairs, _STRIDE, _MIN_NEARER)
     else:
         pixels = points.view(*seen.shape, 3), seen, labels.view(seen.shape)
-        rows = [values[::_EVERY] for values in pixels]
-        columns = [values[:, ::_EVERY].transpose(0, 1) for values in pixels]
+        rows = [values[::_STRIDE] for values in pixels]
+        columns = [values[:, ::_STRIDE].transpose(0, 1) for values in pixels]
         lines = pairs.new_tensor(
             [
-                sum(_count_lines(way, (a, b), *(t[a] for t in tables)) for way in (rows, columns))
+                sum(_count_lines(axis, (a, b), *(t[a] for t in tables)) for axis in (rows, columns))
                 for a, b in pairs.tolist()
             ]
         )
-    lead = lines >= _MIN_LINES
-    return pairs[lead].sort(dim=1).values, lines[lead] * _EVERY
+    is_hidden = lines >= _MIN_LINES
+    return pairs[is_hidden].sort(dim=1).values, lines[is_hidden] * _STRIDE
 
 
 def _aligned_pairs(planes: RegionPlanes) -> Tensor:
-    """Return pairs ``(p, 2)`` of a larger region and a smaller one whose middle is on its plane."""
+    """Return pairs ``(p, 2)`` of a larger region and a smaller one centered on its plane."""
     normal, center, count = planes.normal, planes.center, planes.num_points
-    away = normal @ center.T - (normal * center).sum(dim=1, keepdim=True)
-    aligned = away.abs() <= _MAX_OFFSET * planes.thickness[:, None]
-    place = torch.arange(len(count), device=count.device)
-    is_larger = (count[:, None] > count) | ((count[:, None] == count) & (place[:, None] < place))
+    offset = normal @ center.T - (normal * center).sum(dim=1, keepdim=True)
+    aligned = offset.abs() <= _MAX_OFFSET * planes.thickness[:, None]
+    index = torch.arange(len(count), device=count.device)
+    is_larger = (count[:, None] > count) | ((count[:, None] == count) & (index[:, None] < index))
     both_flat = ~(planes.curved[:, None] | planes.curved)
     return (aligned & is_larger & both_flat).nonzero()
 
@@ -165,10 +165,10 @@ def _aligned_pairs(planes: RegionPlanes) -> Tensor:
 def _count_lines(
     lines: list[Tensor], pair: tuple[int, int], normal: Tensor, center: Tensor, reach: Tensor
 ) -> int:
-    """Return how many lines lead from one region to the other past what is nearer.
+    """Return the number of lines that connect two regions past nearer objects.
 
-    That is than the plane of the larger one. The lines are points ``(n, L, 3)``, which of them are
-    seen, and labels ``(n, L)``.
+    Nearer means in front of the plane of the larger one. The lines are points ``(n, L, 3)``, a mask
+    of seen pixels, and labels ``(n, L)``.
     """
     points, seen, labels = lines
     first, second = ((labels == region) for region in pair)
@@ -179,12 +179,12 @@ def _count_lines(
     height = ((points - center) * normal).sum(dim=2)
     in_front = seen & (height > reach)
     ends = first | second | (seen & (height < -reach))
-    place = torch.arange(ends.shape[1], device=ends.device).expand_as(height)
-    previous = torch.where(ends, place, -1).cummax(dim=1).values[:, :-1]
-    passed = in_front.cumsum(dim=1)
+    index = torch.arange(ends.shape[1], device=ends.device).expand_as(height)
+    previous = torch.where(ends, index, -1).cummax(dim=1).values[:, :-1]
+    num_in_front = in_front.cumsum(dim=1)
     here, before = ends[:, 1:], previous.clamp(min=0)
-    gap = place[:, 1:] - previous - 1
-    nearer = passed[:, :-1] - passed.gather(1, before)
+    gap = index[:, 1:] - previous - 1
+    num_nearer = num_in_front[:, :-1] - num_in_front.gather(1, before)
     other = (first[:, 1:] & second.gather(1, before)) | (second[:, 1:] & first.gather(1, before))
-    leads = here & other & (previous >= 0) & (gap > 0) & (nearer >= _MIN_NEARER * gap)
-    return int(leads.any(dim=1).sum())
+    connects = here & other & (previous >= 0) & (gap > 0) & (num_nearer >= _MIN_NEARER * gap)
+    return int(connects.any(dim=1).sum())

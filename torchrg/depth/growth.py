@@ -1,4 +1,4 @@
-"""Regions of a depth image: growth from pixel to pixel, then absorption, merging, sharp creases."""
+"""Region growing in depth images, with boundary assignment, merging and creases."""
 
 from typing import NamedTuple
 
@@ -9,54 +9,54 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import map_tasks
 from torchrg.config import DepthConfig
-from torchrg.depth.faces import borders, hidden_contacts, join_strips
-from torchrg.depth.passes import serves
+from torchrg.depth.faces import boundaries, hidden_contacts, join_strips
+from torchrg.depth.passes import has_kernels
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MAX_FITTED, RegionPlanes
 from torchrg.regions.growth import number_by_size
 from torchrg.regions.repair import absorb_points, merge_coplanar
 from torchrg.robust.scale import MAD_FACTOR
 
-_AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
-"""Steps in rows and columns to those around a pixel that come after it."""
+_FORWARD_STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
+"""Row and column steps to the adjacent pixels that come later."""
 
-_AROUND = (*_AHEAD, *((-down, -right) for down, right in _AHEAD))
+_ALL_STEPS = (*_FORWARD_STEPS, *((-down, -right) for down, right in _FORWARD_STEPS))
 
 _NUM_PASSES = 2
-"""Absorption and merging go on twice: pixels that a region absorbed may make it touch another."""
+"""Passes of boundary assignment and merging: assigned pixels may make regions adjacent."""
 
 _ABSORB_REACH = 3.0
-"""Standard deviations of the noise: a pixel this near to the plane of the flat region beside it is
-on it, as 99.7 % of its pixels are."""
+"""Maximum distance of a pixel to the plane of the adjacent flat region, in standard deviations of
+the noise: 99.7 % of its pixels are within."""
 
 _MERGE_TOLERANCE = 1.2
-"""One plane explains two flat regions that touch when neither is farther from it than this many
-times its distance from its own: that of clouds, see :class:`torchrg.config.GrowingConfig`."""
+"""Maximum ratio of the RMS distances to the joint plane and to the own plane of two merged flat
+regions, as for clouds; see :class:`torchrg.config.GrowingConfig`."""
 
-_CURVED = 3.0
-"""Thickness of a region in units of the noise up to which it is a plane, however it is bent."""
+_MAX_NOISE = 3.0
+"""Maximum thickness of a planar region in units of the noise, regardless of its bend."""
 
-_BENT = 0.03
-"""Thickness of a region as a share of its extent up to which it is a plane, whatever the noise is.
-A slightly bent face is a face, and a column is 0.4 of its extent thick."""
+_MAX_BEND = 0.03
+"""Maximum thickness of a planar region as a fraction of its extent, regardless of the noise. A
+slightly bent surface is one plane; a column is 0.4 of its extent thick."""
 
 _NUM_FITS = 2
-"""Fits of a region's plane, a plain one and a reweighted one: its pixels are near the plane
-already."""
+"""Fits of a region's plane, a plain and a reweighted one: its pixels are already near the plane."""
 
 _MAX_MOVES = 16
-"""Pixels by which a border may move: windows hardly reach farther from their middle."""
+"""Maximum displacement of a boundary, in pixels: windows hardly reach farther from their center."""
 
-_STRAIGHT = 0.85
-"""Cosine of the largest angle between a step straight away from a crease and one that counts."""
+_MIN_COSINE = 0.85
+"""Minimum cosine of the angle between a step perpendicular to a crease and one that counts."""
 
 
 class InverseCloud(NamedTuple):
-    """A depth image as a cloud where planes stay planes and noise is the same near and far.
+    """A depth image as a cloud in which planes stay planes and noise does not depend on depth.
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
-    the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are of float64, in
-    columns; ``noise`` ``(H * W,)`` is that of the last coordinate; ``seen`` ``(H, W)`` have depth.
+    the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are float64, in
+    columns; ``noise`` ``(H * W,)`` is the noise of the last coordinate; ``seen`` ``(H, W)`` masks
+    pixels with depth.
     """
 
     points: Tensor
@@ -67,15 +67,15 @@ class InverseCloud(NamedTuple):
 def grow_pixels(
     cloud: InverseCloud, flat: Tensor, joins: tuple[Tensor, Tensor], config: DepthConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Grow regions over a depth image, and give border pixels and parts of one face to them.
+    """Grow regions over a depth image, assign boundary pixels, and merge coplanar regions.
 
-    Regions are the connected components of the flat pixels, by the ``joins`` to the right and down
-    of :class:`torchrg.depth.pixels.Pixels`.
+    Regions are the connected components of the flat pixels, connected by the ``joins`` to the right
+    and down from :class:`torchrg.depth.pixels.Pixels`.
 
     Returns:
         Labels ``(H * W,)``, 0 to M-1 by descending size or :data:`torchrg.UNLABELED`; unit normals
-        of the regions' planes towards the camera, in space, ``(M, 3)``; and whether a region is
-        thicker than noise and a slight bend can make it, ``(M,)``, bool.
+        of the regions' planes towards the camera, in space, ``(M, 3)``; and a mask of regions
+        thicker than noise and a slight bend explain, ``(M,)``, bool.
     """
     labels = number_by_size(connect_pixels(flat, *joins), config.min_size)
     if not bool((labels >= 0).any()):
@@ -94,7 +94,7 @@ def _normals_in_space(fit: RegionPlanes) -> Tensor:
 
 def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:
     """Return the connected components of an image ``(H * W,)``, -1 where it is not flat."""
-    if serves(flat):
+    if has_kernels(flat):
         return kernels.call("connect_pixels", flat, right, down)[0].flatten()
     from scipy.ndimage import label
 
@@ -108,64 +108,64 @@ def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:
 
 
 class PixelGrid:
-    """The eight pixels around each pixel of an image, a :class:`torchrg.regions.repair.Beside`."""
+    """8-connected pixel grid, a :class:`torchrg.regions.repair.Adjacency`."""
 
     def __init__(self, shape: torch.Size) -> None:
         self.height, self.width = shape
 
-    def around(self, rows: Tensor) -> Tensor:
-        """Return the pixels around some, ``(n, 8)``; for those outside the nearest inside."""
-        down, right = torch.tensor(_AROUND, device=rows.device).T
+    def neighbor_rows(self, rows: Tensor) -> Tensor:
+        """Return the neighbors of pixels ``(n, 8)``, clamped to the image."""
+        down, right = torch.tensor(_ALL_STEPS, device=rows.device).T
         row = (rows[:, None] // self.width + down).clamp(0, self.height - 1)
         column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)
-        around: Tensor = row * self.width + column
-        return around
+        near_rows: Tensor = row * self.width + column
+        return near_rows
 
-    def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
-        """Return those of the pixels that have a new one beside them."""
-        is_reached = waiting.new_zeros(self.height * self.width, dtype=torch.bool)
-        is_reached[self.around(new)] = True
-        return waiting[is_reached[waiting]]
+    def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
+        """Return the candidates that have a changed neighbor."""
+        is_near = candidates.new_zeros(self.height * self.width, dtype=torch.bool)
+        is_near[self.neighbor_rows(changed)] = True
+        return candidates[is_near[candidates]]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pairs of regions that touch, and the number of contacts of each pair."""
-        first, second = (labels[pixels] for pixels in self.borders(labels))
+        """Return the pairs of adjacent regions, and the number of contacts of each pair."""
+        first, second = (labels[pixels] for pixels in self.boundaries(labels))
         num_regions = int(labels.max()) + 1
         keys = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
         keys, counts = torch.unique(keys, return_counts=True)
-        # Either pixel is beside the other.
+        # Contacts are symmetric.
         return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
 
-    def borders(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pairs of pixels of two regions side by side, each once."""
-        pairs = borders(labels.view(self.height, self.width), _AHEAD)
+    def boundaries(self, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pairs of adjacent pixels of two regions, each once."""
+        pairs = boundaries(labels.view(self.height, self.width), _FORWARD_STEPS)
         first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
-        touch = (labels[first] >= 0) & (labels[second] >= 0)
-        return first[touch], second[touch]
+        adjacent = (labels[first] >= 0) & (labels[second] >= 0)
+        return first[adjacent], second[adjacent]
 
 
 def _refine(
     cloud: InverseCloud, labels: Tensor, config: DepthConfig
 ) -> tuple[Tensor, RegionPlanes]:
-    """Give border pixels and parts of one face to the regions of a depth image.
+    """Refine the regions of a depth image: boundary assignment, merging, strips, and creases.
 
-    Twice, pixels without a region join the one beside them whose plane they are on, and flat
-    regions that touch and lie on one plane are merged. Then borders between regions move to the
-    lines where their planes meet. Returns labels by descending size, and the planes of the regions.
+    Twice, unlabeled pixels join the adjacent region whose plane they are on, and adjacent coplanar
+    flat regions are merged. Then boundaries move to the intersection lines of the planes. Returns
+    labels by descending size, and the planes of the regions.
     """
-    beside = PixelGrid(cloud.seen.shape)
+    grid = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
         planes = fit_inverse_planes(cloud, labels)
         reach = planes.times_thickness(_ABSORB_REACH)
         labels = absorb_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
-        pairs = zip(beside.contacts(labels), hidden, strict=True)
+        pairs = zip(grid.contacts(labels), hidden, strict=True)
         contacts, counts = (torch.cat(ends) for ends in pairs)
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = number_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
     width, (x, y, _) = cloud.seen.shape[1], cloud.points.unbind(dim=1)
-    tables = _planes_over_rays(planes), _normals_in_space(planes), planes.num_points
+    tables = _ray_planes(planes), _normals_in_space(planes), planes.num_points
     joined = join_strips(labels, (x[:width], y[::width]), cloud.noise, *tables)
     if joined is not labels:
         labels = number_by_size(joined, config.min_size)
@@ -179,20 +179,20 @@ def _refine(
 def absorb_pixels(
     cloud: InverseCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    """Do as :func:`torchrg.regions.repair.absorb_points` for the pixels of an image."""
+    """Apply :func:`torchrg.regions.repair.absorb_points` to the pixels of an image."""
     seen = cloud.seen
-    if not serves(cloud.points):
-        beside = PixelGrid(seen.shape)
-        return absorb_points(cloud.points, labels, beside, planes, reach, valid=seen.flatten())
+    if not has_kernels(cloud.points):
+        grid = PixelGrid(seen.shape)
+        return absorb_points(cloud.points, labels, grid, planes, reach, valid=seen.flatten())
     image = labels.view(seen.shape).clone()
-    room = [torch.empty_like(image) for _ in range(3)]
+    buffers = [torch.empty_like(image) for _ in range(3)]
     tables = planes.normal, planes.center, reach
-    kernels.call("absorb_pixels", cloud.points.T, seen, image, *tables, *room)
+    kernels.call("absorb_pixels", cloud.points.T, seen, image, *tables, *buffers)
     return image.flatten()
 
 
-def _planes_over_rays(fit: RegionPlanes) -> Tensor:
-    """Return planes ``(M, 3)`` that times a ray ``(x, y, 1)`` are the last coordinate."""
+def _ray_planes(fit: RegionPlanes) -> Tensor:
+    """Return planes ``(M, 3)`` whose product with a ray ``(x, y, 1)`` is the last coordinate."""
     offset = (fit.normal * fit.center).sum(dim=1, keepdim=True)
     return torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
 
@@ -200,20 +200,20 @@ def _planes_over_rays(fit: RegionPlanes) -> Tensor:
 def fit_inverse_planes(
     cloud: InverseCloud, labels: Tensor, *, most: int = MAX_FITTED
 ) -> RegionPlanes:
-    """Fit planes to regions by least squares along the last coordinate, which alone has noise.
+    """Fit planes to regions by least squares along the last coordinate, the only noisy one.
 
-    A second fit has weights by Tukey's bisquare, as :func:`torchrg.regions.fit.fit_planes` has; the
-    thickness, along the normals, is never taken for less than the mean noise of the region. Curved
-    is what is thicker than noise and a slight bend can make it. Fits are to ``most`` pixels of each
-    region, in even steps.
+    A second fit uses Tukey's bisquare weights, as in :func:`torchrg.regions.fit.fit_planes`. The
+    thickness, along the normals, is at least the mean noise of the region. Regions thicker than
+    noise and a slight bend explain are curved. Each fit uses up to ``most`` evenly spaced pixels
+    per region.
     """
     chunks = Segments(labels, most=most).chunks(len(labels) + 1)
-    parts = map_tasks(lambda chunk: _fit_together(cloud, chunk), chunks, labels.device)
+    parts = map_tasks(lambda chunk: _fit_chunk(cloud, chunk), chunks, labels.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
-    """Fit planes to the regions of a share; see :func:`fit_inverse_planes`."""
+def _fit_chunk(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
+    """Fit planes to one chunk of regions; see :func:`fit_inverse_planes`."""
     noise = segments.mean(segments.take(cloud.noise))
     columns = segments.take_columns(cloud.points)
     weights = torch.ones_like(columns[0])
@@ -226,7 +226,7 @@ def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
         weights, median, squares = segments.reweigh(columns, center, normal, noise, factors)
     thickness = MAD_FACTOR * median
     length = normal.norm(dim=1, keepdim=True)
-    # In the distance d of a plane from the camera, w is 1 / d of the cosine along a ray.
+    # For a plane at distance d from the camera, w is the cosine along a ray over d.
     offset = (normal * center).sum(dim=1, keepdim=True)
     nearness = torch.cat([slopes, offset], dim=1).norm(dim=1)
     extent = torch.linalg.eigvalsh(covariance[:, :2, :2])[:, 0].clamp(min=0).sqrt()
@@ -237,7 +237,7 @@ def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
         torch.maximum(thickness / length.squeeze(1), noise),
         rms=squares.sqrt() / length.squeeze(1),
         num_points=segments.sizes,
-        curved=thickness > torch.maximum(_CURVED * noise, _BENT * extent * nearness),
+        curved=thickness > torch.maximum(_MAX_NOISE * noise, _MAX_BEND * extent * nearness),
         floor=noise,
         reach=torch.full_like(noise, torch.inf),
         bent=torch.zeros_like(noise, dtype=torch.bool),
@@ -248,71 +248,72 @@ def _fit_together(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
 def move_to_creases(
     cloud: InverseCloud, labels: Tensor, fit: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    """Move borders between flat regions to where their planes meet.
+    """Move boundaries between flat regions to the intersection lines of their planes.
 
-    Within the noise of a crease a pixel lies on both planes, and which region took it is chance.
-    Where the middles of two regions are on opposite sides of the line in which their planes meet,
-    each off the other's plane, a pixel on the other's side goes to the other region, if it is on
-    its plane and next to a pixel of it that is straight behind, as seen from the crease: borders
-    move across to the crease, never along it. Pixels that went are followed by those beside them.
+    Within the noise of a crease a pixel lies on both planes, and its region is arbitrary. Two
+    regions form a crease if their centers are on opposite sides of the intersection line, each off
+    the other's plane. A pixel on the other side then joins the other region if it is on its plane.
+    It must be next to a pixel of that region straight behind it, as seen from the crease.
+    Boundaries thus move towards the crease, never along it. Neighbors of changed pixels are
+    revisited.
 
-    ``reach`` is the distance along the last coordinate that counts as on the plane, shape ``(M,)``.
+    ``reach`` is the maximum distance of a point on the plane along the last coordinate, ``(M,)``.
     """
-    planes, middles = _planes_over_rays(fit), fit.center[:, :2]
+    planes, middles = _ray_planes(fit), fit.center[:, :2]
     labels = labels.clone()
-    if serves(cloud.points):
+    if has_kernels(cloud.points):
         image = labels.view(cloud.seen.shape)
-        room = [torch.empty_like(image) for _ in range(3)]
-        limits = _MAX_MOVES, _STRAIGHT
+        buffers = [torch.empty_like(image) for _ in range(3)]
+        limits = _MAX_MOVES, _MIN_COSINE
         kernels.call(
-            "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *room
+            "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *buffers
         )
         return labels
     grid = PixelGrid(cloud.seen.shape)
-    rows = torch.unique(torch.cat(grid.borders(labels)))
+    rows = torch.unique(torch.cat(grid.boundaries(labels)))
     for _ in range(_MAX_MOVES):
-        around = grid.around(rows)
-        across = _regions_across(cloud, labels, planes, middles, reach, rows, around)
-        moved = across != labels[rows]
+        near_rows = grid.neighbor_rows(rows)
+        regions = _crease_regions(cloud, labels, planes, middles, reach, rows, near_rows)
+        moved = regions != labels[rows]
         if not bool(moved.any()):
             break
-        labels[rows[moved]] = across[moved]
-        rows = torch.unique(torch.cat([rows[moved], around[moved].flatten()]))
+        labels[rows[moved]] = regions[moved]
+        rows = torch.unique(torch.cat([rows[moved], near_rows[moved].flatten()]))
         rows = rows[labels[rows] >= 0]
     return labels
 
 
-def _regions_across(
+def _crease_regions(
     cloud: InverseCloud,
     labels: Tensor,
     planes: Tensor,
     middles: Tensor,
     reach: Tensor,
     rows: Tensor,
-    around: Tensor,
+    near_rows: Tensor,
 ) -> Tensor:
-    """Return the region ``(n,)`` that pixels belong to by the creases beside them."""
+    """Return the region ``(n,)`` of pixels according to the adjacent creases."""
     x, y, inverse = cloud.points.unbind(dim=1)
-    label, near = labels[rows][:, None], labels[around]
+    label, near = labels[rows][:, None], labels[near_rows]
     other, near = (near >= 0) & (near != label), near.clamp(min=0)
-    ray, around_rays = (x[rows][:, None], y[rows][:, None]), (x[around], y[around])
-    apart = planes[label] - planes[near]
-    a, b, _ = apart.unbind(dim=2)
-    here, there = _over_rays(apart, *ray), _over_rays(apart, *around_rays)
-    mine, theirs = (_over_rays(apart, *middles[which].unbind(dim=2)) for which in (label, near))
+    ray, near_rays = (x[rows][:, None], y[rows][:, None]), (x[near_rows], y[near_rows])
+    gap = planes[label] - planes[near]
+    a, b, _ = gap.unbind(dim=2)
+    here, there = _evaluate(gap, *ray), _evaluate(gap, *near_rays)
+    side, other_side = (_evaluate(gap, *middles[which].unbind(dim=2)) for which in (label, near))
     slope = (a.square() + b.square()).sqrt()
-    step = ((around_rays[0] - ray[0]).square() + (around_rays[1] - ray[1]).square()).sqrt()
-    straight = there.abs() - here.abs() >= _STRAIGHT * slope * step
-    away = (inverse[rows][:, None] - _over_rays(planes[near], *ray)).abs()
-    goes = other & straight & (here * mine < 0) & (mine * theirs < 0) & (away <= reach[near])
-    goes = goes & (mine.abs() > reach[near]) & (theirs.abs() > reach[label])
-    away = torch.where(goes, away, torch.inf)
-    least = away.amin(dim=1, keepdim=True)
-    nearest = torch.where(goes & (away == least), near, len(planes)).amin(dim=1)
+    step = ((near_rays[0] - ray[0]).square() + (near_rays[1] - ray[1]).square()).sqrt()
+    straight = there.abs() - here.abs() >= _MIN_COSINE * slope * step
+    away = (inverse[rows][:, None] - _evaluate(planes[near], *ray)).abs()
+    moves = other & straight & (here * side < 0) & (side * other_side < 0) & (away <= reach[near])
+    moves = moves & (side.abs() > reach[near]) & (other_side.abs() > reach[label])
+    away = torch.where(moves, away, torch.inf)
+    minimum = away.amin(dim=1, keepdim=True)
+    nearest = torch.where(moves & (away == minimum), near, len(planes)).amin(dim=1)
     return torch.where(nearest < len(planes), nearest, label.squeeze(1))
 
 
-def _over_rays(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def _evaluate(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Return the last coordinates ``(*)`` of planes ``(*, 3)`` at rays ``(x, y, 1)``."""
     a, b, c = planes.unbind(dim=-1)
     return a * x + b * y + c

@@ -1,4 +1,4 @@
-"""The plane at each pixel of a depth image: that of the largest flat window around it."""
+"""Plane of each depth pixel, from the largest flat window around it."""
 
 import math
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import places_of
-from torchrg.depth.passes import pass_over_rows, serves
+from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import (
     CELL_SIZES,
     NARROW,
@@ -21,36 +21,36 @@ from torchrg.depth.windows import (
     find_jitter,
     fit_narrow_windows,
     fit_windows,
-    held_pixels,
     noise_by_size,
+    window_pixels,
 )
 
 FLAT = 1.35
-"""A flat window deviates from its plane by at most this many times the tolerance."""
-_OWN_REACH = 3.5
-"""A pixel is on the plane of a window within this many times the noise."""
-_SAME_NOISE = 2.0
-"""A flat window deviates from its plane at most by a factor of 1 plus this over its side in pixels
-more than its quarters do from planes of their own."""
+"""Maximum deviation of a flat window from its plane, in tolerances."""
+_MAX_PIXEL_NOISE = 3.5
+"""Maximum distance of a pixel on the plane of a window, in units of the noise."""
+_QUARTER_MARGIN = 2.0
+"""Maximum ratio of the deviation of a flat window to that of its quarters, minus 1, times its side
+in pixels."""
 _MIN_QUARTERS = 0.7
-"""Least deviation of the quarters of a window that is counted, in units of the tolerance."""
-_BEND = 0.005
-"""Share of half its side by which a flat window may bend, however little noise there is."""
-_MAX_BEND = 0.03
-"""Share of half its side by which a window of the smallest size may bend where none is flat. Twice
-as much would hide creases of 20 degrees."""
-_STEEPEST = 4.0
-"""Inverse of the cosine of the steepest angle at which a surface may bend. Seen at a steeper angle,
-a step looks like a bend."""
+"""Minimum counted deviation of the quarters of a window, in units of the tolerance."""
+_BEND_FRACTION = 0.005
+"""Maximum bend of a flat window as a fraction of half its side, regardless of the noise."""
+_MAX_BEND_FRACTION = 0.03
+"""Maximum bend of a smallest window as a fraction of half its side, if none is flat. Twice this
+value would hide creases of 20 degrees."""
+_MAX_STEEPNESS = 4.0
+"""Inverse cosine of the maximum angle at which a surface may bend. At a steeper angle, a step looks
+like a bend."""
 _STEEP_SIZE = 2
-"""Width of the cells of the windows that jitter is read from, in pixels."""
+"""Cell width of the windows used to measure jitter, in pixels."""
 
 
 class Choice(NamedTuple):
-    """The window of each pixel ``(H, W)``, by its number among those of all sizes.
+    """The window index of each pixel ``(H, W)``, among the windows of all sizes.
 
-    ``flat`` tells whether that is flat, ``edge`` whether it is but could not lie around the pixel.
-    Others have the smallest square around them.
+    ``flat`` marks pixels with a flat window, ``edge`` flat windows that are not centered on the
+    pixel. Other pixels have the smallest square around them.
     """
 
     window: Tensor
@@ -59,11 +59,11 @@ class Choice(NamedTuple):
 
 
 class PixelPlanes(NamedTuple):
-    """Windows of an image, and which of them each pixel chose.
+    """Windows of an image, and the window chosen by each pixel.
 
-    Windows are numbered from the smallest squares to the largest, then the lying narrow ones around
-    ``pixels`` ``(n,)``, then the upright ones. ``squares`` are tables of :class:`Windows` by the
-    size of cells, ``narrow`` is one ``(9, 2, n)``; ``noise`` is that of the largest windows.
+    Windows are numbered from the smallest squares to the largest, then the horizontal narrow ones
+    around ``pixels`` ``(n,)``, then the vertical ones. ``squares`` are tables of :class:`Windows`
+    by cell size, ``narrow`` is one ``(9, 2, n)``; ``noise`` is the noise of the largest windows.
     """
 
     choice: Choice
@@ -74,34 +74,34 @@ class PixelPlanes(NamedTuple):
 
     @property
     def tables(self) -> list[Tensor]:
-        """All windows as kernels take them: squares, narrow ones, their pixels."""
+        """All windows in kernel format: squares, narrow windows, and their pixels."""
         size = sum(table.numel() for table in self.squares.values())
         squares = self.squares[1].as_strided((size,), (1,))
         return [squares, self.narrow.flatten(), self.pixels]
 
-    def take(self, places: Tensor) -> Windows:
-        """Return the windows of pixels at row-major places."""
-        numbers = self.choice.window.flatten()[places]
-        every = (*self.squares.values(), self.narrow)
-        columns = zip(*every, strict=True)
-        return Windows(*(torch.cat([values.flatten() for values in c])[numbers] for c in columns))
+    def take(self, index: Tensor) -> Windows:
+        """Return the windows of pixels at row-major indices."""
+        indices = self.choice.window.flatten()[index]
+        tables = (*self.squares.values(), self.narrow)
+        columns = zip(*tables, strict=True)
+        return Windows(*(torch.cat([values.flatten() for values in c])[indices] for c in columns))
 
-    def sides_and_middles(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return rows and columns of the windows of pixels, and the places of their middles.
+    def sides_and_centers(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Return sides (rows, columns) and centers (row, column) of the windows of pixels.
 
         Both have the shape ``(2, n)``.
         """
-        width, double, parts = self.choice.window.shape[1], self.narrow.dtype, []
+        width, dtype, parts = self.choice.window.shape[1], self.narrow.dtype, []
         for size, table in self.squares.items():
-            rows, columns = (torch.arange(n, dtype=double) for n in table.shape[1:])
+            rows, columns = (torch.arange(n, dtype=dtype) for n in table.shape[1:])
             grid = torch.cartesian_prod(rows, columns).T * size + (size - 1) / 2
             parts.append(torch.cat([torch.full_like(grid, SIDE * size), grid]))
         for sides in NARROW:
-            middles = torch.stack([self.pixels // width, self.pixels % width]).to(double).cpu()
+            middles = torch.stack([self.pixels // width, self.pixels % width]).to(dtype).cpu()
             parts.append(
                 torch.cat([middles.new_tensor(sides)[:, None].expand_as(middles), middles])
             )
-        windows = torch.cat(parts, dim=1).to(places.device)[:, self.choice.window.flatten()[places]]
+        windows = torch.cat(parts, dim=1).to(index.device)[:, self.choice.window.flatten()[index]]
         return windows[:2], windows[2:]
 
 
@@ -112,21 +112,20 @@ def fit_pixels(
     noise: tuple[float, float] | None,
     dtype: torch.dtype,
 ) -> PixelPlanes:
-    r"""Choose for each pixel the largest flat window that holds it.
+    """Select for each pixel the largest flat window that contains it.
 
-    In inverse depth ``w = 1 / z`` a plane of space is a plane over the image [1],
-    ``w = (n_x x + n_y y + n_z) / d`` with the ray ``(x, y, 1)``, and the noise of a triangulating
-    sensor is the same everywhere, so that plain least squares is right. A window is flat when it
-    deviates from its plane by hardly more than the noise, or than a slight bend, and than its four
-    quarters do from planes of their own; one across a step or an edge is not. For each size, the
-    largest first, a pixel takes the window around its cell if that is flat; else the flattest
-    window that holds it [2]; in both cases only if the pixel itself is on the plane. Where none is
-    flat but the smallest is smooth, as on a column without noise, it takes that. What is left then,
-    on faces seen at a grazing angle or a few pixels wide, is seen again by itself, with narrow
-    windows. Pixels in no flat window have the smallest square around them.
+    In inverse depth ``w = 1 / z`` a plane in space is a plane over the image [1], ``w = (n_x x +
+    n_y y + n_z) / d`` with the ray ``(x, y, 1)``. The noise of a triangulating sensor is uniform in
+    ``w``, so ordinary least squares applies. A window is flat if its deviation is hardly above the
+    noise (or a slight bend) and the deviation of its four quarters. A window across a step or an
+    edge is not. For each size, largest first, a pixel takes the window around its cell if it is
+    flat, otherwise the flattest window that contains it [2]. The pixel itself must be on the plane.
+    If none is flat but the smallest is smooth, as on a noise-free column, it is taken. The
+    remaining pixels, on surfaces at a grazing angle or a few pixels wide, are processed separately
+    with narrow windows. Pixels in no flat window have the smallest square around them.
 
-    ``focal`` are the focal lengths along columns and rows, ``noise`` is that of
-    :class:`torchrg.config.DepthConfig`, ``dtype`` that of the depth.
+    ``focal`` are the focal lengths along columns and rows, ``noise`` is from
+    :class:`torchrg.config.DepthConfig`, ``dtype`` is the dtype of the depth.
 
     References:
         [1] D. Gallup, J.-M. Frahm, M. Pollefeys. Piecewise planar and non-planar stereo for urban
@@ -147,18 +146,18 @@ def fit_pixels(
         first -= math.prod(squares[size].shape[1:])
         offer_windows(choice, image, squares[size], size, first)
     pixels = places_of(image.seen & ~choice.flat)
-    numbers = torch.full_like(choice.window, -1)
-    numbers.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
-    narrow = fit_narrow_windows(image, numbers, pixels)
+    indices = torch.full_like(choice.window, -1)
+    indices.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
+    narrow = fit_narrow_windows(image, indices, pixels)
     rate_windows(
         {1: narrow}, 1, noises, focal, jitter=find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)
     )
-    chosen, beside = choose_narrow(image, numbers, pixels, narrow)
-    taken = chosen >= 0
-    pixel = pixels[taken]
-    choice.window.view(-1)[pixel] = num_squares + chosen[taken]
+    chosen, off_center = choose_narrow(image, indices, pixels, narrow)
+    is_taken = chosen >= 0
+    pixel = pixels[is_taken]
+    choice.window.view(-1)[pixel] = num_squares + chosen[is_taken]
     choice.flat.view(-1)[pixel] = True
-    choice.edge.view(-1)[pixel] = beside[taken]
+    choice.edge.view(-1)[pixel] = off_center[is_taken]
     return PixelPlanes(choice, squares, narrow, pixels, noises[CELL_SIZES[0]])
 
 
@@ -171,41 +170,41 @@ def rate_windows(
     quarters: int | None = None,
     jitter: float = 0.0,
 ) -> None:
-    """Fill in what windows of a size may deviate by; jitter is that of the rays, in pixels.
+    """Compute the deviation limits of windows of a size; ``jitter`` of the rays is in pixels.
 
-    A bend is a share of half a window's side on the surface. On a plane at a distance d from the
-    camera, seen at a depth z, a pixel is up to ``z^2 / (f d)`` long, and a deviation e of inverse
-    depth is one of ``d z e`` from the plane. Windows that deviate by more than their ``quarters``,
-    the windows of half the size, are not flat.
+    A bend is a fraction of half a window's side on the surface. On a plane at distance d from the
+    camera, a pixel at depth z is up to ``z^2 / (f d)`` long. A deviation e of inverse depth equals
+    a distance of ``d z e`` to the plane. Windows that deviate by more than their ``quarters``, the
+    windows of half the size, are not flat.
     """
     table, noise, half = tables[size], noises[size], SIDE * size / 2 / max(map(abs, focal))
-    if serves(table):
+    if has_kernels(table):
         finer = tables[size][0, :0] if quarters is None else tables[quarters][3]
-        numbers = *noise, noises[quarters or size].factor, *focal, half, jitter
-        pass_over_rows("rate_windows", table.shape[1], table, finer, *numbers, size)
+        parameters = *noise, noises[quarters or size].factor, *focal, half, jitter
+        pass_over_rows("rate_windows", table.shape[1], table, finer, *parameters, size)
         return
     u_slope, v_slope, origin, deviation, mean = table[:NUM_PLANE]
     sq_blur = jitter * jitter * (u_slope.square() + v_slope.square())
-    by_noise = (noise.at(mean).square() + sq_blur).sqrt()
+    by_noise = (noise.evaluate(mean).square() + sq_blur).sqrt()
     sq_nearness = (u_slope * focal[0]).square() + (v_slope * focal[1]).square() + origin.square()
-    is_steep = sq_nearness > (_STEEPEST * mean).square()
+    is_steep = sq_nearness > (_MAX_STEEPNESS * mean).square()
     bend = half * torch.where(is_steep, 0.0, sq_nearness) / mean
     bend = torch.where(mean > 0, bend, 0.0)
-    tolerance = torch.maximum(by_noise, _BEND * bend)
+    tolerance = torch.maximum(by_noise, _BEND_FRACTION * bend)
     relative = deviation / tolerance
     is_flat = relative <= FLAT
     if quarters is not None:
-        usual = _deviation_of_quarters(tables[quarters][3], relative.shape)
-        # Neighbouring pixels err alike, so that parts of a flat window deviate less too.
-        usual = usual * (by_noise / noises[quarters].at(mean))
-        usual = torch.maximum(usual, _MIN_QUARTERS * tolerance)
-        is_flat &= deviation <= (1 + _SAME_NOISE / (SIDE * size)) * usual
+        typical = _deviation_of_quarters(tables[quarters][3], relative.shape)
+        # Errors of adjacent pixels are correlated, so parts of a flat window deviate less, too.
+        typical = typical * (by_noise / noises[quarters].evaluate(mean))
+        typical = torch.maximum(typical, _MIN_QUARTERS * tolerance)
+        is_flat &= deviation <= (1 + _QUARTER_MARGIN / (SIDE * size)) * typical
     relative = torch.where(is_flat, relative, torch.inf)
-    table[NUM_PLANE:] = torch.stack([by_noise, tolerance, _MAX_BEND * bend, relative])
+    table[NUM_PLANE:] = torch.stack([by_noise, tolerance, _MAX_BEND_FRACTION * bend, relative])
 
 
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
-    """Return the root mean square deviation of the windows of half the size that cover windows."""
+    """Return the RMS deviation of the half-size windows that cover each window."""
     height, width = shape
     corner = SIDE
     padded = deviation.new_full((2 * height + corner, 2 * width + corner), torch.inf)
@@ -221,86 +220,86 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
 
 
 def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first: int) -> None:
-    """Offer pixels without a window those of a size, numbered from ``first`` on.
+    """Offer windows of a size, numbered from ``first``, to pixels without a window.
 
-    They take the window around their cell if it is flat, of the smallest size also if it is smooth,
-    else the flattest that holds them.
+    A pixel takes the window around its cell if it is flat (or, for the smallest size, smooth),
+    otherwise the flattest window that contains it.
     """
     windows = Windows(*table)
-    if serves(table):
+    if has_kernels(table):
         pass_over_rows("offer_windows", table.shape[1], *image, table, *choice, size, first)
         return
     itself = torch.arange(windows.mean.numel(), device=table.device).view_as(windows.mean)
-    least, flattest = min_in_windows(windows.relative, REACH)
-    beside = torch.where(least.isfinite(), flattest, -1)
-    reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
+    minimum, flattest = min_in_windows(windows.relative, REACH)
+    off_center = torch.where(minimum.isfinite(), flattest, -1)
+    reach = torch.maximum(_MAX_PIXEL_NOISE * windows.noise, windows.tolerance)
     flat = torch.where(windows.relative.isfinite(), itself, -1)
-    offers = [(flat, _OWN_REACH * windows.tolerance), (beside, reach)]
+    offers = [(flat, _MAX_PIXEL_NOISE * windows.tolerance), (off_center, reach)]
     if size == 1:
-        smooth = torch.where(windows.deviation <= windows.most, itself, -1)
+        smooth = torch.where(windows.deviation <= windows.max_bend, itself, -1)
         offers.insert(1, (smooth, torch.full_like(reach, torch.inf)))
-    for places, reach in offers:
+    for index, reach in offers:
         pixels = places_of(image.seen & ~choice.flat)
         row, column = pixels // len(image.u), pixels % len(image.u)
-        offered = places[row // size, column // size]
-        taken = (offered >= 0) & _are_near(image, pixels, offered, table, reach)
-        pixels = pixels[taken]
-        choice.window.view(-1)[pixels] = first + offered[taken]
+        offered = index[row // size, column // size]
+        is_taken = (offered >= 0) & _are_near(image, pixels, offered, table, reach)
+        pixels = pixels[is_taken]
+        choice.window.view(-1)[pixels] = first + offered[is_taken]
         choice.flat.view(-1)[pixels] = True
-        choice.edge.view(-1)[pixels] = places is beside
+        choice.edge.view(-1)[pixels] = index is off_center
 
 
 def choose_narrow(
-    image: Image, numbers: Tensor, pixels: Tensor, table: Tensor
+    image: Image, indices: Tensor, pixels: Tensor, table: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Choose for pixels the flatter narrow window around them, else the flattest that holds them.
+    """Select the flatter narrow window around each pixel, otherwise the flattest containing it.
 
-    A pixel must be on its plane, too. The arguments are those of :func:`fit_narrow_windows`.
-    Returns places in the table, row by row, -1 for none, and whether they are the latter.
+    A pixel must also be on its plane. For the arguments see :func:`fit_narrow_windows`. Returns
+    row-major indices into the table, -1 for none, and a mask of the latter case.
     """
-    if serves(table):
-        chosen, beside = torch.empty_like(pixels), torch.empty_like(pixels, dtype=torch.bool)
-        fixed = image.values, image.u, image.v, numbers, pixels, table, chosen, beside
+    if has_kernels(table):
+        chosen, off_center = torch.empty_like(pixels), torch.empty_like(pixels, dtype=torch.bool)
+        fixed = image.values, image.u, image.v, indices, pixels, table, chosen, off_center
         pass_over_rows("choose_narrow", len(pixels), *fixed)
-        return chosen, beside
+        return chosen, off_center
     windows, count = Windows(*table), len(pixels)
     relative = windows.relative.flatten()
-    reach = torch.maximum(_OWN_REACH * windows.noise, windows.tolerance)
+    reach = torch.maximum(_MAX_PIXEL_NOISE * windows.noise, windows.tolerance)
 
-    def reached(window: Tensor) -> Tensor:
+    def cost_in_reach(window: Tensor) -> Tensor:
         near = (window >= 0) & _are_near(image, pixels, window, table, reach)
         cost: Tensor = torch.where(near, relative[window], torch.inf)
         return cost
 
-    around = torch.arange(count, device=pixels.device)
-    around = torch.where(windows.relative[1] < windows.relative[0], around + count, around)
-    takes_around = reached(around).isfinite()
-    least, flattest = torch.full_like(relative[:count], torch.inf), torch.full_like(pixels, -1)
+    centered = torch.arange(count, device=pixels.device)
+    centered = torch.where(windows.relative[1] < windows.relative[0], centered + count, centered)
+    takes_centered = cost_in_reach(centered).isfinite()
+    minimum, flattest = torch.full_like(relative[:count], torch.inf), torch.full_like(pixels, -1)
     for shape, sides in enumerate(NARROW):
-        for _, number in held_pixels(numbers, pixels, *sides):
+        for _, number in window_pixels(indices, pixels, *sides):
             window = torch.where(number >= 0, shape * count + number, -1)
-            cost = reached(window)
-            flattest = torch.where(cost < least, window, flattest)
-            least = torch.minimum(least, cost)
-    return torch.where(takes_around, around, flattest), ~takes_around & (flattest >= 0)
+            cost = cost_in_reach(window)
+            flattest = torch.where(cost < minimum, window, flattest)
+            minimum = torch.minimum(minimum, cost)
+    return torch.where(takes_centered, centered, flattest), ~takes_centered & (flattest >= 0)
 
 
-def _are_near(image: Image, pixels: Tensor, places: Tensor, table: Tensor, reach: Tensor) -> Tensor:
-    """Tell which pixels are within the reach of windows, both by place."""
-    u_slope, v_slope, origin = (values.flatten()[places] for values in table[:3])
+def _are_near(image: Image, pixels: Tensor, index: Tensor, table: Tensor, reach: Tensor) -> Tensor:
+    """Return a mask of pixels within reach of windows, both by index."""
+    u_slope, v_slope, origin = (values.flatten()[index] for values in table[:3])
     row, column = pixels // len(image.u), pixels % len(image.u)
     on_plane = u_slope * image.u[column] + v_slope * image.v[row]
-    away = (image.values[row, column] - (on_plane + origin)).abs()
-    is_near: Tensor = away <= reach.flatten()[places]
+    distance = (image.values[row, column] - (on_plane + origin)).abs()
+    is_near: Tensor = distance <= reach.flatten()[index]
     return is_near
 
 
 def min_in_windows(image: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Return the least value within reach of each cell along both axes, and its row-major place."""
-    best, place = -image[None, None], torch.arange(image.numel(), device=image.device)
+    """Return the minimum within reach of each cell along both axes, and its row-major index."""
+    best, index = -image[None, None], torch.arange(image.numel(), device=image.device)
     for axis in (1, 0):
         size, pad = [1, 1], [0, 0]
         size[axis], pad[axis] = 2 * reach + 1, reach
         best, chosen = torch.nn.functional.max_pool2d(best, size, 1, pad, return_indices=True)
-        place = place[chosen.flatten()]
-    return -best[0, 0], place.view(image.shape)
+        index = index[chosen.flatten()]
+    return -best[0, 0], index.view(image.shape)

@@ -1,4 +1,4 @@
-"""Kernels that pass over the rows of an image, on as many threads as torch may use."""
+"""Multi-threaded kernel passes over image rows."""
 
 import torch
 from torch import Tensor
@@ -9,18 +9,18 @@ from torchrg._parallel import allowed_threads, chunks_of, map_tasks
 _CPU = torch.device("cpu")
 
 _MIN_ROWS = 32
-"""Rows that are worth a thread's start."""
+"""Minimum number of rows per thread that outweighs its start."""
 
 
-def serves(image: Tensor) -> bool:
-    """Tell whether kernels work on an image of float64."""
+def has_kernels(image: Tensor) -> bool:
+    """Return whether kernels support a float64 image."""
     return image.device.type == "cpu" and kernels.serve()
 
 
 def pass_over_rows(name: str, num_rows: int, *arguments: Tensor | float) -> None:
-    """Call a kernel that writes the rows of its tensors from one number to another."""
-    # Two tasks a thread: whoever begins first takes more.
+    """Call a kernel that writes a range of rows of its tensors."""
+    # Two tasks per thread balance the load.
     size = max(-(-num_rows // (2 * allowed_threads())), _MIN_ROWS)
-    # An even number of them: rows of cells twice as wide belong to one task.
+    # An even size keeps rows of cells twice as wide in one task.
     rows = chunks_of(num_rows, size + size % 2)
     map_tasks(lambda chunk: kernels.call(name, *arguments, chunk.start, chunk.stop), rows, _CPU)

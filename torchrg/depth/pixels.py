@@ -1,4 +1,4 @@
-"""What the windows of pixels say of them, and which pixels are on one surface with the next."""
+"""Per-pixel normals, curvature and noise, and connectivity of adjacent pixels."""
 
 from typing import NamedTuple
 
@@ -8,26 +8,26 @@ from torch import Tensor
 from torchrg._parallel import places_of
 from torchrg.config import DepthConfig
 from torchrg.depth.normals import FLAT, PixelPlanes
-from torchrg.depth.passes import pass_over_rows, serves
+from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import Image, Windows
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 
-_ALIKE = 1.75
-"""Factor of the largest angle between normals of two windows that both hold both pixels. On a
-column, large windows turn by more than the angle from one cell to the next."""
+_WIDE_ANGLE_FACTOR = 1.75
+"""Factor of the maximum angle between the normals of two windows that both contain both pixels. On
+a column, large windows turn by more than the angle from one cell to the next."""
 
-_SLOPE_NOISE = 1.0
-"""Standard deviations by which the slopes of two windows that both hold both pixels may differ,
-whatever the angle is. The small windows of a narrow face turn by noise alone."""
+_MAX_SLOPE_NOISE = 1.0
+"""Maximum slope difference, in standard deviations, of two windows that both contain both pixels,
+at any angle. The small windows of a narrow surface turn by noise alone."""
 
 
 class Pixels(NamedTuple):
-    """What the windows of pixels say, ``(H, W)``; normals are unit ones ``(H, W, 3)``.
+    """Per-pixel measurements ``(H, W)``; normals are unit vectors ``(H, W, 3)``.
 
-    ``curvature`` is the fraction of a window's variance across its plane; ``noise`` is the noise
-    of inverse depth in large windows. ``valid`` marks pixels that have a plane; normals and
-    curvature are 0 at the others. ``right`` and ``down`` mark pixels that lie on one surface with
-    the next.
+    ``curvature`` is the fraction of a window's variance perpendicular to its plane; ``noise`` is
+    the noise of inverse depth in large windows. ``valid`` marks pixels that have a plane; normals
+    and curvature are 0 at other pixels. ``right`` and ``down`` mark pixels on one surface with the
+    next.
     """
 
     normals: Tensor
@@ -41,51 +41,51 @@ class Pixels(NamedTuple):
 def describe_pixels(
     image: Image, planes: PixelPlanes, focal: tuple[float, float], config: DepthConfig
 ) -> Pixels:
-    """Return normals towards the camera, curvature, noise, and what is one surface.
+    """Return normals towards the camera, curvature, noise, and surface connectivity.
 
-    A deviation e of inverse depth is one of ``distance * z * e`` from the plane; a step of a column
-    is one of ``(x_step - x_slope * z * ray) z`` along it.
+    A deviation e of inverse depth equals a distance of ``distance * z * e`` to the plane; a column
+    step equals ``(x_step - x_slope * z * ray) z`` along it.
 
-    Pixels are on one surface if both have a flat window, their normals in space are within the
-    angle, and at both pixels their two planes differ by at most ``max_step`` times what a flat
-    window may deviate by: no region crosses a step. Where both windows hold both pixels the angle
-    may be larger: a crease between the pixels would lie within two flat windows.
+    Two pixels are on one surface if both have a flat window and their normals in space are within
+    the angle. At both pixels, their planes must differ by at most ``max_step`` times the allowed
+    deviation of a flat window: no region crosses a step. If both windows contain both pixels the
+    angle may be larger: a crease between the pixels would lie within two flat windows.
     """
     values, seen, choice = image.values, image.seen, planes.choice
     x, y = image.u / focal[0], image.v / focal[1]
-    wider = min(_ALIKE * config.max_angle_deg, 90.0)
+    wider = min(_WIDE_ANGLE_FACTOR * config.max_angle_deg, 90.0)
     limits = config.max_step, deg_to_sq_chord(config.max_angle_deg), deg_to_sq_chord(wider)
-    if serves(values):
+    if has_kernels(values):
         curvature, noise = torch.empty_like(values), torch.empty_like(values)
         valid, right, down = (torch.empty_like(seen) for _ in range(3))
         normals = values.new_empty(*values.shape, 3)
         found = Pixels(normals, curvature, noise, valid, right, down)
         fixed = *image, x, y, choice.window, choice.flat, *planes.tables
-        numbers = *focal, *planes.noise, *limits
-        pass_over_rows("describe_pixels", len(y), *fixed, *found, *numbers)
+        parameters = *focal, *planes.noise, *limits
+        pass_over_rows("describe_pixels", len(y), *fixed, *found, *parameters)
         return found
-    places = torch.arange(values.numel(), device=values.device)
-    windows = Windows(*(column.view(values.shape) for column in planes.take(places)))
-    sides = planes.sides_and_middles(places)[0].view(2, *values.shape)
-    noise = planes.noise.at(values)
+    index = torch.arange(values.numel(), device=values.device)
+    windows = Windows(*(column.view(values.shape) for column in planes.take(index)))
+    sides = planes.sides_and_centers(index)[0].view(2, *values.shape)
+    noise = planes.noise.evaluate(values)
     valid = choice.flat | (seen & windows.deviation.isfinite())
     is_smooth = windows.deviation > FLAT * windows.tolerance
     limit = torch.maximum(windows.tolerance, noise)
     tolerance = torch.where(is_smooth, windows.deviation, limit)
-    away = windows.u_slope * focal[0], windows.v_slope * focal[1], windows.origin
-    length = (away[0].square() + away[1].square() + away[2].square()).sqrt()
+    scaled = windows.u_slope * focal[0], windows.v_slope * focal[1], windows.origin
+    length = (scaled[0].square() + scaled[1].square() + scaled[2].square()).sqrt()
     length = torch.where(length > 0, length, 1.0)
     z = 1 / torch.where(values > 0, values, 1.0)
     across = (z * torch.where(valid, windows.deviation, 0.0) / length).square()
     rays, y = x * x + (y * y)[:, None] + 1, y[:, None]
     along = torch.zeros_like(z)
     slopes = (windows.u_slope, windows.v_slope)
-    for side, slope, f, place in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
+    for side, slope, f, coordinate in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
         step, spread = slope * z, (side * side - 1) / 12
-        along = along + spread * (step * step * rays - 2 / f * step * place + 1 / (f * f))
+        along = along + spread * (step * step * rays - 2 / f * step * coordinate + 1 / (f * f))
     total = across + along * z * z
     variation = (across / torch.where(total > 0, total, 1.0)).clamp(max=1 / 3)
-    normals = torch.stack([-column / length for column in away], dim=-1)
+    normals = torch.stack([-column / length for column in scaled], dim=-1)
     joins = [_join(image, planes, normals, tolerance, limits, axis) for axis in (1, 0)]
     return Pixels(
         torch.where(valid[..., None], normals, 0.0),
@@ -104,13 +104,13 @@ def _join(
     limits: tuple[float, float, float],
     axis: int,
 ) -> Tensor:
-    """Return which pixels are on one surface with the next along an axis, ``(H, W)``.
+    """Return a mask of pixels on one surface with the next along an axis, ``(H, W)``.
 
-    The tolerance ``(H, W)`` is what their windows may deviate by; the limits are of step, angle and
-    wider angle.
+    ``tolerance`` ``(H, W)`` is the allowed deviation of the windows; ``limits`` are the step, the
+    angle and the wider angle.
     """
     max_step, max_sq_chord, wider_sq_chord = limits
-    flat, numbers, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
+    flat, indices, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
     length, joined = flat.shape[axis] - 1, torch.zeros_like(flat)
     both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
     here = places_of(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
@@ -123,22 +123,24 @@ def _join(
     tolerance, normals = tolerance.flatten(), normals.view(-1, 3)
     limit = max_step * torch.maximum(tolerance[here], tolerance[there])
     turned = sq_chords(*(normals[at][:, :, None].unbind(dim=1) for at in (here, there))).squeeze(1)
-    sides, middles = planes.sides_and_middles(here)
-    their_sides, their_middles = planes.sides_and_middles(there)
+    sides, middles = planes.sides_and_centers(here)
+    their_sides, their_middles = planes.sides_and_centers(there)
     sq_noise = _sq_slope_noise(sides, tolerance[here])
     sq_noise = sq_noise + _sq_slope_noise(their_sides, tolerance[there])
-    alike = u_slope.square() + v_slope.square() <= _SLOPE_NOISE**2 * sq_noise
-    both_hold = holds(sides, middles, there, width) & holds(their_sides, their_middles, here, width)
-    accepted = (turned <= max_sq_chord) | ((alike | (turned <= wider_sq_chord)) & both_hold)
+    similar = u_slope.square() + v_slope.square() <= _MAX_SLOPE_NOISE**2 * sq_noise
+    both_hold = contain(sides, middles, there, width) & contain(
+        their_sides, their_middles, here, width
+    )
+    accepted = (turned <= max_sq_chord) | ((similar | (turned <= wider_sq_chord)) & both_hold)
     accepted &= (step.abs() <= limit) & (next_step.abs() <= limit)
-    joined.view(-1)[here] = accepted | (numbers[here] == numbers[there])
+    joined.view(-1)[here] = accepted | (indices[here] == indices[there])
     return joined
 
 
 def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
-    """Return the variance of the slopes of windows of so many rows and columns, ``(2, n)``.
+    """Return the slope variance of windows with the given rows and columns, ``(2, n)``.
 
-    That of least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, the mean of both
+    For least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, averaged over the
     axes.
     """
     rows, columns = sides.unbind()
@@ -146,10 +148,11 @@ def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
     return 6 * tolerance.square() * (1 / (rows * rows) + 1 / (columns * columns)) / count
 
 
-def holds(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
-    """Tell whether windows hold pixels, by row-major place in an image of so many columns.
+def contain(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
+    """Return a mask of windows that contain pixels, by row-major index; ``width`` is in pixels.
 
-    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` row and column of their middles.
+    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` the row and column of their
+    centers.
     """
     (rows, columns), (row, column) = sides.unbind(), middles.unbind()
     down, right = (pixels // width - row).abs(), (pixels % width - column).abs()

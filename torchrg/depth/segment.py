@@ -1,4 +1,4 @@
-"""From one depth image to planes."""
+"""Plane segmentation of a single depth image."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -39,36 +39,35 @@ def segment_depth(
 ) -> Segmentation:
     """Segment a depth image into planes.
 
-    All is decided in inverse depth, where planes stay planes and the noise of a sensor that
-    triangulates does not depend on depth; see :func:`torchrg.depth.normals.fit_pixels`
-    and :func:`torchrg.depth.growth.grow_pixels`.
+    All decisions use inverse depth. In it planes stay planes, and the noise of a triangulating
+    sensor does not depend on depth; see :func:`torchrg.depth.normals.fit_pixels` and
+    :func:`torchrg.depth.growth.grow_pixels`.
 
     Convention:
-        Pixels without depth (0, negative, not finite, beyond ``max_depth``) belong to nothing, and
-        no neighbourhood crosses a step of the depth. The unit of the depth does not matter.
+        Pixels without depth (0, negative, not finite, above ``max_depth``) are unlabeled, and no
+        neighborhood crosses a depth step. The unit of the depth is arbitrary.
 
     Args:
         depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
         intrinsics: Camera matrix, shape ``(3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; see
             :func:`torchrg.depth.camera.depth_to_points`.
-        config: Settings, or a dictionary of them. Default: :class:`DepthConfig`.
-        pose: Matrix from camera to world coordinates, shape ``(4, 4)``, for normals and planes in
-            the world. Default: they are in camera coordinates.
-        orient: Side to which normals point: to the camera for "auto", "viewpoint" and "none", else
-            as in :func:`torchrg.normals.orient_normals`.
-        **changes: Single settings, as in ``max_depth=4.0``.
+        config: A depth configuration, or a dictionary. Default: :class:`DepthConfig`.
+        pose: Camera-to-world matrix, shape ``(4, 4)``, for normals and planes in world coordinates.
+            Default: camera coordinates.
+        orient: Normal orientation: towards the camera for "auto", "viewpoint" and "none", otherwise
+            as in :func:`torchrg.normals.orient_normals`. Default: "auto".
+        **changes: Individual parameters, as in ``max_depth=4.0``.
 
     Returns:
-        A segmentation whose fields are images, of ``(H, W)`` or ``(H, W, 3)``. Sharp are the pixels
-        so near to an edge that no flat window lies around them.
+        A segmentation whose fields are images of ``(H, W)`` or ``(H, W, 3)``. Pixels near an edge,
+        without a flat window centered on them, are sharp.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
-        ConfigError: If ``intrinsics`` cannot be of a camera of such images, or a setting is wrong.
+        ConfigError: If ``intrinsics`` are impossible for such images, or a parameter is invalid.
 
     Warns:
-        DepthWarning: If ``intrinsics`` are improbable; see
-            :func:`torchrg.depth.camera.check_view`.
+        DepthWarning: If ``intrinsics`` are improbable; see :func:`torchrg.depth.camera.check_view`.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -102,7 +101,7 @@ def _segment(
     pose: Tensor | None,
     orient: Orientation,
 ) -> Segmentation:
-    """Do what :func:`segment_depth` says."""
+    """Implement :func:`segment_depth`."""
     if depth.numel() == 0:
         pixel = _segment(depth.new_zeros(1, 1), intrinsics, config, pose, orient)
         images: dict[str, Any] = {
@@ -115,7 +114,7 @@ def _segment(
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = has_depth(depth)
     inverse = torch.where(seen, 1 / depth.double(), 0.0)
-    fx, fy, cx, cy = (float(intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx, fy, cx, cy = (float(intrinsics[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     focal = (fx, fy)
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
     v = torch.arange(depth.shape[0], device=depth.device).double() - cy
@@ -127,11 +126,11 @@ def _segment(
     cloud = _inverse_cloud(image, pixels, x, y)
     labels, plane_normals, curved = grow_pixels(cloud, flat, joins, config)
     normals, valid = pixels.normals.view(-1, 3), pixels.valid
-    # A window at a border that is not flat has no normal of its own; the region has.
-    borders = (~flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
-    borders = borders[~curved[labels[borders]]]
-    normals[borders] = plane_normals[labels[borders]]
-    valid.view(-1)[borders] = True
+    # A boundary pixel without a flat window has no normal; use the region's.
+    boundary = (~flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
+    boundary = boundary[~curved[labels[boundary]]]
+    normals[boundary] = plane_normals[labels[boundary]]
+    valid.view(-1)[boundary] = True
 
     if pose is not None:
         pose = pose.to(normals)
@@ -147,8 +146,8 @@ def _segment(
         up = unit_direction("segment_depth", config.up)
         table = replace(table, kind=classify_planes(table, points, labels, up))
     if orient not in ("auto", "viewpoint", "none"):
-        places = torch.where(seen.view(-1, 1), points, torch.nan).float()
-        normals = orient_normals(places, normals, orient=orient)
+        positions = torch.where(seen.view(-1, 1), points, torch.nan).float()
+        normals = orient_normals(positions, normals, orient=orient)
     return Segmentation(
         labels.view(depth.shape),
         normals.view(*depth.shape, 3).to(depth.dtype),
@@ -160,7 +159,7 @@ def _segment(
 
 
 def _inverse_cloud(image: Image, pixels: Pixels, x: Tensor, y: Tensor) -> InverseCloud:
-    """Return the image as the cloud that regions grow in, from the rays ``(x, y, 1)``."""
+    """Return the image as the cloud for region growing, from the rays ``(x, y, 1)``."""
     inverse, seen = image.values, image.seen
     values = inverse.flatten()[places_of(seen)]
     unit = kth_smallest(values, (len(values) - 1) // 2) if len(values) else inverse.new_ones(())

@@ -1,7 +1,7 @@
-"""Planes of square windows all over a depth image, of narrow ones here and there, and their noise.
+"""Planes of square and narrow windows of a depth image, and their noise.
 
-Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Windows stand a cell
-apart, so that the sums over all large ones together cost less than those over the smallest.
+Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Windows are one cell
+apart, so that all large ones together cost less than the smallest.
 """
 
 from collections.abc import Iterator, Mapping
@@ -11,45 +11,46 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import places_of
-from torchrg.depth.passes import pass_over_rows, serves
+from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
 
 CELL_SIZES = (8, 4, 2, 1)
-"""Widths of the cells in pixels, the largest first."""
+"""Cell widths in pixels, largest first."""
 REACH = 2
-"""A window reaches over so many cells around its middle one."""
+"""Cells of a window on each side of its center cell."""
 SIDE = 2 * REACH + 1
 """Cells along a side of a window."""
 NARROW = ((3, 9), (9, 3))
 """Rows and columns of narrow windows in pixels; each has about as many as the smallest square."""
 _MIN_FRACTION = 0.4
-"""Least share of a window's pixels that must be seen for it to have a plane."""
+"""Minimum fraction of seen pixels for a window to have a plane."""
 _MIN_SPREAD = 0.2
-"""Least determinant of the covariance of a window's pixels, as a share of that of a full window.
-With less, the pixels lie nearly on a line and tell no plane."""
+"""Minimum determinant of the covariance of a window's pixels, as a fraction of a full window's.
+Below it, the pixels are nearly collinear and do not define a plane."""
 _NUM_MOMENTS = 10
-"""Sums of a window's pixels that its plane needs."""
+"""Number of moment sums required for the plane of a window."""
 _FLAT_QUANTILE = 0.35
-"""Share of the windows of an image that deviate by noise alone: at least a third of it is flat."""
-_PIXELS_APART = 4
-"""Windows overlap: of the small ones those so many pixels apart tell as much of noise as all."""
+"""Fraction of the windows of an image that deviate by noise alone: at least a third is flat."""
+_SAMPLE_STRIDE = 4
+"""Stride of the small windows used for the noise, in pixels: because windows overlap, it loses
+nothing."""
 _NUM_BINS = 12
-"""Classes of depth that noise is fitted to."""
+"""Number of depth bins for the noise fit."""
 _MAX_GROWTH = 1.4
-"""Noise of windows grows at most by this from one size to the next."""
+"""Maximum growth of the window noise from one size to the next."""
 _MAX_JITTER = 0.15
-"""Pixels by which rays may be off the middles of their pixels, standard deviation."""
+"""Maximum standard deviation of rays from their pixel centers, in pixels."""
 _ROUNDING = 8.0
-"""Least noise of inverse depth, in units of the rounding of the depth."""
+"""Minimum noise of inverse depth, in units of the rounding of the depth."""
 _MIN_ROUNDING = 1e-7
-"""Least noise of inverse depth as a share of it, whatever the dtype: the rounding of float32."""
+"""Minimum relative noise of inverse depth for any dtype: the rounding of float32."""
 
 
 class Image(NamedTuple):
-    """Inverse depths ``(H, W)``, float64 and finite, which pixels have one, and their places.
+    """Inverse depths ``(H, W)``, float64 and finite, a mask of pixels with depth, and coordinates.
 
-    Columns ``u`` ``(W,)`` and rows ``v`` ``(H,)`` count from the optical axis.
+    Columns ``u`` ``(W,)`` and rows ``v`` ``(H,)`` are relative to the optical axis.
     """
 
     values: Tensor
@@ -59,12 +60,12 @@ class Image(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Planes ``value = u_slope * u + v_slope * v + origin`` of windows, each number ``(h, w)``.
+    """Planes ``value = u_slope * u + v_slope * v + origin`` of windows, each field ``(h, w)``.
 
-    ``deviation`` is the standard deviation of a window's pixels from its plane, infinite where
-    there is none, ``mean`` their mean value. :func:`torchrg.depth.normals.rate_windows` adds limits
-    of the deviation: the noise; the noise or a slight bend; the strongest bend. ``relative`` is the
-    deviation of a flat window as a share of the second, else infinite.
+    ``deviation`` is the standard deviation of a window's pixels from its plane, infinite if there
+    is none, ``mean`` their mean value. :func:`torchrg.depth.normals.rate_windows` adds limits of
+    the deviation: the noise; the noise or a slight bend; the strongest bend. ``relative`` is the
+    deviation of a flat window as a fraction of the second limit, otherwise infinite.
     """
 
     u_slope: Tensor
@@ -74,20 +75,20 @@ class Windows(NamedTuple):
     mean: Tensor
     noise: Tensor
     tolerance: Tensor
-    most: Tensor
+    max_bend: Tensor
     relative: Tensor
 
 
 NUM_PLANE = 5
-"""Numbers of a window's plane; what follows rates it."""
+"""Number of plane fields of a window; the remaining fields rate it."""
 
 
 def fit_windows(image: Image) -> dict[int, Tensor]:
-    """Fit a plane by least squares to the window around each cell, for ascending sizes of cells.
+    """Fit a least-squares plane to the window around each cell, for ascending cell sizes.
 
-    Cells begin at the first pixel, and windows are cut off at the borders of the image. One with
-    too few pixels seen, or nearly on a line, has no plane. Returns tables ``(9, h, w)`` of
-    :class:`Windows`, of which the planes are filled in; they lie side by side in memory.
+    Cells begin at the first pixel, and windows are clipped to the image. A window with too few or
+    nearly collinear seen pixels has no plane. Returns tables ``(9, h, w)`` of :class:`Windows` with
+    the plane fields filled in; they are contiguous in memory.
     """
     values, seen, u, v = image
     shapes = [seen.shape]
@@ -97,73 +98,72 @@ def fit_windows(image: Image) -> dict[int, Tensor]:
     flat = values.new_empty(len(Windows._fields) * sum(shape.numel() for shape in shapes))
     parts = torch.split(flat, [len(Windows._fields) * shape.numel() for shape in shapes])
     tables = {
-        size: numbers.view(-1, *shape)
-        for size, numbers, shape in zip(sizes, parts, shapes, strict=True)
+        size: part.view(-1, *shape) for size, part, shape in zip(sizes, parts, shapes, strict=True)
     }
-    if not serves(values):
+    if not has_kernels(values):
         ones = seen.to(values.dtype)
         w = torch.where(seen, values, 0.0)
         mu, mv = ones * u, ones * v[:, None]
         cells = torch.stack([ones, mu, mv, w, mu * u, mu * mv, mv * mv, w * mu, w * mv, w * w])
         for size, table in tables.items():
-            cells = _sums_of_pairs(cells) if size > 1 else cells
-            table[:NUM_PLANE] = _planes_of_sums(_sums_around(cells), SIDE * size, SIDE * size)
+            cells = _pool_sums(cells) if size > 1 else cells
+            table[:NUM_PLANE] = _planes_from_sums(_window_sums(cells), SIDE * size, SIDE * size)
         return tables
     cells = values
     for size, table in tables.items():
         height, width = table.shape[1:]
         coarse = values.new_empty(_NUM_MOMENTS, -(-height // 2), -(-width // 2))
         name, source = ("cell", [cells]) if size > 1 else ("pixel", [values, seen, u, v])
-        limits = _least_of(SIDE * size, SIDE * size)
+        limits = _min_moments(SIDE * size, SIDE * size)
         planes = table[:NUM_PLANE]
         pass_over_rows(f"fit_{name}_windows", height, *source, planes, coarse, *limits)
         cells = coarse
     return tables
 
 
-def fit_narrow_windows(image: Image, numbers: Tensor, pixels: Tensor) -> Tensor:
-    """Fit a plane to the window of either narrow shape around some pixels ``(n,)``.
+def fit_narrow_windows(image: Image, indices: Tensor, pixels: Tensor) -> Tensor:
+    """Fit a plane to the narrow windows of both shapes around the given pixels ``(n,)``.
 
-    Only these pixels count: ``numbers`` ``(H, W)`` are their places among them, -1 of all others.
-    Returns a table ``(9, 2, n)``; see :func:`fit_windows`.
+    Only these pixels count: ``indices`` ``(H, W)`` are their indices, -1 for other pixels. Returns
+    a table ``(9, 2, n)``; see :func:`fit_windows`.
     """
     values, _, u, v = image
     table = values.new_empty(len(Windows._fields), len(NARROW), len(pixels))
-    if serves(values):
-        limits, planes = _least_of(*NARROW[0]), table[:NUM_PLANE]
-        fixed = values, u, v, numbers, pixels, *limits, planes
+    if has_kernels(values):
+        limits, planes = _min_moments(*NARROW[0]), table[:NUM_PLANE]
+        fixed = values, u, v, indices, pixels, *limits, planes
         pass_over_rows("fit_narrow_windows", len(pixels), *fixed)
         return table
     for shape, (rows, columns) in enumerate(NARROW):
         sums = values.new_zeros(_NUM_MOMENTS, len(pixels))
-        for at, _ in held_pixels(numbers, pixels, rows, columns):
+        for at, _ in window_pixels(indices, pixels, rows, columns):
             ones = (at >= 0).to(values.dtype)
             at = at.clamp(min=0)
             row, column = at // len(u), at % len(u)
             mu, mv, w = u[column] * ones, v[row] * ones, values[row, column] * ones
             sums += torch.stack([ones, mu, mv, w, mu * mu, mu * mv, mv * mv, w * mu, w * mv, w * w])
-        table[:NUM_PLANE, shape] = _planes_of_sums(sums, rows, columns)
+        table[:NUM_PLANE, shape] = _planes_from_sums(sums, rows, columns)
     return table
 
 
-def held_pixels(
-    numbers: Tensor, pixels: Tensor, rows: int, columns: int
+def window_pixels(
+    indices: Tensor, pixels: Tensor, rows: int, columns: int
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield for each place of a narrow window the pixels there ``(n,)``, and their numbers.
+    """Yield, for each position of a narrow window, the pixels there ``(n,)`` and their indices.
 
-    Row by row; where there is no pixel that counts both are -1.
+    Row by row; both are -1 where no pixel counts.
     """
-    height, width = numbers.shape
+    height, width = indices.shape
     for step in range(rows * columns):
         row = pixels // width + step // columns - rows // 2
         column = pixels % width + step % columns - columns // 2
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        place = torch.where(inside, row * width + column, 0)
-        number = torch.where(inside, numbers.flatten()[place], -1)
-        yield torch.where(number >= 0, place, -1), number
+        index = torch.where(inside, row * width + column, 0)
+        number = torch.where(inside, indices.flatten()[index], -1)
+        yield torch.where(number >= 0, index, -1), number
 
 
-def _sums_of_pairs(cells: Tensor) -> Tensor:
+def _pool_sums(cells: Tensor) -> Tensor:
     """Return the sums over cells of twice the width, ``(*, ceil(h / 2), ceil(w / 2))``."""
     height, width = cells.shape[1:]
     cells = torch.nn.functional.pad(cells, (0, width % 2, 0, height % 2))
@@ -171,8 +171,8 @@ def _sums_of_pairs(cells: Tensor) -> Tensor:
     return rows[:, :, 0::2] + rows[:, :, 1::2]
 
 
-def _sums_around(cells: Tensor) -> Tensor:
-    """Return the sums over the cells of the window around each, ``(*, h, w)``."""
+def _window_sums(cells: Tensor) -> Tensor:
+    """Return the sums over the cells of the window around each cell, ``(*, h, w)``."""
     for axis in (1, 2):
         length, total = cells.shape[axis], cells.clone()
         for step in range(1, min(REACH, length - 1) + 1):
@@ -182,21 +182,21 @@ def _sums_around(cells: Tensor) -> Tensor:
     return cells
 
 
-def _least_of(rows: int, columns: int) -> tuple[float, float]:
-    """Return the count and the spread of pixels of a window that has a plane, at least."""
+def _min_moments(rows: int, columns: int) -> tuple[float, float]:
+    """Return the minimum pixel count and spread of a window that has a plane."""
     full = (rows * rows - 1) * (columns * columns - 1) / 144
     return _MIN_FRACTION * rows * columns, _MIN_SPREAD * full
 
 
-def _planes_of_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
-    """Return planes ``(5, *)`` of windows of so many pixels, from sums of moments ``(10, *)``."""
+def _planes_from_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
+    """Return planes ``(5, *)`` of windows from sums of moments ``(10, *)``."""
     count = sums[0]
     weight = 1 / count.clamp(min=1)
     u, v, w, uu, uv, vv, uw, vw, ww = (moment * weight for moment in sums[1:])
     uu, uv, vv = uu - u * u, uv - u * v, vv - v * v
     uw, vw, ww = uw - u * w, vw - v * w, ww - w * w
     spread = uu * vv - uv * uv
-    min_count, min_spread = _least_of(rows, columns)
+    min_count, min_spread = _min_moments(rows, columns)
     has_plane = (count >= min_count) & (spread > min_spread)
     spread = torch.where(has_plane, spread, 1.0)
     u_slope, v_slope = (vv * uw - uv * vw) / spread, (uu * vw - uv * uw) / spread
@@ -207,9 +207,9 @@ def _planes_of_sums(sums: Tensor, rows: int, columns: int) -> Tensor:
 
 
 class WindowNoise(NamedTuple):
-    """Noise of inverse depth ``w`` as windows of a size see it: ``factor (growth + constant w^2)``.
+    """Noise of inverse depth ``w`` in windows of a size: ``factor (growth + constant w^2)``.
 
-    It is never less than ``rounding`` times the inverse depth.
+    It is at least ``rounding`` times the inverse depth.
     """
 
     factor: float
@@ -217,60 +217,60 @@ class WindowNoise(NamedTuple):
     growth: float
     rounding: float
 
-    def at(self, inverse: Tensor) -> Tensor:
+    def evaluate(self, inverse: Tensor) -> Tensor:
         """Return the noise at inverse depths."""
-        least = self.rounding * inverse
-        usual = torch.maximum(self.growth + self.constant * (inverse * inverse), least)
-        return torch.maximum(self.factor * usual, least)
+        minimum = self.rounding * inverse
+        typical = torch.maximum(self.growth + self.constant * (inverse * inverse), minimum)
+        return torch.maximum(self.factor * typical, minimum)
 
 
 def noise_by_size(
     tables: Mapping[int, Tensor], noise: tuple[float, float] | None, dtype: torch.dtype
 ) -> dict[int, WindowNoise]:
-    """Return the noise of inverse depth as windows of each size see it.
+    """Return the noise of inverse depth in windows of each size.
 
-    A standard deviation of ``a + b z^2`` in depth is one of ``b + a w^2`` in inverse depth
-    ``w = 1 / z``. Where ``a`` and ``b`` are not given, they are fitted to what windows deviate from
-    their planes: to the 35 % quantiles of twelve classes of depth. Neighbouring pixels of a sensor
-    err alike, and its depth has steps, so that large windows deviate more than small ones: the
-    noise has a factor for each size. It is never less than the rounding of ``dtype``, that of the
+    A standard deviation of ``a + b z^2`` in depth is ``b + a w^2`` in inverse depth ``w = 1 / z``.
+    Without ``noise``, ``a`` and ``b`` are fitted to the deviations of windows from their planes,
+    i.e. to the 35 % quantiles of twelve depth bins. Errors of adjacent sensor pixels are
+    correlated, and depth is quantized. Large windows thus deviate more than small ones, and the
+    noise has a factor for each size. It is at least the rounding of ``dtype``, the dtype of the
     depth.
     """
     rounding = max(_ROUNDING * machine_epsilon(dtype), _MIN_ROUNDING)
     if noise is not None:
         constant, growth = noise
         return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
-    windows = {size: _windows_apart(tables[size], size) for size in sorted(tables)}
+    windows = {size: _sample_windows(tables[size], size) for size in sorted(tables)}
     middle = windows[sorted(windows)[len(windows) // 2 - 1]]
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0
     for size, (*_, deviation, mean) in windows.items():
-        ratios = torch.maximum(deviation, rounding * mean) / shape.at(mean)
-        usual = float(_low_quantile(ratios)) if len(ratios) else factor
-        factor = usual if factor == 0 else min(max(usual, factor), _MAX_GROWTH * factor)
+        ratios = torch.maximum(deviation, rounding * mean) / shape.evaluate(mean)
+        typical = float(_low_quantile(ratios)) if len(ratios) else factor
+        factor = typical if factor == 0 else min(max(typical, factor), _MAX_GROWTH * factor)
         noises[size] = shape._replace(factor=factor)
     return noises
 
 
-def _windows_apart(table: Tensor, size: int) -> Tensor:
-    """Return the planes ``(5, n)`` of windows four pixels or a cell apart, of those that have one.
+def _sample_windows(table: Tensor, size: int) -> Tensor:
+    """Return the planes ``(5, n)`` of valid windows four pixels or a cell apart.
 
-    They are from a table ``(9, h, w)`` of those of a size.
+    The input is a table ``(9, h, w)`` of windows of one size.
     """
-    step = max(_PIXELS_APART // size, 1)
+    step = max(_SAMPLE_STRIDE // size, 1)
     planes = table[:NUM_PLANE, ::step, ::step].flatten(1)
     return planes.index_select(1, places_of(planes[3].isfinite()))
 
 
 def find_jitter(table: Tensor, size: int) -> float:
-    """Return by how many pixels the rays of an image are off the middles of their pixels.
+    """Return the standard deviation of the rays from their pixel centers, in pixels.
 
-    It is a standard deviation, from 0 for exact rays to 0.15. Jitter moves a value by as much of
-    what it changes from one pixel to the next, so that it shows in windows that are steep: no flat
-    window deviates by less. Of the steeper half of the classes of steepness the one counts where
-    flat windows deviate least. ``table`` ``(9, h, w)`` is that of windows of a size.
+    It ranges from 0 for exact rays to 0.15. Jitter changes a value in proportion to its slope, so
+    it shows in steep windows: no flat window deviates by less. Among the steeper half of the slope
+    bins, the one with the smallest deviation of flat windows counts. ``table`` ``(9, h, w)``
+    contains windows of one size.
     """
-    u_slope, v_slope, _, deviation, _ = _windows_apart(table, size)
+    u_slope, v_slope, _, deviation, _ = _sample_windows(table, size)
     slope, order = torch.hypot(u_slope, v_slope).sort()
     is_steep = slope > 0
     ratio = deviation[order][is_steep] / slope[is_steep]
@@ -279,12 +279,12 @@ def find_jitter(table: Tensor, size: int) -> float:
 
 
 def _low_quantile(values: Tensor) -> Tensor:
-    """Return the quantile of values that flat windows reach."""
+    """Return the quantile of values reached by flat windows."""
     return kth_smallest(values, int(_FLAT_QUANTILE * (len(values) - 1)))
 
 
 def _fit_noise(planes: Tensor, rounding: float) -> tuple[float, float]:
-    """Fit ``b + a w^2``, both not negative, to the deviations of flat windows; return a and b."""
+    """Fit nonnegative ``b + a w^2`` to the deviations of flat windows; return a and b."""
     mean, order = planes[4].sort()
     deviation = torch.maximum(planes[3][order], rounding * mean)
     bins = [rows for rows in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(rows)]
@@ -292,7 +292,7 @@ def _fit_noise(planes: Tensor, rounding: float) -> tuple[float, float]:
         return 0.0, 0.0
     x = torch.stack([mean[rows].square().mean() for rows in bins])
     q = torch.stack([_low_quantile(deviation[rows]) for rows in bins])
-    # Relative errors: a class whose windows are all cluttered counts little.
+    # Relative errors: a bin with only cluttered windows has little weight.
     p, e = x / q, 1 / q
     spread = (p * p).sum() * (e * e).sum() - (p * e).sum() ** 2
     constant = (p.sum() * (e * e).sum() - e.sum() * (p * e).sum()) / spread

@@ -1,4 +1,4 @@
-"""Neighbourhoods: exact search, canonical order, patches, voxels."""
+"""Exact neighbor search, canonical order, patches and voxels."""
 
 from torchrg.neighbors.knn import (
     check_neighbors,

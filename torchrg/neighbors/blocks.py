@@ -1,8 +1,8 @@
-"""Nearest neighbours of a large cloud block by block, within little memory.
+"""Block-wise nearest neighbors of large clouds with little memory.
 
-A block is a range of rows in canonical order. How far away neighbours can be is known from a few of
-its points; among all points within that distance of its boxes the search is that of a whole cloud.
-Candidates stay in canonical order, so ties come out as they do there.
+A block is a range of rows in canonical order. A few of its points bound the neighbor distance; the
+search then runs among all points within that distance of its boxes. Candidates stay in canonical
+order, so ties are resolved as in a search of the complete cloud.
 """
 
 import itertools
@@ -16,31 +16,31 @@ from torchrg._parallel import ROWS_AT_ONCE, chunks_of
 from torchrg.neighbors.order import MORTON_BITS, morton_codes
 
 BLOCK_SIZE = 300_000
-"""Points of a block. Smaller ones search more points around them in vain, larger ones take more
+"""Points per block. Smaller blocks search more surrounding points in vain, larger ones take more
 memory."""
 _MIN_CANDIDATES = 65536
-_CANDIDATES = 2
-"""Rows searched at a time at most: as many as two blocks have, and so many that a small block is
-not searched in crumbs."""
+_NUM_BLOCKS = 2
+"""Maximum number of rows searched at a time: those of two blocks, but at least ``_MIN_CANDIDATES``,
+so that a small block is not fragmented."""
 
 SearchRows = Callable[[NDArray[np.floating], slice, int], NDArray[np.int32]]
-"""Points in canonical order, rows that are asked for, and k -> their neighbours, ``(n, k)``."""
+"""Points in canonical order, query rows, and k -> their neighbors, ``(n, k)``."""
 POINTS_PER_BOX = 256
-"""Points of a box of surface about as wide as two neighbourhoods of 50: few rows are read in vain,
+"""Points per box, a surface patch about two neighborhoods of 50 wide. Few rows are read in vain,
 and boxes take a hundredth of the memory of the points."""
 
 _ROUNDING = 1 + 1e-9
-"""Factor by which distances are taken larger, so that rounding leaves no point out."""
+"""Factor by which distances are enlarged, so that rounding excludes no point."""
 
 _BOXES_AT_ONCE = 64
-"""Boxes that follow one another, whose common box leaves few others to compare with each."""
+"""Consecutive boxes whose common bounding box leaves few candidates to compare with each."""
 
 
 class Boxes(NamedTuple):
-    """The cells of an octree that hold few points each; in canonical order each is one run of rows.
+    """Octree cells with few points each; in canonical order each is one run of rows.
 
-    The first row of each, then the number of points, ``(B + 1,)``; lower and upper corners of the
-    points, ``(B, 3)``, float64.
+    First row of each, followed by the number of points, ``(B + 1,)``; lower and upper corners of
+    the points, ``(B, 3)``, float64.
     """
 
     starts: NDArray[np.int64]
@@ -48,8 +48,8 @@ class Boxes(NamedTuple):
     high: NDArray[np.float64]
 
 
-def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxes:
-    """Return the boxes of at most so many points ``(N, 3)`` in canonical order.
+def find_boxes(points: NDArray[np.floating], max_points: int = POINTS_PER_BOX) -> Boxes:
+    """Return boxes of at most ``max_points`` points ``(N, 3)`` in canonical order.
 
     Only a cell of the finest level may hold more: nearly equal points.
     """
@@ -59,41 +59,41 @@ def find_boxes(points: NDArray[np.floating], most: int = POINTS_PER_BOX) -> Boxe
     for level in range(MORTON_BITS - 1, -1, -1):
         starts = np.flatnonzero(is_start)
         counts = np.diff(starts)
-        full = counts > most
+        full = counts > max_points
         if not full.any():
             break
         changes = codes >> (3 * level)
         is_start[1:-1] |= (changes[1:] != changes[:-1]) & np.repeat(full, counts)[1:]
     starts = np.flatnonzero(is_start)
-    low, high = (how.reduceat(points, starts[:-1], axis=0) for how in (np.minimum, np.maximum))
+    low, high = (ufunc.reduceat(points, starts[:-1], axis=0) for ufunc in (np.minimum, np.maximum))
     return Boxes(starts, low.astype(np.float64), high.astype(np.float64))
 
 
 def near_boxes(
     boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return which boxes are within the reach ``(n,)`` of one of those chosen ``(n,)``."""
+    """Return a mask of boxes within ``reach`` ``(n,)`` of one of the chosen boxes ``(n,)``."""
     is_near = np.zeros(len(boxes.low), dtype=bool)
-    about = _about(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
-    all_low, all_high = boxes.low[about], boxes.high[about]
+    nearby = _near_bounding_box(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
+    all_low, all_high = boxes.low[nearby], boxes.high[nearby]
     for chunk in chunks_of(len(chosen), _BOXES_AT_ONCE):
         low, high = boxes.low[chosen[chunk]], boxes.high[chosen[chunk]]
-        near = _about(all_low, all_high, low, high, reach[chunk])
+        near = _near_bounding_box(all_low, all_high, low, high, reach[chunk])
         within = _gaps(all_low[near], all_high[near], low, high) <= reach[chunk, None] * _ROUNDING
-        is_near[about[near[within.any(axis=0)]]] = True
+        is_near[nearby[near[within.any(axis=0)]]] = True
     return is_near
 
 
-def _about(
+def _near_bounding_box(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
-    own_low: NDArray[np.float64],
-    own_high: NDArray[np.float64],
+    query_low: NDArray[np.float64],
+    query_high: NDArray[np.float64],
     reach: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Return which boxes are within the largest reach of the box about some."""
+    """Return the boxes within the maximum reach of the bounding box of the query boxes."""
     far = reach.max() * _ROUNDING
-    inside = (low <= own_high.max(axis=0) + far) & (high >= own_low.min(axis=0) - far)
+    inside = (low <= query_high.max(axis=0) + far) & (high >= query_low.min(axis=0) - far)
     return np.flatnonzero(inside.all(axis=1))
 
 
@@ -110,11 +110,11 @@ def farthest_neighbor(boxes: Boxes, box: int, k: int) -> float:
 def _gaps(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
-    own_low: NDArray[np.float64],
-    own_high: NDArray[np.float64],
+    query_low: NDArray[np.float64],
+    query_high: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the distances between some boxes and others, shape ``(own, others)``."""
-    gap = np.maximum(low - own_high[:, None], own_low[:, None] - high).clip(min=0)
+    """Return the distances between query boxes and boxes, shape ``(queries, boxes)``."""
+    gap = np.maximum(low - query_high[:, None], query_low[:, None] - high).clip(min=0)
     distance: NDArray[np.float64] = np.sqrt((gap * gap).sum(axis=2))
     return distance
 
@@ -122,10 +122,10 @@ def _gaps(
 def search_blocks(
     points: NDArray[np.floating], k: int, search: SearchRows
 ) -> Iterator[tuple[slice, NDArray[np.int32]]]:
-    """Yield blocks of rows, and their neighbours ``(n, k)`` as :func:`torchrg.search_knn` has them.
+    """Yield blocks of rows, and their neighbors ``(n, k)`` as in :func:`torchrg.search_knn`.
 
-    The points ``(N, 3)`` are in canonical order, k at most N; ``search`` answers for some rows of a
-    smaller cloud.
+    The points ``(N, 3)`` are in canonical order, k is at most N; ``search`` processes the given
+    rows of a smaller cloud.
     """
     boxes = find_boxes(points)
     ends = boxes.starts[np.searchsorted(boxes.starts, np.arange(0, len(points), BLOCK_SIZE))]
@@ -140,53 +140,54 @@ def search_block(
     block: slice,
     k: int,
     search: SearchRows,
-    most: int | None = None,
+    max_rows: int | None = None,
 ) -> NDArray[np.int32]:
-    """Return the rows of the ``k`` nearest points of those of a block, shape ``(n, k)``.
+    """Return the rows of the ``k`` nearest points of each point of a block, shape ``(n, k)``.
 
-    The block begins and ends where ``boxes`` do; at most ``most`` rows are searched at a time.
+    The block begins and ends at the boundaries of ``boxes``; at most ``max_rows`` rows are searched
+    at a time.
     """
     first, last = np.searchsorted(boxes.starts, (block.start, block.stop))
     reach = _reach_of_boxes(points[block], boxes, slice(first, last), k)
     nearest = np.empty((block.stop - block.start, k), dtype=np.int32)
-    most = max(_CANDIDATES * len(nearest), _MIN_CANDIDATES) if most is None else most
-    waiting = [slice(first, last)]
-    while waiting:
-        run = waiting.pop()
-        numbers = np.arange(run.start, run.stop)
-        rows = _rows_near(boxes, numbers, reach[numbers - first])
-        if len(rows) > most and len(numbers) > 1:
+    max_rows = max(_NUM_BLOCKS * len(nearest), _MIN_CANDIDATES) if max_rows is None else max_rows
+    pending = [slice(first, last)]
+    while pending:
+        run = pending.pop()
+        indices = np.arange(run.start, run.stop)
+        rows = _rows_near(boxes, indices, reach[indices - first])
+        if len(rows) > max_rows and len(indices) > 1:
             middle = (run.start + run.stop) // 2
-            waiting += [slice(run.start, middle), slice(middle, run.stop)]
+            pending += [slice(run.start, middle), slice(middle, run.stop)]
             continue
-        if len(rows) > most:
-            bound = np.minimum(reach[numbers - first], farthest_neighbor(boxes, run.start, k))
-            rows = _rows_near(boxes, numbers, bound)
-        asked = slice(boxes.starts[run.start], boxes.starts[run.stop])
-        into = nearest[asked.start - block.start : asked.stop - block.start]
-        if len(rows) > most:
-            into[:] = _search_each(points, rows, np.arange(asked.start, asked.stop), k)
+        if len(rows) > max_rows:
+            bound = np.minimum(reach[indices - first], farthest_neighbor(boxes, run.start, k))
+            rows = _rows_near(boxes, indices, bound)
+        queries = slice(boxes.starts[run.start], boxes.starts[run.stop])
+        out = nearest[queries.start - block.start : queries.stop - block.start]
+        if len(rows) > max_rows:
+            out[:] = _search_each(points, rows, np.arange(queries.start, queries.stop), k)
             continue
-        start = int(np.searchsorted(rows, asked.start))
-        local = slice(start, start + asked.stop - asked.start)
-        np.take(rows.astype(np.int32), search(points[rows], local, k), out=into, mode="clip")
+        start = int(np.searchsorted(rows, queries.start))
+        local = slice(start, start + queries.stop - queries.start)
+        np.take(rows.astype(np.int32), search(points[rows], local, k), out=out, mode="clip")
     return nearest
 
 
 def _reach_of_boxes(
-    inside: NDArray[np.floating], boxes: Boxes, numbers: slice, k: int
+    inside: NDArray[np.floating], boxes: Boxes, indices: slice, k: int
 ) -> NDArray[np.float64]:
-    """Return distances within which all points of each box of a block have ``k`` neighbours."""
+    """Return distances within which all points of each box of a block have ``k`` neighbors."""
     from scipy.spatial import cKDTree
 
     if len(inside) < k:
         return np.array(
-            [farthest_neighbor(boxes, i, k) for i in range(numbers.start, numbers.stop)]
+            [farthest_neighbor(boxes, i, k) for i in range(indices.start, indices.stop)]
         )
-    firsts = inside[boxes.starts[numbers] - boxes.starts[numbers.start]]
+    firsts = inside[boxes.starts[indices] - boxes.starts[indices.start]]
     tree = cKDTree(inside, balanced_tree=False, compact_nodes=False)
-    sides = boxes.high[numbers] - boxes.low[numbers]
-    # Any other point of the box is at most its diagonal away from the first.
+    sides = boxes.high[indices] - boxes.low[indices]
+    # Each other point of the box is at most its diagonal away from the first.
     reach: NDArray[np.float64] = tree.query(firsts, [k])[0][:, 0] + np.linalg.norm(sides, axis=1)
     return reach
 
@@ -194,9 +195,9 @@ def _reach_of_boxes(
 def _rows_near(
     boxes: Boxes, chosen: NDArray[np.int64], reach: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Return the rows of all boxes within reach of one of those chosen."""
-    numbers = np.flatnonzero(near_boxes(boxes, chosen, reach))
-    starts, counts = boxes.starts[numbers], np.diff(boxes.starts)[numbers]
+    """Return the rows of all boxes within reach of one of the chosen boxes."""
+    indices = np.flatnonzero(near_boxes(boxes, chosen, reach))
+    starts, counts = boxes.starts[indices], np.diff(boxes.starts)[indices]
     ends = np.cumsum(counts)
     return np.repeat(starts - ends + counts, counts) + np.arange(ends[-1])
 
@@ -204,25 +205,25 @@ def _rows_near(
 def _search_each(
     points: NDArray[np.floating],
     rows: NDArray[np.int64],
-    asked: NDArray[np.int64],
+    queries: NDArray[np.int64],
     k: int,
 ) -> NDArray[np.int64]:
-    """Return the nearest of many candidates for a few points, as far outliers have them."""
-    places = points[asked].astype(np.float64)
-    nearest = [np.empty(0, dtype=np.int64)] * len(asked)
-    keys = [np.empty(0)] * len(asked)
+    """Return the nearest of many candidates for a few points, such as far outliers."""
+    positions = points[queries].astype(np.float64)
+    nearest = [np.empty(0, dtype=np.int64)] * len(queries)
+    keys = [np.empty(0)] * len(queries)
     for chunk in chunks_of(len(rows), ROWS_AT_ONCE):
-        numbers = rows[chunk]
-        candidates = points[numbers].astype(np.float64)
-        for i, (number, place) in enumerate(zip(asked, places, strict=True)):
-            away = candidates - place
-            sq_distances = away[:, 0] ** 2 + away[:, 1] ** 2 + away[:, 2] ** 2
-            # The point itself stands first.
-            distances = np.where(numbers == number, -1.0, np.sqrt(sq_distances))
+        indices = rows[chunk]
+        candidates = points[indices].astype(np.float64)
+        for i, (index, position) in enumerate(zip(queries, positions, strict=True)):
+            offset = candidates - position
+            sq_distances = offset[:, 0] ** 2 + offset[:, 1] ** 2 + offset[:, 2] ** 2
+            # The point itself comes first.
+            distances = np.where(indices == index, -1.0, np.sqrt(sq_distances))
             limit = keys[i][-1] if len(keys[i]) == k else np.inf
             near = distances <= limit
-            joined = np.append(nearest[i], numbers[near])
+            merged = np.append(nearest[i], indices[near])
             distances = np.append(keys[i], distances[near])
-            order = np.lexsort((joined, distances))[:k]
-            nearest[i], keys[i] = joined[order], distances[order]
+            order = np.lexsort((merged, distances))[:k]
+            nearest[i], keys[i] = merged[order], distances[order]
     return np.stack(nearest)

@@ -1,4 +1,4 @@
-"""Exact nearest neighbours, by cells or a tree, and the patches they make."""
+"""Exact nearest-neighbor search, by grid cells or a tree, and patches."""
 
 import itertools
 import math
@@ -27,22 +27,23 @@ from torchrg.neighbors.order import canonical_order, distinct_rows, mark_first
 from torchrg.structures import MAX_POINTS, Neighbors, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
-"""Points that tell how far the k-th neighbour is."""
+"""Number of sampled points that estimate the distance of the k-th neighbor."""
 
 SomeNeighbors = Callable[[NDArray[np.integer]], NDArray[np.integer]]
 """Function from rows ``(n,)`` to their neighbors ``(n, k)``, each first its own."""
 
 _MIN_FOR_CELLS = 2000
-"""Points below which a tree is as fast as cells."""
+"""Minimum number of points for which cells are faster than a tree."""
 
 _SIZE_STEP = 1.5
-"""Cells of one size answer for points whose k-th neighbour is from 1 / 1.75 to 1 size away."""
+"""Ratio of a cell size to the smallest remaining distance of a k-th neighbor. Cells of one size
+serve points whose k-th neighbor is 1 / 1.75 to 1 size away."""
 
 _MIN_FRACTION = 0.03
-"""Share of the points for which another size of cells is worth its sort."""
+"""Minimum fraction of the points for which another cell size is worth its sort."""
 
-_CELLS_A_POINT = 8
-"""Cells of the box about a cloud, empty ones too, that are worth their memory, 4 bytes each."""
+_MAX_CELLS_PER_POINT = 8
+"""Maximum number of cells per point in the bounding box, including empty ones, 4 bytes each."""
 
 
 @of_clouds
@@ -55,21 +56,21 @@ def search_knn(
     offset: Tensor | None = None,
     canonical: bool = False,
 ) -> Neighbors:
-    """Find the ``k`` nearest points of every point, exactly.
+    """Find the exact ``k`` nearest neighbors of every point.
 
     Convention:
-        ``k`` counts the point itself, which always stands first, duplicates or not. The others are
-        sorted by distance; equal distances by :func:`canonical_order`, never by the input order.
+        ``k`` includes the point itself, which always comes first, even with duplicates. Other
+        neighbors are sorted by distance, ties by :func:`canonical_order`, never by the input order.
         The search runs on the CPU with as many threads as torch uses.
 
     Args:
         points: Points, shape ``(N, 3)``, finite.
-        k: Number of neighbours, the point itself included.
-        max_distance: Neighbours farther than this do not count (``valid`` False, index: the point
-            itself): a hybrid search. In the unit of the cloud. Default: no limit.
+        k: Number of neighbors, including the point itself.
+        max_distance: Maximum distance of a neighbor, in coordinate units (hybrid search); farther
+            ones have ``valid`` False and the index of the point itself. Default: no limit.
         offset: Ends of the clouds of a ragged batch, shape ``(B,)``, ascending, the last one ``N``
-            (Pointcept's convention); no neighbour crosses clouds. Default: one cloud.
-        canonical: Whether the points already are in canonical order; saves two passes.
+            (Pointcept's convention); neighbors are from the same cloud. Default: one cloud.
+        canonical: Whether the points are already in canonical order; saves two passes.
 
     Returns:
         Indices of shape ``(N, k)``, int32, on the device of the points.
@@ -87,35 +88,35 @@ def search_knn(
     check_floating("search_knn", points=tensor)
     if len(tensor) > MAX_POINTS:
         raise ShapeError(
-            f"search_knn: expected at most {MAX_POINTS:,} points, got {len(tensor):,}; cut the "
-            "cloud into parts."
+            f"search_knn: expected at most {MAX_POINTS:,} points, got {len(tensor):,}. Split "
+            "the cloud."
         )
     if max_distance is not None and not max_distance >= 0:
         raise ConfigError(f"search_knn: expected max_distance >= 0, got {max_distance!r}.")
     coordinates = tensor.detach().cpu().numpy()
     if not np.isfinite(coordinates).all():
-        num_bad = int((~np.isfinite(coordinates)).any(axis=1).sum())
+        num_nonfinite = int((~np.isfinite(coordinates)).any(axis=1).sum())
         raise ShapeError(
-            f"search_knn: expected finite points, got {num_bad:,} of {len(coordinates):,} with NaN "
-            "or Inf; leave them out first."
+            f"search_knn: expected finite points, got {num_nonfinite:,} of {len(coordinates):,} "
+            "with NaN or Inf. Remove them first."
         )
     bounds = _cloud_bounds(offset, len(coordinates))
-    least = min((stop - start for start, stop in bounds), default=MAX_POINTS)
-    if not 1 <= k <= least:
+    min_points = min((stop - start for start, stop in bounds), default=MAX_POINTS)
+    if not 1 <= k <= min_points:
         raise ShapeError(
-            f"search_knn: expected k from 1 to the number of points ({least:,}), got {k}; lower k "
-            "or pass a larger cloud."
+            f"search_knn: expected k from 1 to the number of points ({min_points:,}), got {k}. "
+            "Lower k or pass a larger cloud."
         )
     indices = scratch.empty((len(coordinates), k), np.int32)
-    outside = None if max_distance is None else np.empty(indices.shape, dtype=bool)
+    is_far = None if max_distance is None else np.empty(indices.shape, dtype=bool)
     for start, stop in bounds:
         cloud = coordinates[start:stop]
         order = None if canonical else canonical_order(cloud).numpy()
         cloud = cloud if order is None else cloud[order]
         if scratch.is_active() and max_distance is None:
             for rows, near in search_blocks(cloud, k, search_rows):
-                into = rows if order is None else order[rows]
-                indices[start:stop][into] = (near if order is None else order[near]) + start
+                target = rows if order is None else order[rows]
+                indices[start:stop][target] = (near if order is None else order[near]) + start
             continue
         _search_cloud(
             cloud,
@@ -124,23 +125,23 @@ def search_knn(
             start,
             math.inf if max_distance is None else max_distance,
             indices[start:stop],
-            None if outside is None else outside[start:stop],
+            None if is_far is None else is_far[start:stop],
         )
-    valid = None if outside is None else torch.from_numpy(~outside).to(tensor.device)
+    valid = None if is_far is None else torch.from_numpy(~is_far).to(tensor.device)
     return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
 
 
 def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
-    """Check the lists that a user passes: one for each point, itself first, of rows of the points.
+    """Validate input neighbor lists: one per point, itself first, of rows of the points.
 
     Raises:
-        ShapeError: If they are not as :class:`torchrg.structures.Neighbors` says.
+        ShapeError: If they do not match :class:`torchrg.structures.Neighbors`.
     """
     indices: object = getattr(neighbors, "indices", None)
     if not is_tensor(indices):
         raise ShapeError(
-            f"{caller}: expected neighbors as torchrg.structures.Neighbors of a tensor, got "
-            f"{type(neighbors).__name__}; pass Neighbors(torch.as_tensor(rows))."
+            f"{caller}: expected torchrg.structures.Neighbors with a tensor, got "
+            f"{type(neighbors).__name__}. Pass Neighbors(torch.as_tensor(rows))."
         )
     num_points = len(points)
     check_shapes(
@@ -151,7 +152,7 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     )
     if indices.dtype not in (torch.int32, torch.int64):
         raise ShapeError(
-            f"{caller}: expected neighbors of int32 or int64, got {indices.dtype}; convert them."
+            f"{caller}: expected neighbors of int32 or int64, got {indices.dtype}. Convert them."
         )
     if indices.device != points.device:
         raise ShapeError(
@@ -161,34 +162,34 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     if num_points == 0:
         return
     if indices.shape[1] == 0:
-        raise ShapeError(f"{caller}: expected neighbors of each point, got none; pass k of them.")
+        raise ShapeError(f"{caller}: expected at least 1 neighbor per point, got 0.")
     low, high = (int(end) for end in torch.aminmax(indices))
     if not 0 <= low <= high < num_points:
         raise ShapeError(
             f"{caller}: expected neighbors to be rows of {num_points:,} points, got {low:,} to "
-            f"{high:,}; search them among these points."
+            f"{high:,}. Search them among these points."
         )
-    is_own = indices[:, 0] == torch.arange(num_points, device=points.device)
-    if not bool(is_own.all()):
+    is_self = indices[:, 0] == torch.arange(num_points, device=points.device)
+    if not bool(is_self.all()):
         raise ShapeError(
-            f"{caller}: expected each point to be the first of its own neighbors, got others for "
-            f"{num_points - int(torch.count_nonzero(is_own)):,} of {num_points:,} points; put the "
-            "row of the point before its neighbors, as search_knn does."
+            f"{caller}: expected each point as its own first neighbor, got other points in "
+            f"{num_points - int(torch.count_nonzero(is_self)):,} of {num_points:,} rows. Put the "
+            "row of the point first, as search_knn does."
         )
 
 
 def keep_within(
     neighbors: Neighbors, groups: Tensor, chunk_size: int, places: Rows = slice(None)
 ) -> Neighbors:
-    """Return those neighbors of each point that are of its group, the nearest first.
+    """Restrict the neighbors of each point to its group, nearest first.
 
-    Points of several groups may share a place. They are ascending by place, then by group.
+    Points of different groups may share a position. They are sorted by position, then by group.
 
     Args:
-        neighbors: Neighbors of each place.
-        groups: Group of each point, shape ``(N,)``, from 0 where places are passed.
-        chunk_size: Points handled at a time.
-        places: Place of each point, shape ``(N,)``. Default: each has one point.
+        neighbors: Neighbors of each position.
+        groups: Group of each point, shape ``(N,)``, from 0 if ``places`` are passed.
+        chunk_size: Points processed at a time.
+        places: Index of each point's position, shape ``(N,)``. Default: one point per position.
 
     Example:
         >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
@@ -211,9 +212,9 @@ def keep_within(
             same &= neighbors.counted(rows)
         else:
             at = places[rows]
-            wanted = neighbors.indices[at].long() * width + groups[rows, None]
-            near = torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)
-            same = (keys[near] == wanted) & neighbors.counted(at)
+            requested = neighbors.indices[at].long() * width + groups[rows, None]
+            near = torch.searchsorted(keys, requested).clamp(max=len(keys) - 1)
+            same = (keys[near] == requested) & neighbors.counted(at)
         order = same.byte().argsort(dim=1, descending=True, stable=True)
         near, same = near.gather(1, order), same.gather(1, order)
         indices[rows] = torch.where(same, near, near[:, :1]).numpy(force=True)
@@ -227,10 +228,10 @@ def keep_within(
 def search_nearest(
     points: NDArray[np.floating], queries: NDArray[np.floating], max_distance: float
 ) -> NDArray[np.int64]:
-    """Return the row of the nearest point of each query ``(M,)``, -1 where none is near enough.
+    """Return the row of the nearest point of each query ``(M,)``, -1 if none is within range.
 
-    Points and queries are finite, ``(N, 3)`` and ``(M, 3)`` in the same coordinates. Of points at
-    equal distances the first in :func:`canonical_order` is taken.
+    Points and queries are finite, ``(N, 3)`` and ``(M, 3)`` in the same coordinates. Ties go to the
+    first point in :func:`canonical_order`.
 
     Example:
         >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
@@ -244,16 +245,16 @@ def search_nearest(
         return nearest
     first = distinct_rows(as_tensor("search_nearest", "points", points)).numpy()
     tree = cKDTree(points[first], balanced_tree=False, compact_nodes=False)
-    # Those close to each other find the same parts of the tree in the cache.
-    asked = canonical_order(queries).numpy()
-    for chunk in chunks_of(len(asked), ROWS_AT_ONCE):
-        distances, places = _query(tree, queries[asked[chunk]], 1)
-        nearest[asked[chunk]] = np.where(distances <= max_distance, first[places], -1)[:, 0]
+    # Consecutive close queries use the same cached parts of the tree.
+    query_rows = canonical_order(queries).numpy()
+    for chunk in chunks_of(len(query_rows), ROWS_AT_ONCE):
+        distances, found = _query(tree, queries[query_rows[chunk]], 1)
+        nearest[query_rows[chunk]] = np.where(distances <= max_distance, first[found], -1)[:, 0]
     return nearest
 
 
 def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int]]:
-    """Return first and last row of each cloud of a ragged batch."""
+    """Return start and stop row of each cloud of a ragged batch."""
     if offset is None:
         return [(0, num_points)]
     ends = [int(end) for end in offset]
@@ -285,7 +286,7 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
 
 @sequential_operations()
 def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np.int32]:
-    """Do as :func:`search_knn` for some rows of points in canonical order, at least ``k``."""
+    """Apply :func:`search_knn` to some rows of at least ``k`` points in canonical order."""
     indices = np.empty((len(points), k), dtype=np.int32)
     _search_cloud(points, rows, None, 0, math.inf, indices, None)
     return indices[rows]
@@ -293,17 +294,17 @@ def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np
 
 def _search_cloud(
     points: NDArray[np.floating],
-    asked: slice,
+    query_rows: slice,
     order: NDArray[np.int64] | None,
     first_row: int,
     max_distance: float,
     indices: NDArray[np.int32],
-    outside: NDArray[np.bool_] | None,
+    is_far: NDArray[np.bool_] | None,
 ) -> None:
     """Search one cloud in canonical order and write results in the caller's order.
 
-    Rows that are not ``asked`` may be answered or not. The tree holds each distinct place once, so
-    that a place with many points costs no more than a place with one.
+    Rows outside ``query_rows`` may be searched or not. The tree holds each distinct position once,
+    so that duplicates cost nothing.
     """
     from scipy.spatial import cKDTree
 
@@ -311,46 +312,46 @@ def _search_cloud(
     columns = as_tensor("search_knn", "points", points).unbind(dim=1)
     starts = np.flatnonzero(mark_first(*columns).numpy())
     counts = np.diff(starts, append=len(points))
-    places = points[starts].astype(np.float64)
+    positions = points[starts].astype(np.float64)
 
     def store(
         queried: NDArray[np.integer], distances: NDArray[np.float64], nearest: NDArray[np.integer]
     ) -> None:
         rows = queried
-        if len(places) < len(points):
+        if len(positions) < len(points):
             rows, distances, nearest = _restore_duplicates(
                 queried, distances, nearest, starts, counts, k
             )
-        if outside is not None:
+        if is_far is not None:
             too_far = distances > max_distance
             nearest = np.where(too_far, rows[:, None], nearest)
-        into = rows if order is None else order[rows]
-        indices[into] = (nearest if order is None else order[nearest]) + first_row
-        if outside is not None:
-            outside[into] = too_far
+        target = rows if order is None else order[rows]
+        indices[target] = (nearest if order is None else order[nearest]) + first_row
+        if is_far is not None:
+            is_far[target] = too_far
 
-    width = min(k, len(places))
-    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
-    first, last = np.searchsorted(starts, (asked.start, asked.stop - 1), side="right") - 1
-    left = np.arange(first, last + 1)
-    if len(places) >= _MIN_FOR_CELLS and kernels.serve(k=k):
-        sample = places[left[:: -(-len(left) // _SAMPLE_SIZE)]]
+    width = min(k, len(positions))
+    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    first, last = np.searchsorted(starts, (query_rows.start, query_rows.stop - 1), side="right") - 1
+    pending = np.arange(first, last + 1)
+    if len(positions) >= _MIN_FOR_CELLS and kernels.serve(k=k):
+        sample = positions[pending[:: -(-len(pending) // _SAMPLE_SIZE)]]
         reach = tree.query(sample, [k])[0][:, 0]
-        if len(places) == len(points) and outside is None:
-            left = search_cells(places, left, reach, indices, order, first_row)
+        if len(positions) == len(points) and is_far is None:
+            pending = search_cells(positions, pending, reach, indices, order, first_row)
         else:
-            found, wanted = np.empty((len(places), k), dtype=np.int32), left
-            left = search_cells(places, wanted, reach, found)
-            answered = np.setdiff1d(wanted, left, assume_unique=True)
-            for chunk in chunks_of(len(answered), ROWS_IN_CACHE):
-                rows = answered[chunk]
+            found, requested = np.empty((len(positions), k), dtype=np.int32), pending
+            pending = search_cells(positions, requested, reach, found)
+            resolved = np.setdiff1d(requested, pending, assume_unique=True)
+            for chunk in chunks_of(len(resolved), ROWS_IN_CACHE):
+                rows = resolved[chunk]
                 near = found[rows]
                 distances = np.broadcast_to(0.0, near.shape)
-                if outside is not None:
-                    distances = np.linalg.norm(places[near] - places[rows, None], axis=2)
+                if is_far is not None:
+                    distances = np.linalg.norm(positions[near] - positions[rows, None], axis=2)
                 store(rows, distances, near)
-    for chunk in chunks_of(len(left), ROWS_AT_ONCE):
-        store(left[chunk], *_query(tree, places[left[chunk]], width))
+    for chunk in chunks_of(len(pending), ROWS_AT_ONCE):
+        store(pending[chunk], *_query(tree, positions[pending[chunk]], width))
 
 
 def search_cells(
@@ -361,51 +362,51 @@ def search_cells(
     order: NDArray[np.int64] | None = None,
     first_row: int = 0,
 ) -> NDArray[np.int64]:
-    """Find the k nearest of distinct points ``(N, 3)`` for rows that cells of some size answer for.
+    """Find the k nearest of distinct points ``(N, 3)`` for the rows that grid cells can resolve.
 
-    A cell and the 26 around it hold a few hundred points, whose distances a kernel takes. A result
-    counts only if no point outside the cells can be nearer. The grid is that of the box about the
-    cloud, empty cells too. The point itself counts. This is for where kernels serve.
+    A cell and its 26 neighbors hold a few hundred points, whose distances a kernel computes. A
+    result counts only if no point outside these cells can be nearer. The grid covers the bounding
+    box, including empty cells. The point itself counts. Requires the kernels.
 
     Args:
         points: Distinct points.
-        rows: Those that are asked for, ascending.
-        reach: Distances of the k-th neighbour of a sample of the points.
-        found: Where the neighbours of each point go, ``(N, k)``, sorted by distance, then by row.
-        order: Row of ``found`` for each point, and its number there. Default: its own.
-        first_row: What is added to each number.
+        rows: Query rows, ascending.
+        reach: Distances of the k-th neighbor for a sample of the points.
+        found: Output neighbors of each point, ``(N, k)``, sorted by distance, then by row.
+        order: Row of ``found`` for each point, and its index there. Default: the point's row.
+        first_row: Offset added to each index.
 
     Returns:
-        The rows that are left, ascending. What is in ``found`` for them means nothing.
+        The unresolved rows, ascending. Their values in ``found`` are undefined.
     """
     low, high = bounding_box(points)
     extent = high - low
-    places = torch.from_numpy(np.ascontiguousarray(points))
-    into, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
+    positions = torch.from_numpy(np.ascontiguousarray(points))
+    target, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
     certain = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-    asked = torch.zeros_like(certain)
+    is_query = torch.zeros_like(certain)
     for size in _cell_sizes(reach):
         if len(rows) < _MIN_FOR_CELLS:
             break
         counts = extent / size + 4
-        if counts.prod() > min(max(_CELLS_A_POINT * len(points), 2**20), MAX_POINTS - 1):
+        if counts.prod() > min(max(_MAX_CELLS_PER_POINT * len(points), 2**20), MAX_POINTS - 1):
             continue
         _, width, height = (int(count) for count in counts)
         starts = torch.empty(int(counts[0]) * width * height + 1, dtype=torch.int32, device="cpu")
         shape = width, height, *low.tolist(), size
-        of_place, _, sorted_places = kernels.call("fill_cells", places, starts, *shape)
-        asked.zero_()[torch.from_numpy(rows)] = True
-        # Tasks of about so many points each.
+        sorted_rows, _, sorted_positions = kernels.call("fill_cells", positions, starts, *shape)
+        is_query.zero_()[torch.from_numpy(rows)] = True
+        # Tasks of about this many points each.
         ends = np.arange(ROWS_IN_CACHE, len(points), ROWS_IN_CACHE)
         bounds = [1, *np.searchsorted(starts.numpy(), ends, side="right").tolist(), len(starts) - 1]
 
         def work(
             cells: tuple[int, int],
             shape: tuple[float, ...] = shape,
-            grid: tuple[Tensor, ...] = (sorted_places, of_place, starts),
+            grid: tuple[Tensor, ...] = (sorted_positions, sorted_rows, starts),
         ) -> None:
             numbers = *cells, *shape[:2], first_row, *shape[2:]
-            kernels.call("search_cells", *grid, asked, by_row, into, certain, *numbers)
+            kernels.call("search_cells", *grid, is_query, by_row, target, certain, *numbers)
 
         map_tasks(work, list(itertools.pairwise(bounds)), torch.device("cpu"))
         rows = rows[~certain.numpy()[rows]]
@@ -413,12 +414,12 @@ def search_cells(
 
 
 def _cell_sizes(reach: NDArray[np.float64]) -> list[float]:
-    """Return ascending sizes of cells that together answer for nearly all of a sample."""
+    """Return ascending cell sizes that together resolve nearly all of a sample."""
     sizes: list[float] = []
     reach = np.sort(reach[reach > 0])
-    few = int(_MIN_FRACTION * len(reach))
-    while len(reach) > few:
-        sizes.append(_SIZE_STEP * float(reach[few]))
+    min_count = int(_MIN_FRACTION * len(reach))
+    while len(reach) > min_count:
+        sizes.append(_SIZE_STEP * float(reach[min_count]))
         reach = reach[reach > sizes[-1]]
     return sizes
 
@@ -428,19 +429,19 @@ def _query(
     queries: NDArray[np.floating],
     k: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the k nearest of distinct points by (distance, row), ties at the last place too."""
+    """Return the k nearest distinct points by (distance, row), also for ties at the last rank."""
     distances = np.empty((len(queries), k))
     rows = np.empty((len(queries), k), dtype=np.int64)
-    left, width = np.arange(len(queries)), k + 1
-    while len(left):
+    pending, width = np.arange(len(queries)), k + 1
+    while len(pending):
         ranks = np.arange(1, min(width, tree.n) + 1)
-        near, rows_near = tree.query(queries[left], ranks, workers=allowed_threads())
+        near, rows_near = tree.query(queries[pending], ranks, workers=allowed_threads())
         tied = np.flatnonzero((near[:, 1:] == near[:, :-1]).any(axis=1))
-        by_both = np.lexsort((rows_near[tied], near[tied]))
-        rows_near[tied] = np.take_along_axis(rows_near[tied], by_both, axis=1)
-        distances[left], rows[left] = near[:, :k], rows_near[:, :k]
-        is_open = (near[:, k - 1] == near[:, -1]) & (width < tree.n)
-        left, width = left[is_open], 2 * width
+        order = np.lexsort((rows_near[tied], near[tied]))
+        rows_near[tied] = np.take_along_axis(rows_near[tied], order, axis=1)
+        distances[pending], rows[pending] = near[:, :k], rows_near[:, :k]
+        is_tied = (near[:, k - 1] == near[:, -1]) & (width < tree.n)
+        pending, width = pending[is_tied], 2 * width
     return distances, rows
 
 
@@ -452,16 +453,16 @@ def _restore_duplicates(
     counts: NDArray[np.int64],
     k: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-    """Replace places by all their points: their rows, and the nearest k, the point itself first."""
+    """Expand positions to their points: query rows, and the k nearest, the point itself first."""
     before = np.minimum(np.cumsum(counts[nearest], axis=1), k)
     taken = np.diff(before, axis=1, prepend=0).ravel()
     position = np.arange(len(nearest) * k) - np.repeat(np.cumsum(taken) - taken, taken)
     points = (np.repeat(starts[nearest.ravel()], taken) + position).reshape(len(nearest), k)
     far = np.repeat(distances.ravel(), taken).reshape(len(nearest), k)
-    place = np.repeat(np.arange(len(queried)), counts[queried])
-    rank = np.arange(len(place)) - np.searchsorted(place, place)
-    rows = starts[queried][place] + rank
-    points, far = points[place], far[place]
+    owner = np.repeat(np.arange(len(queried)), counts[queried])
+    rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
+    rows = starts[queried][owner] + rank
+    points, far = points[owner], far[owner]
     later = np.flatnonzero(rank)
     if len(later):
         shift = np.arange(k) <= rank[later, None]
@@ -471,10 +472,10 @@ def _restore_duplicates(
 
 
 def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
-    """Return the coordinates of neighbours about the point itself, shape ``(n, K, 3)``.
+    """Return the coordinates of neighbors relative to the point itself, shape ``(n, K, 3)``.
 
-    ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. In memory each
-    coordinate is contiguous, so that ``patches.unbind(-1)`` gives fast columns.
+    ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. Each
+    coordinate is contiguous in memory, so that ``patches.unbind(-1)`` gives fast columns.
 
     Example:
         >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])

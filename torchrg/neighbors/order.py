@@ -1,4 +1,4 @@
-"""The canonical order of points, along a Morton curve: no result depends on the input order."""
+"""Canonical point order along a Morton curve, independent of the input order."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from torchrg._parallel import ROWS_AT_ONCE, chunks_of, places_of
 from torchrg.structures import UNLABELED, bounding_box
 
 MORTON_BITS = 21
-"""Bits of a number in a Morton code: three of them fit an int64."""
+"""Bits per coordinate in a Morton code: three of them fit int64."""
 
 _SPREADS = (
     (32, 0x1F00000000FFFF),
@@ -23,19 +23,19 @@ _SPREADS = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
-"""Shifts that halve the runs of neighbouring bits, and where the bits then are."""
+"""Shifts that halve the runs of adjacent bits, and the resulting bit masks."""
 
 
 def canonical_order(points: Tensor | NDArray[np.floating], ties: Sequence[Tensor] = ()) -> Tensor:
-    """Return an order of the points ``(N, 3)``, finite, that depends on their coordinates alone.
+    """Return an order of finite points ``(N, 3)`` that depends on their coordinates alone.
 
-    Points are sorted along a Morton curve through the bounding box, within one cell of it
-    lexicographically; only exact duplicates keep the order they came in. It breaks ties between
-    equal distances, and points close in this order are close in space, which makes every later
-    gather faster. ``ties`` are columns ``(N,)`` by which exact duplicates are sorted.
+    Points are sorted along a Morton curve through the bounding box, and lexicographically within
+    one of its cells; only exact duplicates keep their input order. The order breaks ties between
+    equal distances. Points close in this order are close in space, which speeds up later indexing.
+    ``ties`` are columns ``(N,)`` by which exact duplicates are sorted.
 
     Returns:
-        Row numbers, shape ``(N,)``, int64: ``points[order]`` is in canonical order.
+        Row indices, shape ``(N,)``, int64: ``points[order]`` is in canonical order.
 
     Raises:
         ShapeError: If the shape or dtype is not as above.
@@ -54,23 +54,23 @@ def canonical_order(points: Tensor | NDArray[np.floating], ties: Sequence[Tensor
     if len(coordinates) == 0:
         return torch.zeros(0, dtype=torch.int64, device=tensor.device)
     codes = morton_codes(coordinates)
-    # Six times faster than a stable sort; what is equal is put in order below.
+    # Six times faster than a stable sort; ties are sorted below.
     order = np.argsort(codes)
     codes = codes[order]
-    same = codes[1:] == codes[:-1]
-    if same.any():
-        tied = np.zeros(len(order), dtype=bool)
-        tied[1:] |= same
-        tied[:-1] |= same
-        rows = order[tied]
+    is_equal = codes[1:] == codes[:-1]
+    if is_equal.any():
+        is_tied = np.zeros(len(order), dtype=bool)
+        is_tied[1:] |= is_equal
+        is_tied[:-1] |= is_equal
+        rows = order[is_tied]
         x, y, z = coordinates[rows].T
         columns = [column.detach().cpu().numpy()[rows] for column in reversed(ties)]
-        order[tied] = rows[np.lexsort((rows, *columns, z, y, x, codes[tied]))]
+        order[is_tied] = rows[np.lexsort((rows, *columns, z, y, x, codes[is_tied]))]
     return torch.from_numpy(order).to(tensor.device)
 
 
 def finite_rows(points: Tensor, ties: Sequence[Tensor] = ()) -> Tensor:
-    """Return the rows of the finite ones of points ``(N, 3)``, in :func:`canonical_order`, int64.
+    """Return the rows of the finite points ``(N, 3)`` in :func:`canonical_order`, int64.
 
     Example:
         >>> finite_rows(torch.tensor([[3.0, 0, 0], [torch.nan, 0, 0], [2, 0, 0]])).tolist()
@@ -85,7 +85,7 @@ def finite_rows(points: Tensor, ties: Sequence[Tensor] = ()) -> Tensor:
 
 
 def mark_first(*columns: Tensor) -> Tensor:
-    """Return which rows of columns ``(N,)`` differ from the row before them, shape ``(N,)``, bool.
+    """Return a mask of rows that differ from the previous row of columns ``(N,)``, shape ``(N,)``.
 
     Example:
         >>> mark_first(torch.tensor([1.0, 1.0, 2.0, 2.0]), torch.tensor([0, 0, 0, 1])).tolist()
@@ -102,10 +102,9 @@ class DistinctPoints(NamedTuple):
     """The distinct finite points of a cloud, in canonical order.
 
     Attributes:
-        points: One point of each position, shape ``(P, 3)``.
+        points: One point per position, shape ``(P, 3)``.
         rows: Row of that point in the cloud, shape ``(P,)``, int64.
-        inverse: Position of each point of the cloud, shape ``(N,)``, int64; -1 for a point that is
-            not finite.
+        inverse: Position index of each point of the cloud, shape ``(N,)``, int64; -1 if not finite.
     """
 
     points: Tensor
@@ -114,20 +113,20 @@ class DistinctPoints(NamedTuple):
 
     @property
     def num_copies(self) -> int:
-        """Number of points beyond the first one of each position."""
+        """Number of duplicates, i.e. points after the first one of each position."""
         return int(torch.count_nonzero(self.inverse >= 0)) - len(self.rows)
 
     def restore(self, values: Tensor, *, fill: int = 0) -> Tensor:
-        """Return the value of its position for each point; see :func:`restore_points`."""
+        """Expand values per position to all points; see :func:`restore_points`."""
         return restore_points(values, self.inverse, fill=fill)
 
 
 def distinct_points(points: Tensor, ties: Sequence[Tensor] = ()) -> DistinctPoints:
-    """Find the distinct ones of points ``(N, 3)``, which stand for their copies.
+    """Find the distinct points of ``(N, 3)``, which represent their duplicates.
 
-    Copies in the neighborhood of a point take the places of other points there, so neighbors are
-    searched among distinct points. Of equal points the one of the least ``ties`` is taken, columns
-    ``(N,)``, else the first.
+    Duplicates would displace other points in a neighborhood, so neighbors are searched among
+    distinct points. The representative has the smallest ``ties``, columns ``(N,)``, or is the
+    first.
 
     Example:
         >>> cloud = torch.tensor([[2.0, 0, 0], [1, 0, 0], [2, 0, 0], [torch.nan, 0, 0]])
@@ -147,9 +146,9 @@ def distinct_points(points: Tensor, ties: Sequence[Tensor] = ()) -> DistinctPoin
 
 
 def distinct_rows(points: Tensor, *values: Tensor) -> Tensor:
-    """Return the rows of finite points ``(N, 3)`` that differ, in canonical order, int64.
+    """Return the rows of distinct finite points ``(N, 3)``, in canonical order, int64.
 
-    Points also differ where one of the ``values`` ``(N,)`` does.
+    Points also differ if one of the ``values`` ``(N,)`` differs.
 
     Example:
         >>> distinct_rows(torch.ones(4, 3), torch.tensor([7, 5, 7, 5])).tolist()
@@ -162,9 +161,9 @@ def distinct_rows(points: Tensor, *values: Tensor) -> Tensor:
 
 
 def ascending_rows(values: Tensor) -> Tensor:
-    """Return the rows of values ``(N,)`` in their order, of equal ones in that of the rows, int64.
+    """Return the rows that sort values ``(N,)`` in ascending order, ties by row, int64.
 
-    Where NaN goes is not said.
+    The position of NaN is undefined.
 
     Example:
         >>> ascending_rows(torch.tensor([0.5, -2.0, 0.0, -0.0, 0.5])).tolist()
@@ -172,7 +171,7 @@ def ascending_rows(values: Tensor) -> Tensor:
     """
     if values.dtype != torch.float32 or values.device.type != "cpu":
         return values.argsort(stable=True)
-    # Ten times faster: whole numbers of the bits, where those of negative values descend, and row.
+    # Ten times faster: sort integers of the value bits (reversed for negative values) and the row.
     bits = (values + 0.0).numpy().view(np.int32)
     keys = (bits ^ ((bits >> 31) & np.int32(2**31 - 1))).astype(np.int64) << 32
     keys |= np.arange(len(keys))
@@ -182,7 +181,7 @@ def ascending_rows(values: Tensor) -> Tensor:
 
 
 def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
-    """Return values ``(n, ...)`` at the rows they belong to, and a filling at all others.
+    """Scatter values ``(n, ...)`` to their rows, with ``fill`` at all other rows.
 
     Example:
         >>> restore_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist()
@@ -193,10 +192,10 @@ def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0
 
 
 def restore_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
-    """Give each point the value of its position or voxel, shape ``(N, ...)``.
+    """Return each point's value of its position or voxel, shape ``(N, ...)``.
 
-    ``values`` has a row for each of these, ``inverse`` ``(N,)`` that of each point. Points of a
-    negative one, which have none, get ``fill``; for labels :data:`torchrg.UNLABELED`.
+    ``values`` has one row per position or voxel; ``inverse`` ``(N,)`` is the row of each point.
+    Points with a negative row get ``fill``; for labels use :data:`torchrg.UNLABELED`.
 
     Example:
         >>> restore_points(torch.tensor([7, 8]), torch.tensor([1, -1, 0, 1]), fill=-1).tolist()
@@ -211,7 +210,7 @@ def restore_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
 
 
 def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the Morton code of each of finite points ``(N, 3)`` in the cube about the cloud."""
+    """Return the Morton codes of finite points ``(N, 3)`` in the bounding cube of the cloud."""
     codes = np.zeros(len(coordinates), dtype=np.int64)
     if len(codes) == 0:
         return codes
@@ -233,7 +232,7 @@ def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def spread_bits(values: Tensor) -> Tensor:
-    """Put two zero bits between the bits of numbers below 2**21, int64."""
+    """Insert two zero bits between the bits of integers below 2**21, int64."""
     for shift, pattern in _SPREADS:
         values = (values | values << shift) & pattern
     return values

@@ -1,4 +1,4 @@
-"""One point of each voxel, and the way back to every point."""
+"""Voxel sampling with the inverse map to all points."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,19 +13,18 @@ from torchrg.errors import ConfigError
 from torchrg.structures import UNLABELED
 
 _MAX_VOXELS = 2**53
-"""Most voxels along one axis: float64 counts no further."""
+"""Maximum number of voxels along one axis: float64 counts no further."""
 
 _MAX_KEYS = 2**62
-"""Most cells with numbers of their own in int64; the square of the number of points is below it."""
+"""Maximum number of cells with distinct int64 keys; above the squared number of points."""
 
 
 class Voxels(NamedTuple):
-    """The points that stand for the voxels of a cloud.
+    """Representative points of the voxels of a cloud.
 
     Attributes:
-        rows: Row of one point of each voxel, ascending, shape ``(V,)``, int64.
-        inverse: Place in ``rows`` of the voxel of each point, shape ``(N,)``, int64; -1 for a point
-            that is not finite.
+        rows: Row of one point per voxel, ascending, shape ``(V,)``, int64.
+        inverse: Index in ``rows`` of each point's voxel, shape ``(N,)``, int64; -1 if not finite.
     """
 
     rows: Tensor
@@ -33,10 +32,10 @@ class Voxels(NamedTuple):
 
 
 def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
-    """Choose one point of each occupied cell of a cubic grid of side ``size``.
+    """Select one point of each occupied cell of a cubic grid with cell width ``size``.
 
-    The point nearest to the middle of its cell is chosen, so the result is made of points of the
-    cloud ``(N, 3)`` and does not depend on their order. The grid begins at the least coordinates.
+    The point nearest to the center of its cell is selected. The result consists of points of the
+    cloud ``(N, 3)`` and does not depend on their order. The grid begins at the minimum coordinates.
 
     Raises:
         ShapeError: If ``points`` has another shape or dtype.
@@ -60,26 +59,26 @@ def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
     scaled = [(column - column.min()) / size for column in columns]
     if max(float(column.max()) for column in scaled) >= _MAX_VOXELS:
         raise ConfigError(
-            f"sample_voxels: expected size to divide the cloud's extent into less than 2^53 "
-            f"cells, got {size!r}; choose a larger one."
+            f"sample_voxels: expected size to divide the extent of the cloud into fewer than 2^53 "
+            f"cells, got {size!r}. Choose a larger size."
         )
     cells = [column.floor() for column in scaled]
     x, y, z = ((s - cell - 0.5).square() for s, cell in zip(scaled, cells, strict=True))
-    keys, by_voxel = cell_keys(cells).sort(stable=True)
+    keys, order = cell_keys(cells).sort(stable=True)
     voxel, counts = torch.unique_consecutive(keys, return_inverse=True, return_counts=True)[1:]
-    sq_distance = (x + y + z)[by_voxel]
-    least = torch.segment_reduce(sq_distance, "min", lengths=counts)
-    nearest = (sq_distance == least[voxel]).nonzero().squeeze(1)
+    sq_distance = (x + y + z)[order]
+    minimum = torch.segment_reduce(sq_distance, "min", lengths=counts)
+    nearest = (sq_distance == minimum[voxel]).nonzero().squeeze(1)
     if len(nearest) > len(counts):
-        nearest = _first_by_coordinates(nearest, voxel, [c[by_voxel] for c in columns])
-    rows = finite[by_voxel[nearest]]
-    places = rows.argsort().argsort()
-    inverse[finite[by_voxel]] = places[voxel]
+        nearest = _first_by_coordinates(nearest, voxel, [c[order] for c in columns])
+    rows = finite[order[nearest]]
+    ranks = rows.argsort().argsort()
+    inverse[finite[order]] = ranks[voxel]
     return Voxels(rows.sort().values, inverse)
 
 
 def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: list[Tensor]) -> Tensor:
-    """Return of the chosen points, voxel by voxel, the one of least x, then y, then z in each."""
+    """Return the chosen point of lowest x, then y, then z in each voxel, in voxel order."""
     x, y, z = (column[chosen].cpu().numpy() for column in columns)
     order = torch.from_numpy(np.lexsort((z, y, x, voxel[chosen].cpu().numpy()))).to(voxel.device)
     chosen = chosen[order]
@@ -89,18 +88,18 @@ def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: list[Tensor]) 
 
 
 def cell_keys(cells: Sequence[Tensor]) -> Tensor:
-    """Return a number for each point that is the same in a cell of a grid and another elsewhere.
+    """Return an integer key per point, equal for points of the same grid cell only.
 
-    ``cells`` are whole numbers from 0, shape ``(N,)`` each: which cell along each axis.
+    ``cells`` are the cell indices along each axis, integers from 0, shape ``(N,)`` each.
     """
     keys = torch.zeros_like(cells[0], dtype=torch.int64)
     num_keys = 1
     for cell in cells:
-        number, count = cell.long(), int(cell.max()) + 1
+        index, count = cell.long(), int(cell.max()) + 1
         if num_keys * count > _MAX_KEYS:
-            values, number = torch.unique(number, return_inverse=True)
+            values, index = torch.unique(index, return_inverse=True)
             used, keys = torch.unique(keys, return_inverse=True)
             num_keys, count = len(used), len(values)
-        keys = keys.mul(count).add_(number)
+        keys = keys.mul(count).add_(index)
         num_keys *= count
     return keys

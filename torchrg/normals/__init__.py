@@ -1,22 +1,22 @@
-"""Normals and curvature of clouds: one call for every estimator.
+"""Normal and curvature estimation for point clouds.
 
-:func:`estimate_normals` takes a cloud and the name of one of :data:`ESTIMATORS`:
+:func:`estimate_normals` takes a cloud and the name of an estimator in :data:`ESTIMATORS`:
 
 ====================  =============================================  =============================
-name                  what it is                                     what for
+name                  estimator                                      purpose
 ====================  =============================================  =============================
 ``pca``               least squares                                  smooth surfaces, speed
-``jet``               polynomial of second degree                    curved surfaces without edges
-``irls``              plane by reweighting                           edges with little noise
-``fastmcd``, ``mve``  least determinant or volume, random starts     to compare
-``detmcd``            least determinant, deterministic starts        many outliers at any point
+``jet``               quadratic surface                              curved surfaces without edges
+``irls``              iteratively reweighted plane                   edges with little noise
+``fastmcd``, ``mve``  min. determinant or volume, random starts      comparison
+``detmcd``            min. determinant, deterministic starts         many outliers at any point
 ``detmm``             MM-estimator                                   outliers, more efficiency
 ``paper``             ``pca``, then ``detmcd`` at sharp points       the published method
-``consensus``         ``pca``, then planes that neighbours agree on  the default: edges, noise
+``consensus``         ``pca``, then planes that neighbors support    the default: edges, noise
 ====================  =============================================  =============================
 
 Signs are arbitrary until :func:`orient_normals` chooses them. The ``fit_*`` functions take patches
-of shape ``(*, K, 3)`` and are what the estimators are made of.
+of shape ``(*, K, 3)``; the estimators are built on them.
 """
 
 from functools import partial
@@ -74,10 +74,10 @@ ESTIMATORS: dict[str, Estimator] = {
     "paper": estimate_paper,
     "consensus": estimate_consensus,
 }
-"""Estimators by name: points, their neighbours, settings, chunk size -> fit."""
+"""Estimators by name: points, neighbors, configuration, chunk size -> fit."""
 
 WITHOUT_GRADIENT = {"consensus"}
-"""Estimators that choose and smooth in so many steps that no fit is left to differentiate."""
+"""Estimators without gradients, because they select and smooth planes in several steps."""
 
 
 @of_clouds
@@ -91,37 +91,37 @@ def estimate_normals(
     chunk_size: int = CHUNK_SIZE,
     **changes: Any,  # noqa: ANN401
 ) -> NormalFit:
-    """Estimate normal and curvature of every point of a cloud.
+    """Estimate the normal and curvature of every point of a cloud.
 
     Convention:
-        Gradients flow from normals, curvature and residual to the points: those of the fit, with
-        what is chosen held fixed, that is neighbours, inliers, sharp points, and the noise that
-        ``irls`` assumes. With the covariance ``C`` of the points of the fit, its eigenvalues ``l``
-        and eigenvectors ``v``, ``dn = sum_j v_j (v_j . dC n) / (l_0 - l_j)``. ``jet`` adds the
-        gradient of its least squares, ``irls`` that of each of its steps; ``consensus`` has none.
-        They flow to one of several copies of a point, the first.
+        Gradients flow from normals, curvature and residual to the points. They are the gradients of
+        the fit with all selections held fixed: neighbors, inliers, sharp points, and the noise in
+        ``irls``. With the covariance ``C`` of the fitted points, its eigenvalues ``l`` and
+        eigenvectors ``v``, ``dn = sum_j v_j (v_j . dC n) / (l_0 - l_j)``. ``jet`` adds the gradient
+        of its least squares, ``irls`` that of each of its steps; ``consensus`` has none. Among
+        duplicates, gradients flow to the first.
 
     Args:
-        points: Points, shape ``(N, 3)``. Points with NaN or Inf are kept out and not ``valid``.
-        config: Settings, a dictionary of them, a whole configuration, or the name of a preset.
+        points: Points, shape ``(N, 3)``. Points with NaN or Inf are skipped and not ``valid``.
+        config: A normals configuration, a dictionary, a complete configuration, or a preset name.
             Default: that of :func:`torchrg.load_config`.
-        neighbors: Neighbours found before, for finite points, the point itself first. Default:
-            searched among distinct points, and copies of a point have its result.
-        max_distance: As of :func:`torchrg.search_knn`.
-        chunk_size: Points handled at a time; bounds memory, changes no result.
-        **changes: Single settings, as in ``method="pca", k=20``: see
-            :class:`torchrg.config.NormalsConfig`.
+        neighbors: Precomputed neighbors of finite points, the point itself first. Default: searched
+            among distinct points; duplicates share a result.
+        max_distance: See :func:`torchrg.search_knn`.
+        chunk_size: Points processed at a time; bounds memory, does not change the result.
+        **changes: Individual parameters, as in ``method="pca", k=20``: see
+        :class:`torchrg.config.NormalsConfig`.
 
     Returns:
         The fit in the order of the points.
 
     Raises:
-        ConfigError: If ``method`` is unknown or a setting is out of range, or the points require
-            gradients that the method has not.
+        ConfigError: If ``method`` is unknown, a parameter is out of range, or the points require
+            gradients that the method does not support.
         ShapeError: If a shape or dtype is not as above.
 
     Warns:
-        PrecisionWarning: As :func:`torchrg.segment_planes` does.
+        PrecisionWarning: See :func:`torchrg.segment_planes`.
 
     Example:
         >>> floor = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))

@@ -1,8 +1,8 @@
-"""Faces of a cloud: planes, the two sides of thin plates, and smooth patches between them.
+"""One-sided faces of a cloud: planes, sides of thin plates, and smooth patches.
 
-A double cover tells how normals of a face agree. Each node of a graph is there twice, with its
+A double cover makes the normals of a face consistent. Each node of a graph occurs twice, with its
 normal and with the opposite one, and a link joins the copies that agree. A connected component
-holds one copy of each of its nodes, and is a face.
+contains one copy of each of its nodes and is a face.
 """
 
 import numpy as np
@@ -14,32 +14,32 @@ from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
-"""Neighbors, by rank, over which faces spread. Noise tilts the links to nearer ones."""
+"""Neighbor ranks over which faces spread. Noise tilts the links to nearer ones."""
 
-_MIN_BEND, _MAX_BEND, _BENDS = 0.01, 0.05, 4.0
-"""Largest bend within a smooth patch: a multiple of the median bend, but at least that between
-normals 8 degrees apart, and at most that between normals 18 degrees apart."""
+_MIN_BEND, _MAX_BEND, _BEND_FACTOR = 0.01, 0.05, 4.0
+"""Maximum bend within a smooth patch: a multiple of the median bend, clamped to the bends of
+normals 8 and 18 degrees apart."""
 
 _TRUST_POWER = 4
-"""Power of ``1 - bend / 2`` that weighs a link: 1 on a plane, 1/16 over a right-angled edge, 0
+"""Power of ``1 - bend / 2`` that weights a link: 1 on a plane, 1/16 over a right-angled edge, 0
 through a plate."""
 
-_FEW_POINTS = 10
+_MIN_FACE_POINTS = 10
 """A face of fewer points joins its neighbor. Noise tilts its normals, or an edge bends them."""
 
-_STRONG_AGREEMENT = 0.5
-"""Agreement for each of its points above which a face joins its neighbor. The median is 0.5 to 1
-for patches that noise cuts from one surface, and 0.05 for faces that meet at an edge of a room."""
+_MIN_AGREEMENT = 0.5
+"""Minimum agreement per point at which a face joins its neighbor. The median is 0.5 to 1 for
+patches of one surface split by noise, and 0.05 for faces that meet at an edge of a room."""
 
-_TWO_SIDES = 0.73
-"""Squared mean height about the middle by mean squared height, above which a thin face is a plate.
-Noise about one side has 0.70, a slab with points all through it 0.75, and a plate 0.8 to 1."""
+_MIN_TWO_SIDED = 0.73
+"""Minimum ratio of squared mean height to mean squared height, about the middle, of a plate among
+thin faces. One side with noise has 0.70, a filled slab 0.75, and a plate 0.8 to 1."""
 
-_FAR_OFF = 2.0
-"""Multiple of the mean height at which heights are cut off, so that stray points do not matter."""
+_MAX_HEIGHT_FACTOR = 2.0
+"""Multiple of the mean height at which heights are clamped, to limit stray points."""
 
 _MIN_COSINE = 0.5
-"""Cosine between a normal and its plane, 60 degrees, below which the point is on an edge."""
+"""Minimum cosine between a normal and its plane, 60 degrees; other points are on an edge."""
 
 
 def find_faces(
@@ -50,17 +50,18 @@ def find_faces(
     axes: Tensor,
     max_thickness: float,
 ) -> tuple[Tensor, Tensor]:
-    """Find faces, each of which looks to one side: planes, and smooth patches between them.
+    """Find one-sided faces: planes, and smooth patches between them.
 
-    1. A thin plane is a face. A plate, with points at both ends of its heights, is two.
-    2. The remaining points form smooth patches. A patch joins the face that it agrees with most if
-       it has few points, or if the agreement is large for its size.
-    3. Plates among the patches are two faces, too.
+    1. A thin plane is a face. A plate, with points at both ends of its heights, is two faces.
+    2. The remaining points form smooth patches. A patch joins the face with the highest agreement
+       if it has few points, or if the agreement is large for its size.
+    3. Plates among the patches are also two faces.
 
     Points ``(N, 3)`` are in canonical order, ``near`` ``(N, K)`` are rows of their neighbors,
-    ``labels`` ``(N,)`` those of planes or negative, with unit normals ``axes`` ``(M, 3)``. Thin is
-    a face up to a root mean square height. Returns the face of each point, and the sign by which
-    its normal agrees with others of the face, ``(N,)`` each. Some numbers of faces have no point.
+    ``labels`` ``(N,)`` are plane IDs or negative, with unit normals ``axes`` ``(M, 3)``.
+    ``max_thickness`` is the maximum RMS height of a thin face. Returns the face of each point, and
+    the sign that makes its normal consistent within the face, ``(N,)`` each. Some face IDs are
+    unused.
     """
     faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
     rows = places_of(labels >= 0)
@@ -70,12 +71,12 @@ def find_faces(
     is_on_plane = is_thin[label] & (cosine.abs() > _MIN_COSINE)
     rows = rows[is_on_plane]
     faces[rows], signs[rows] = (2 * label + side)[is_on_plane], cosine[is_on_plane].sign()
-    joined, signs = _join_patches(points, normals, near, faces, signs, _STRONG_AGREEMENT)
+    joined, signs = _join_patches(points, normals, near, faces, signs, _MIN_AGREEMENT)
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
     has_plane[joined[rows]] = True
     rows = places_of(~has_plane[joined])
-    numbers, patch = torch.unique(joined[rows], return_inverse=True)
-    sums = normals.new_zeros(len(numbers), 3)
+    indices, patch = torch.unique(joined[rows], return_inverse=True)
+    sums = normals.new_zeros(len(indices), 3)
     sums.index_add_(0, patch, normals[rows] * signs[rows, None])
     axes = torch.nn.functional.normalize(sums, dim=1)
     side, _ = _split_plates(points[rows], patch, axes, max_thickness)
@@ -84,7 +85,7 @@ def find_faces(
 
 
 def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
-    """Return the neighbors of some points at some ranks; lists on a disk leave the memory again."""
+    """Return the neighbors of points at the given ranks; releases memory-mapped lists."""
     parts = []
     for chunk in torch.split(rows, ROWS_IN_CACHE):
         parts.append(near[chunk][:, ranks])
@@ -95,7 +96,7 @@ def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
 def find_surfaces(points: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
     """Find connected surfaces, over edges and across thin plates; see :func:`find_faces`.
 
-    Smooth patches join the one that they agree with most until none has a neighbor.
+    Smooth patches join the patch with the highest agreement until none has a neighbor.
     """
     none = torch.full((len(points),), -1)
     return _join_patches(points, normals, near, none, normals.new_ones(len(points)), 0.0)
@@ -104,7 +105,7 @@ def find_surfaces(points: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor
 def _split_plates(
     points: Tensor, faces: Tensor, axes: Tensor, max_thickness: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the side of each point ``(n,)``, 0 or 1 on a plate, and which faces are thin ``(M,)``.
+    """Return the side of each point ``(n,)``, 0 or 1 on a plate, and a mask of thin faces ``(M,)``.
 
     Faces ``(n,)`` are rows of their axes ``(M, 3)``.
     """
@@ -116,25 +117,25 @@ def _split_plates(
     height = dot(points, axes[faces]).double()
     middle = height - mean(height)[faces]
     for _ in range(2):
-        reach = _FAR_OFF * mean(middle.abs())[faces]
+        reach = _MAX_HEIGHT_FACTOR * mean(middle.abs())[faces]
         middle = torch.minimum(torch.maximum(middle, -reach), reach)
         middle -= mean(middle)[faces]
     squares = mean(middle * middle)
     is_thin = squares <= max_thickness * max_thickness
-    is_plate = is_thin & (mean(middle.abs()) ** 2 > _TWO_SIDES * squares)
+    is_plate = is_thin & (mean(middle.abs()) ** 2 > _MIN_TWO_SIDED * squares)
     return ((middle > 0) & is_plate[faces]).long(), is_thin
 
 
 def _join_patches(
     points: Tensor, normals: Tensor, near: Tensor, faces: Tensor, signs: Tensor, strong: float
 ) -> tuple[Tensor, Tensor]:
-    """Grow smooth patches where there is no face, negative, and join them and the faces.
+    """Grow smooth patches of points without a face (negative), and join patches and faces.
 
-    Two normals agree if one and the mirror image of the other in the plane halfway between the two
-    points form less than a right angle [1]: so they do on a sphere, on both sides of a sharp edge,
-    and on the two faces of a thin plate, each pointing away from the other. How far a link can be
-    trusted is its bend ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle
-    and ``u`` the direction of the link: 0 on a plane, 1 over a right-angled edge, 2 through a
+    Two normals agree if one and the mirror image of the other form less than a right angle,
+    mirrored in the bisecting plane of the two points [1]. This holds on a sphere, on both sides of
+    a sharp edge, and for the opposite normals of a thin plate. The bend of a link measures how
+    reliable it is: ``1 - |c| + (u . n_i)^2 + (u . n_j)^2``, with ``c`` the cosine of that angle and
+    ``u`` the direction of the link. It is 0 on a plane, 1 over a right-angled edge, and 2 through a
     plate.
 
     References:
@@ -145,7 +146,7 @@ def _join_patches(
     ranks = [rank for rank in _RANKS if rank < near.shape[1]]
     bend = _compare(points, normals, rows[::8], gather_lists(near, rows[::8], ranks))[1]
     typical = float(bend.median()) if bend.numel() else 0.0
-    limit = min(max(_BENDS * typical, _MIN_BEND), _MAX_BEND)
+    limit = min(max(_BEND_FACTOR * typical, _MIN_BEND), _MAX_BEND)
     node = torch.full((len(points),), -1, dtype=torch.int32)
     node[rows] = torch.arange(len(rows), dtype=torch.int32)
     patches = _Components(len(rows))
@@ -174,8 +175,8 @@ def _join_patches(
         links.append((faces[starts], faces[ends], agreement))
     low, high, agreement = (torch.cat(parts) for parts in zip(*links, strict=True))
     sizes = torch.bincount(faces)
-    joined, turns = _join_faces(low, high, agreement, sizes, strong)
-    return joined[faces], signs * turns[faces].to(signs)
+    joined, flips = _join_faces(low, high, agreement, sizes, strong)
+    return joined[faces], signs * flips[faces].to(signs)
 
 
 def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
@@ -184,17 +185,17 @@ def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tup
     def compare(chunk: slice) -> tuple[Tensor, Tensor]:
         at, shape = rows[chunk], ends[chunk].shape
         cosine, here, there, squares = (points.new_zeros(shape) for _ in range(4))
-        for place, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
-            arm, other = (
+        for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
+            offset, other = (
                 values.index_select(0, ends[chunk].reshape(-1)).view(shape)
-                for values in (place, normal)
+                for values in (position, normal)
             )
-            arm -= place[at, None]
-            own = normal[at, None]
-            cosine += other * own
-            here += arm * own
-            there += arm * other
-            squares += arm * arm
+            offset -= position[at, None]
+            normal_here = normal[at, None]
+            cosine += other * normal_here
+            here += offset * normal_here
+            there += offset * other
+            squares += offset * offset
         squares = torch.where(squares > 0, squares, 1.0)
         cosine -= 2 * here * there / squares
         return cosine, 1 - cosine.abs() + (here * here + there * there) / squares
@@ -207,15 +208,15 @@ def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tup
 def _join_faces(
     low: Tensor, high: Tensor, agreement: Tensor, sizes: Tensor, strong: float
 ) -> tuple[Tensor, Tensor]:
-    """Let each face join the one that it agrees with most, again and again.
+    """Repeatedly join each face to the face it agrees with most.
 
-    The agreement of two faces is the sum over the links ``(L,)`` between them; where it is
-    negative, one is turned. Faces of many points join where it is ``strong`` for their ``sizes``
-    ``(M,)``. Returns the new number of each face, and its sign there, ``(M,)``.
+    The agreement of two faces is the sum over the links ``(L,)`` between them; if it is negative,
+    one is flipped. Faces of many points join if it is ``strong`` for their ``sizes`` ``(M,)``.
+    Returns the new index of each face and its sign, ``(M,)``.
     """
     from scipy.sparse import coo_array
 
-    numbers, signs = torch.arange(len(sizes)), torch.ones(len(sizes))
+    indices, signs = torch.arange(len(sizes)), torch.ones(len(sizes))
     while True:
         is_between = low != high
         ends = torch.stack([torch.minimum(low, high), torch.maximum(low, high)])[:, is_between]
@@ -224,76 +225,69 @@ def _join_faces(
         both = (half + half.T).tocsr()
         both.sort_indices()
         strength, owner = np.abs(both.data), np.repeat(np.arange(len(sizes)), np.diff(both.indptr))
-        most = torch.where(sizes < _FEW_POINTS, 0.0, strong * sizes).double().numpy()
-        np.maximum.at(most, owner, strength)
-        # Of equal ones the first, so that no more than two faces choose each other in a circle.
-        chosen = np.flatnonzero((strength == most[owner]) & (strength > 0))
+        limit = torch.where(sizes < _MIN_FACE_POINTS, 0.0, strong * sizes).double().numpy()
+        np.maximum.at(limit, owner, strength)
+        # Ties go to the first, so that only two faces can choose each other in a cycle.
+        chosen = np.flatnonzero((strength == limit[owner]) & (strength > 0))
         chosen = chosen[np.unique(owner[chosen], return_index=True)[1]]
         components = _Components(len(sizes))
-        components.link(
-            *(
-                torch.from_numpy(values)
-                for values in (
-                    owner[chosen].astype(np.int32),
-                    both.indices[chosen].astype(np.int32),
-                    both.data[chosen] < 0,
-                )
-            )
-        )
-        joined, turns = components.find()
+        pairs = torch.from_numpy(np.stack([owner[chosen], both.indices[chosen]]).astype(np.int32))
+        components.link(pairs[0], pairs[1], torch.from_numpy(both.data[chosen] < 0))
+        joined, flips = components.find()
         if int(joined.max()) + 1 == len(sizes):
-            return numbers, signs
-        numbers, signs = joined[numbers], signs * turns[numbers]
+            return indices, signs
+        indices, signs = joined[indices], signs * flips[indices]
         sizes = torch.bincount(joined, sizes).long()
         half = half.tocoo()
         low, high = (torch.from_numpy(end).long() for end in half.coords)
-        agreement = torch.from_numpy(half.data) * turns[low] * turns[high]
+        agreement = torch.from_numpy(half.data) * flips[low] * flips[high]
         low, high = joined[low], joined[high]
 
 
 class _Components:
-    """Connected components of a signed graph: the signs of two nodes agree along a link, or differ.
+    """Connected components of a signed graph.
 
-    Components that no signs fit are taken apart: each of their nodes is a component.
+    The signs of two nodes agree along a link, or differ along a flipped one. If links contradict
+    each other, every node of their component remains single.
     """
 
     def __init__(self, num_nodes: int) -> None:
         self.parents = torch.arange(num_nodes, dtype=torch.int32)
-        self.is_turned = torch.zeros(num_nodes, dtype=torch.bool)
-        self.is_torn = torch.zeros(num_nodes, dtype=torch.bool)
+        self.is_flipped = torch.zeros(num_nodes, dtype=torch.bool)
+        self.is_contradictory = torch.zeros(num_nodes, dtype=torch.bool)
         self.links: list[tuple[Tensor, Tensor, Tensor]] = []
 
-    def link(self, starts: Tensor, ends: Tensor, is_turned: Tensor) -> None:
-        """Add links between nodes ``(L,)``, int32; signs differ along those that are turned."""
+    def link(self, starts: Tensor, ends: Tensor, is_flipped: Tensor) -> None:
+        """Add links between nodes ``(L,)``, int32; ``is_flipped`` ``(L,)`` marks flipped links."""
         if kernels.serve():
-            forest = self.parents, self.is_turned, self.is_torn
-            kernels.call("link_nodes", starts, ends, is_turned, *forest)
+            forest = self.parents, self.is_flipped, self.is_contradictory
+            kernels.call("link_nodes", starts, ends, is_flipped, *forest)
         else:
-            self.links.append((starts, ends, is_turned))
+            self.links.append((starts, ends, is_flipped))
 
     def find(self) -> tuple[Tensor, Tensor]:
-        """Return the component of each node, by its first node, and its sign there, 1 or -1."""
+        """Return the component of each node, in the order of first nodes, and its sign, 1 or -1."""
         if kernels.serve():
-            kernels.call("flatten_nodes", self.parents, self.is_turned, self.is_torn)
+            kernels.call("flatten_nodes", self.parents, self.is_flipped, self.is_contradictory)
         elif self.links:
             self._search()
         nodes = torch.arange(len(self.parents))
-        # Single nodes come last.
-        roots = torch.where(self.is_torn, len(nodes) + nodes, self.parents)
+        # Single nodes of contradictory components come last.
+        roots = torch.where(self.is_contradictory, len(nodes) + nodes, self.parents)
         is_used = torch.zeros(2 * len(nodes), dtype=torch.bool).index_fill_(0, roots, True)
-        signs = torch.where(self.is_turned & ~self.is_torn, -1.0, 1.0)
+        signs = torch.where(self.is_flipped & ~self.is_contradictory, -1.0, 1.0)
         return is_used.cumsum(0)[roots] - 1, signs
 
     def _search(self) -> None:
-        """Find components on a double cover, whose nodes are each there with both signs."""
+        """Find components of the double cover, which contains each node with both signs."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
         count = len(self.parents)
-        starts, ends, is_turned = (
+        starts, ends, is_flipped = (
             torch.cat(parts).numpy() for parts in zip(*self.links, strict=True)
         )
-        other = count * is_turned.astype(np.int32)
+        other = count * is_flipped.astype(np.int32)
         pairs = np.append(starts, starts + count), np.append(ends + other, ends + count - other)
         cover = coo_array((np.ones(2 * len(starts)), pairs), shape=(2 * count, 2 * count))
         upright, opposite = connected_components(cover, directed=False)[1].reshape(2, count)
@@ -301,6 +295,6 @@ class _Components:
             np.minimum(upright, opposite), return_index=True, return_inverse=True
         )
         self.parents = torch.from_numpy(first[inverse].astype(np.int32))
-        self.is_turned, self.is_torn = map(
+        self.is_flipped, self.is_contradictory = map(
             torch.from_numpy, (upright > opposite, upright == opposite)
         )

@@ -1,4 +1,4 @@
-"""The side of a surface that has more free space in front of it."""
+"""Free-space vote: the side of a surface with more free space."""
 
 import math
 from functools import reduce
@@ -15,47 +15,45 @@ from torchrg.normals.faces import gather_lists
 
 _SPACINGS_PER_CELL = 1.5
 _SPACING_QUANTILE = 0.9
-"""Quantile of the spacing of the points that gives the side of a cell, so that sparse walls are
-closed."""
+"""Quantile of the point spacing that defines the cell width, so that sparse walls are closed."""
 
 _MAX_CELLS = 2**19
-"""Cells along an axis. The number of a line and the place on it then fit an int64."""
+"""Maximum number of cells along an axis; a line index and a cell index then fit into int64."""
 
 _NUM_OBSTACLES = 12
 """Nearest neighbors that can be an obstacle."""
 
-_PARALLEL, _ABOVE = 0.99, 0.5
-"""Cosine, of 8 degrees, between normals that are parallel, and sine, of 30 degrees, of the angle at
-which a neighbor with such a normal lies on another face. On one smooth surface it rises by no more
-than half of the angle between the normals."""
+_MIN_PARALLEL_COSINE, _MIN_ELEVATION_SINE = 0.99, 0.5
+"""Minimum cosine (8 degrees) between parallel normals, and minimum sine (30 degrees) of the
+elevation of such a neighbor on another face. On one smooth surface the elevation is at most half
+the angle between the normals."""
 
 _OPEN_WEIGHT = 0.5
-"""Weight of a free path that leaves the box around the cloud."""
+"""Weight of a free path that leaves the bounding box of the cloud."""
 
-_HALF_WORTH = 8
-"""Free cells at which a path gets half of the largest weight. A gap so weighs less than a room, and
-a hall no more than a room."""
+_HALF_PATH = 8
+"""Free cells at which a path gets half of the maximum weight. A gap thus counts less than a room,
+and a hall no more than a room."""
 
 _HALF_DIRECTIONS = [steps for steps in product((-1, 0, 1), repeat=3) if steps > (0, 0, 0)]
-"""Thirteen directions to cells around one; the opposite directions lead to the other thirteen."""
+"""Thirteen of the 26 directions to neighboring cells, without their opposites."""
 
 
 def vote_free_side(
     points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, width: float
 ) -> Tensor:
-    """Return how much more free space lies in front of some points than behind them.
+    """Return the excess of free space in front of points over free space behind them.
 
     1. The points mark the cells of a grid.
-    2. From each point, in each of the 26 directions to neighboring cells, the free path is measured
-       to the next marked cell. A path that leaves the box of the cloud counts half.
-    3. If a neighbor with a parallel normal lies above the surface by more than 30 degrees, paths to
-       the front end there, and paths to the back likewise: faces of thin plates are closer than
-       cells.
+    2. From each point, the free path to the next marked cell is measured in each of the 26
+       directions to neighboring cells. A path that leaves the bounding box counts half.
+    3. A neighbor with a parallel normal that lies above the surface by more than 30 degrees ends
+       paths to the front; likewise to the back. Faces of thin plates are closer than cells.
     4. The vote is the sum of ``sign(n . d) (n . d)^2 f(path)`` over the directions ``d``, where
        ``f`` rises from 0 to 1 and is half at 8 cells.
 
     Points ``(N, 3)`` are in canonical order, ``near`` ``(N, K)`` are rows of their neighbors, and
-    ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive where the normal points to the freer side.
+    ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive if the normal points to the freer side.
     """
     low = points.amin(dim=0)
     codes = torch.zeros(len(points), dtype=torch.int64)
@@ -67,14 +65,14 @@ def vote_free_side(
     x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
     at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell])
     cell = np.searchsorted(cells, codes[rows].numpy())
-    own = normals[rows]
+    normal = normals[rows]
     front, back = _find_obstacles(points, normals, near, rows, width)
 
     def vote(steps: tuple[int, ...]) -> Tensor:
         stride = math.sqrt(sum(step * step for step in steps))
-        cosine = dot(own, own.new_tensor(steps)) / stride
+        cosine = dot(normal, normal.new_tensor(steps)) / stride
         ahead, behind = (
-            torch.from_numpy(worth[cell]).to(own) for worth in _free_paths(at, steps, stride)
+            torch.from_numpy(score[cell]).to(normal) for score in _free_paths(at, steps, stride)
         )
         is_front = cosine > 0
         ahead = torch.minimum(ahead, torch.where(is_front, front, back))
@@ -85,14 +83,14 @@ def vote_free_side(
 
 
 def cell_width(points: Tensor, near: Tensor) -> float:
-    """Return the side of cells, by the spacing of the points; any where that is zero."""
+    """Return the cell width from the point spacing; arbitrary if the spacing is zero."""
     rank = (near.shape[1] - 1) // 2
     if rank == 0:
         return 1.0
     rows = torch.arange(0, len(points), max(len(points) // ROWS_AT_ONCE, 1))
-    arms = points[gather_lists(near, rows, [rank])[:, 0]] - points[rows]
-    # A disk of that radius holds ``rank`` points, one for each square of the spacing.
-    spacing = dot(arms, arms).sqrt() * math.sqrt(math.pi / rank)
+    offsets = points[gather_lists(near, rows, [rank])[:, 0]] - points[rows]
+    # A disk of that radius holds ``rank`` points, one per squared spacing.
+    spacing = dot(offsets, offsets).sqrt() * math.sqrt(math.pi / rank)
     at = math.ceil(_SPACING_QUANTILE * len(rows)) - 1
     width = _SPACINGS_PER_CELL * float(kth_smallest(spacing, at))
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
@@ -102,24 +100,24 @@ def cell_width(points: Tensor, near: Tensor) -> float:
 def _find_obstacles(
     points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, width: float
 ) -> list[Tensor]:
-    """Return the worth of paths to the nearest faces ahead and behind on which neighbors lie."""
+    """Return the weights of paths to the nearest neighboring faces ahead and behind."""
     ranks = list(range(min(_NUM_OBSTACLES, near.shape[1])))
-    ends, own = gather_lists(near, rows, ranks), normals[rows, None]
-    arms = points[ends] - points[rows, None]
-    height = dot(arms, own)
-    is_face = dot(normals[ends], own).abs() > _PARALLEL
-    is_face &= height * height > _ABOVE * _ABOVE * dot(arms, arms)
+    ends, normal = gather_lists(near, rows, ranks), normals[rows, None]
+    offsets = points[ends] - points[rows, None]
+    height = dot(offsets, normal)
+    is_face = dot(normals[ends], normal).abs() > _MIN_PARALLEL_COSINE
+    is_face &= height * height > _MIN_ELEVATION_SINE * _MIN_ELEVATION_SINE * dot(offsets, offsets)
     nearest = (
         torch.where(is_face & (above > 0), above, torch.inf).amin(dim=1)
         for above in (height, -height)
     )
-    return [1 / (1 + _HALF_WORTH * width / path) for path in nearest]
+    return [1 / (1 + _HALF_PATH * width / path) for path in nearest]
 
 
 def _free_paths(
     at: NDArray[np.int64], steps: tuple[int, ...], stride: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the worth of the free paths from cells ``(3, C)`` in a direction, and opposite to it.
+    """Return the weights of the free paths from cells ``(3, C)`` in a direction and its opposite.
 
     Each is ``(C,)``. Gaps between the cells of a line are paths, without a grid of empty cells.
     """
@@ -132,7 +130,7 @@ def _free_paths(
     is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
     gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)
 
-    def worth(gap: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
+    def score(gap: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
         free = np.empty(len(order), np.int64)
         free[order] = gap
         to_ends = [
@@ -142,6 +140,6 @@ def _free_paths(
         ]
         path = stride * np.where(free < 0, np.minimum.reduce(to_ends), free).astype(np.float32)
         weight = np.where(free < 0, np.float32(_OPEN_WEIGHT), np.float32(1))
-        return weight * (path / (path + np.float32(_HALF_WORTH)))
+        return weight * (path / (path + np.float32(_HALF_PATH)))
 
-    return worth(np.append(gaps, -1), 1), worth(np.insert(gaps, 0, -1), -1)
+    return score(np.append(gaps, -1), 1), score(np.insert(gaps, 0, -1), -1)

@@ -1,4 +1,4 @@
-"""Iteratively weighted PCA: an M-estimator of planes by graduated non-convexity."""
+"""Iteratively reweighted PCA: a plane M-estimator by graduated non-convexity."""
 
 from functools import partial
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from torchrg.linalg import second_moments
 from torchrg.linalg.eigen import principal_frame
 from torchrg.normals.consensus.noise import survey_noise
 from torchrg.normals.pca import (
-    about_first,
+    center_on_first,
     check_patches,
     fit_normals_pca,
     fit_points,
@@ -23,32 +23,31 @@ from torchrg.normals.pca import (
 )
 from torchrg.structures import Neighbors, NormalFit
 
-_HEAVY = 0.25
+_MIN_HEAVY_WEIGHT = 0.25
 """Weight above which a point belongs to the plane."""
 
 _MIN_STEPS = 5
-"""Steps that are taken at least, even if the start is close to the limit."""
+"""Minimum number of steps, even if the start is close to the limit."""
 
-_CLOSE_TO_PCA = 0.996
-"""Cosine of 5 degrees. A normal that has turned less than that from the one of PCA has no edge
-beside it."""
+_UNTURNED_COSINE = 0.996
+"""Cosine of 5 degrees. A normal within this angle of the PCA normal has no nearby edge."""
 
-_SAME_SOLUTION = 0.95
-"""Cosine of 18 degrees. Two solutions whose normals are closer than that are one."""
+_SAME_COSINE = 0.95
+"""Cosine of 18 degrees. Two solutions with normals within this angle are one."""
 
 _SECOND_START = 0.35
 """Quantile of the squared distances at which the second solution starts."""
 
 _MIN_FRACTION = 0.1
-"""Share of the points. A solution that explains fewer gives way to the other one."""
+"""Minimum fraction of the points explained by a solution; otherwise the other one wins."""
 
 _MIN_NOISE = 1e-4
-"""Share of the distance to the farthest point. Exact planes have no noise, and without a least
-value the steps would never end. The numbers above are those of the authors' program."""
+"""Fraction of the distance to the farthest point. Exact planes have no noise, and without a minimum
+the steps would never end. All constants above are those of the authors' program."""
 
 
 class _Offsets(NamedTuple):
-    """Neighbours about each point: coordinates, and 1 for those that count, shape ``(n, K)``."""
+    """Neighbors relative to each point: coordinates, and 1 if counted, shape ``(n, K)``."""
 
     x: Tensor
     y: Tensor
@@ -56,10 +55,10 @@ class _Offsets(NamedTuple):
     counted: Tensor
 
     def take(self, rows: Tensor | slice) -> "_Offsets":
-        """Return some of the rows."""
+        """Return the given rows."""
         return _Offsets(*(column[rows] for column in self))
 
-    def about(self, centers: Tensor) -> "_Offsets":
+    def relative_to(self, centers: Tensor) -> "_Offsets":
         """Return the points relative to other centers, shape ``(n, 3)``."""
         x, y, z = (
             column - center for column, center in zip(self[:3], centers.T[..., None], strict=True)
@@ -74,7 +73,7 @@ class _Offsets(NamedTuple):
 
 
 class _Plane(NamedTuple):
-    """Unit normals and centers ``(n, 3)``, the scale of weights ``(n, 1)``, and those last used."""
+    """Unit normals and centers ``(n, 3)``, weight scale ``(n, 1)``, and their last used values."""
 
     normal: Tensor
     center: Tensor
@@ -83,12 +82,12 @@ class _Plane(NamedTuple):
     weighed_mu: Tensor
 
     def take(self, rows: Tensor | slice) -> "_Plane":
-        """Return some of the rows."""
+        """Return the given rows."""
         return _Plane(*(column[rows] for column in self))
 
 
 class _Solution(NamedTuple):
-    """A plane for each edge, the distance of the point itself to it, and the plane's points."""
+    """A plane per point, the distance of the point to it, and a mask of the plane's points."""
 
     normal: Tensor
     through: Tensor
@@ -97,7 +96,7 @@ class _Solution(NamedTuple):
 
 
 def _no_fit(patches: Tensor) -> NormalFit:
-    """Return fits of patches ``(*, K, 3)`` that are not valid."""
+    """Return invalid fits of patches ``(*, K, 3)``."""
     first = patches[..., 0, 0]
     return NormalFit(
         patches.new_zeros((*first.shape, 3)),
@@ -118,30 +117,31 @@ def fit_normals_irls(
 ) -> NormalFit:
     """Fit a plane to each patch by iteratively weighted PCA [1], eqs. (3) and (5).
 
-    1. Where the plane of PCA fits within the noise, it is the answer.
-    2. Elsewhere the normal is the smallest eigenvector of the covariance about the point itself
+    1. If the PCA plane fits within the noise, it is the result.
+    2. Otherwise the normal is the smallest eigenvector of the covariance about the point itself
        with weights ``(mu / (mu + r^2))^2`` (Geman-McClure) of the distances ``r`` to the plane
-       through it; ``mu`` shrinks by ``mu_decay`` from the largest ``r^2`` of PCA to
-       ``(noise / 2)^2`` (graduated non-convexity [2]).
-    3. The same once more from a quarter of that, now with the plane shifted along its normal to
-       the weighted mean of the points of weight above 1/4, so that noise of the point itself
-       matters less.
-    4. If that turned the normal by more than 5 degrees, there is an edge: a second solution starts
-       across the first, and the one closer to the point with more than a tenth of the others wins.
+       through it. ``mu`` shrinks by ``mu_decay`` from the largest ``r^2`` of PCA to ``(noise /
+       2)^2`` (graduated non-convexity [2]).
+    3. This is repeated from a quarter of that ``mu``. The plane is now shifted along its normal to
+       the weighted mean of the points with weight above 1/4, to reduce the effect of the point's
+       noise.
+    4. If the normal turned by more than 5 degrees, there is an edge: a second solution starts
+       perpendicular to the first. The solution closer to the point wins if it explains more than a
+       tenth of the neighbors.
 
-    The point itself is the first of the patch that counts; it takes no part in the fit. The
-    authors' ``mu_decay`` is 1.01; 1.05 takes a fifth of the time, and its mean squared errors on
-    solids with edges are 4 to 11 % larger. (The paper prints eq. (5) without the square of ``r``;
-    the authors square it.) Their surface may be curved by a known radius; here it is flat.
-    Gradients are those of the steps as taken.
+    The point itself, the first counted one of the patch, is excluded from the fit. The authors use
+    a ``mu_decay`` of 1.01; 1.05 takes a fifth of the time, with mean squared errors 4 to 11 %
+    larger on solids with edges. (The paper prints eq. (5) without the square of ``r``; the authors
+    square it.) Their surface may be curved with a known radius; here it is flat. Gradients are
+    those of the steps as taken.
 
-    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`. ``noise`` is a
-    standard deviation, shape ``(*)``, in the unit of the cloud; at least 1e-4 of the distance to
-    the farthest point is assumed. ``mu_decay`` is above 1.
+    For arguments and errors see :func:`torchrg.normals.fit_normals_pca`. ``noise`` is a standard
+    deviation, shape ``(*)``, in coordinate units, clamped to at least 1e-4 of the distance to the
+    farthest point. ``mu_decay`` is above 1.
 
     Returns:
-        The fit. Curvature and residual are those of PCA on it and the points of weight above
-        1/4, or on all points where these span no plane; so is ``valid``.
+        The fit. Curvature, residual and ``valid`` are from PCA on the point itself and the points
+        with weight above 1/4, or on all points if these span no plane.
 
     References:
         [1] J. Sanchez, F. Denis, D. Coeurjolly, F. Dupont, L. Trassoudaine, P. Checchin. Robust
@@ -178,8 +178,7 @@ def estimate_irls(
 ) -> NormalFit:
     """Estimate normals by iteratively weighted PCA.
 
-    The authors ask the user for the noise; here it is estimated from the planes of PCA about each
-    point.
+    The authors require the noise as input; here it is estimated from the PCA planes.
     """
     fixed = points.detach()
     planes = fit_points(fixed, neighbors, fit_normals_pca, chunk_size=chunk_size)
@@ -193,10 +192,10 @@ def _fit_rows(
 ) -> NormalFit:
     """Fit patches with one leading axis."""
     itself = mask & (mask.cumsum(dim=-1) == 1)
-    others = mask & ~itself
+    neighbor_mask = mask & ~itself
     plane = fit_normals_pca(patches, mask, resolution=resolution)
-    start = fit_normals_pca(patches, others, resolution=resolution)
-    _, offsets = about_first(patches, mask)
+    start = fit_normals_pca(patches, neighbor_mask, resolution=resolution)
+    _, offsets = center_on_first(patches, mask)
     radius = (offsets * offsets).sum(dim=-1).amax(dim=-1).detach().sqrt()
     noise = torch.maximum(noise, _MIN_NOISE * radius)
     is_flat = start.residual_rms <= noise
@@ -205,7 +204,7 @@ def _fit_rows(
 
     rows = (start.valid & ~is_flat).nonzero().squeeze(-1)
     x, y, z = offsets[rows].unbind(dim=-1)
-    points = _Offsets(x, y, z, others[rows].to(patches.dtype))
+    points = _Offsets(x, y, z, neighbor_mask[rows].to(patches.dtype))
     normals, heavy = _fit_edges(points, start.normals[rows], noise[rows, None], decay)
     resolution = None if resolution is None else resolution[rows]
     inliers = fit_normals_pca(patches[rows], heavy | itself[rows], resolution=resolution)
@@ -217,20 +216,20 @@ def _fit_rows(
 def _fit_edges(
     points: _Offsets, start: Tensor, noise: Tensor, decay: float
 ) -> tuple[Tensor, Tensor]:
-    """Return normals and heavy points of the better of two solutions."""
+    """Return normals and inlier masks of the better of two solutions."""
     limit = noise * noise / 4
     largest = _sq_distances(points, start).amax(dim=-1, keepdim=True)
     first = _fit_twice(points, start, largest, largest / 4, limit, decay)
     normals, heavy = first.normal, first.heavy
 
-    rows = (_cosine(start, normals) < _CLOSE_TO_PCA).nonzero().squeeze(-1)
-    turned, ours, limit = points.take(rows), normals[rows], limit[rows]
-    axis = torch.linalg.cross(torch.linalg.cross(start[rows], ours), ours)
+    rows = (_cosine(start, normals) < _UNTURNED_COSINE).nonzero().squeeze(-1)
+    turned, current, limit = points.take(rows), normals[rows], limit[rows]
+    axis = torch.linalg.cross(torch.linalg.cross(start[rows], current), current)
     across = axis / (axis * axis).sum(dim=-1, keepdim=True).sqrt()
     mu = _low_quantile(_sq_distances(turned, across), turned.counted)
     second = _fit_twice(turned, across, mu, mu / 2, limit, decay)
     firsts = _Solution(*(field[rows] for field in first))
-    better = (_cosine(firsts.through, second.through) < _SAME_SOLUTION) & ~_first_wins(
+    better = (_cosine(firsts.through, second.through) < _SAME_COSINE) & ~_first_wins(
         firsts, second, turned
     )
     rows = rows[better]
@@ -252,16 +251,16 @@ def _fit_twice(
         weighed_mu=through.mu,
     )
     near = _fit_graduated(points, restarted, limit, decay, shift=True)
-    points = points.about(near.center)
+    points = points.relative_to(near.center)
     weights = _weigh(points.distances(near.weighed_normal), near.weighed_mu, points.counted)
     height = (near.center * near.normal).sum(dim=-1)
     above = (points.distances(near.normal) * points.counted).sum(dim=-1) > 0
     error = torch.where(above, -height, height)
-    return _Solution(near.normal, through.normal, error, weights > _HEAVY)
+    return _Solution(near.normal, through.normal, error, weights > _MIN_HEAVY_WEIGHT)
 
 
 def _first_wins(first: _Solution, second: _Solution, points: _Offsets) -> Tensor:
-    """Return whether the first of two solutions is to be taken, shape ``(n,)``."""
+    """Return a mask of patches where the first solution wins, shape ``(n,)``."""
     nearer = first.error < second.error
     many_first, many_second = (
         solution.heavy.sum(dim=-1) > _MIN_FRACTION * points.counted.sum(dim=-1)
@@ -277,14 +276,14 @@ def _sq_distances(points: _Offsets, normal: Tensor) -> Tensor:
 
 
 def _low_quantile(values: Tensor, counted: Tensor) -> Tensor:
-    """Return the 35th percentile of the values that count, shape ``(n, 1)``."""
+    """Return the 35th percentile of the counted values, shape ``(n, 1)``."""
     ordered = torch.where(counted > 0, values, torch.inf).sort(dim=-1).values
     rank = (_SECOND_START * counted.sum(dim=-1, keepdim=True)).long()
     return ordered.gather(-1, rank)
 
 
 def _cosine(a: Tensor, b: Tensor) -> Tensor:
-    """Return the cosine of the angle between directions without sign."""
+    """Return the cosine of the angle between unsigned directions."""
     return (a * b).sum(dim=-1).abs()
 
 
@@ -293,12 +292,12 @@ def _fit_graduated(
 ) -> _Plane:
     """Reweight and refit planes while ``mu`` shrinks to a limit: graduated non-convexity.
 
-    Each step divides ``mu`` by ``decay``, weighs every point by its distance, and takes the
+    Each step divides ``mu`` by ``decay``, weights every point by its distance, and takes the
     direction in which the weighted points are flattest about the center. With ``shift`` the center
-    first moves along the normal to the weighted mean of the heavy points, their weights being those
-    of the step before. ``mu`` ends at the first value at or below the limit, with ``shift`` at the
-    last one at or above. Patches leave the batch when they are done. For gradients each step keeps
-    its input only and is run again.
+    first moves along the normal to the weighted mean of the heavy points, using the weights of the
+    previous step. ``mu`` ends at the first value at or below the limit, with ``shift`` at the last
+    one at or above. Patches leave the batch when they are done. For gradients each step stores only
+    its input and is recomputed.
     """
     differentiable = torch.is_grad_enabled() and plane.normal.requires_grad
     step = partial(checkpoint, _step, use_reentrant=False) if differentiable else _step
@@ -310,15 +309,15 @@ def _fit_graduated(
     for done in range(remaining[0] if remaining else 0):
         while remaining[active - 1] <= done:
             active -= 1
-        moving = slice(0, active)
-        moved = step(points.take(moving), plane.take(moving), decay, shift)
-        arrived = plane.take(slice(active, None))
-        plane = _Plane(*map(torch.cat, zip(moved, arrived, strict=True)))
+        active_rows = slice(0, active)
+        updated = step(points.take(active_rows), plane.take(active_rows), decay, shift)
+        finished = plane.take(slice(active, None))
+        plane = _Plane(*map(torch.cat, zip(updated, finished, strict=True)))
     return plane.take(order.argsort())
 
 
 def _weigh(distances: Tensor, mu: Tensor, counted: Tensor) -> Tensor:
-    """Return Geman-McClure weights ``(mu / (mu + r^2))^2``, 0 for what does not count."""
+    """Return Geman-McClure weights ``(mu / (mu + r^2))^2``, 0 if not counted."""
     weights = mu / (mu + distances * distances)
     return weights * weights * counted
 
@@ -327,13 +326,13 @@ def _step(points: _Offsets, plane: _Plane, decay: float, shift: bool) -> _Plane:
     """Return the next plane, with the normal along which the weighted points are flattest."""
     center = plane.center
     if shift:
-        points = points.about(center)
+        points = points.relative_to(center)
         weights = _weigh(points.distances(plane.weighed_normal), plane.weighed_mu, points.counted)
-        heavy = weights * (weights > _HEAVY)
+        heavy = weights * (weights > _MIN_HEAVY_WEIGHT)
         total = heavy.sum(dim=-1, keepdim=True)
         heights = (heavy * points.distances(plane.normal)).sum(dim=-1, keepdim=True)
         move = plane.normal * (heights / torch.where(total > 0, total, 1.0))
-        points, center = points.about(move), center + move
+        points, center = points.relative_to(move), center + move
     mu = plane.mu / decay
     weights = _weigh(points.distances(plane.normal), mu, points.counted)
     matrix = second_moments(points[:3], weights)
@@ -343,13 +342,13 @@ def _step(points: _Offsets, plane: _Plane, decay: float, shift: bool) -> _Plane:
 def _count_steps(mu: Tensor, limit: Tensor, decay: float, *, stay_above: bool) -> Tensor:
     """Return the number of divisions that bring ``mu`` to the limit, shape ``(n,)``.
 
-    Counted by dividing, not by a logarithm, whose last bit depends on where an element stands.
+    Computed by division, not by a logarithm, whose last bit depends on the element's position.
     """
     num_steps = torch.zeros(len(mu), dtype=torch.int64, device=mu.device)
     while True:
         following = mu / decay
-        goes_on = following >= limit if stay_above else mu > limit
-        if not bool(goes_on.any()):
+        continues = following >= limit if stay_above else mu > limit
+        if not bool(continues.any()):
             return num_steps.clamp(min=_MIN_STEPS)
-        num_steps += goes_on.squeeze(-1)
-        mu = torch.where(goes_on, following, mu)
+        num_steps += continues.squeeze(-1)
+        mu = torch.where(continues, following, mu)

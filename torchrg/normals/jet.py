@@ -1,8 +1,8 @@
 """Quadratic height fields: normals and curvatures of curved surfaces.
 
-Jets serve all points of a cloud, with gradients, and are as exact as CGAL's in float64, so they
-are fitted by orthogonalisation. The paraboloids of the consensus need three digits and no gradient:
-normal equations, which square the condition number, do them no harm and take half the time.
+Jets support gradients and match CGAL's accuracy in float64, so they are fitted by
+orthogonalization. The consensus paraboloids need three digits and no gradient: normal equations
+square the condition number but take half the time.
 """
 
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from torchrg._checks import in_own_precision
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root, square_root
 from torchrg.linalg.moments import Columns, along, sq_lengths, sum_neighbors
-from torchrg.normals.pca import about_first, check_patches, fit_plane, patch_resolution
+from torchrg.normals.pca import center_on_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
 _NUM_TERMS = 6
-"""Terms of a quadratic function of two coordinates, which fewer points do not determine."""
+"""Number of terms of a quadratic in two coordinates, and the minimum number of points."""
 
 FLAT_PIVOT = 1e-5
-"""Share of its squared length that a term of a paraboloid must keep beside the terms before it.
-Normal equations in float32 then give a share of the length, which is the root of this, three parts
-in a thousand, to within one percent."""
+"""Minimum fraction of its squared length that a paraboloid term must retain after the terms before
+it are removed. Normal equations in float32 then give the retained length fraction, the root of
+this, 3e-3, to within one percent."""
 
 
 def fit_normals_jet(
@@ -33,7 +33,7 @@ def fit_normals_jet(
 ) -> NormalFit:
     """Fit a quadratic surface to each patch and return its normal at the point itself.
 
-    See :func:`fit_jet`, which gives the principal curvatures too. ``curvature`` is the surface
+    See :func:`fit_jet`, which also returns the principal curvatures. ``curvature`` is the surface
     variation of PCA; ``residual_rms`` belongs to the quadratic surface.
 
     Example:
@@ -47,19 +47,19 @@ def fit_normals_jet(
 
 
 class JetFit(NamedTuple):
-    """A quadratic surface through each neighbourhood, zero if not valid; see :func:`fit_jet`.
+    """A quadratic surface per neighborhood, zero if not valid; see :func:`fit_jet`.
 
     Attributes:
         normals: Unit normals of the surface at the point itself, shape ``(*, 3)``, of any sign.
         foot: Point of the surface above or below it, shape ``(*, 3)``.
-        principal_curvatures: The larger and the smaller one, shape ``(*, 2)``, in 1 / unit of the
-            cloud; positive where the surface bends towards ``normals``.
-        principal_directions: Unit tangents of these, shape ``(*, 2, 3)``, of arbitrary sign; any
-            two orthogonal ones where the two curvatures are equal.
-        curvature: Surface variation, as of :func:`torchrg.normals.fit_normals_pca`, shape ``(*)``.
+        principal_curvatures: Maximum and minimum, shape ``(*, 2)``, in 1 / coordinate unit;
+            positive if the surface bends towards ``normals``.
+        principal_directions: Their unit tangents, shape ``(*, 2, 3)``, of arbitrary sign; any two
+            orthogonal ones if the curvatures are equal.
+        curvature: Surface variation, as in :func:`torchrg.normals.fit_normals_pca`, shape ``(*)``.
         valid: Whether there is a plane, shape ``(*)``, bool.
-        residual_rms: Root mean square distance of the points to the surface along the normal of
-            their plane, shape ``(*)``.
+        residual_rms: RMS distance of the points to the surface along the normal of their plane,
+            shape ``(*)``.
     """
 
     normals: Tensor
@@ -77,19 +77,18 @@ def fit_jet(
 ) -> JetFit:
     """Fit a quadratic height field to each patch: a jet of degree 2 [1].
 
-    In the frame of the patch's PCA about the point itself, the first of the patch that counts, the
+    In the PCA frame of the patch about the point itself, the first counted one of the patch, the
     height ``w`` is fitted by least squares as ``a0 + a1 u + a2 v + a3 u^2/2 + a4 u v + a5 v^2/2``.
-    The normal at the point is ``(-a1, -a2, 1)`` turned back, and the principal curvatures are the
-    eigenvalues of the shape operator there. This is what CGAL's ``jet_estimate_normals`` does in
-    degree 2.
+    The normal at the point is ``(-a1, -a2, 1)`` rotated back, and the principal curvatures are the
+    eigenvalues of the shape operator. This equals CGAL's ``jet_estimate_normals`` of degree 2.
 
-    Arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`. Gradients flow
-    through everything but the principal directions, and are finite where two eigenvalues are equal.
+    For arguments and errors see :func:`torchrg.normals.fit_normals_pca`. Gradients flow through
+    everything but the principal directions, and are finite if two eigenvalues are equal.
 
     Returns:
-        The fit. Terms that the points do not determine are left out, the last ones first. Two
-        straight scan lines have no ``v^2``; fewer than six points have no quadratic terms, which
-        leaves the plane of PCA. ``valid`` is that of :func:`torchrg.normals.fit_normals_pca`.
+        The fit. Terms not determined by the points are omitted, the last ones first. Two straight
+        scan lines have no ``v^2``; fewer than six points have no quadratic terms, which leaves the
+        PCA plane. For ``valid`` see :func:`torchrg.normals.fit_normals_pca`.
 
     References:
         [1] F. Cazals, M. Pouget. Estimating differential quantities using polynomial fitting of
@@ -104,7 +103,7 @@ def fit_jet(
     """
     check_patches("fit_jet", patches, mask, resolution)
     plane, frame = fit_plane(patches, mask, resolution)
-    place, offsets = about_first(patches, mask)
+    position, offsets = center_on_first(patches, mask)
     axes = _tangent_axes(frame)
     u, v, w = (offsets @ axes).unbind(dim=-1)
     rounding = patch_resolution(patches, mask) if resolution is None else resolution
@@ -114,7 +113,7 @@ def fit_jet(
     valid = plane.valid
     return JetFit(
         torch.where(valid[..., None], (axes @ normal[..., None]).squeeze(-1), 0.0),
-        torch.where(valid[..., None], place + height[..., None] * axes[..., 2], 0.0),
+        torch.where(valid[..., None], position + height[..., None] * axes[..., 2], 0.0),
         torch.where(valid[..., None], curvatures, 0.0),
         torch.where(valid[..., None, None], directions @ axes.mT, 0.0),
         plane.curvature,
@@ -126,15 +125,15 @@ def fit_jet(
 def fit_paraboloids(
     columns: Columns, normals: Tensor, counted: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Fit ``h(u, v) = a + b u + c v + d u^2 + e u v + f v^2`` over a plane through each point.
+    """Fit ``h(u, v) = a + b u + c v + d u^2 + e u v + f v^2`` over a plane through each point.
 
     The normal at the point is that of the height field at ``u = v = 0``: the 2-jet of
-    :func:`fit_jet` in another frame, by normal equations. Terms that the neighbours cannot tell
-    from the ones before, as on two scan lines, are left out. The heights are along ``normals``
-    ``(n, 3)``, within some 60 degrees of the surface normal; ``counted`` are weights 0 or 1.
+    :func:`fit_jet` in another frame, by normal equations. Terms not determined by the neighbors, as
+    on two scan lines, are omitted. The heights are along ``normals`` ``(n, 3)``, within about 60
+    degrees of the surface normal; ``counted`` are weights 0 or 1.
 
     Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``,
-    and standard deviations of the residuals ``(n,)``, six degrees of freedom less.
+    and standard deviations of the residuals ``(n,)``, with six degrees of freedom less.
     """
     radius = square_root(sq_lengths(columns).mul_(counted).amax(dim=1))
     scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None] * counted
@@ -159,7 +158,7 @@ def fit_paraboloids(
 def _tangent_axes(frame: PrincipalFrame) -> Tensor:
     """Return the longest, the middle and the normal direction as columns.
 
-    The fit is the same for any two tangents, so only the normal needs gradients; the tangents just
+    The fit is the same for any two tangents, so only the normal needs gradients; the tangents only
     have to stay orthogonal to it.
     """
     normal, longest = frame.normals, frame.vectors[..., 2]
@@ -178,17 +177,17 @@ def _fit_height(
     count = u.shape[-1] if mask is None else mask.sum(dim=-1, keepdim=True)
     ones = torch.ones_like(u) if mask is None else mask.to(u.dtype)
     sides = [_mean_size(u), _mean_size(v)]
-    # Rounding of a coordinate, relative to the size of each column, hides dependent columns.
-    rough = [rounding[..., None] / side for side in sides]
+    # Coordinate rounding, relative to the column size, hides dependent columns.
+    rounding_ratio = [rounding[..., None] / side for side in sides]
     exact = rank_tolerance(u.shape[-1], u.dtype)
     quadratic = torch.where(torch.as_tensor(count, device=u.device) < _NUM_TERMS, torch.inf, exact)
     fractions = (
         exact,
-        exact + rough[0],
-        exact + rough[1],
-        quadratic + 2 * rough[0],
-        quadratic + rough[0] + rough[1],
-        quadratic + 2 * rough[1],
+        exact + rounding_ratio[0],
+        exact + rounding_ratio[1],
+        quadratic + 2 * rounding_ratio[0],
+        quadratic + rounding_ratio[0] + rounding_ratio[1],
+        quadratic + 2 * rounding_ratio[1],
     )
     terms = _quadratic_terms(ones, u / sides[0], v / sides[1])
     coefficients, residual = least_squares(list(zip(terms, fractions, strict=True)), w)
@@ -205,19 +204,19 @@ def _mean_size(values: Tensor) -> Tensor:
 
 
 def _quadratic_terms(ones: Tensor, u: Tensor, v: Tensor) -> list[Tensor]:
-    """Return the terms of a quadratic height field, all zero where a point does not count."""
+    """Return the terms of a quadratic height field, all zero for points that do not count."""
     return [ones, u, v, u * u, u * v, v * v]
 
 
 def least_squares(
     columns: Sequence[tuple[Tensor, Tensor | float]], target: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Fit a target ``(*, K)`` by columns, and leave out columns that depend on the ones before.
+    """Fit a target ``(*, K)`` by columns, omitting columns that depend on previous ones.
 
-    Modified Gram-Schmidt with the target as the last column: as accurate as Householder's QR, and
-    made of sums of products only, so it runs batched on any device and gradients flow. Each column
-    comes with the share of its length that must be left. Returns the coefficient of each, shape
-    ``(*, 1)``, 0 where it is left out, and the residual.
+    Modified Gram-Schmidt with the target as the last column: as accurate as Householder QR. Made
+    only of sums of products, it is batched on any device and differentiable. Each column comes with
+    the minimum fraction of its length that must remain. Returns the coefficient of each column,
+    shape ``(*, 1)``, 0 if omitted, and the residual.
     """
     basis: list[Tensor] = []
     mixing: list[list[Tensor]] = []
@@ -226,9 +225,9 @@ def least_squares(
         for direction in basis:
             mix.append((direction * residual).sum(dim=-1, keepdim=True))
             residual = residual - mix[-1] * direction
-        sq_rest = (residual * residual).sum(dim=-1, keepdim=True)
-        is_independent = sq_rest > fraction * fraction * (column * column).sum(dim=-1, keepdim=True)
-        length = torch.where(is_independent, sq_rest, 1.0).sqrt()
+        square = (residual * residual).sum(dim=-1, keepdim=True)
+        is_independent = square > fraction * fraction * (column * column).sum(dim=-1, keepdim=True)
+        length = torch.where(is_independent, square, 1.0).sqrt()
         basis.append(torch.where(is_independent, residual / length, 0.0))
         mixing.append([*mix, length])
     projections = []
@@ -250,9 +249,10 @@ def _principal_curvatures(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit normals of height fields, principal curvatures and their directions.
 
-    From first and second derivatives: normals of positive height ``(*, 3)``; curvatures ``(*, 2)``,
-    larger first, the eigenvalues of the shape operator, of entries aa, ab, bb in an orthonormal
-    basis of tangents; and directions ``(*, 2, 3)``, without gradient.
+    The inputs are first and second derivatives. Returns normals of positive height ``(*, 3)``,
+    curvatures ``(*, 2)``, larger first, and directions ``(*, 2, 3)``, without gradient. Curvatures
+    are the eigenvalues of the shape operator with entries aa, ab, bb in an orthonormal tangent
+    basis.
     """
     one = torch.ones_like(slope_u)
     gradient = (slope_u * slope_u + slope_v * slope_v + 1).sqrt()
@@ -268,7 +268,7 @@ def _principal_curvatures(
     radius = root(half * half + ab * ab)
     values = torch.stack([middle + radius, middle - radius], dim=-1)
     with torch.no_grad():
-        # Of the two rows of (S - k1), the longer one is orthogonal to the first direction.
+        # The longer of the two rows of (S - k1) is orthogonal to the first direction.
         a = torch.where(half >= 0, half + radius, ab)
         b = torch.where(half >= 0, ab, radius - half)
         size = root(a * a + b * b)
@@ -291,7 +291,7 @@ def _tangents(normals: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _solve(matrix: dict[tuple[int, int], Tensor], right: list[Tensor]) -> list[Tensor]:
-    """Solve positive semi-definite systems by LDL^T; a term without a pivot of its own gets 0."""
+    """Solve positive semidefinite systems by LDL^T; terms without a usable pivot are 0."""
     size = len(right)
     lower: dict[tuple[int, int], Tensor] = {}
     inverse: list[Tensor] = []

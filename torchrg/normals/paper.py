@@ -1,4 +1,4 @@
-"""Planes by robust fits, and the paper's two stages: PCA, then these where normals disagree."""
+"""Robust plane fits, and the paper's two-stage estimator."""
 
 from collections.abc import Callable
 from functools import partial
@@ -23,7 +23,7 @@ from torchrg.robust.scale import QN_FACTOR, qn_exceeds
 from torchrg.structures import Neighbors, NormalFit
 
 _PLANE = 2
-"""Dimension of a plane: a robust fit to points on a line says nothing of a normal."""
+"""Dimension of a plane: a robust fit to collinear points does not define a normal."""
 
 
 def fit_normals_robust(
@@ -32,22 +32,22 @@ def fit_normals_robust(
     *,
     estimator: Callable[..., RobustFit] = fit_detmcd,
     resolution: Tensor | None = None,
-    **settings: Any,  # noqa: ANN401 - of the estimator, which knows them
+    **settings: Any,  # noqa: ANN401 - passed to the estimator
 ) -> NormalFit:
     """Fit a plane to the inliers of each patch's robust location and scatter.
 
-    By default those of DetMCD [1], eq. (6) and Algorithm 1. Points whose squared robust distance is
-    at most the chi-square quantile are inliers; the normal, curvature and residual are those of PCA
-    on them. (The paper prints the cut as 3.075; that is the root, 3.0575, of the quantile 9.3484
-    that its eq. (6) asks for.)
+    The default is DetMCD [1], eq. (6) and Algorithm 1. Points whose squared robust distance is at
+    most the chi-square quantile are inliers; normal, curvature and residual are those of PCA on
+    them. (The paper prints the cutoff as 3.075; the root of the quantile 9.3484 in its eq. (6) is
+    3.0575.)
 
     ``estimator`` is one of :mod:`torchrg.robust`, such as ``fit_detmm`` [2]; other keywords are its
-    settings. The other arguments and errors are those of :func:`torchrg.normals.fit_normals_pca`; a
-    setting out of range is a ``ConfigError``.
+    parameters, and a value out of range is a ``ConfigError``. For the remaining arguments and
+    errors see :func:`torchrg.normals.fit_normals_pca`.
 
     Returns:
-        The fit. Where the trusted share of the points lies exactly on one plane it is that plane,
-        with curvature 0; where no unique plane exists ``valid`` is False.
+        The fit. If the trusted fraction of the points lies exactly on one plane, it is that plane,
+        with curvature 0; without a unique plane ``valid`` is False.
 
     References:
         [1] M. Hubert, P. Rousseeuw, T. Verdonck. A deterministic algorithm for robust location and
@@ -75,21 +75,21 @@ def find_sharp_points(
     angle_deg: float = 5.0,
     chunk_size: int = CHUNK_SIZE,
 ) -> Tensor:
-    """Tell sharp feature points ``(N,)`` by the angles to their neighbours' normals.
+    """Return a mask of sharp feature points ``(N,)`` from the angles between neighboring normals.
 
-    With ``a_j`` the angle between the normals of a point and of its j-th neighbour (the point
-    itself included, with angle 0), a point is sharp if ``Qn(a) > angle_deg`` (``"qn"``, eq. 9), or
-    if the 25th percentile of ``a``, the ``ceil(K/4)``-th smallest, exceeds it (``"percentile"``,
-    Algorithm 1).
+    Let ``a_j`` be the angle between the normals of a point and its j-th neighbor (the point itself
+    included, with angle 0). A point is sharp if ``Qn(a) > angle_deg`` (``"qn"``, eq. 9), or if the
+    25th percentile of ``a``, the ``ceil(K/4)``-th smallest, exceeds it (``"percentile"``, Algorithm
+    1).
 
     Args:
         normals: Unit normals of any sign, shape ``(N, 3)``.
-        neighbors: Neighbours of each point.
-        valid: Points that have a normal, shape ``(N,)``; the others do not count as neighbours and
-            are sharp themselves, so that a robust fit may find them one. Default: all.
+        neighbors: Neighbors of each point.
+        valid: Points that have a normal, shape ``(N,)``; invalid points are ignored as neighbors
+            and are sharp, so that a robust fit may find a normal. Default: all.
         rule: See above.
         angle_deg: Limit in degrees.
-        chunk_size: Points handled at a time.
+        chunk_size: Points processed at a time.
 
     Raises:
         ConfigError: If ``rule`` is unknown.
@@ -110,8 +110,8 @@ def find_sharp_points(
     def classify(block: slice) -> None:
         near = neighbors.at(block)
         counted = near.valid if valid is None else near.counted() & near.of(valid)
-        around = [near.of(column) for column in columns]
-        chords = sq_chords([component[:, :1] for component in around], around)
+        near_columns = [near.of(column) for column in columns]
+        chords = sq_chords([component[:, :1] for component in near_columns], near_columns)
         exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
         sharp[block] = exceeds(chords, counted, angle_deg)
 
@@ -122,8 +122,8 @@ def find_sharp_points(
 def _qn_exceeds(chords: Tensor, counted: Tensor | None, angle_deg: float) -> Tensor:
     """Return whether Qn of the angles exceeds the limit.
 
-    If the majority of the angles lies within one difference of zero, all their pairs do, and they
-    are enough: counting decides for most points of a room, and only the rest needs angles.
+    If the majority of the angles lies within one difference of zero, so do all their pairs, which
+    suffices: counting decides for most points of a room, and only the remaining ones need angles.
     """
     near = at_most(chords, deg_to_sq_chord(angle_deg / QN_FACTOR))
     if counted is None:
@@ -149,7 +149,7 @@ def _percentile_exceeds(chords: Tensor, counted: Tensor | None, angle_deg: float
 def estimate_paper(
     points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
 ) -> NormalFit:
-    """Estimate normals by Algorithm 1: PCA, sharp feature points, DetMCD at those."""
+    """Estimate normals by Algorithm 1: PCA, sharp feature points, DetMCD at sharp points."""
     fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
     sharp = find_sharp_points(
         fit.normals,

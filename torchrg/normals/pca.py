@@ -1,7 +1,4 @@
-"""Least-squares planes: the classic estimator, and the last step of every robust one.
-
-:func:`fit_points` leads from a fit of patches, by whichever method, to the points of a cloud.
-"""
+"""Least-squares planes, and point-wise application of patch estimators."""
 
 from collections.abc import Callable
 from functools import partial
@@ -34,10 +31,10 @@ FitPatches = Callable[..., NormalFit]
 """Patches ``(n, K, 3)``, mask ``(n, K)`` or None, keyword ``resolution`` ``(n,)`` -> fit."""
 
 Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
-"""Points, their neighbours, settings, chunk size -> fit."""
+"""Points, neighbors, configuration, chunk size -> fit."""
 
-_NARROW = 0.03
-"""A patch of a width below this share of its length is lost in the rounding of its covariance."""
+_MIN_RATIO = 0.03
+"""Minimum ratio of width to length of a patch resolved by its covariance; below it is rounding."""
 
 
 def fit_normals_pca(
@@ -50,28 +47,27 @@ def fit_normals_pca(
 
     Convention:
         The sign of a normal is arbitrary. Gradients flow through normals, curvature and residual,
-        and are finite where two eigenvalues are equal: the turn between the two is left out.
-        ``torch.vmap`` works with ``out_dims=NormalFit(0, 0, 0, 0, None)``, as there is no
-        ``sharp``.
+        and are finite if two eigenvalues are equal: the rotation between the two is omitted.
+        ``torch.vmap`` requires ``out_dims=NormalFit(0, 0, 0, 0, None)``, since ``sharp`` is None.
 
     Args:
-        patches: Points of each neighbourhood, shape ``(*, K, 3)``.
-        mask: Which points count, shape ``(*, K)``, bool; the others may hold anything, NaN
-            included. Default: all.
-        resolution: Size below which a coordinate difference is rounding, shape ``(*)``, in the unit
-            of the cloud. Default: rounding of the patch's own coordinates.
+        patches: Points of each neighborhood, shape ``(*, K, 3)``.
+        mask: Points that count, shape ``(*, K)``, bool; masked points may have any value, including
+            NaN. Default: all.
+        resolution: Size below which a coordinate difference is rounding, shape ``(*)``, in
+            coordinate units. Default: rounding of the patch coordinates.
 
     Returns:
-        The fit. A patch of fewer than three points, or whose points lie on one line, is not an
-        error: it has ``valid`` False, a zero normal and curvature 0.
+        The fit. A patch with fewer than three points or with collinear points has ``valid`` False,
+        a zero normal and curvature 0.
 
     Raises:
         ShapeError: If a shape or dtype is not as above.
 
     References:
         [1] H. Hoppe et al. Surface reconstruction from unorganized points. SIGGRAPH, 1992.
-        [2] M. Pauly, M. Gross, L. Kobbelt. Efficient simplification of point-sampled surfaces.
-        IEEE Visualization, 2002.
+        [2] M. Pauly, M. Gross, L. Kobbelt. Efficient simplification of point-sampled surfaces. IEEE
+        Visualization, 2002.
 
     Example:
         >>> patches = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
@@ -83,7 +79,7 @@ def fit_normals_pca(
 
 
 _Decomposition = tuple[Tensor, PrincipalFrame]
-"""Covariances ``(*, 3, 3)``, and their frame."""
+"""Covariances ``(*, 3, 3)``, and their principal frames."""
 
 
 def _decompose(patches: Tensor, mask: Tensor | None) -> _Decomposition:
@@ -92,10 +88,10 @@ def _decompose(patches: Tensor, mask: Tensor | None) -> _Decomposition:
 
 
 def _decompose_for_normals(patches: Tensor, mask: Tensor | None) -> _Decomposition:
-    """Decompose as kernels do, to the bit, where nothing but values and normals is asked for."""
+    """Decompose bit-identically to the kernels if only values and normals are needed."""
     if patches.dtype != torch.float32 or patches.requires_grad or not has_values(patches, mask):
         return _decompose(patches, mask)
-    columns = about_first(patches, mask)[1].unbind(dim=-1)
+    columns = center_on_first(patches, mask)[1].unbind(dim=-1)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(patches.dtype)
     _, matrix = weighted_moments(columns, counted)
     values, normals = smallest_eigenvector3(matrix)
@@ -108,7 +104,7 @@ def fit_plane(
     resolution: Tensor | None,
     decompose: Callable[[Tensor, Tensor | None], _Decomposition] = _decompose,
 ) -> tuple[NormalFit, PrincipalFrame]:
-    """Return the fit of :func:`fit_normals_pca` and the principal frame it comes from."""
+    """Return the fit of :func:`fit_normals_pca` and its principal frame."""
     matrix, frame = decompose(patches, mask)
     total = matrix[..., 0, 0] + matrix[..., 1, 1] + matrix[..., 2, 2]
     with torch.no_grad():
@@ -125,23 +121,23 @@ def fit_plane(
 
 
 def _fit_normals(patches: Tensor, mask: Tensor | None, *, resolution: Tensor) -> NormalFit:
-    """Do as :func:`fit_normals_pca`, with the bits of its kernel."""
+    """Apply :func:`fit_normals_pca`, bit-identical to its kernel."""
     return fit_plane(patches, mask, resolution, _decompose_for_normals)[0]
 
 
 def fit_points_pca(
     points: Tensor, neighbors: Neighbors, *, chunk_size: int = CHUNK_SIZE
 ) -> NormalFit:
-    """Fit the neighbourhoods of a cloud ``(N, 3)``; :func:`fit_points` of least squares."""
+    """Fit planes to the neighborhoods of a cloud ``(N, 3)``; see :func:`fit_points`."""
     num_neighbors = neighbors.indices.shape[1]
     if not kernels.serve(points, *neighbors, k=num_neighbors):
         return fit_points(points, neighbors, _fit_normals, chunk_size=chunk_size)
-    places, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
+    positions, tolerance = points.contiguous(), rank_tolerance(num_neighbors, points.dtype)
 
     def work(rows: slice) -> tuple[Tensor, ...]:
         resolution = coordinate_resolution(points[rows])
         near = neighbors.at(rows)
-        return kernels.call("fit_normals_pca", places, *near, resolution, tolerance, _NARROW)
+        return kernels.call("fit_normals_pca", positions, *near, resolution, tolerance, _MIN_RATIO)
 
     parts = map_chunks(work, len(points), chunk_size, points.device)
     normals, curvature, rms, valid, narrow = map(torch.cat, zip(*parts, strict=True))
@@ -149,14 +145,14 @@ def fit_points_pca(
     rows = places_of(narrow)
     if len(rows) == 0:
         return fit
-    again = fit_points(points, neighbors, _fit_normals, rows=rows, chunk_size=chunk_size)
-    return replace_rows(fit, rows, again)
+    refitted = fit_points(points, neighbors, _fit_normals, rows=rows, chunk_size=chunk_size)
+    return replace_rows(fit, rows, refitted)
 
 
 def check_patches(
     caller: str, patches: Tensor, mask: Tensor | None, resolution: Tensor | None
 ) -> None:
-    """Check the arguments of an estimator of patches; raise ShapeError if one is wrong."""
+    """Validate the arguments of a patch estimator; raise ShapeError if one is wrong."""
     check_shapes(caller, patches=(patches, "* K 3"), mask=(mask, "* K"))
     check_shapes(caller, patches=(patches[..., 0, 0], "*"), resolution=(resolution, "*"))
     check_floating(caller, patches=patches, resolution=resolution)
@@ -165,17 +161,16 @@ def check_patches(
 def _spans_plane(
     patches: Tensor, mask: Tensor | None, values: Tensor, resolution: Tensor | None
 ) -> Tensor:
-    """Return whether the second direction of each patch is more than rounding.
+    """Return whether the second principal width of each patch exceeds rounding.
 
-    A covariance holds squares, so its own rounding hides widths below the root of its precision.
-    Patches as narrow as that are few and are looked at again, or all are where a compiler cannot
-    tell which.
+    A covariance holds squares, so its rounding hides widths below the root of its precision. Such
+    narrow patches are few and are recomputed; all patches are when a compiler cannot select them.
     """
     if resolution is None:
         resolution = patch_resolution(patches, mask)
     lengths, widths = (square_root(values[..., axis].clamp(min=0)) for axis in (2, 1))
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
-    narrow = widths < _NARROW * lengths
+    narrow = widths < _MIN_RATIO * lengths
     if not has_values(patches, mask, values):
         widths = torch.where(narrow, _width(patches, mask), widths)
     elif bool(narrow.any()):
@@ -185,7 +180,7 @@ def _spans_plane(
 
 
 def _width(patches: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the root mean square extent of long patches across their length, shape ``(n,)``."""
+    """Return the RMS extent of long patches perpendicular to their length, shape ``(n,)``."""
     mean, matrix = covariance(patches.double(), mask)
     direction = eigh3(matrix)[1][..., 2]
     offsets = patches - mean[..., None, :]
@@ -208,20 +203,20 @@ def fit_points(
     *,
     rows: Tensor | None = None,
     chunk_size: int = CHUNK_SIZE,
-    **of_points: Tensor,
+    **point_arguments: Tensor,
 ) -> NormalFit:
-    """Fit the neighbourhoods of some points of a cloud ``(N, 3)``, by default of all of them.
+    """Fit the neighborhoods of the given points of a cloud ``(N, 3)``, default all.
 
-    At most ``chunk_size`` patches are in memory at a time, which changes no result. Other keywords
-    are those of ``fit`` that have a value for each point, shape ``(N,)``. Returns the fit of the
-    given rows, without ``sharp``.
+    At most ``chunk_size`` patches are in memory at a time, which does not change the result. Other
+    keywords are per-point arguments of ``fit``, shape ``(N,)``. Returns the fit of the given rows,
+    without ``sharp``.
     """
 
     def fit_chunk(chunk: slice) -> NormalFit:
         chosen = chunk if rows is None else rows[chunk]
         indices, mask = neighbors.at(chosen)
         patches = gather_patches(points, indices)
-        extra = {name: values[chosen] for name, values in of_points.items()}
+        extra = {name: values[chosen] for name, values in point_arguments.items()}
         return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **extra)
 
     num_rows = len(points) if rows is None else len(rows)
@@ -230,10 +225,9 @@ def fit_points(
 
 
 def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
-    """Return the estimator that fits every neighbourhood alike.
+    """Return the estimator that applies ``fit`` to every neighborhood.
 
-    The settings are keywords of the fit, and the fields of :class:`torchrg.config.NormalsConfig`
-    for them.
+    ``settings`` maps keywords of the fit to fields of :class:`torchrg.config.NormalsConfig`.
     """
 
     def estimate(
@@ -245,21 +239,21 @@ def at_all_points(fit: FitPatches, **settings: str) -> Estimator:
     return estimate
 
 
-def about_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the first point of each patch that counts, and all points relative to it.
+def center_on_first(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the first counted point of each patch, and all points relative to it.
 
-    Zero where no point counts, and for points that do not; these may hold NaN.
+    Zero if no point counts, and for masked points, which may be NaN.
     """
     if mask is None:
         return patches[..., 0, :], patches - patches[..., :1, :]
     first = mask.to(torch.uint8).argmax(dim=-1)[..., None, None]
-    place = patches.gather(-2, first.expand(*first.shape[:-1], 3))
-    place = torch.where(mask.any(dim=-1)[..., None, None], place, 0.0)
-    return place.squeeze(-2), torch.where(mask[..., None], patches - place, 0.0)
+    origin = patches.gather(-2, first.expand(*first.shape[:-1], 3))
+    origin = torch.where(mask.any(dim=-1)[..., None, None], origin, 0.0)
+    return origin.squeeze(-2), torch.where(mask[..., None], patches - origin, 0.0)
 
 
 def replace_rows(fit: NormalFit, rows: Tensor, refined: NormalFit) -> NormalFit:
-    """Return a fit in which some points have another one; ``sharp`` stays."""
+    """Return a fit with some rows replaced; ``sharp`` is kept."""
     merged = [old.index_copy(0, rows, new) for old, new in zip(fit[:4], refined[:4], strict=True)]
     normals, curvature, valid, residual_rms = merged
     return NormalFit(normals, curvature, valid, residual_rms, fit.sharp)

@@ -1,7 +1,7 @@
-"""Regions: which neighbours join, growth, plane table, selection, and superpoints.
+"""Region growing, plane table, plane selection and superpoints.
 
-Everything here takes normals that are there and estimates none. :func:`torchrg.segment_planes`
-calls these functions one after the other, with what comes before and after them.
+These functions use existing normals and estimate none. :func:`torchrg.segment_planes` runs them in
+order.
 """
 
 from torchrg.regions.axes import align_axes

@@ -1,4 +1,4 @@
-"""Which planes meet, along which length, and at which angle."""
+"""Region adjacency: pairs of planes that meet, boundary lengths and angles."""
 
 import math
 from array import array
@@ -16,27 +16,27 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
 NUM_CONTACTS = 8
-"""Neighbours that surround a point of a surface; more reach across gaps."""
+"""Nearest neighbors that count as adjacent; farther neighbors reach across gaps."""
 
 MIN_CONTACTS = 3
-"""Regions that touch in fewer edges neither meet nor are merged: one may be an outlier's."""
+"""Minimum number of edges between two regions that meet or are merged: a single edge may be an
+outlier's."""
 
 PARALLEL_DEG = 15.0
-"""At a smaller angle the line in which two planes cross may be far from where the faces end."""
+"""Below this angle the intersection line of two planes may lie far from where the regions end."""
 
 _CHUNKS_AT_ONCE = 16
-"""Chunks whose edges threads share, so few that what is kept of them is little."""
+"""Chunks of edges per parallel batch, few enough that their results need little memory."""
 
 _MAX_CELL = 2.0**53
-"""Largest number of a cell on a line. float64 does not tell cells beyond it apart."""
+"""Largest cell index on a line. float64 cannot distinguish cells beyond it."""
 
 _REACH = 4.0
-"""An edge that leads across the planes by at most this many of their thicknesses is within their
-noise."""
+"""Maximum out-of-plane component of an edge within the noise, in thicknesses of the planes."""
 
 _MAX_STEEPNESS = 0.25
-"""An edge follows the surface if it leads across the planes by at most this share of the way to the
-8th neighbour. One beyond this and the noise goes to a parallel surface."""
+"""An edge follows the surface if its out-of-plane component is at most this fraction of the
+distance to the 8th neighbor. Beyond this and the noise it leads to a parallel surface."""
 
 
 def find_adjacency(
@@ -48,23 +48,23 @@ def find_adjacency(
     *,
     curved: Tensor,
 ) -> PlaneAdjacency:
-    r"""Find pairs of regions that meet, and measure where they do.
+    r"""Find pairs of regions that meet, and measure their common boundary.
 
-    Flat regions at an angle meet along the line in which their planes cross: the neighbours of one
-    in the other, however narrow the strip without labels between them, are projected onto it. Their
-    extent there, gaps left out, is the length. Of parallel or curved regions only the 8 nearest
-    neighbours count, and the length is that of a curve that so many edges cross: with density
-    :math:`\rho` and n edges from each point a curve of length L meets edges with
-    :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy and Crofton) [1].
+    Non-parallel flat regions meet along the intersection line of their planes. Edges between their
+    points, also across a narrow unlabeled strip, are projected onto it; the covered length without
+    gaps is the boundary length. For parallel or curved regions only the 8 nearest neighbors count.
+    Their length is that of a curve crossed by the edges. With density :math:`\rho` and n edges per
+    point, a curve of length L crosses edges with :math:`\sum 1 / |e| = 2 n \rho L / \pi` (Cauchy
+    and Crofton) [1].
 
-    The planes have unit normals ``(M, 3)`` and a standard deviation of their points (``thickness``,
-    ``(M,)``). Regions that touch in less than three edges do not meet.
+    Planes are given by unit normals ``(M, 3)`` and the standard deviation of their points
+    (``thickness``, ``(M,)``). Regions joined by fewer than three edges do not meet.
 
     References:
         [1] L. Santalo. Integral Geometry and Geometric Probability. Addison-Wesley, 1976.
     """
-    border = _Border(labels, neighbors)
-    pairs = border.pairs
+    edges = _RegionEdges(labels, neighbors)
+    pairs = edges.pairs
     first, second = normal[pairs[:, 0]], normal[pairs[:, 1]]
     angle = unsigned_angle_deg(first, second)
     crossing = (angle > PARALLEL_DEG) & ~curved[pairs].any(dim=1)
@@ -74,7 +74,7 @@ def find_adjacency(
         is_crossing = crossing[contacts.pair]
         on_lines = _select(contacts, is_crossing)
         on_curves = _select(contacts, ~is_crossing & (contacts.column <= NUM_CONTACTS))
-        edge, pair = _edges(points, on_curves), on_curves.pair
+        edge, pair = _edge_vectors(points, on_curves), on_curves.pair
         across = torch.stack([(edge * side[pair]).sum(dim=1) for side in (first, second)])
         spacing, num_nearest = _contact_radii(points, neighbors, on_curves.source)
         farthest = torch.maximum(reach[pair], _MAX_STEEPNESS * spacing)
@@ -84,32 +84,32 @@ def find_adjacency(
         flat = across.abs().amax(dim=0) <= farthest
         return (
             on_lines.pair,
-            _edges(points, on_lines).norm(dim=1),
+            _edge_vectors(points, on_lines).norm(dim=1),
             pair[flat],
             length_each[flat],
         )
 
     lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
-    for on_line, size, on_curve, length_each in border.map_contacts(measure):
+    for on_line, size, on_curve, length_each in edges.map_contacts(measure):
         lines.add(on_line, size)
         curves.add(on_curve, length_each)
-    (sizes, on_line), (lengths, on_curve) = (kind.on(points.device) for kind in (lines, curves))
+    (sizes, on_line), (lengths, on_curve) = (kind.to(points.device) for kind in (lines, curves))
     along = torch.linalg.cross(first, second)
     along = along / along.norm(dim=1, keepdim=True)
-    length = _length_on_line(points, border, along, sizes / on_line)
+    length = _length_on_line(points, edges, along, sizes / on_line)
     meets = on_line + on_curve >= MIN_CONTACTS
     length = torch.where(crossing, length, lengths)
     return PlaneAdjacency(pairs[meets], length[meets], angle[meets])
 
 
 class NearestPoints:
-    """Who is beside whom in a cloud: the 8 nearest neighbours, at most, are beside each point.
+    """Adjacency of a point cloud: up to 8 nearest neighbors per point.
 
     Example:
-        >>> beside = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
-        >>> beside.around(torch.tensor([2, 0])).tolist()
+        >>> adjacency = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
+        >>> adjacency.neighbor_rows(torch.tensor([2, 0])).tolist()
         [[1], [1]]
-        >>> beside.contacts(torch.tensor([0, 1, 1]))
+        >>> adjacency.contacts(torch.tensor([0, 1, 1]))
         (tensor([[0, 1]]), tensor([2]))
     """
 
@@ -118,40 +118,40 @@ class NearestPoints:
         valid = None if valid is None else valid[:, columns]
         self.neighbors = Neighbors(neighbors.indices[:, columns], valid)
 
-    def around(self, rows: Rows) -> Tensor:
-        """Return the points beside some, shape ``(n, 8)``; where there are fewer, the point."""
+    def neighbor_rows(self, rows: Rows) -> Tensor:
+        """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
         near, counted = self.neighbors.at(rows)
         if counted is None:
             return near
-        numbers = rows
-        if isinstance(numbers, slice):
-            numbers = torch.arange(len(self.neighbors.indices), device=near.device)[numbers]
-        return torch.where(counted, near, numbers[:, None].to(near.dtype))
+        indices = rows
+        if isinstance(indices, slice):
+            indices = torch.arange(len(self.neighbors.indices), device=near.device)[indices]
+        return torch.where(counted, near, indices[:, None].to(near.dtype))
 
-    def reached(self, waiting: Tensor, new: Tensor) -> Tensor:
-        """Return those of the rows that have a new one beside them."""
+    def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
+        """Return the candidates that have a changed neighbor."""
         num_points = len(self.neighbors.indices)
-        is_new = torch.zeros(num_points, dtype=torch.bool, device=waiting.device)
-        is_new[new] = True
-        return waiting[is_new[self.around(waiting)].any(dim=1)]
+        is_changed = torch.zeros(num_points, dtype=torch.bool, device=candidates.device)
+        is_changed[changed] = True
+        return candidates[is_changed[self.neighbor_rows(candidates)].any(dim=1)]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what :func:`find_contacts` does, of the nearest points."""
+        """Apply :func:`find_contacts` to the nearest neighbors."""
         return find_contacts(labels, self.neighbors)
 
 
 def find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
-    """Return the pairs of regions with neighbours of each other, and how often they are.
+    """Return pairs of adjacent regions and the number of edges between them.
 
-    Of labels ``(N,)``, negative for none: pairs ``(E, 2)``, the smaller label first, ascending, and
-    counts ``(E,)``.
+    For labels ``(N,)``, negative if unlabeled: pairs ``(E, 2)``, smaller label first, ascending,
+    and counts ``(E,)``.
     """
-    border = _Border(labels, neighbors)
-    return border.pairs, border.counts
+    edges = _RegionEdges(labels, neighbors)
+    return edges.pairs, edges.counts
 
 
 class _Contacts(NamedTuple):
-    """Edges between regions: numbers of their pairs, ends of the edges, columns in the lists."""
+    """Edges between regions: pair index, end points, and column in the neighbor lists."""
 
     pair: Tensor
     source: Tensor
@@ -160,7 +160,7 @@ class _Contacts(NamedTuple):
 
 
 class _Totals:
-    """Sums of values of each pair, and how many these are: one after the other on any device."""
+    """Per-pair sums and counts, accumulated in a fixed order on every device."""
 
     def __init__(self, num_pairs: int) -> None:
         self._sums, self._counts = np.zeros(num_pairs), np.zeros(num_pairs, dtype=np.int64)
@@ -171,33 +171,32 @@ class _Totals:
         np.add.at(self._sums, owner, values.cpu().numpy())
         np.add.at(self._counts, owner, 1)
 
-    def on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+    def to(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return sums and counts, each ``(E,)``."""
         return torch.from_numpy(self._sums).to(device), torch.from_numpy(self._counts).to(device)
 
 
-class _Border:
-    """The edges between regions, found anew each time: all of them may outweigh the cloud.
+class _RegionEdges:
+    """Edges between regions, recomputed on each pass: storing all could take more than the cloud.
 
-    ``pairs`` ``(E, 2)`` are the regions with an edge between them, ascending, and ``counts``
-    ``(E,)`` the edges of each pair.
+    ``pairs`` ``(E, 2)`` are the adjacent regions, ascending, and ``counts`` ``(E,)`` their edges.
     """
 
     def __init__(self, labels: Tensor, neighbors: Neighbors) -> None:
-        # Narrow numbers are gathered three times as fast.
+        # int32 indexing is three times faster.
         self._labels, self._neighbors = labels.to(torch.int32), neighbors
         self._num_regions = int(labels.max()) + 1 if len(labels) else 0
         meets = torch.empty_like(labels, dtype=torch.bool)
 
         def mark(chunk: slice) -> None:
-            meets[chunk] = self._meets_others(chunk)
+            meets[chunk] = self._at_boundary(chunk)
 
         map_chunks(mark, len(labels), ROWS_IN_CACHE, labels.device)
         self._rows = places_of(meets).to(torch.int32)
-        # Small tensors kept from each chunk would split the room that glibc has for the next.
+        # Keeping small tensors of every chunk would fragment the heap (glibc).
         counts: Counter[int] = Counter()
         for rows in torch.split(self._rows, ROWS_IN_CACHE):
-            values = torch.unique(self._edges_of(rows)[2], return_counts=True)
+            values = torch.unique(self._boundary_edges(rows)[2], return_counts=True)
             counts.update(dict(zip(*(of_chunk.tolist() for of_chunk in values), strict=True)))
         self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
         self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
@@ -208,59 +207,59 @@ class _Border:
     def _width(self) -> int:
         return max(self._neighbors.indices.shape[1], 1)
 
-    def _meets_others(self, rows: slice) -> Tensor:
-        """Return which of some points have a neighbour of another region, shape ``(n,)``."""
-        own, near = self._labels[rows], self._neighbors.at(rows)
-        if kernels.serve(own, *near):
-            return kernels.call("meet_others", self._labels, own, *near)[0]
-        return self._touches(own, near)[0].any(dim=1)
+    def _at_boundary(self, rows: slice) -> Tensor:
+        """Return which points have a neighbor in another region, shape ``(n,)``."""
+        label, near = self._labels[rows], self._neighbors.at(rows)
+        if kernels.serve(label, *near):
+            return kernels.call("meet_others", self._labels, label, *near)[0]
+        return self._crossing_neighbors(label, near)[0].any(dim=1)
 
-    def _touches(self, own: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
-        """Return which neighbours of points of some regions are of another one, and of which."""
+    def _crossing_neighbors(self, label: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
+        """Return a mask of the neighbors in another region, and their labels."""
         other = near.of(self._labels)
-        touches = (other != own[:, None]) & (other >= 0) & (own >= 0)[:, None]
-        return touches if near.valid is None else touches & near.valid, other
+        crosses = (other != label[:, None]) & (other >= 0) & (label >= 0)[:, None]
+        return crosses if near.valid is None else crosses & near.valid, other
 
-    def _edges_of(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where in the lists of some points other regions are, the lists, and the pairs."""
+    def _boundary_edges(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the flat list indices of boundary edges, the neighbor lists, and the pairs."""
         label, near = self._labels[rows], self._neighbors.at(rows)
         scratch.release()
-        touches, other = self._touches(label, near)
-        places = places_of(touches)
-        first = label.index_select(0, places // self._width)
-        second = other.reshape(-1).index_select(0, places)
+        crosses, other = self._crossing_neighbors(label, near)
+        flat_index = places_of(crosses)
+        first = label.index_select(0, flat_index // self._width)
+        second = other.reshape(-1).index_select(0, flat_index)
         lower, higher = torch.minimum(first, second), torch.maximum(first, second)
-        return places, near.indices, lower.long() * self._num_regions + higher
+        return flat_index, near.indices, lower.long() * self._num_regions + higher
 
     def map_contacts(self, work: Callable[[_Contacts], Result]) -> Iterator[Result]:
-        """Yield what work makes of all edges, those of some points at a time, in their order."""
+        """Yield the results of ``work`` for all edges in order, one chunk of points at a time."""
 
         def find(rows: Tensor) -> Result:
-            places, targets, keys = self._edges_of(rows)
-            source, column = places // self._width, places % self._width
-            targets = targets.reshape(-1).index_select(0, places)
+            flat_index, targets, keys = self._boundary_edges(rows)
+            source, column = flat_index // self._width, flat_index % self._width
+            targets = targets.reshape(-1).index_select(0, flat_index)
             pair = torch.searchsorted(self._keys, keys)
             return work(_Contacts(pair, rows.index_select(0, source), targets, column))
 
         chunks = torch.split(self._rows, ROWS_IN_CACHE)
-        for some in chunks_of(len(chunks), _CHUNKS_AT_ONCE):
-            yield from map_tasks(find, chunks[some], self._rows.device)
+        for batch in chunks_of(len(chunks), _CHUNKS_AT_ONCE):
+            yield from map_tasks(find, chunks[batch], self._rows.device)
 
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
-    """Return the chosen ones of the edges."""
+    """Return the selected edges."""
     rows = chosen.nonzero().squeeze(1)
     return _Contacts(*(values.index_select(0, rows) for values in contacts))
 
 
-def _edges(points: Tensor, contacts: _Contacts) -> Tensor:
+def _edge_vectors(points: Tensor, contacts: _Contacts) -> Tensor:
     """Return the edges as vectors ``(n, 3)`` in float64."""
     start, end = (points.index_select(0, rows) for rows in (contacts.source, contacts.target))
     return end.double() - start.double()
 
 
-def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Tensor) -> Tensor:
-    """Return how much of a line the middles of each pair's edges cover, shape ``(E,)``."""
+def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing: Tensor) -> Tensor:
+    """Return the length of each pair's line covered by edge midpoints, shape ``(E,)``."""
     origin = points[:1].double()
     cells = array("q"), array("q")
 
@@ -268,15 +267,15 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
-        place = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
-        cell = place.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
-        return _each_once(contacts.pair, cell)
+        position = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
+        cell = position.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
+        return _unique_cells(contacts.pair, cell)
 
-    for found in border.map_contacts(find_cells):
-        for numbers, values in zip(cells, found, strict=True):
-            numbers.frombytes(values.cpu().numpy().tobytes())
-    pair, cell = _each_once(
-        *(torch.from_numpy(np.array(numbers)).to(points.device) for numbers in cells)
+    for found in edges.map_contacts(find_cells):
+        for indices, values in zip(cells, found, strict=True):
+            indices.frombytes(values.cpu().numpy().tobytes())
+    pair, cell = _unique_cells(
+        *(torch.from_numpy(np.array(indices)).to(points.device) for indices in cells)
     )
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
@@ -284,19 +283,19 @@ def _length_on_line(points: Tensor, border: _Border, along: Tensor, spacing: Ten
     return steps * torch.where(spacing.isfinite(), spacing, 0.0)
 
 
-def _each_once(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cells of pairs ascending, each once."""
+def _unique_cells(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distinct cells of each pair, ascending."""
     if len(cell) == 0:
         return pair, cell
-    # Ranks of cells are small enough for a number with the pair, which cells far apart are not.
+    # Cell ranks fit into one integer with the pair; indices of distant cells do not.
     cells, rank = torch.unique(cell, return_inverse=True)
     keys = torch.unique(pair * len(cells) + rank)
     return keys // len(cells), cells[keys % len(cells)]
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distance to the last of the contact neighbours of points, and their number."""
+    """Return the distance to the last contact neighbor of each point, and their number."""
     nearest = NearestPoints(neighbors).neighbors.at(rows)
-    number = nearest.counted().sum(dim=1)
-    last = nearest.indices.gather(1, (number - 1).clamp(min=0)[:, None]).squeeze(1)
-    return (points[last].double() - points[rows].double()).norm(dim=1), number
+    count = nearest.counted().sum(dim=1)
+    last = nearest.indices.gather(1, (count - 1).clamp(min=0)[:, None]).squeeze(1)
+    return (points[last].double() - points[rows].double()).norm(dim=1), count

@@ -1,4 +1,4 @@
-"""The axes of a room from its planes: up by floors and ceilings, x and y along the walls."""
+"""Room alignment from planes: up from floors and ceilings, x and y along walls."""
 
 import math
 import warnings
@@ -11,49 +11,50 @@ from torch import Tensor
 from torchrg._checks import made_on_cpu
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_of_few, unit_direction
-from torchrg.regions.fit import with_table_sign
+from torchrg.regions.fit import canonicalize_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
 _MAX_TILT_DEG = 30.0
-"""A room is tilted by less, so that no wall is taken for its floor."""
-_NEAR_DEG = 3.0
-"""Planes of one direction differ by less: walls are built within a degree, scanned within two."""
+"""Maximum tilt of a room: a larger one could mistake a wall for the floor."""
+_MAX_ANGLE_DEG = 3.0
+"""Maximum angle between planes of one direction: walls are built to within one degree and scanned
+to within two."""
 _NUM_FITS = 5
-"""Reweighted fits, after which a direction stands."""
+"""Reweighted fits until a direction has converged."""
 _MIN_FRACTION = 0.02
-"""Share of the area of all planes below which those of a direction are furniture, not a room."""
+"""Minimum fraction of the plane area per direction: smaller ones are furniture, not a room."""
 
 
 @made_on_cpu()
 def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -> Tensor:
-    r"""Return the motion that sets a room upright, with walls along x and y and the floor at 0.
+    r"""Compute the rigid transform that makes a room upright and axis-aligned.
 
-    Up is the unit vector :math:`u` that minimises, over planes of area :math:`a` and unit normal
+    Up is the unit vector :math:`u` that minimizes, over planes of area :math:`a` and unit normal
     :math:`n`,
 
     .. math:: \sum_{\mathrm{level}} a w \|n \times u\|^2 +
         \sum_{\mathrm{upright}} a w (n \cdot u)^2,
 
-    where the weights fall to 0 at 3 degrees (Tukey's bisquare), so that sloped ceilings and shelves
-    that lean do not count. It starts from the plane, level to within 30 degrees, that most area
-    agrees with. The x axis is, of the directions of upright planes modulo a right angle, that of
-    most area, fitted in the same way; of the four turns that this leaves, the one that turns least
-    about up is taken. Then the lowest plane that is level is at z = 0, and the middle of what
-    planes with sides along the axes take up is at x = y = 0. Where the origin is far, points should
-    be moved in float64.
+    where the weights (Tukey's bisquare) fall to 0 at 3 degrees, which excludes sloped ceilings and
+    leaning shelves. The initial direction is the normal within 30 degrees of ``up`` that most area
+    agrees with. The x axis follows the walls: it is the direction of upright planes, modulo 90
+    degrees, with most area, fitted in the same way. Among the four possible rotations, the smallest
+    about up is used. The lowest level plane (the floor) is at z = 0; the center of the bounding box
+    of axis-aligned planes is at x = y = 0. If the origin is far from the cloud, transform the
+    points in float64.
 
     Args:
-        seg: A segmentation, or its plane table.
-        up: Upward direction to within 30 degrees, as three numbers or as the name of an axis.
+        seg: A segmentation or its plane table.
+        up: Upward direction to within 30 degrees, as three numbers or an axis name.
 
     Returns:
-        A rigid motion, shape ``(4, 4)``, float64: ``points @ motion[:3, :3].T + motion[:3, 3]``.
+        A rigid transform, shape ``(4, 4)``, float64: ``points @ motion[:3, :3].T + motion[:3, 3]``.
 
     Raises:
-        ConfigError: If ``up`` is no direction, or no plane is level or upright.
+        ConfigError: If ``up`` is not a direction, or no plane is level or upright.
 
     Warns:
-        UserWarning: If no walls say where x and y are.
+        UserWarning: If there are no walls to define x and y.
 
     Example:
         >>> from torchrg import segment_planes
@@ -72,8 +73,8 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
     heading = _find_heading(normals, areas, axis)
     if heading is None:
         warnings.warn(
-            "align_axes: expected upright planes for the directions of x and y, got none of some "
-            "size; it is turned upright only.",
+            "align_axes: expected upright planes (walls) to define x and y, got none large "
+            "enough. Only the up axis is aligned.",
             stacklevel=3,
         )
         heading = _horizontal(torch.eye(3, dtype=torch.float64)[upwards.abs().argmin()], axis)
@@ -85,9 +86,9 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
 
 
 def move_planes(planes: Planes, motion: Tensor) -> Planes:
-    """Return a plane table in coordinates that a rigid motion ``(4, 4)`` leads to.
+    """Apply a rigid transform ``(4, 4)`` to a plane table.
 
-    Normals have the sign that every table gives them.
+    Normals keep the canonical sign of plane tables.
 
     Example:
         >>> from torchrg.regions import summarize_planes
@@ -103,36 +104,36 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
     rotation, shift = motion[:3, :3].to(planes.normal.device), motion[:3, 3]
     shift = shift.to(planes.normal.device)
 
-    def turned(vectors: Tensor) -> Tensor:
+    def rotate(vectors: Tensor) -> Tensor:
         return vectors.double() @ rotation.T
 
-    def moved(points: Tensor) -> Tensor:
-        return (turned(points) + shift).to(dtype)
+    def transform(points: Tensor) -> Tensor:
+        return (rotate(points) + shift).to(dtype)
 
-    normal = with_table_sign(turned(planes.normal))
-    center = turned(planes.center) + shift
-    # On the plane, and nearer than the origin, so that little is lost where that is far.
+    normal = canonicalize_sign(rotate(planes.normal))
+    center = rotate(planes.center) + shift
+    # A nearby point of the plane keeps precision if the origin is far away.
     foot = planes.center.double() - planes.normal.double() * (
         (planes.center.double() * planes.normal.double()).sum(dim=1) - planes.offset.double()
     ).unsqueeze(1)
     outline = planes.outline
     if outline is not None:
-        outline = tuple(tuple(moved(ring) for ring in rings) for rings in outline)
+        outline = tuple(tuple(transform(ring) for ring in rings) for rings in outline)
     return replace(
         planes,
         normal=normal.to(dtype),
-        offset=((turned(foot) + shift) * normal).sum(dim=1).to(dtype),
-        centroid=moved(planes.centroid),
+        offset=((rotate(foot) + shift) * normal).sum(dim=1).to(dtype),
+        centroid=transform(planes.centroid),
         center=center.to(dtype),
-        axes=turned(planes.axes).to(dtype),
+        axes=rotate(planes.axes).to(dtype),
         outline=outline,
     )
 
 
 def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
-    """Return a cloud after a rigid motion ``(4, 4)`` of its coordinates and normals.
+    """Apply a rigid transform ``(4, 4)`` to the coordinates and normals of a cloud.
 
-    What its file says about places, as a viewpoint or a coordinate system, is left out.
+    Positions in the file header, such as a viewpoint or a coordinate system, are dropped.
 
     Example:
         >>> import numpy as np
@@ -143,7 +144,7 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
         ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
     """
     rotation, coordinates, finite = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
-    # Far from the origin most digits are those of the place, which a turn would spread over all.
+    # Rotate about the cloud origin: large offsets would lose digits in the rotation.
     shift = motion[:3, 3].numpy() + rotation @ cloud.origin
     coordinates[finite] = (cloud.coordinates[finite] - cloud.origin) @ rotation.T + shift
     fields = dict(cloud.fields)
@@ -155,22 +156,21 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
 
 
 def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
-    """Return the direction that most area is level or upright to; see :func:`align_axes`."""
+    """Return the direction to which most area is level or upright; see :func:`align_axes`."""
     level = (normals @ upwards).abs() >= math.cos(math.radians(_MAX_TILT_DEG))
     candidates = normals[level & (areas > 0)]
     if not len(candidates):
-        # Walls alone say where up is, too: across their normals.
+        # Without level planes, up is perpendicular to the wall normals.
         upright = (normals @ upwards).abs() <= math.sin(math.radians(_MAX_TILT_DEG))
         spread = (areas * upright)[:, None, None] * normals[:, :, None] * normals[:, None, :]
         values, vectors = eigh3_of_few(spread.sum(dim=0))
         if not bool(values[1] > _MIN_FRACTION * values[2]) or values[2] == 0:
             raise ConfigError(
                 "align_axes: expected a floor, a ceiling, or walls in two directions, got none "
-                f"within {_MAX_TILT_DEG:g} degrees of that; segment the cloud first, or say where "
-                "up is."
+                f"within {_MAX_TILT_DEG:g} degrees of up. Segment the cloud first, or pass up."
             )
         candidates = vectors[:, 0][None]
-    agreeing = [_agreement(normals, areas, axis) for axis in candidates]
+    agreeing = [_agreeing_area(normals, areas, axis) for axis in candidates]
     axis = candidates[int(torch.stack(agreeing).argmax())]
     for _ in range(_NUM_FITS):
         lengths = (normals @ axis).abs().clamp(max=1)
@@ -182,19 +182,19 @@ def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
     return axis
 
 
-def _agreement(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor:
+def _agreeing_area(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor:
     """Return the area of planes that are level or upright if this direction is up."""
     lengths = (normals @ axis).abs().clamp(max=1)
     return (areas * (_bisquare(lengths.acos()) + _bisquare(lengths.asin()))).sum()
 
 
 def _bisquare(angles: Tensor) -> Tensor:
-    """Return Tukey's weights of angles in radians, 0 beyond those of one direction."""
-    return (1 - (angles / math.radians(_NEAR_DEG)) ** 2).clamp(min=0) ** 2
+    """Return Tukey weights of angles in radians, 0 beyond the same-direction limit."""
+    return (1 - (angles / math.radians(_MAX_ANGLE_DEG)) ** 2).clamp(min=0) ** 2
 
 
 def _find_heading(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor | None:
-    """Return the horizontal direction next to x that most walls are along, None without walls."""
+    """Return the main horizontal wall direction closest to x, or None without walls."""
     across = areas * _bisquare((normals @ axis).abs().clamp(max=1).asin())
     if not bool(across.sum() > _MIN_FRACTION * areas.sum()):
         return None
@@ -202,43 +202,43 @@ def _find_heading(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor | None
     second = torch.linalg.cross(axis, first)
     angles = torch.atan2(normals @ second, normals @ first)
     candidates = angles[across > 0]
-    agreeing = [(across * _bisquare(_off_square(angles - angle))).sum() for angle in candidates]
+    agreeing = [(across * _bisquare(_modulo_90(angles - angle))).sum() for angle in candidates]
     angle = candidates[int(torch.stack(agreeing).argmax())]
     for _ in range(_NUM_FITS):
-        off = _off_square(angles - angle)
+        off = _modulo_90(angles - angle)
         weights = across * _bisquare(off)
         angle = angle + (weights * off).sum() / weights.sum()
-    angle = _off_square(angle)
+    angle = _modulo_90(angle)
     heading: Tensor = angle.cos() * first + angle.sin() * second
     return heading
 
 
-def _off_square(angles: Tensor) -> Tensor:
-    """Return angles in radians modulo a right angle, within 45 degrees of 0."""
+def _modulo_90(angles: Tensor) -> Tensor:
+    """Return angles in radians modulo 90 degrees, within 45 degrees of 0."""
     return angles - (angles / (math.pi / 2)).round() * (math.pi / 2)
 
 
 def _horizontal(direction: Tensor, axis: Tensor) -> Tensor:
-    """Return the unit vector across an axis that is next to a direction."""
+    """Return the unit vector perpendicular to an axis that is closest to a direction."""
     across = direction - (direction @ axis) * axis
-    if bool(across.norm() < math.sin(math.radians(_NEAR_DEG))):
+    if bool(across.norm() < math.sin(math.radians(_MAX_ANGLE_DEG))):
         across = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[axis.abs().argmin()])
     unit: Tensor = across / across.norm()
     return unit
 
 
 def _origin(planes: Planes, rotation: Tensor) -> Tensor:
-    """Return what becomes the origin, in turned coordinates: middle in x and y, lowest in z."""
+    """Return the new origin in rotated coordinates: center in x and y, floor in z."""
     axes = planes.axes.cpu().double() @ rotation.T
-    reach = (planes.extent.cpu().double()[:, :, None] * axes).abs().sum(dim=1) / 2
+    half_extent = (planes.extent.cpu().double()[:, :, None] * axes).abs().sum(dim=1) / 2
     center = planes.center.cpu().double() @ rotation.T
-    # The box of a rectangle that stands across the room is larger than what it holds.
-    straight = (axes.abs().amax(dim=2) > math.cos(math.radians(_NEAR_DEG))).all(dim=1)
-    used = straight if bool(straight.any()) else torch.ones_like(straight)
-    low, high = (center - reach)[used].amin(dim=0), (center + reach)[used].amax(dim=0)
+    # The bounding box of a diagonal rectangle exceeds its content.
+    axis_aligned = (axes.abs().amax(dim=2) > math.cos(math.radians(_MAX_ANGLE_DEG))).all(dim=1)
+    used = axis_aligned if bool(axis_aligned.any()) else torch.ones_like(axis_aligned)
+    low, high = (center - half_extent)[used].amin(dim=0), (center + half_extent)[used].amax(dim=0)
     upright = (planes.normal.cpu().double() @ rotation[2]).abs().clamp(max=1)
     area = planes.area.cpu().double()
-    level = (upright.acos() < math.radians(_NEAR_DEG)) & (area > _MIN_FRACTION * area.sum())
+    level = (upright.acos() < math.radians(_MAX_ANGLE_DEG)) & (area > _MIN_FRACTION * area.sum())
     if bool(level.any()):
         low[2] = center[level, 2].amin()
     return torch.stack([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])

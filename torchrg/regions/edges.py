@@ -1,8 +1,8 @@
-"""The edges that regions grow along: from points to the neighbours that all criteria accept.
+"""Edge criteria of region growing.
 
-A criterion is a function that tests the edges from some points, ``rows``, to their K neighbours,
-and returns which of them pass, shape ``(n, K)``, bool. A new one is a setting, a function here, and
-the line of :func:`accept_edges` that calls it.
+A criterion tests the edges from points ``rows`` to their K neighbors and returns a mask of passing
+edges, shape ``(n, K)``, bool. A new one needs a config field, a function here, and a call in
+:func:`accept_edges`.
 """
 
 import math
@@ -26,20 +26,20 @@ from torchrg.structures import Neighbors, Rows
 
 
 class GrowingCloud(NamedTuple):
-    """What growth reads: a cloud in canonical order, its columns contiguous as they gather fast.
+    """Input of region growing in canonical order, with contiguous columns for fast indexing.
 
     Attributes:
         points: Shape ``(N, 3)``.
         normals: Unit normals, shape ``(N, 3)``.
         curvature: Shape ``(N,)``.
-        neighbors: Neighbours of each point.
+        neighbors: Neighbors of each point.
         valid: Points that may belong to a region, shape ``(N,)``, bool.
-        reach: Distance from its plane within which a neighbour lies on it, shape ``(N,)``, infinite
-            where that is not known, or None.
+        reach: Maximum distance of a coplanar neighbor to the point's plane, shape ``(N,)``,
+            infinite if unknown, or None.
         colors: Shape ``(N, C)``, floating point, or None.
-        max_color_distance: Largest difference of colours across which regions grow.
+        max_color_distance: Maximum color difference between neighbors of a region.
         signed_normals: Whether opposite normals differ by 180 degrees instead of 0.
-        angle_share: Share of the largest angle between normals across which regions grow.
+        angle_fraction: Fraction of ``max_angle_deg`` that limits the angle between normals.
     """
 
     points: Tensor
@@ -54,45 +54,45 @@ class GrowingCloud(NamedTuple):
     angle_fraction: float = 1.0
 
 
-def is_order_free(config: GrowingConfig) -> bool:
-    """Tell whether what a claimed point does next depends on itself, not on who claimed it."""
-    of_cloud = config.curvature_scope == "cloud"
-    return config.seed_rule == "curvature" and of_cloud and not promotes_late(config)
+def is_order_independent(config: GrowingConfig) -> bool:
+    """Return whether the seed test of a claimed point depends on the point alone."""
+    is_global = config.curvature_scope == "cloud"
+    return config.seed_rule == "curvature" and is_global and not has_late_promotion(config)
 
 
-def promotes_late(config: GrowingConfig) -> bool:
-    """Tell whether any edge of its region makes a point a seed, not only that which claimed it."""
+def has_late_promotion(config: GrowingConfig) -> bool:
+    """Return whether any edge of its region, not only the claiming one, can promote a point."""
     return config.connectivity is not None and config.connectivity_scope == "seed"
 
 
 def mark_edges(
     cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Return which neighbours join, and by which edges they become seeds, a bit for each.
+    """Return the neighbors that join and the edges that make seeds, packed into bits.
 
-    The bits are in words of 64, ``(N, words)``, int64. Where growth is free of order a point
-    becomes a seed by itself, and the second is None. ``limit`` is that of the curvature.
+    The bits are in 64-bit words, ``(N, words)``, int64. If the seed test is order-independent, the
+    second value is None. ``limit`` is the curvature limit.
     """
-    shared, free = _shared_neighbors(cloud, config), is_order_free(config)
+    shared, order_independent = _shared_neighbors(cloud, config), is_order_independent(config)
     num_points, k = cloud.neighbors.indices.shape
     joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
-    seeds = joins if free else np.zeros_like(joins)
+    seeds = joins if order_independent else np.zeros_like(joins)
 
     def mark(rows: slice) -> None:
         accepted, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
         _write_bits(joins[rows], accepted)
-        if not free:
+        if not order_independent:
             _write_bits(seeds[rows], _become_seeds(cloud, config, rows, limit, connected))
 
     map_chunks(mark, num_points, chunk_size, cloud.points.device)
-    bits, of_seeds = (torch.from_numpy(marks.view(np.int64)) for marks in (joins, seeds))
-    return bits, None if free else of_seeds
+    bits, seed_bits = (torch.from_numpy(marks.view(np.int64)) for marks in (joins, seeds))
+    return bits, None if order_independent else seed_bits
 
 
-def _write_bits(into: NDArray[np.uint8], flags: Tensor) -> None:
-    """Write flags ``(n, K)`` to the bits of bytes, the first to the lowest."""
+def _write_bits(target: NDArray[np.uint8], flags: Tensor) -> None:
+    """Write flags ``(n, K)`` to the bits of bytes, lowest bit first."""
     packed = np.packbits(flags.cpu().numpy(), axis=1, bitorder="little")
-    into[:, : packed.shape[1]] = packed
+    target[:, : packed.shape[1]] = packed
 
 
 def _become_seeds(
@@ -102,7 +102,7 @@ def _become_seeds(
     limit: Tensor,
     connected: Tensor | None,
 ) -> Tensor:
-    """Tell which neighbours of some points become seeds by the edge from the point, ``(n, K)``."""
+    """Return a mask of the edges that make the neighbor a seed, shape ``(n, K)``."""
     target = cloud.neighbors.of(cloud.curvature, rows)
     if config.curvature_scope == "neighborhood":
         counted = cloud.neighbors.counted(rows) & cloud.neighbors.of(cloud.valid, rows)
@@ -117,10 +117,10 @@ def _become_seeds(
 
 
 def _curvature_limits(curvature: Tensor, counted: Tensor, quantile: float) -> Tensor:
-    """Return the lower quantile of each row ``(n, K)`` of those that count, ``(n, 1)``."""
+    """Return the lower quantile of the counted values of each row ``(n, K)``, shape ``(n, 1)``."""
     ascending = curvature.where(counted, torch.inf).sort(dim=1).values
-    places = (quantile * (counted.sum(dim=1, keepdim=True) - 1).double()).long()
-    return ascending.gather(1, places.clamp_min(0))
+    index = (quantile * (counted.sum(dim=1, keepdim=True) - 1).double()).long()
+    return ascending.gather(1, index.clamp_min(0))
 
 
 def accept_edges(
@@ -129,11 +129,11 @@ def accept_edges(
     rows: Rows,
     connect: Callable[[Tensor], Tensor] | None,
 ) -> tuple[Tensor, Tensor | None]:
-    """Tell which neighbours of some points pass all criteria that are on, cheap ones first.
+    """Evaluate the enabled edge criteria for the given points, cheapest first.
 
-    Returns whether the neighbour joins the region of the point, shape ``(n, K)``, bool; and whether
-    the two are connected, only known where it joins, None without ``connect``, which tells it of
-    the edges that it is asked for.
+    Returns a mask of neighbors that join the point's region, shape ``(n, K)``, bool, and a mask of
+    connected neighbors, valid only where the first holds. The second is None without ``connect``,
+    which tests the connectivity of the edges in a mask.
     """
     ids = rows
     if isinstance(ids, slice):
@@ -147,9 +147,9 @@ def accept_edges(
         distance = cloud.points.new_tensor(config.max_distance**2)
     columns = cloud.points.T, cloud.normals.T
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
-        numbers = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
+        limits = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
         (joins,) = kernels.call(
-            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids.long(), *numbers, signed
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids.long(), *limits, signed
         )
     else:
         joins = are_valid(near, ids, cloud.valid)
@@ -158,7 +158,7 @@ def accept_edges(
         if distance is not None:
             joins &= within_distance(near, ids, columns[0], distance)
         if cloud.reach is not None:
-            joins &= on_planes(near, ids, *columns, cloud.reach)
+            joins &= within_reach(near, ids, *columns, cloud.reach)
     if cloud.colors is not None:
         limit = cloud.points.new_tensor(cloud.max_color_distance**2)
         joins &= within_distance(near, ids, cloud.colors.T, limit)
@@ -166,8 +166,8 @@ def accept_edges(
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
             connected = connect(cloud.neighbors.counted(rows))
-        asked = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
-        joins &= ~asked | are_coplanar(cloud, rows, asked, connected, config.coplanarity_floor)
+        mask = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
+        joins &= ~mask | are_coplanar(cloud, rows, mask, connected, config.coplanarity_floor)
     if connect is not None:
         if connected is None:
             connected = connect(joins)
@@ -177,12 +177,12 @@ def accept_edges(
 
 
 def _connect(shared: SharedNeighbors | None, rows: slice) -> Callable[[Tensor], Tensor] | None:
-    """Return the test of connectivity of a block of points."""
+    """Return the connectivity test of a block of points."""
     return None if shared is None else partial(shared.connected, rows)
 
 
 def _shared_neighbors(cloud: GrowingCloud, config: GrowingConfig) -> SharedNeighbors | None:
-    """Return the test of connectivity, eq. (10), None where it is off."""
+    """Return the connectivity test, eq. (10), or None if disabled."""
     if config.connectivity is None:
         return None
     k = cloud.neighbors.indices.shape[1]
@@ -190,7 +190,7 @@ def _shared_neighbors(cloud: GrowingCloud, config: GrowingConfig) -> SharedNeigh
 
 
 def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
-    """Tell which edges lead from one valid point to another one that is its neighbour."""
+    """Return a mask of the edges between two different valid points."""
     passed = near.of(valid) & valid[rows][:, None]
     passed &= near.indices != rows[:, None]
     return passed if near.valid is None else passed & near.valid
@@ -199,7 +199,7 @@ def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
 def within_angle(
     near: Neighbors, rows: Tensor, normals: Tensor, max_sq_chord: Tensor | float, *, signed: bool
 ) -> Tensor:
-    """Tell which neighbours' normals ``(3, N)`` are within an angle of the point's, eq. (8)."""
+    """Return a mask of neighbors whose normals ``(3, N)`` are within the angle limit, eq. (8)."""
     ours = [column[rows][:, None] for column in normals.unbind()]
     theirs = [near.of(column) for column in normals.unbind()]
     return sq_chords(ours, theirs, signed=signed) <= max_sq_chord
@@ -208,7 +208,7 @@ def within_angle(
 def within_distance(
     near: Neighbors, rows: Tensor, values: Tensor, max_sq_distance: Tensor
 ) -> Tensor:
-    """Tell which neighbours' values ``(C, N)``, places or colours, are within a distance."""
+    """Return a mask of neighbors whose positions or colors ``(C, N)`` are within a distance."""
     total = values.new_zeros(())
     for column in values.unbind():
         difference = near.of(column) - column[rows][:, None]
@@ -216,44 +216,44 @@ def within_distance(
     return total <= max_sq_distance
 
 
-def on_planes(
+def within_reach(
     near: Neighbors, rows: Tensor, points: Tensor, normals: Tensor, reach: Tensor
 ) -> Tensor:
-    """Tell which neighbours are within reach ``(N,)`` of the point's plane, and it of theirs."""
+    """Return a mask of edges whose ends lie within ``reach`` ``(N,)`` of each other's planes."""
     ours = theirs = points.new_zeros(())
-    for place, normal in zip(points.unbind(), normals.unbind(), strict=True):
-        away = near.of(place) - place[rows][:, None]
-        ours = (away * normal[rows][:, None]).add_(ours)
-        theirs = away.mul_(near.of(normal)).add_(theirs)
-    on_own = ours.abs_() <= reach[rows][:, None]
-    return on_own & (theirs.abs_() <= near.of(reach))
+    for position, normal in zip(points.unbind(), normals.unbind(), strict=True):
+        offset = near.of(position) - position[rows][:, None]
+        ours = (offset * normal[rows][:, None]).add_(ours)
+        theirs = offset.mul_(near.of(normal)).add_(theirs)
+    on_plane = ours.abs_() <= reach[rows][:, None]
+    return on_plane & (theirs.abs_() <= near.of(reach))
 
 
 def are_coplanar(
     cloud: GrowingCloud,
     rows: Rows,
-    asked: Tensor,
+    mask: Tensor,
     compared: Tensor | None,
     floor_fraction: float,
 ) -> Tensor:
-    """Tell which neighbours are on the point's plane by eq. (11), False where not asked.
+    """Return a mask of the candidate neighbors on the point's plane, eq. (11).
 
-    The limit is taken over the neighbours ``compared``, shape ``(n, K)``, default all; its floor is
-    a fraction of the distance to the farthest neighbour.
+    The limit is computed over the neighbors ``compared``, shape ``(n, K)``, default all. Its floor
+    is a fraction of the distance to the farthest neighbor.
     """
-    needed = (asked.sum(dim=1) > 0).nonzero().squeeze(-1)
-    indices, counted = cloud.neighbors.at(rows).at(needed)
+    tested = (mask.sum(dim=1) > 0).nonzero().squeeze(-1)
+    indices, counted = cloud.neighbors.at(rows).at(tested)
     patches = gather_patches(cloud.points, indices)
-    residuals = plane_residuals(patches, cloud.normals[rows][needed])
+    residuals = plane_residuals(patches, cloud.normals[rows][tested])
     floor = floor_fraction * patch_radii(patches, counted)
-    limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[needed])
-    result = torch.zeros_like(asked)
-    result[needed] = residuals <= limits[:, None]
+    limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[tested])
+    result = torch.zeros_like(mask)
+    result[tested] = residuals <= limits[:, None]
     return result
 
 
 def plane_residuals(patches: Tensor, normals: Tensor) -> Tensor:
-    """Return ``|(p_j - p_i) . n_i|``, shape ``(n, K)``, below eq. (10), of patches about p_i."""
+    """Return ``|(p_j - p_i) . n_i|`` of patches about p_i, shape ``(n, K)``, below eq. (10)."""
     x, y, z = patches.unbind(dim=-1)
     a, b, c = normals[:, :, None].unbind(dim=1)
     result = x * a
@@ -263,18 +263,18 @@ def plane_residuals(patches: Tensor, normals: Tensor) -> Tensor:
 
 
 def coplanarity_limits(residuals: Tensor, floor: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return the largest residual ``(n,)`` of a coplanar neighbour, eq. (11).
+    r"""Return the maximum residual ``(n,)`` of a coplanar neighbor, eq. (11).
 
     :math:`\gamma_{th} = \mathrm{median}(\gamma) + 2 \max(Q_n(\gamma), \mathrm{floor})`. The paper
-    has no floor. Without one, the limit of a neighbourhood where most residuals are equal (exact
-    or quantised coordinates) is their median, and the wall shatters.
+    has no floor. Without it, the limit of a neighborhood with mostly equal residuals (exact or
+    quantized coordinates) is their median, which fragments the wall.
     """
     scale = torch.maximum(qn(residuals, mask=mask), floor)
     return median(residuals, mask=mask) + 2 * scale
 
 
 def neighborhood_radii(points: Tensor, neighbors: Neighbors) -> Tensor:
-    """Return the distance of each point to its last neighbour, shape ``(N,)``."""
+    """Return the distance of each point to its last neighbor, shape ``(N,)``."""
     indices, counted = neighbors
     last = torch.full_like(indices[:, :1], indices.shape[1] - 1)
     if counted is not None:
@@ -284,7 +284,7 @@ def neighborhood_radii(points: Tensor, neighbors: Neighbors) -> Tensor:
 
 
 def patch_radii(patches: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the distance from each point to its farthest neighbour that counts, shape ``(n,)``."""
+    """Return the distance from each point to its farthest counted neighbor, shape ``(n,)``."""
     x, y, z = patches.unbind(dim=-1)
     sq_distances = x * x
     sq_distances += y * y

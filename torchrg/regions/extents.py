@@ -1,4 +1,4 @@
-"""Extents of planar regions: smallest rectangles and covered areas."""
+"""Extents of planar regions: minimum-area rectangles and covered areas."""
 
 import math
 from typing import NamedTuple
@@ -12,37 +12,37 @@ from torchrg import kernels
 from torchrg._parallel import places_of
 from torchrg.linalg.moments import Segments, reduce_runs
 
-_TIE = 1e-9
-"""Rectangles whose areas differ by less than this share are equal but for rounding."""
+_REL_TOL = 1e-9
+"""Relative area difference below which rectangles count as equal (rounding)."""
 
 _COMPASS = np.array([[1.0, 0], [1, 1], [0, 1], [-1, 1]])
-"""Four directions counter-clockwise; the opposite ones follow."""
+"""Four directions, counterclockwise; the opposite four are implied."""
 
 _ROUNDING = 1e-12
-"""Share of the coordinates by which a point inside an octagon is inside beyond rounding."""
+"""Relative margin by which a discarded point must be inside the octagon (rounding)."""
 
-_TO_OTHER_SIDES = np.array([[1.5], [2.0], [2.5]])
-"""Turns, in units of pi, from an edge to the front, opposite and back edges of its rectangle: 0.5,
-1 and 1.5, and 1 more as angles begin at -pi."""
+_SIDE_TURNS = np.array([[1.5], [2.0], [2.5]])
+"""Angles, in units of pi, from an edge to the front, opposite and back edges of its rectangle: 0.5,
+1 and 1.5, plus 1 because angles start at -pi."""
 
 _POINTS_PER_CELL = 9.0
-"""Points in an average cell; one cell of 8,000 is then empty by chance."""
+"""Mean number of points per cell; one cell in 8,000 is then empty by chance."""
 
 _NUM_DOUBLINGS = 4
-"""How often cells are made twice as wide, at most."""
+"""Maximum number of times the cell width is doubled."""
 
-_WIDE_ENOUGH = 1.05
-"""Cells are wide enough when cells twice as wide give less than this times the area."""
+_MAX_AREA_GROWTH = 1.05
+"""Cells are wide enough if doubling their width gives less than this times the area."""
 
 _CELL_ANGLE = math.radians(28.0)
-"""Angle between cells and rectangle: along a parallel edge all cells would be cut alike."""
+"""Angle between cell grid and rectangle: a parallel edge would cut all its cells equally."""
 
 
 class Rectangles(NamedTuple):
-    """Rectangles about M regions.
+    """Minimum-area rectangles of M regions.
 
-    Lengths of the long and of the short side, shape ``(M, 2)``; their unit directions in the
-    plane's coordinates, ``(M, 2, 2)``; and the centers, ``(M, 2)``, along those directions.
+    Lengths of the long and the short side, shape ``(M, 2)``; their unit directions in plane
+    coordinates, ``(M, 2, 2)``; and the centers, ``(M, 2)``, along those directions.
     """
 
     sides: Tensor
@@ -51,17 +51,17 @@ class Rectangles(NamedTuple):
 
 
 def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
-    """Find the rectangle of least area about each region.
+    """Fit the minimum-area rectangle to each region.
 
-    One of its sides runs along an edge of the region's convex hull [1]. Of equally small ones it is
-    that with the least angle to the coordinates ``u`` and ``v`` in the plane, given in the order of
-    :meth:`Segments.take`. A region on one line has a short side of 0, one of one place two.
+    One side lies along an edge of the convex hull [1]. Ties go to the smallest angle to the plane
+    coordinates ``u`` and ``v``, which are in the order of :meth:`Segments.take`. A collinear region
+    has a short side of 0; for a single position both sides are 0.
 
     References:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
         closed curve. Communications of the ACM 18(7), 1975.
     """
-    rectangles = [_min_rectangle(places) for places in outer_places(segments, u, v)]
+    rectangles = [_min_rectangle(positions) for positions in outer_places(segments, u, v)]
     cosine, sine, *ends = u.new_tensor(rectangles).view(-1, 6).unbind(dim=1)
     low, high = torch.stack(ends[:2], dim=1), torch.stack(ends[2:], dim=1)
     directions = torch.stack([cosine, sine, -sine, cosine], dim=1).view(-1, 2, 2)
@@ -74,84 +74,84 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
     )
 
 
-def _min_rectangle(places: NDArray[np.float64]) -> list[float]:
-    """Return cosine and sine of the smallest rectangle about points ``(n, 2)``, and its ends.
+def _min_rectangle(positions: NDArray[np.float64]) -> list[float]:
+    """Return cosine and sine of the minimum-area rectangle of points ``(n, 2)``, and its bounds.
 
-    These are the least coordinates along its two directions, then the largest ones.
+    The bounds are the minimum coordinates along its two directions, then the maximum ones.
     """
-    angle = _min_area_angle(places)
+    angle = _min_area_angle(positions)
     cosine, sine = math.cos(angle), math.sin(angle)
-    u, v = places.T
+    u, v = positions.T
     along = np.stack([u * cosine + v * sine, v * cosine - u * sine])
     return [cosine, sine, *along.min(axis=1).tolist(), *along.max(axis=1).tolist()]
 
 
-def _min_area_angle(places: NDArray[np.float64]) -> float:
-    """Return the angle of the smallest rectangle about points ``(n, 2)``, in [0, 90) degrees.
+def _min_area_angle(positions: NDArray[np.float64]) -> float:
+    """Return the angle of the minimum-area rectangle of points ``(n, 2)``, in [0, 90) degrees.
 
-    A corner of the hull is the farthest in a direction if the edges before and after it are on
-    either side of the edge that would be across it: a search among the angles of the edges.
+    The farthest corner in a direction lies between the two hull edges whose angles enclose the
+    perpendicular. It is found by a search among the edge angles.
     """
-    corners = places[_hull_corners(places)] @ [1, 1j]
+    corners = positions[_hull_corners(positions)] @ [1, 1j]
     angles = np.angle(np.roll(corners, -1) - corners)
     order = np.argsort(angles)
     corners, angles = corners[order], angles[order]
-    across = (angles + np.pi * _TO_OTHER_SIDES) % (2 * np.pi) - np.pi
+    across = (angles + np.pi * _SIDE_TURNS) % (2 * np.pi) - np.pi
     front, top, back = corners[np.searchsorted(angles, across) % len(corners)]
     to_edge = np.exp(-1j * angles)
     length, height = ((front - back) * to_edge).real, ((top - corners) * to_edge).imag
     area = (length * height).clip(min=0)
-    smallest = angles[area <= area.min() * (1 + _TIE)] % (np.pi / 2)
-    return float(np.where(smallest < np.pi / 2 - _TIE, smallest, smallest - np.pi / 2).min())
+    smallest = angles[area <= area.min() * (1 + _REL_TOL)] % (np.pi / 2)
+    return float(np.where(smallest < np.pi / 2 - _REL_TOL, smallest, smallest - np.pi / 2).min())
 
 
-def _hull_corners(places: NDArray[np.float64]) -> NDArray[np.integer]:
-    """Return the corners of the convex hull, counter-clockwise; the two ends of a line."""
+def _hull_corners(positions: NDArray[np.float64]) -> NDArray[np.integer]:
+    """Return the corners of the convex hull, counterclockwise; the two ends of a line."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        corners: NDArray[np.integer] = ConvexHull(places).vertices
+        corners: NDArray[np.integer] = ConvexHull(positions).vertices
     except QhullError:
-        corners = np.lexsort(places.T)[[0, -1]]
+        corners = np.lexsort(positions.T)[[0, -1]]
     return corners
 
 
 def outer_places(segments: Segments, u: Tensor, v: Tensor) -> list[NDArray[np.float64]]:
     """Return the points ``(n, 2)`` of each region that may be corners of its convex hull.
 
-    Not those inside the octagon of the farthest points in eight directions: S. Akl, G. Toussaint. A
-    fast convex hull algorithm. Information Processing Letters 7(5), 1978.
+    Discards points inside the octagon of the extreme points in eight directions: S. Akl, G.
+    Toussaint. A fast convex hull algorithm. Information Processing Letters 7(5), 1978.
     """
     if not segments.is_served(u):
         regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
-        return [_outside_of_octagon(places.numpy().astype(np.float64)) for places in regions]
+        return [_outside_octagon(positions.numpy().astype(np.float64)) for positions in regions]
     (outer,) = kernels.call("outer_places", u, v, segments.counts, _ROUNDING)
     chosen = places_of(outer)
     ends = torch.searchsorted(chosen, segments.counts.cumsum(0)).tolist()
-    places = torch.stack([u[chosen], v[chosen]], dim=1).numpy()
-    return [places[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+    positions = torch.stack([u[chosen], v[chosen]], dim=1).numpy()
+    return [positions[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def _outside_of_octagon(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Do as :func:`outer_places` for the points of one region."""
-    # BLAS would start threads of its own.
-    along = _COMPASS[:, :1] * places[:, 0] + _COMPASS[:, 1:] * places[:, 1]
+def _outside_octagon(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Apply :func:`outer_places` to the points of one region."""
+    # Avoids BLAS, which would start its own threads.
+    along = _COMPASS[:, :1] * positions[:, 0] + _COMPASS[:, 1:] * positions[:, 1]
     ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
-    octagon = places[ends[ends != np.roll(ends, 1)]]
+    octagon = positions[ends[ends != np.roll(ends, 1)]]
     if len(octagon) < 3:
-        return places
+        return positions
     edges = np.roll(octagon, -1, axis=0) - octagon
     inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
     offsets = (inward * octagon).sum(axis=1)
-    rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(places).max()
-    heights = inward[:, :1] * places[:, 0] + inward[:, 1:] * places[:, 1]
+    rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(positions).max()
+    heights = inward[:, :1] * positions[:, 0] + inward[:, 1:] * positions[:, 1]
     inside = (heights > (offsets + rounding)[:, None]).all(axis=0)
-    outside: NDArray[np.float64] = places[~inside]
+    outside: NDArray[np.float64] = positions[~inside]
     return outside
 
 
 class _Cells(NamedTuple):
-    """Occupied cells: region, row and column of each, and the open sides of each region's cells."""
+    """Occupied cells: region, row and column, and the cell and open side counts of each region."""
 
     owner: Tensor
     row: Tensor
@@ -163,45 +163,45 @@ class _Cells(NamedTuple):
 def covered_areas(
     segments: Segments, u: Tensor, v: Tensor, boxes: Rectangles
 ) -> tuple[Tensor, Tensor]:
-    """Return the area covered by points, without gaps, holes and dents, and the cells' width.
+    """Return the area covered by points, without gaps, holes and dents, and the cell width.
 
-    The plane is divided into square cells, at first three times as wide as the mean spacing of the
-    points, then wider until the area hardly grows, so that parts of low density have no holes.
-    Cells along the outline are only partly covered: the expected excess is taken off. Areas
-    ``(M,)`` are 0 where the points are on one line, and at most those of the rectangles; the width
-    ``(M,)`` of cells leaves no holes between points.
+    The plane is divided into square cells, initially three times the mean point spacing. They are
+    widened until the area hardly grows, so that sparse parts have no holes. Cells along the
+    boundary are only partly covered: the expected excess is subtracted. Areas ``(M,)`` are 0 for
+    collinear points and at most the rectangle areas. The cell width ``(M,)`` leaves no holes
+    between points.
     """
     box = boxes.sides.prod(dim=1)
     size = (box * _POINTS_PER_CELL / segments.counts).sqrt()
-    # A strip thinner than the spacing would have more cells than points.
+    # A strip narrower than the spacing would have more cells than points.
     size = torch.maximum(size, boxes.sides[:, 0] / segments.counts)
     cosine, sine = boxes.directions[:, 0].unbind(dim=1)
     c = segments.spread(cosine * math.cos(_CELL_ANGLE) - sine * math.sin(_CELL_ANGLE))
     s = segments.spread(sine * math.cos(_CELL_ANGLE) + cosine * math.sin(_CELL_ANGLE))
-    row = _numbered(segments, u * c + v * s, size)
-    column = _numbered(segments, v * c - u * s, size)
-    cells = _occupied(segments.labels, row, column, segments.counts)
-    area, width = _corrected(cells, segments.counts, size), size
+    row = _cell_indices(segments, u * c + v * s, size)
+    column = _cell_indices(segments, v * c - u * s, size)
+    cells = _occupied_cells(segments.labels, row, column, segments.counts)
+    area, width = _corrected_area(cells, segments.counts, size), size
     wide_enough = torch.zeros_like(size, dtype=torch.bool)
     for _ in range(_NUM_DOUBLINGS):
-        cells = _occupied(cells.owner, cells.row // 2, cells.column // 2, cells.num_cells)
+        cells = _occupied_cells(cells.owner, cells.row // 2, cells.column // 2, cells.num_cells)
         size = size * 2
-        wider = _corrected(cells, segments.counts, size)
-        wide_enough |= wider <= _WIDE_ENOUGH * area
+        wider = _corrected_area(cells, segments.counts, size)
+        wide_enough |= wider <= _MAX_AREA_GROWTH * area
         area, width = torch.where(wide_enough, area, wider), torch.where(wide_enough, width, size)
     return torch.minimum(area, box), width
 
 
-def _numbered(segments: Segments, x: Tensor, size: Tensor) -> Tensor:
-    """Return the number of each point's cell along one axis, from 0 on in each region."""
+def _cell_indices(segments: Segments, x: Tensor, size: Tensor) -> Tensor:
+    """Return the cell index of each point along one axis, from 0 in each region."""
     low = segments.spread(reduce_runs(x, segments.counts, "min"))
     return ((x - low) / segments.spread(torch.where(size > 0, size, 1.0))).long()
 
 
-def _occupied(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Cells:
-    """Return the cells with points, each once, of regions of so many points one after the other."""
-    # One empty row and column on each side, so that no cell has a neighbour of another region.
-    heights, widths = (reduce_runs(place, counts, "max") + 3 for place in (row, column))
+def _occupied_cells(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Cells:
+    """Return the distinct occupied cells of consecutive regions with ``counts`` points each."""
+    # Pad each region by one empty row and column, so that regions share no cell sides.
+    heights, widths = (reduce_runs(position, counts, "max") + 3 for position in (row, column))
     num_regions, ends = len(counts), (heights * widths).cumsum(0)
     starts = ends - heights * widths
     keys = (starts + widths + 1).index_select(0, owner) + row * widths.index_select(0, owner)
@@ -222,12 +222,12 @@ def _occupied(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Ce
     )
 
 
-def _corrected(cells: _Cells, counts: Tensor, size: Tensor) -> Tensor:
-    """Return the area of cells less what their outline overshoots.
+def _corrected_area(cells: _Cells, counts: Tensor, size: Tensor) -> Tensor:
+    """Return the cell area less the expected overshoot at the boundary.
 
     A convex shape of area A meets A + E/2 - 1 cells on average, areas in cells, E their open sides.
-    A cell covered to a share f is seen if it has a point: with probability 1 - exp(-n f), n points
-    in a full cell. Averaged over f this leaves the share 1 - 2 (1 - exp(-n)) / n of the excess.
+    A cell with covered fraction f is detected with probability 1 - exp(-n f), n points in a full
+    cell. Averaged over f, the fraction 1 - 2 (1 - exp(-n)) / n of the excess remains.
     """
     density = (counts / cells.num_cells).double()
     fraction = 1 - 2 * (1 - (-density).exp()) / density

@@ -1,4 +1,4 @@
-"""Planes of regions: robust fits, and what is known of the noise of their points."""
+"""Robust plane fits of regions, and their noise statistics."""
 
 import math
 from typing import NamedTuple
@@ -14,67 +14,68 @@ from torchrg.regions.edges import GrowingCloud, neighborhood_radii
 from torchrg.robust.scale import MAD_FACTOR
 
 POINTS_AT_ONCE = 2**18
-"""Points of regions that are fitted or measured together: at some 400 bytes each."""
+"""Points of regions that are fitted or measured together: about 400 bytes each."""
 
 BISQUARE_CUT = 4.685
-"""Residuals of this many standard deviations have weight 0: 95 % efficiency for normal data."""
+"""Residuals beyond this many standard deviations have weight 0: 95 % efficiency for normal data."""
 
 _NUM_FITS = 4
-"""After so many reweighted fits the plane no longer moves."""
+"""Reweighted fits until the plane has converged."""
 
 _FLAT_RATIO = 4.0
-"""Where one variance is not this many times the next smaller one, rounding and noise decide between
-their directions."""
+"""Minimum ratio of consecutive variances; below it noise determines their directions."""
 
 _SAME_MAGNITUDE = 1e-6
-"""Components of a normal that differ by less than this share are equal but for rounding."""
+"""Relative difference below which components of a normal count as equal (rounding)."""
 
 _CURVED_SPREAD_DEG = 8.0
-"""Root mean square angle of a region's normals to the direction they share, from which on it is
-curved: a smooth bend by three to four times this angle has this spread, a full column 45."""
+"""Minimum RMS angle of the normals of a curved region to their mean direction. A smooth bend by
+three to four times this angle has this spread, a full column 45 degrees."""
 
 MAX_FITTED = 4096
-"""Points of a region that its plane is fitted to while regions change: more of them move it by less
+"""Maximum number of points for plane fits while regions change: more points move the plane by less
 than a fiftieth of their noise."""
 
 MIN_FITTED = 10
-"""Points whose plane says where others at its border belong: that of three passes through them."""
+"""Minimum number of points of a plane that assigns boundary points: any three are coplanar."""
 
-_BENT = 0.5
-"""A region is bent if its thickness is over half the median reach of its points. Reach is four
-residuals, so this is twice the noise."""
+_BENT_FRACTION = 0.5
+"""A region is bent if its thickness exceeds this fraction of the median reach of its points. Reach
+is four residuals, so this is twice the noise."""
 
 _FACET_THICKNESS = 2 / 3
-"""Least thickness of the faces of a mesh, in facet tolerances: points beside a face are on facets
-no closer to its plane than those in it."""
+"""Minimum thickness of mesh surfaces, in facet tolerances: points next to a surface are on facets
+no closer to its plane than the points in it."""
 
 _MAX_FACET_RMS = 1.5
-"""Facet tolerances, root mean square, within which the points of a faceted region are on one plane,
-however much their normals are spread."""
+"""Maximum RMS distance, in facet tolerances, of a planar faceted region with any normals."""
 
 _MIN_HEIGHT = 0.2
-"""An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. What is
+"""An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. A region
 thinner than 0.2 a w is a plane with noisy normals."""
 
 
 _SQ_WIDTH = 12.0
-"""Square of the width of a strip that points cover evenly, in units of their variance across it."""
+"""Squared width of a uniformly covered strip, in units of the variance across it."""
 
 
 class RegionPlanes(NamedTuple):
-    """Planes of M regions, and what is known of their noise, in float64.
+    """Planes of M regions with noise statistics, in float64.
 
     Attributes:
         normal: Unit normals, shape ``(M, 3)``.
         center: A point of each plane, the weighted mean, shape ``(M, 3)``.
         covariance: Weighted covariance, shape ``(M, 3, 3)``.
         thickness: Robust standard deviation of the points from the plane, at least the floor, shape
-            ``(M,)``, as all that follow.
-        rms: Root mean square distance of the points from the plane. num_points: Number of points,
-        int64. curved: Whether the points' normals are spread too much for a plane, bool. floor:
-        Least thickness that counts. reach: Median distance within which the points take others for
-        coplanar, infinite if unknown. bent: Whether noise does not explain the thickness, bool.
-        radius: Median distance of the points to the last of their neighbours, 0 without any.
+            ``(M,)``, like all following attributes.
+        rms: RMS distance of the points from the plane.
+        num_points: Number of points, int64.
+        curved: Whether the spread of the normals is too large for a plane, bool.
+        floor: Minimum thickness.
+        reach: Median distance within which the points accept neighbors as coplanar, infinite if
+            unknown.
+        bent: Whether noise does not explain the thickness, bool.
+        radius: Median distance of the points to their last neighbor, 0 if unknown.
     """
 
     normal: Tensor
@@ -91,41 +92,41 @@ class RegionPlanes(NamedTuple):
 
     @property
     def strips(self) -> Tensor:
-        """Whether a flat region is narrower than its neighbourhoods reach, shape ``(M,)``, bool."""
+        """Mask of flat regions narrower than the neighborhood radius, shape ``(M,)``, bool."""
         width = (_SQ_WIDTH * eigh3_of_few(self.covariance)[0][:, 1].clamp(min=0)).sqrt()
         return ~self.curved & (width <= self.radius)
 
     @property
     def noise(self) -> Tensor:
-        """The thickness where it is known to be noise, shape ``(M,)``, else 0."""
+        """The thickness if it is known to be noise, otherwise 0, shape ``(M,)``."""
         is_noise = self.reach.isfinite() & ~self.bent & ~self.curved
         return torch.where(is_noise, self.thickness, 0.0)
 
     def times_thickness(self, factor: float) -> Tensor:
-        """Return a distance from each plane ``(M,)``: NaN, no distance at all, if it is curved."""
+        """Return ``factor`` times the thickness ``(M,)``, NaN for curved regions."""
         return torch.where(self.curved, torch.nan, factor * self.thickness)
 
     def flattened(self, facet_tolerance: float | Auto | None) -> "RegionPlanes":
-        """Return the planes with no region curved whose points lie within 1.5 facet tolerances."""
+        """Return the planes with regions within 1.5 facet tolerances marked as not curved."""
         if facet_tolerance is None:
             return self
         limit = _MAX_FACET_RMS * float(facet_tolerance)
         return self._replace(curved=self.curved & (self.rms > limit))
 
     def distances(self, points: Tensor, regions: Tensor) -> Tensor:
-        """Return the distance of each point ``(n, 3)`` from the plane of a region ``(n,)``."""
-        away = points.new_zeros(len(points), dtype=torch.float64)
+        """Return the distance of each point ``(n, 3)`` to the plane of a region ``(n,)``."""
+        offset = points.new_zeros(len(points), dtype=torch.float64)
         columns = [values.unbind(dim=1) for values in (points, self.center, self.normal)]
         for chunk in chunks_of(len(points), ROWS_AT_ONCE):
             owner = regions[chunk]
-            for place, center, normal in zip(*columns, strict=True):
-                away[chunk] += (place[chunk].double() - center[owner]) * normal[owner]
-        return away.abs_()
+            for position, center, normal in zip(*columns, strict=True):
+                offset[chunk] += (position[chunk].double() - center[owner]) * normal[owner]
+        return offset.abs_()
 
     def signed_distances(self, points: Tensor, regions: Tensor) -> Tensor:
-        """Return distances of points ``(n, 3)`` from planes of regions ``(n, C)``, with signs."""
-        away = points.double()[:, None] - self.center[regions]
-        return (away * self.normal[regions]).sum(dim=2)
+        """Return signed distances of points ``(n, 3)`` to planes of regions ``(n, C)``."""
+        offset = points.double()[:, None] - self.center[regions]
+        return (offset * self.normal[regions]).sum(dim=2)
 
 
 def fit_planes(
@@ -133,43 +134,42 @@ def fit_planes(
 ) -> RegionPlanes:
     """Fit planes by total least squares, iteratively reweighted with Tukey's bisquare [1].
 
-    The weight of a point falls to 0 at 4.685 times the robust standard deviation of the residuals
-    (1.4826 times their median), so that points of another surface do not tilt the plane.
-    ``normals`` of any sign decide where points do not, in regions of one or two points or along a
-    line; the sign is that of :func:`with_table_sign`. Nothing is known of the noise: the floor is
-    0. Where points of a region have ``shared`` normals these are ``(M, 3)``, and no region is
-    curved.
+    The weight of a point falls to 0 at 4.685 robust standard deviations of the residuals (1.4826
+    times their median). Points of another surface thus do not tilt the plane. ``normals`` of any
+    sign decide for degenerate regions: one or two points, or collinear points. For the sign see
+    :func:`canonicalize_sign`. The floor is 0 because the noise is unknown. With ``shared``,
+    ``normals`` are one per region, ``(M, 3)``, and no region is curved.
 
     References:
         [1] P. Huber, E. Ronchetti. Robust Statistics, 2nd edition. Wiley, 2009.
     """
     chunks = segments.chunks(POINTS_AT_ONCE)
     sizes = [len(chunk.counts) for chunk in chunks]
-    own = torch.split(normals, sizes) if shared else [None] * len(chunks)
+    chunk_normals = torch.split(normals, sizes) if shared else [None] * len(chunks)
     parts = map_tasks(
-        lambda task: _fit_together(task[0], points, normals, task[1]),
-        list(zip(chunks, own, strict=True)),
+        lambda task: _fit_chunk(task[0], points, normals, task[1]),
+        list(zip(chunks, chunk_normals, strict=True)),
         points.device,
     )
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _shared_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal that points share, signs aside, and the spread of theirs, in degrees."""
+def _mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean normal of each region, up to sign, and its spread in degrees."""
     columns = segments.take_about(normals, normals.new_zeros(len(segments.counts), 3).double())
     _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
     eigenvalues, directions = eigh3_of_few(squares)
     return directions[:, :, 2], (1 - eigenvalues[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
 
 
-def _fit_together(
+def _fit_chunk(
     segments: Segments, points: Tensor, normals: Tensor, shared: Tensor | None
 ) -> RegionPlanes:
-    """Fit planes to regions that are held in memory together; see :func:`fit_planes`."""
+    """Fit planes to one chunk of regions; see :func:`fit_planes`."""
     if shared is None:
-        usual, spread = _shared_normals(segments, normals)
+        mean_normal, spread = _mean_normals(segments, normals)
     else:
-        usual, spread = shared.double(), torch.zeros_like(shared[:, 0])
+        mean_normal, spread = shared.double(), torch.zeros_like(shared[:, 0])
     origin = segments.first(points).double()
     local = segments.take_about(points, origin)
     weights = torch.ones_like(local[0])
@@ -177,14 +177,14 @@ def _fit_together(
     for _ in range(_NUM_FITS):
         mean, covariance = segments.moments(local, weights)
         variances, axes = eigh3_of_few(covariance)
-        normal = with_table_sign(_plane_normals(variances, axes, usual))
+        normal = canonicalize_sign(_plane_normals(variances, axes, mean_normal))
         factors = (MAD_FACTOR, BISQUARE_CUT)
         weights, median, squares = segments.reweigh(local, mean, normal, resolution, factors)
     thickness = MAD_FACTOR * median
-    # The angle times the width across the bend, which is at least the middle one, is its height.
+    # The height of an arc is its angle times its width, which is at least the middle axis.
     height = _MIN_HEIGHT * spread.deg2rad() * variances[:, 1].clamp(min=0).sqrt()
-    # Of an arc without width the plane is its own, and says nothing of its thickness.
-    crosses = (usual * normal).sum(dim=1).abs() > math.sqrt(0.5)
+    # An arc without width lies in its own plane, which does not show its thickness.
+    crosses = (mean_normal * normal).sum(dim=1).abs() > math.sqrt(0.5)
     return RegionPlanes(
         normal,
         origin + mean,
@@ -201,12 +201,12 @@ def _fit_together(
 
 
 def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> RegionPlanes:
-    """Return the planes of the regions of a cloud in canonical order, of some points of each.
+    """Fit planes to the regions of a cloud in canonical order, using a sample of each.
 
-    The floor of the thickness is a fraction of the median neighbourhood's radius, as in the test of
-    coplanarity. Curved are regions whose normals are spread and that noise alone does not make so
-    thick: in faces a few centimetres wide, noise spreads normals, too. ``labels`` ``(N,)`` are 0 to
-    M-1, each at least once, or negative.
+    The floor of the thickness is a fraction of the median neighborhood radius, as in the
+    coplanarity test. A region is curved if its normals are spread and noise alone does not explain
+    its thickness. In surfaces a few centimeters wide, noise also spreads normals. ``labels``
+    ``(N,)`` are 0 to M-1, each at least once, or negative.
     """
     segments = Segments(labels, most=MAX_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
@@ -229,40 +229,40 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
     if cloud.reach is None:
         return planes
     reach = segments.median(segments.take(cloud.reach)).double()
-    explained = torch.where(reach.isfinite(), torch.maximum(_BENT * reach, floor), floor)
+    explained = torch.where(reach.isfinite(), torch.maximum(_BENT_FRACTION * reach, floor), floor)
     bent = planes.thickness > explained
     return planes._replace(curved=planes.curved & bent, reach=reach, bent=bent)
 
 
 class RegionFits:
-    """The planes of the regions of a cloud, fitted again only when the labels have changed."""
+    """Cached region planes, refitted only when the labels change."""
 
     def __init__(self, cloud: GrowingCloud, config: GrowingConfig) -> None:
         self._cloud, self._config = cloud, config
-        self._known: tuple[Tensor, RegionPlanes] | None = None
+        self._cached: tuple[Tensor, RegionPlanes] | None = None
 
-    def of(self, labels: Tensor) -> RegionPlanes:
-        """Return what :func:`fit_regions` does."""
-        if self._known is None or not torch.equal(self._known[0], labels):
-            self._known = labels, fit_regions(self._cloud, labels, self._config)
-        return self._known[1]
+    def get(self, labels: Tensor) -> RegionPlanes:
+        """Return the result of :func:`fit_regions`."""
+        if self._cached is None or not torch.equal(self._cached[0], labels):
+            self._cached = labels, fit_regions(self._cloud, labels, self._config)
+        return self._cached[1]
 
 
-def _plane_normals(variances: Tensor, axes: Tensor, usual: Tensor) -> Tensor:
-    """Return the normals of planes, from the points' own normals where the points give none."""
+def _plane_normals(variances: Tensor, axes: Tensor, mean_normal: Tensor) -> Tensor:
+    """Return plane normals, using the mean normals where the points are degenerate."""
     low, middle, high = variances.unbind(dim=1)
     along = axes[:, :, 2]
     is_line = high > _FLAT_RATIO * middle
-    component = (usual * along).sum(dim=1, keepdim=True) * along
-    across = usual - torch.where(is_line[:, None], component, 0.0)
+    component = (mean_normal * along).sum(dim=1, keepdim=True) * along
+    across = mean_normal - torch.where(is_line[:, None], component, 0.0)
     length = across.norm(dim=1, keepdim=True)
     across = torch.where(length > 0, across / length, axes[:, :, 0])
     is_flat = middle > _FLAT_RATIO * low
     return torch.where(is_flat[:, None], axes[:, :, 0], across)
 
 
-def with_table_sign(normals: Tensor) -> Tensor:
-    """Return normals whose component of largest magnitude, of equal ones the last, is positive."""
+def canonicalize_sign(normals: Tensor) -> Tensor:
+    """Flip normals so that the component of largest magnitude (the last among ties) is positive."""
     magnitudes = normals.abs()
     near = magnitudes >= (1 - _SAME_MAGNITUDE) * magnitudes.amax(dim=1, keepdim=True)
     last = 2 - near.flip(1).to(torch.uint8).argmax(dim=1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Region growing: from points, normals and neighbours to labels."""
+"""Region growing from points, normals and neighbors."""
 
 import math
 from collections.abc import Iterator
@@ -21,15 +21,15 @@ from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import NearestPoints
-from torchrg.regions.edges import GrowingCloud, mark_edges, neighborhood_radii, promotes_late
+from torchrg.regions.edges import GrowingCloud, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
 from torchrg.structures import UNLABELED, Neighbors
 
 _ROOTS_AT_ONCE = 1024
-"""Points that regions begin at between two releases of what is on a disk. Where each reads a list
-for itself, the system maps some 200 kB around it."""
+"""Root points between two releases of memory-mapped arrays. Each root may map about 200 kB of
+lists."""
 
 
 @of_clouds
@@ -50,50 +50,50 @@ def grow_regions(
     chunk_size: int = CHUNK_SIZE,
     **changes: Any,  # noqa: ANN401
 ) -> Tensor:
-    """Grow regions of similar normals, in the order of ascending curvature (Algorithm 2) [1].
+    """Grow regions of similar normals in order of ascending curvature (Algorithm 2) [1].
 
-    A region starts at the free point of least curvature. Each of its seeds claims those of its free
-    neighbours that pass the criteria of the settings; a claimed point becomes a seed if the seed
-    rule holds. With ``connectivity_scope="seed"`` the two must also be connected, and where that
-    fails for the seed that claimed the point, any later seed of its region may still make it one:
-    without such late promotion regions shatter.
+    A region starts at the unassigned point of lowest curvature. Each seed claims its unassigned
+    neighbors that pass the configured criteria; a claimed point becomes a seed if the seed rule
+    holds. With ``connectivity_scope="seed"`` the two must also be connected. If this fails for the
+    claiming seed, any later seed of the region may still promote the point; without this late
+    promotion regions fragment.
 
     Convention:
-        All limits are inclusive. The curvature limit is the value at place
+        All limits are inclusive. The curvature limit is the value at index
         ``floor(curvature_quantile * (n - 1))`` of the sorted curvatures of the n valid points.
-        Equal curvatures are taken in canonical order. Labels are 0 to M-1 by descending size,
-        regions of equal size by their first point in canonical order. They do not depend on the
-        order of the points (exact duplicates may swap) or on chunk size.
+        Equal curvatures are taken in canonical order. Labels are 0 to M-1 by descending size, ties
+        by first point in canonical order. They do not depend on the point order (exact duplicates
+        may swap) or on the chunk size.
 
     Args:
         points: Finite points, shape ``(N, 3)``.
-        normals: Unit normals, shape ``(N, 3)``; their sign only matters with ``signed_normals``.
+        normals: Unit normals, shape ``(N, 3)``; the sign only matters with ``signed_normals``.
         curvature: Surface variation, shape ``(N,)``.
-        neighbors: Neighbours of each point, as :func:`torchrg.search_knn` gives them: the point
-            itself first. Copies of points are neighbors there, so leave them out before the search
-            (:func:`torchrg.neighbors.distinct_points`), as :func:`torchrg.segment_planes` does.
-        config: Settings, a dictionary of them, a whole configuration, or the name of a preset.
-            Default: that of :func:`torchrg.load_config`, which needs ``residual_rms``.
-        valid: Points that have a normal, shape ``(N,)``, bool; no region passes through others, nor
-            through points whose normal or curvature is not finite. Default: all.
-        residual_rms: How far the neighbours are from the planes of the points, shape ``(N,)``, as a
-            :class:`torchrg.structures.NormalFit` has it, for ``plane_reach``.
-        colors: Colours of the points, shape ``(N, C)``.
-        max_color_distance: A neighbour whose colour differs by more than this (Euclidean, in the
-            unit of the colours) does not join. Default: colours play no part.
-        signed_normals: Whether opposite normals, if oriented, differ by 180 degrees instead of 0,
-            so that the two faces of a thin wall never join.
-        canonical: Whether the points already are in canonical order; saves a copy.
-        chunk_size: Points handled at a time.
-        **changes: Single settings, as in ``max_angle_deg=7``.
+        neighbors: Neighbors of each point from :func:`torchrg.search_knn`, the point itself first.
+            Remove duplicates before the search (:func:`torchrg.neighbors.distinct_points`), as
+            :func:`torchrg.segment_planes` does, because duplicates are neighbors of each other.
+        config: A growing configuration, a dictionary, a complete configuration, or a preset name.
+            Default: that of :func:`torchrg.load_config`, which requires ``residual_rms``.
+        valid: Points that have a normal, shape ``(N,)``, bool. Regions do not pass through invalid
+            points or points with a non-finite normal or curvature. Default: all.
+        residual_rms: RMS distance of the neighbors to each point's plane, shape ``(N,)``, as in
+            :class:`torchrg.structures.NormalFit`; required for ``plane_reach``.
+        colors: Colors of the points, shape ``(N, C)``.
+        max_color_distance: Maximum Euclidean color difference of a neighbor that joins, in color
+            units. Default: colors are ignored.
+        signed_normals: Whether opposite normals differ by 180 degrees instead of 0 (for oriented
+            normals), which separates the two sides of a thin wall.
+        canonical: Whether the points are already in canonical order; saves a copy.
+        chunk_size: Points processed at a time.
+        **changes: Individual parameters, as in ``max_angle_deg=7``.
 
     Returns:
-        Labels, shape ``(N,)``, int64; :data:`torchrg.UNLABELED` for points of no region and of
-        regions smaller than ``min_size``.
+        Labels, shape ``(N,)``, int64; :data:`torchrg.UNLABELED` for unassigned points and regions
+        smaller than ``min_size``.
 
     Raises:
         ShapeError: If a shape, dtype or device is not as above.
-        ConfigError: If residuals or colours are needed, and there are none, or a setting is wrong.
+        ConfigError: If required residuals or colors are missing, or a parameter is invalid.
 
     References:
         [1] T. Rabbani, F. van den Heuvel, G. Vosselman. Segmentation of point clouds using
@@ -117,7 +117,7 @@ def grow_regions(
     cloud = checked_cloud(settings, points, normals, curvature, neighbors, valid, residual_rms)
     cloud = cloud._replace(signed_normals=signed_normals)
     if max_color_distance < math.inf:
-        cloud = _with_colors(cloud, colors, max_color_distance)
+        cloud = _add_colors(cloud, colors, max_color_distance)
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
     order = None if canonical else canonical_order(cloud.points)
@@ -130,7 +130,7 @@ def grow_regions(
 
 
 def needs_sampling(config: GrowingConfig) -> bool:
-    """Whether a setting is ``auto``, to be chosen by :func:`measure_sampling`."""
+    """Return whether a parameter is ``auto``, resolved by :func:`measure_sampling`."""
     faceted = config.faceted if config.facet_tolerance is not None else False
     return "auto" in (config.min_size, config.facet_tolerance, faceted)
 
@@ -138,16 +138,16 @@ def needs_sampling(config: GrowingConfig) -> bool:
 def label_regions(
     cloud: GrowingCloud, roots: Tensor, config: GrowingConfig, chunk_size: int
 ) -> Tensor:
-    """Return labels of regions that have grown, after all steps that the settings ask for."""
-    least = int(config.min_size)
+    """Return region labels after the enabled split and refinement steps."""
+    min_points = int(config.min_size)
     if config.absorb:
-        # A region may be large enough only with the points that it absorbs.
-        least = min(least, max(least // 2, MIN_FITTED))
-    # Facets make a face together, however small they are.
-    fitted = least if config.facet_tolerance is None else min(least, MIN_FITTED)
+        # A region may reach ``min_size`` only after boundary assignment.
+        min_points = min(min_points, max(min_points // 2, MIN_FITTED))
+    # Facets of any size can be merged into a large surface.
+    fitted = min_points if config.facet_tolerance is None else min(min_points, MIN_FITTED)
     labels, fits = number_by_size(roots, fitted), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
-        mixed = find_mixed_regions(cloud, labels, fits.of(labels), config, chunk_size)
+        mixed = find_mixed_regions(cloud, labels, fits.get(labels), config, chunk_size)
         if mixed is not None:
             cores = number_by_size(grow(mixed.part, config, chunk_size), int(config.min_size))
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
@@ -155,10 +155,10 @@ def label_regions(
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
         contacts = NearestPoints(cloud.neighbors).contacts(labels)
         tolerance = float(config.facet_tolerance)
-        labels = merge_facets(labels, contacts, fits.of(labels), tolerance=tolerance)
-        labels = number_by_size(labels, least)
+        labels = merge_facets(labels, contacts, fits.get(labels), tolerance=tolerance)
+        labels = number_by_size(labels, min_points)
     if config.cut_bridges and bool((labels >= 0).any()):
-        split = split_levels(cloud, labels, fits.of(labels), config)
+        split = split_levels(cloud, labels, fits.get(labels), config)
         labels = labels if split is labels else number_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = number_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
@@ -174,7 +174,7 @@ def checked_cloud(
     valid: Tensor | None,
     residual_rms: Tensor | NDArray[np.floating] | None,
 ) -> GrowingCloud:
-    """Check what the user passed to :func:`grow_regions`, in the order it came in."""
+    """Validate the arguments of :func:`grow_regions`, keeping the point order."""
     caller = "grow_regions"
     points = as_tensor(caller, "points", points).detach()
     normals = as_tensor(caller, "normals", normals).detach()
@@ -195,13 +195,13 @@ def checked_cloud(
     if config.plane_reach is not None:
         if residual_rms is None:
             raise ConfigError(
-                f"{caller}: expected residual_rms, which plane_reach needs, got None; pass that of "
-                "the normals or set plane_reach to None."
+                f"{caller}: expected residual_rms (required by plane_reach), got None. Pass "
+                "residual_rms of the normals, or set plane_reach to None."
             )
         residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
         check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
         check_floating(caller, points=points, residual_rms=residual_rms)
-        # Where the fit is exact nothing is known of the noise.
+        # The noise is unknown if the fit is exact.
         floor = config.coplanarity_floor * neighborhood_radii(points, neighbors)
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
@@ -210,10 +210,10 @@ def checked_cloud(
     return GrowingCloud(*columns, curvature, neighbors, valid, reach)
 
 
-def _with_colors(
+def _add_colors(
     cloud: GrowingCloud, colors: Tensor | NDArray[np.generic] | None, max_distance: float
 ) -> GrowingCloud:
-    """Return the cloud with colours, and how much they may differ."""
+    """Return the cloud with colors and the maximum color difference."""
     if colors is None or max_distance < 0:
         raise ConfigError(
             "grow_regions: expected colors and max_color_distance >= 0, got "
@@ -226,7 +226,7 @@ def _with_colors(
 
 
 def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
-    """Return the cloud, and the rows its neighbours name, in an order ``(N,)`` of old rows."""
+    """Return the cloud in the order of old rows ``(N,)``, with neighbor indices remapped."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
     neighbors = cloud.neighbors.at(order)
@@ -242,38 +242,38 @@ def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
 
 
 def by_column(vectors: Tensor) -> Tensor:
-    """Return vectors ``(N, C)`` laid out column by column."""
+    """Return vectors ``(N, C)`` in column-major layout."""
     return vectors.T.contiguous().T
 
 
 def number_by_size(regions: Tensor, min_size: int) -> Tensor:
-    """Number regions by descending size, those of equal size by their first point.
+    """Number regions by descending size, ties by first point.
 
-    ``regions`` ``(N,)`` holds a number below N for each region, -1 for none. Those smaller than
-    ``min_size`` become :data:`torchrg.UNLABELED`.
+    ``regions`` ``(N,)`` holds one integer below N per region, -1 if unassigned. Regions smaller
+    than ``min_size`` become :data:`torchrg.UNLABELED`.
     """
     old = regions.cpu().numpy()
-    # Runs of equal numbers are counted at once: many are long.
+    # Count runs of equal labels at once: many are long.
     starts = np.append(0, np.flatnonzero(old[1:] != old[:-1]) + 1)[: len(old)]
-    lengths, of_run = np.diff(starts, append=len(old)), old[starts]
-    num = int(of_run.max(initial=UNLABELED)) + 1
-    sizes = np.bincount(of_run + 1, lengths, minlength=num + 1)[1:]
+    lengths, run_labels = np.diff(starts, append=len(old)), old[starts]
+    num = int(run_labels.max(initial=UNLABELED)) + 1
+    sizes = np.bincount(run_labels + 1, lengths, minlength=num + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))
     firsts = np.empty(num + 1, dtype=np.int32)
-    # Of several writes to one place the last one stays: in reverse, the first.
-    firsts[of_run[::-1]] = starts[::-1]
+    # The last of several writes to an index wins: in reverse order, the first.
+    firsts[run_labels[::-1]] = starts[::-1]
     large = large[np.lexsort((firsts[large], -sizes[large]))]
-    # The last entry is what -1 finds.
+    # The last entry is selected by -1.
     numbers = np.full(num + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
-    return torch.from_numpy(np.repeat(numbers[of_run], lengths)).to(regions.device)
+    return torch.from_numpy(np.repeat(numbers[run_labels], lengths)).to(regions.device)
 
 
 def number_by_count(labels: Tensor) -> Tensor:
-    """Return new numbers of regions, by their points: descending, equal counts in their order.
+    """Return new region numbers by descending point count, ties in the old order.
 
-    ``labels`` ``(N,)`` are those of points, -1 for none. The last of the numbers ``(M + 1,)`` is
-    that of -1, so that they can be indexed by labels.
+    ``labels`` ``(N,)`` are per point, -1 if unlabeled. The last of the numbers ``(M + 1,)`` belongs
+    to -1, so that labels can index them.
 
     Example:
         >>> number_by_count(torch.tensor([0, 1, 1, -1])).tolist()
@@ -285,9 +285,9 @@ def number_by_count(labels: Tensor) -> Tensor:
 
 
 def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
-    """Return the root of each point's region ``(N,)``: the point it began with, or -1.
+    """Return the root of each point's region ``(N,)``, i.e. its first point, or -1.
 
-    Points that are not valid have none, and some of those whose region is too small to count.
+    Invalid points have none, nor do some points of regions below ``min_size``.
     """
     growing, indices = cloud.curvature[cloud.valid], cloud.neighbors.indices.cpu()
     limit = curvature_limit(growing, config.curvature_quantile)
@@ -297,13 +297,13 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
     joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
         order = order[: int(torch.count_nonzero(growing <= limit))]
-    tables, late = (indices, joins, makes_seed, is_seed, valid), promotes_late(config)
+    tables, late = (indices, joins, makes_seed, is_seed, valid), has_late_promotion(config)
     if kernels.serve(indices, valid):
         roots = torch.full(valid.shape, UNLABELED, dtype=torch.int32, device="cpu")
         queue = torch.empty_like(roots)
         at_once = _ROOTS_AT_ONCE if scratch.is_active() else max(len(order), 1)
-        for some in torch.split(order, at_once):
-            kernels.call("grow_regions", *tables, some, late, roots, queue)
+        for batch in torch.split(order, at_once):
+            kernels.call("grow_regions", *tables, batch, late, roots, queue)
             scratch.release()
     else:
         roots = grow_first_in_first_out(*tables, order, late=late)
@@ -311,7 +311,7 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
-    """Return the lower quantile of curvatures ``(n,)``, one of the values; 0 where n is 0."""
+    """Return the lower quantile of curvatures ``(n,)``, an element of them; 0 if n is 0."""
     if len(curvature) == 0:
         return curvature.new_zeros(())
     return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
@@ -327,28 +327,28 @@ def grow_first_in_first_out(
     *,
     late: bool,
 ) -> Tensor:
-    """Grow one region after the other, each from a first-in-first-out queue of seeds (Algorithm 2).
+    """Grow regions one after another, each from a FIFO queue of seeds (Algorithm 2).
 
-    A point belongs to the first seed in the queue that it joins. Whether it becomes a seed itself
-    is a property of that edge, or its own where edges say nothing of it; :func:`mark_edges` returns
-    the bits of both. With ``late`` promotion any edge of its region may make a point a seed,
-    whichever claimed it: those that merely join do so when all seeds are known.
+    A point belongs to the first seed in the queue that it joins. The claiming edge decides whether
+    it becomes a seed, or the point itself if ``makes_seed`` is None; :func:`mark_edges` returns
+    both masks. With ``late`` promotion any edge of its region may make a point a seed; points that
+    merely join are claimed after all seeds are known.
 
-    All waiting seeds are taken at a time, their edges in the order of the queue: this claims
-    exactly what one seed after the other does. Returns the root of each point's region.
+    All waiting seeds are processed at once, their edges in queue order, which claims exactly the
+    same points as one seed after another. Returns the root of each point's region.
     """
     lists, free, is_seed_itself = neighbors.numpy(), valid.numpy().copy(), is_seed.numpy()
     roots, slots = np.full(len(free), UNLABELED, dtype=np.int32), np.empty(len(free), np.int32)
 
     def claim(root: int, seeds: NDArray[np.integer], *, promoted: bool) -> NDArray[np.integer]:
-        """Give a region the free neighbours of its seeds, and return those that become seeds."""
+        """Assign unassigned neighbors of the seeds to a region, and return the new seeds."""
         near = lists[seeds]
-        claims = _flags(joins, seeds, near) & free[near]
-        by_edge = None if makes_seed is None else _flags(makes_seed, seeds, near)
+        claims = _unpack(joins, seeds, near) & free[near]
+        by_edge = None if makes_seed is None else _unpack(makes_seed, seeds, near)
         if promoted:
             claims &= by_edge
         targets = near[claims]
-        # Of several writes to one place the last one stays: in reverse, the first edge to a point.
+        # The last of several writes wins: in reverse order, the first edge to a point.
         numbers = np.arange(len(targets), dtype=np.int32)
         slots[targets[::-1]] = numbers[::-1]
         free[targets], roots[targets] = False, root
@@ -356,7 +356,7 @@ def grow_first_in_first_out(
         new: NDArray[np.integer] = targets[becomes_seed & (slots[targets] == numbers)]
         return new
 
-    for root in _still_free(order.numpy(), free):
+    for root in _unassigned(order.numpy(), free):
         if not free[root]:
             continue
         free[root], roots[root] = False, root
@@ -368,15 +368,17 @@ def grow_first_in_first_out(
     return torch.from_numpy(roots)
 
 
-def _flags(bits: Tensor, rows: NDArray[np.integer], near: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return the bits of some rows, one for each of the neighbours ``(n, K)``."""
+def _unpack(
+    bits: Tensor, rows: NDArray[np.integer], near: NDArray[np.integer]
+) -> NDArray[np.bool_]:
+    """Return the bits of the given rows, one for each neighbor, shape ``(n, K)``."""
     of_rows = bits.numpy()[rows].view(np.uint8)
     flags = np.unpackbits(of_rows, axis=1, count=near.shape[1], bitorder="little")
     return flags.view(np.bool_)
 
 
-def _still_free(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
-    """Give the points that are free when their chunk begins: a list of all takes 36 bytes each."""
+def _unassigned(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
+    """Yield points unassigned when their chunk starts; a full list takes 36 bytes each."""
     for rows in chunks_of(len(order), ROWS_AT_ONCE):
         chunk = order[rows]
         yield from chunk[free[chunk]].tolist()

@@ -1,4 +1,4 @@
-"""Polygons about the points of planar regions."""
+"""Boundary polygons of planar regions."""
 
 from typing import Any
 
@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from torchrg._optional import require
 
 
-def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
-    """Return the outline of points in a plane: rings through some of them.
+def trace_polygon(positions: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
+    """Return the boundary polygons of points in a plane, as rings through some of the points.
 
-    The points near an edge, found with square cells, are triangulated. Triangles over cells without
-    points are left out, and the others united. Holes and dents narrower than ``width``, that of the
-    cells, are filled. Outer rings ``(V, 2)``, the first point not repeated, run counter-clockwise,
-    holes clockwise; points on one line have none.
+    Points near an edge, found with square cells, are triangulated. Triangles over empty cells are
+    dropped, the remaining ones united. Holes and dents narrower than ``width``, the cell width, are
+    filled. Outer rings ``(V, 2)`` run counterclockwise, holes clockwise, without repeating the
+    first point; collinear points have none.
 
     Raises:
         MissingDependencyError: If shapely is not installed.
@@ -25,32 +25,32 @@ def trace_outline(places: NDArray[np.float64], width: float) -> list[NDArray[np.
     shapely = require("shapely", extra="outline", purpose="trace outlines")
     if width <= 0:
         return []
-    cells = np.floor((places - places.min(axis=0)) / width).astype(np.int64) + 1
+    cells = np.floor((positions - positions.min(axis=0)) / width).astype(np.int64) + 1
     occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
     occupied[tuple(cells.T)] = True
     inside = binary_erosion(occupied, np.ones((3, 3), dtype=bool))
-    corners = places[~inside[tuple(cells.T)]]
+    corners = positions[~inside[tuple(cells.T)]]
     try:
         triangles = corners[Delaunay(corners).simplices]
     except (QhullError, ValueError):
         return []
     ends = np.roll(triangles, 1, axis=1)
-    tried = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
-    reached = np.floor((tried - places.min(axis=0)) / width).astype(np.int64) + 1
-    covered = occupied[reached[..., 0], reached[..., 1]].all(axis=1)
-    # Triangles that share whole edges are a coverage, which is united twenty times as fast.
+    probes = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
+    sampled_cells = np.floor((probes - positions.min(axis=0)) / width).astype(np.int64) + 1
+    covered = occupied[sampled_cells[..., 0], sampled_cells[..., 1]].all(axis=1)
+    # Triangles sharing complete edges form a coverage, whose union is twenty times faster.
     shape = shapely.coverage_union_all(shapely.polygons(triangles[covered]))
     return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
 
 
 def _rings(shapely: Any, shape: Any, min_area: float) -> list[NDArray[np.float64]]:  # noqa: ANN401
-    """Return the rings of a polygon or of several, largest polygon first, without specks."""
+    """Return the rings of one or more polygons, largest first, without specks."""
     parts = [polygon for polygon in shapely.get_parts(shape) if polygon.geom_type == "Polygon"]
     largest = max((polygon.area for polygon in parts), default=0.0)
     parts = [polygon for polygon in parts if polygon.area >= min(min_area, largest)]
     rings: list[NDArray[np.float64]] = []
     for polygon in sorted(parts, key=lambda polygon: -polygon.area):
-        turned = shapely.geometry.polygon.orient(polygon)
-        holes = [hole for hole in turned.interiors if shapely.Polygon(hole).area >= min_area]
-        rings += [np.asarray(ring.coords)[:-1] for ring in (turned.exterior, *holes)]
+        oriented = shapely.geometry.polygon.orient(polygon)
+        holes = [hole for hole in oriented.interiors if shapely.Polygon(hole).area >= min_area]
+        rings += [np.asarray(ring.coords)[:-1] for ring in (oriented.exterior, *holes)]
     return rings

@@ -1,10 +1,9 @@
-"""Under-segmentation: regions of several faces are split at bridges and at levels.
+"""Under-segmentation repair: splitting regions at bridges and at parallel levels.
 
-A bridge is a few points that join two faces. Which regions are mixed comes first
-(:func:`find_mixed_regions`). Within them growth goes on once more, under stricter limits; it finds
-*cores* of faces. :func:`cut_bridges` decides which cores are one surface, and gives the points
-between the others to the nearest. :func:`split_levels` splits a region that holds two parallel
-surfaces, as a wall and a board on it.
+A bridge is a few points that connect two surfaces. :func:`find_mixed_regions` detects mixed
+regions. Growing them again under stricter limits yields *cores*. :func:`cut_bridges` decides which
+cores are one surface and assigns the points between cores to the nearest. :func:`split_levels`
+splits regions that contain two parallel surfaces, such as a wall and a board on it.
 """
 
 from typing import NamedTuple
@@ -20,96 +19,97 @@ from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, NearestPoints
 from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
 from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
-from torchrg.regions.repair import misfit_of_pairs, renumber
+from torchrg.regions.repair import pairwise_misfit, remap_labels
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import UNLABELED, Neighbors
 
 _CORE_FRACTION = 0.5
-"""Share of the limits of angle and distance within which the core of a face is connected."""
+"""Fraction of the angle and distance limits within which the core of a surface is connected."""
 
-_SMOOTH_ANGLE = 0.3
-"""A surface is smooth where normals of neighbours differ by less than this share of the largest
+_SMOOTH_FRACTION = 0.3
+"""A surface is smooth where neighboring normals differ by less than this fraction of the maximum
 angle."""
 
-_MIN_SMOOTH = 0.7
-"""Cores grow only through points with at least 0.7 of the smooth neighbours that are usual (the
-median) in their region; elsewhere noise may hide an edge."""
+_MIN_SMOOTH_RATIO = 0.7
+"""Cores grow only through points whose fraction of smooth neighbors is at least 0.7 of the region's
+median. At other points noise may hide an edge."""
 
-_MAX_OFF_PLANE = 0.1
-"""Share of a region's points off its plane up to which the others are one face."""
+_MAX_OFF_PLANE_FRACTION = 0.1
+"""Maximum fraction of a region's points off its plane for which the plane is one surface."""
 
 _EXACT_REACH = 4.0
-"""Points of exact faces lie within this many least thicknesses of the plane of their region."""
+"""Maximum distance of the points of an exact surface to its plane, in minimum thicknesses."""
 
-_MIN_FLAT = 0.5
-"""A region is made of faces if at least this share of its points is in flat cores: a noisy column
-breaks into cores that are few, and curved."""
+_MIN_FLAT_FRACTION = 0.5
+"""Minimum fraction of points in flat cores of a piecewise planar region: a noisy column breaks into
+few, curved cores."""
 
-_MIN_FACE = 0.05
-"""A flat core beside curved ones is a face if it has at least this share of the points of the
-region, as the panel that a moulding runs around. Smaller ones belong to the bend."""
+_MIN_FACE_FRACTION = 0.05
+"""Minimum fraction of the region's points in a flat core next to curved ones, such as a panel
+framed by a molding. Smaller ones belong to the bend."""
 
-_OPEN_FRACTION = 0.1
-"""A surface goes on between two cores if at least this share of the edges between them passes the
-criteria; across a bridge few do."""
+_MIN_OPEN_FRACTION = 0.1
+"""Minimum fraction of edges between two cores of one surface that pass the criteria; few do across
+a bridge."""
 
-_MIN_MISFIT = 2.0
-"""Two cores lie on one plane if their misfit to it is below this many thicknesses, as it is for
-parts of a face that noise has bent."""
+_MAX_MISFIT = 2.0
+"""Two cores are coplanar if their misfit is below this many thicknesses, as for parts of a surface
+bent by noise."""
 
-_MAX_TURNED_DEG = 30.0
-"""Largest angle between the planes of cores that are joined, degrees. ``_MIN_MISFIT`` alone would
-join narrow strips on both sides of an edge."""
+_MAX_DIHEDRAL_DEG = 30.0
+"""Maximum angle between the planes of joined cores, in degrees. ``_MAX_MISFIT`` alone would join
+narrow strips on both sides of an edge."""
 
 _NUM_AVERAGED = 16
-"""Nearest neighbors whose residuals are averaged: a quarter of white noise remains."""
+"""Nearest neighbors whose residuals are averaged, which reduces white noise to a quarter."""
 
-_MIN_POINTS = 3
-"""Points of a region, in multiples of the least size, from which on it may hold two surfaces."""
+_MIN_SIZE_FACTOR = 3
+"""Minimum size of a region that may contain two surfaces, in multiples of ``min_size``."""
 
 _NOISE_QUANTILE, _NOISE_FACTOR = 0.33, 2.345
-"""Quantile of the absolute residuals and its ratio to a standard deviation of normal noise. The
-lower third belongs to the main level even where a second one has nearly half of the points."""
+"""Quantile of the absolute residuals, and the factor that converts it to a standard deviation of
+normal noise. The lower third belongs to the main level even if a second one has nearly half of the
+points."""
 
-_SEED_NOISES = 1.5
-"""Averaged residuals of this many standard deviations are six of their own."""
+_SEED_NOISE_FACTOR = 1.5
+"""Minimum averaged residual of a candidate, in standard deviations; six of the average itself."""
 
-_STEP_NOISES = 2.0
-"""Least step between two levels, in standard deviations of the residuals."""
+_STEP_NOISE_FACTOR = 2.0
+"""Minimum step between two levels, in standard deviations of the residuals."""
 
 _MAX_THICKNESS = 0.6
-"""Largest thickness of a second level, as a fraction of its step: a thicker one is a slope."""
+"""Maximum thickness of a second level, as a fraction of its step: a thicker one is a slope."""
 
 _MAX_VALLEY = 0.8
-"""Largest ratio of the points halfway to the second level to those on it. A step has a valley
-between its levels; a bend and the edge of a region have none."""
+"""Maximum ratio of points halfway to the second level to points on it. A step has a valley between
+its levels; a bend and the edge of a region have none."""
 
 _VALLEY_WIDTH = 1 / 6
-"""Half width of either band of residuals that is counted, as a fraction of the step."""
+"""Half-width of each counted band of residuals, as a fraction of the step."""
 
 _NUM_RINGS = 4
 """Rings of nearest neighbors around a level that are counted with it: they cross the step."""
 
 _MAX_LEVELS = 2
-"""Times that a region is searched: a board may hold a further level."""
+"""Maximum number of searches per region: a board may contain another level."""
 
 _BINS, _WINDOW, _PEAK_WIDTH = 64, (1, 2, 3, 2, 1), 1.5
-"""Bins of half a standard deviation among which the main level is sought, the weights by which
-their counts are smoothed, and the standard deviations around the peak that are averaged."""
+"""Number of half-standard-deviation bins of the main-level histogram, its smoothing weights, and
+the half-width of the averaged peak in standard deviations."""
 
 
 class MixedRegions(NamedTuple):
-    """Regions that do not lie on one plane, ``min_size`` points or more being off it.
+    """Non-planar regions, with at least ``min_size`` points off the plane.
 
     Attributes:
-        rows: Points that may be of another face, ascending, shape ``(n,)``: those off the plane
-            where nearly all points are on it, else all of the region.
-        part: These points as a cloud with limits of a core; only those are valid where the surface
-            bends no more than is usual in the region.
-        near: Points on the plane of a region of which nearly all are, whose normals are within the
-            largest angle of the plane's, shape ``(N,)``, bool.
-        aligned: Those of them whose normals are within the limits of a core.
-        on_plane: Regions of which nearly all points are on one plane, shape ``(M,)``, bool.
+        rows: Points that may be of another surface, ascending, shape ``(n,)``: the points off the
+            plane if nearly all points are on it, otherwise the complete region.
+        part: These points as a cloud with core limits; a point is valid only where the surface is
+            as smooth as is typical for the region.
+        near: Points on the plane of a region with nearly all points on it, and with a normal within
+            the maximum angle of the plane normal, shape ``(N,)``, bool.
+        aligned: Points in ``near`` with a normal within the core limits.
+        on_plane: Regions with nearly all points on one plane, shape ``(M,)``, bool.
     """
 
     rows: Tensor
@@ -120,7 +120,7 @@ class MixedRegions(NamedTuple):
 
 
 class _InnerEdges(NamedTuple):
-    """Edges from rows ``(n,)`` to neighbours: if of the same region, and if within all limits."""
+    """Edges from rows ``(n,)`` to neighbors; masks: same region, and within the full limits."""
 
     rows: Tensor
     targets: Tensor
@@ -135,35 +135,36 @@ def find_mixed_regions(
     config: GrowingConfig,
     chunk_size: int,
 ) -> MixedRegions | None:
-    """Find the regions that may be several faces, None if there are none.
+    """Detect regions that may contain several surfaces; None if there are none.
 
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` those of the regions.
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` the planes of the
+    regions.
     """
     limit = _EXACT_REACH * planes.floor
     limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
     region, has_region = labels.clamp(min=0), labels >= 0
     off = has_region & (planes.distances(cloud.points, region) > limit[region])
     num_off = torch.bincount(labels[off], minlength=len(limit))
-    on_plane = num_off <= _MAX_OFF_PLANE * planes.num_points
+    on_plane = num_off <= _MAX_OFF_PLANE_FRACTION * planes.num_points
     mixed = num_off >= int(config.min_size)
     rows = (torch.where(on_plane[region], off, has_region) & mixed[region]).nonzero().squeeze(1)
     if len(rows) == 0:
         return None
-    others = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
+    remaining = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
     turns = [
         sq_chords(
             cloud.normals[chunk].double().unbind(dim=1),
             planes.normal[labels[chunk]].unbind(dim=1),
         )
-        for chunk in torch.split(others, ROWS_AT_ONCE)
+        for chunk in torch.split(remaining, ROWS_AT_ONCE)
     ]
     turn = torch.cat(turns)
     near, aligned = (
-        torch.zeros_like(off).index_fill_(0, others[turn <= deg_to_sq_chord(limit)], True)
+        torch.zeros_like(off).index_fill_(0, remaining[turn <= deg_to_sq_chord(limit)], True)
         for limit in (config.max_angle_deg, _CORE_FRACTION * config.max_angle_deg)
     )
-    faces = _part_of(cloud, labels, rows)
-    smooth = _are_smooth(faces, labels[rows], _SMOOTH_ANGLE * config.max_angle_deg, chunk_size)
+    faces = _subset(cloud, labels, rows)
+    smooth = _are_smooth(faces, labels[rows], _SMOOTH_FRACTION * config.max_angle_deg, chunk_size)
     faces = faces._replace(
         valid=faces.valid & smooth,
         reach=None if faces.reach is None else _CORE_FRACTION * faces.reach,
@@ -180,39 +181,39 @@ def cut_bridges(
     config: GrowingConfig,
     chunk_size: int,
 ) -> Tensor:
-    """Split regions of several faces that only a few points join.
+    """Split regions whose surfaces are connected only by a few points.
 
     ``grown`` ``(n,)`` are the cores in the ``part`` of the mixed regions, 0 to C-1 or
-    :data:`torchrg.UNLABELED`. They, and the plane if nearly all points are on one, belong together
-    where the surface goes on from one to the next, a tenth of the edges between them passing the
-    whole limits, and where one plane explains both. Regions with cores that do not are split: the
-    other points join the core of the nearest neighbour that they have an edge to, and no core grows
-    through them. Where most points are in curved cores, all that is no large flat one is one core.
-    The regions returned may have gaps in their numbers.
+    :data:`torchrg.UNLABELED`. If nearly all points are on a plane, the plane is a core too. Cores
+    are one surface if a tenth of the edges between them pass the full limits, or if one plane
+    explains both. Regions with several surfaces are split: each remaining point joins the core of
+    the nearest neighbor connected by an edge, without growing through other cores. If most points
+    are in curved cores, all cores except large flat ones form one core. The returned labels may
+    have gaps.
     """
     rows = mixed.rows[grown >= 0]
     if len(rows) == 0:
         return labels
     cores = torch.full_like(labels, UNLABELED).index_copy_(0, mixed.rows, grown)
-    cores, on_core_plane = _add_planes(labels, cores, mixed)
-    around = cloud.neighbors.of(cores.to(torch.int32), rows)
-    rows = rows[((around >= 0) & (around != cores[rows, None])).any(dim=1)]
+    cores, on_core_plane = _add_plane_cores(labels, cores, mixed)
+    near_cores = cloud.neighbors.of(cores.to(torch.int32), rows)
+    rows = rows[((near_cores >= 0) & (near_cores != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
     cores = _join_curved(cloud, labels, cores, mixed.on_plane)
-    split = torch.bincount(_owners(labels, cores), minlength=len(mixed.on_plane)) > 1
+    split = torch.bincount(_core_regions(labels, cores), minlength=len(mixed.on_plane)) > 1
     free = (labels >= 0) & split[labels.clamp(min=0)]
-    # Of points on the plane only those with its direction tell which cores it meets.
+    # Only points aligned with the plane show which cores it meets.
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
     plane_of[labels[on_core_plane]] = cores[on_core_plane]
     cores = torch.where(mixed.near & free & (cores < 0), plane_of[labels.clamp(min=0)], cores)
-    waiting = (free & (cores < 0)).nonzero().squeeze(1)
-    cores = _propagate(cores, _find_edges(cloud, labels, config, waiting, chunk_size))
+    unassigned = (free & (cores < 0)).nonzero().squeeze(1)
+    cores = _propagate(cores, _find_edges(cloud, labels, config, unassigned, chunk_size))
     new = torch.where(cores >= 0, cores + len(split), UNLABELED)
     return torch.where(free, new, labels)
 
 
-def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
-    """Make cores of the planes of regions that have other cores; tell their points."""
+def _add_plane_cores(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
+    """Add the planes of regions with other cores as cores; also return a mask of their points."""
     has_core = torch.zeros_like(mixed.on_plane)
     has_core[labels[cores >= 0]] = True
     on_plane = mixed.aligned & has_core[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
@@ -222,38 +223,38 @@ def _add_planes(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Ten
 
 
 def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
-    """Return cores ``(N,)`` where those of a curved region that are no faces are one."""
-    flat, owner = ~_planes_of(cloud, cores).curved, _owners(labels, cores)
+    """Merge the cores ``(N,)`` of each curved region, except its flat surfaces."""
+    flat, owner = ~_fit_cores(cloud, cores).curved, _core_regions(labels, cores)
     num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
     of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
     covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
-    curved = ~(on_plane | (covered >= _MIN_FLAT * of_region))
-    is_face = flat & (num_points >= _MIN_FACE * of_region[owner])
+    curved = ~(on_plane | (covered >= _MIN_FLAT_FRACTION * of_region))
+    is_face = flat & (num_points >= _MIN_FACE_FRACTION * of_region[owner])
     joined = curved[owner] & ~is_face
-    numbers = torch.arange(len(owner) + 1, device=cores.device)
-    numbers[-1] = UNLABELED
+    indices = torch.arange(len(owner) + 1, device=cores.device)
+    indices[-1] = UNLABELED
     first = torch.full_like(of_region, len(owner))
-    first.scatter_reduce_(0, owner[joined], numbers[:-1][joined], "amin")
-    numbers[:-1][joined] = first[owner[joined]]
-    return numbers[cores]
+    first.scatter_reduce_(0, owner[joined], indices[:-1][joined], "amin")
+    indices[:-1][joined] = first[owner[joined]]
+    return indices[cores]
 
 
-def _owners(labels: Tensor, cores: Tensor) -> Tensor:
-    """Return the region of each core, in ascending order of the cores that have points."""
+def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
+    """Return the region of each non-empty core, ascending."""
     points = (cores >= 0).nonzero().squeeze(1)
-    numbers, rows = torch.unique(cores[points], return_inverse=True)
-    return labels.new_zeros(len(numbers)).index_copy_(0, rows, labels[points])
+    indices, rows = torch.unique(cores[points], return_inverse=True)
+    return labels.new_zeros(len(indices)).index_copy_(0, rows, labels[points])
 
 
-def _planes_of(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
-    """Return the planes of cores."""
+def _fit_cores(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
+    """Fit planes to cores."""
     return fit_planes(Segments(cores, most=MAX_FITTED), cloud.points, cloud.normals)
 
 
 def _are_smooth(
     cloud: GrowingCloud, regions: Tensor, max_angle_deg: float, chunk_size: int
 ) -> Tensor:
-    """Tell at which points the surface bends no more than is usual in their region."""
+    """Return a mask of points where the surface is as smooth as is typical for its region."""
     fractions = torch.zeros_like(cloud.curvature, dtype=torch.float64)
     rows, limit = (
         torch.arange(len(fractions), device=fractions.device),
@@ -261,28 +262,28 @@ def _are_smooth(
     )
     for chunk in chunks_of(len(fractions), chunk_size):
         near, counted = cloud.neighbors.at(chunk), cloud.neighbors.counted(chunk)
-        alike = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
-        fractions[chunk] = alike.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
+        smooth = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
+        fractions[chunk] = smooth.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
     segments = Segments(regions)
-    usual = segments.median(segments.take(fractions))
-    return fractions >= _MIN_SMOOTH * usual[regions]
+    typical = segments.median(segments.take(fractions))
+    return fractions >= _MIN_SMOOTH_RATIO * typical[regions]
 
 
-def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
-    """Return some points as a cloud, where those of one region are neighbours."""
+def _subset(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
+    """Return a subset of points as a cloud, with neighbors limited to the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
     near = cloud.neighbors.at(rows)
-    places = near.of(row_of)
-    counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (places >= 0)
+    local_rows = near.of(row_of)
+    counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (local_rows >= 0)
     counted &= near.counted()
     itself = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
     return cloud._replace(
         points=cloud.points.T[:, rows].T,
         normals=cloud.normals.T[:, rows].T,
         curvature=cloud.curvature[rows],
-        neighbors=Neighbors(torch.where(counted, places, itself), counted),
+        neighbors=Neighbors(torch.where(counted, local_rows, itself), counted),
         valid=cloud.valid[rows],
         reach=None if cloud.reach is None else cloud.reach[rows],
         colors=None if cloud.colors is None else cloud.colors[rows],
@@ -292,7 +293,7 @@ def _part_of(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
 def _find_edges(
     cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _InnerEdges:
-    """Return the edges of some points."""
+    """Return the edges of the given points."""
     near = cloud.neighbors.at(rows)
     inside = (near.of(labels) == labels[rows, None]) & near.counted()
     passed = torch.zeros_like(inside)
@@ -302,7 +303,7 @@ def _find_edges(
 
 
 def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tensor:
-    """Return the cores ``(N,)`` with those of one surface as one."""
+    """Return the cores ``(N,)`` with cores of one surface merged."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -311,15 +312,15 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
     between = edges.inside & (theirs >= 0) & (theirs != ours)
     first, second = ours[between], theirs[between]
     keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
-    keys, numbers = torch.unique(keys, return_inverse=True)
+    keys, indices = torch.unique(keys, return_inverse=True)
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
-    num_edges = torch.bincount(numbers, minlength=len(pairs))
-    num_open = torch.bincount(numbers[edges.passed[between]], minlength=len(pairs))
-    planes = _planes_of(cloud, cores)
+    num_edges = torch.bincount(indices, minlength=len(pairs))
+    num_open = torch.bincount(indices[edges.passed[between]], minlength=len(pairs))
+    planes = _fit_cores(cloud, cores)
     one, other = planes.normal[pairs].unbind(dim=1)
     turn = unsigned_angle_deg(one, other)
-    joined = (misfit_of_pairs(planes, pairs) < _MIN_MISFIT) & (turn <= _MAX_TURNED_DEG)
-    joined |= num_open >= _OPEN_FRACTION * num_edges
+    joined = (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
+    joined |= num_open >= _MIN_OPEN_FRACTION * num_edges
     ends = pairs[joined].T.cpu().numpy()
     ones = np.ones(ends.shape[1], dtype=np.int8)
     graph = coo_array((ones, (ends[0], ends[1])), shape=(num_cores, num_cores))
@@ -328,60 +329,60 @@ def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tenso
 
 
 def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
-    """Give points between the cores to that of the nearest neighbour they have an edge to."""
+    """Assign points between cores to the core of the nearest neighbor they have an edge to."""
     cores = cores.clone()
-    waiting = torch.arange(len(edges.rows), device=cores.device)
-    while len(waiting):
-        targets = edges.targets[waiting]
-        reached = edges.passed[waiting] & (cores[targets] >= 0)
-        nearest = reached.to(torch.uint8).argmax(dim=1, keepdim=True)
-        joined = reached.any(dim=1)
+    unassigned = torch.arange(len(edges.rows), device=cores.device)
+    while len(unassigned):
+        targets = edges.targets[unassigned]
+        connected = edges.passed[unassigned] & (cores[targets] >= 0)
+        nearest = connected.to(torch.uint8).argmax(dim=1, keepdim=True)
+        joined = connected.any(dim=1)
         if not bool(joined.any()):
             break
-        cores[edges.rows[waiting[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
-        waiting = waiting[~joined]
+        cores[edges.rows[unassigned[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
+        unassigned = unassigned[~joined]
     return cores
 
 
 def split_levels(
     cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, config: GrowingConfig
 ) -> Tensor:
-    """Split regions that hold a second, parallel level of points beyond their noise.
+    """Split off second, parallel levels of points outside the noise of a region.
 
     The residuals of a region are measured from its main level, the mode, and averaged over the 16
-    nearest points of the region. Connected points whose average is more than 1.5 standard
-    deviations off are candidates, as far as they lie beyond half of their median step. A candidate
-    becomes a region of its own if
+    nearest points of the region. Candidates are connected points whose average exceeds 1.5 standard
+    deviations, limited to points beyond half of their median step. A candidate becomes a separate
+    region if
 
     - it has ``min_size`` points, and its step is two standard deviations and a facet tolerance;
-    - its plane is parallel to the region's, and its own thickness is below .6 of the step;
-    - in the rings around it fewer points lie halfway than on the level: there is a valley.
+    - its plane is parallel to the region's, and its thickness is below 0.6 of the step;
+    - in the surrounding rings fewer points lie halfway than on the level: there is a valley.
 
     Args:
         cloud: Points, normals and neighbors, in canonical order.
         labels: Regions, 0 to M-1 or negative, shape ``(N,)``.
         planes: Planes of the regions.
-        config: Settings; ``min_size`` and ``facet_tolerance`` are numbers.
+        config: Growing configuration; ``min_size`` and ``facet_tolerance`` are numbers.
 
     Returns:
-        Labels, shape ``(N,)``; second levels are numbered from M on. ``labels`` itself if there are
+        Labels, shape ``(N,)``; second levels are numbered from M. ``labels`` itself if there are
         none.
     """
     searched = labels
     for search in range(_MAX_LEVELS):
         if search:
             planes = fit_regions(cloud, searched, config)
-        large = (planes.num_points >= _MIN_POINTS * int(config.min_size)) & ~planes.curved
+        large = (planes.num_points >= _MIN_SIZE_FACTOR * int(config.min_size)) & ~planes.curved
         if not bool(large.any()):
             break
-        region = renumber(searched, _numbers(large))
+        region = remap_labels(searched, _compact_indices(large))
         level, owner = _find_levels(
             cloud, region, RegionPlanes(*(v[large] for v in planes)), config
         )
         if not len(owner):
             break
         labels = torch.where(level >= 0, level + int(labels.max()) + 1, labels)
-        # Only regions that were split are searched again.
+        # Only split regions are searched again.
         rows = places_of(torch.isin(region, owner))
         searched = torch.full_like(labels, UNLABELED)
         searched[rows] = torch.unique(labels[rows], return_inverse=True)[1]
@@ -393,25 +394,25 @@ def _find_levels(
 ) -> tuple[Tensor, Tensor]:
     """Return the second level of each point ``(N,)``, -1 for none, and the region of each level."""
     residual, average, noise = _measure_residuals(cloud, region, planes)
-    beside = NearestPoints(cloud.neighbors)
-    limit = _SEED_NOISES * torch.cat([noise, noise.new_tensor([torch.inf])])
-    level = _components(average.abs() > limit[region], 2 * region + (average > 0), beside)
-    step = _steps(level, residual)
-    level = _components(average.abs() > step[level] / 2, level, beside)
-    step, owner = _steps(level, residual)[:-1], Segments(level).first(region)
-    min_step = (_STEP_NOISES * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
+    adjacency = NearestPoints(cloud.neighbors)
+    limit = _SEED_NOISE_FACTOR * torch.cat([noise, noise.new_tensor([torch.inf])])
+    level = _components(average.abs() > limit[region], 2 * region + (average > 0), adjacency)
+    step = _median_steps(level, residual)
+    level = _components(average.abs() > step[level] / 2, level, adjacency)
+    step, owner = _median_steps(level, residual)[:-1], Segments(level).first(region)
+    min_step = (_STEP_NOISE_FACTOR * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
     num_points = torch.bincount(level + 1, minlength=1)[1:]
     kept = (num_points >= int(config.min_size)) & (step >= min_step)
-    level, step, owner = renumber(level, _numbers(kept)), step[kept], owner[kept]
+    level, step, owner = remap_labels(level, _compact_indices(kept)), step[kept], owner[kept]
     fits = fit_planes(Segments(level), cloud.points, cloud.normals)
     turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
     kept = (turn <= PARALLEL_DEG) & (fits.thickness <= _MAX_THICKNESS * step)
-    kept &= _have_valleys(level, step, average, region, beside)
-    return renumber(level, _numbers(kept)), owner[kept]
+    kept &= _have_valleys(level, step, average, region, adjacency)
+    return remap_labels(level, _compact_indices(kept)), owner[kept]
 
 
-def _numbers(kept: Tensor) -> Tensor:
-    """Return new numbers of the kept regions ``(M,)``, -1 for the others."""
+def _compact_indices(kept: Tensor) -> Tensor:
+    """Return consecutive numbers of the kept regions ``(M,)``, -1 for removed ones."""
     return torch.where(kept, kept.cumsum(0) - 1, UNLABELED)
 
 
@@ -420,7 +421,7 @@ def _measure_residuals(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return residuals from the main level, their local average, and their standard deviation.
 
-    The first two are ``(N,)``, 0 without a region, the last is ``(M,)``, at least the floor.
+    The first two are ``(N,)``, 0 if unlabeled; the last is ``(M,)``, at least the floor.
     """
     segments, narrow = Segments(region), region.to(torch.int32)
     (along,) = segments.along(cloud.points, planes.center, planes.normal[:, None])
@@ -443,58 +444,58 @@ def _measure_residuals(
 
 
 def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
-    """Return the mode of the averaged residuals of each region, the mean around their peak."""
+    """Return the mode of the averaged residuals of each region, as the mean around their peak."""
     middle = segments.median(average)
-    away = average - segments.spread(middle)
-    width = torch.maximum(MAD_FACTOR * segments.median(away.abs()), floor)
+    offset = average - segments.spread(middle)
+    width = torch.maximum(MAD_FACTOR * segments.median(offset.abs()), floor)
     width = torch.where(width > 0, width, 1.0)
-    bins = (2 * away / segments.spread(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
+    bins = (2 * offset / segments.spread(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
     bins += segments.labels * _BINS + _BINS // 2
     counts = torch.bincount(bins, minlength=len(width) * _BINS).view(-1, 1, _BINS)
     window = counts.new_tensor(_WINDOW).view(1, 1, -1)
     peak = torch.conv1d(counts, window, padding=len(_WINDOW) // 2).argmax(dim=2).squeeze(1)
     peak = (peak - _BINS // 2 + 0.5) * width / 2
-    near = (away - segments.spread(peak)).abs() <= _PEAK_WIDTH * segments.spread(width)
-    total = segments.sum(torch.where(near, away, 0.0).double())
+    near = (offset - segments.spread(peak)).abs() <= _PEAK_WIDTH * segments.spread(width)
+    total = segments.sum(torch.where(near, offset, 0.0).double())
     return (middle + total / segments.sum(near.double()).clamp(min=1)).float()
 
 
-def _components(chosen: Tensor, groups: Tensor, beside: NearestPoints) -> Tensor:
-    """Number the connected components of chosen points of one group, -1 for the other points."""
+def _components(chosen: Tensor, groups: Tensor, adjacency: NearestPoints) -> Tensor:
+    """Label the connected components of chosen points within each group, -1 for other points."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     rows = places_of(chosen & (groups >= 0))
-    number = torch.full_like(groups, UNLABELED).index_copy_(
+    index = torch.full_like(groups, UNLABELED).index_copy_(
         0, rows, torch.arange(len(rows), device=rows.device)
     )
-    near = beside.around(rows).long()
-    joined = (number[near] >= 0) & (groups[near] == groups[rows, None])
-    ends = number[rows, None].expand_as(near)[joined].cpu(), number[near][joined].cpu()
+    near = adjacency.neighbor_rows(rows).long()
+    joined = (index[near] >= 0) & (groups[near] == groups[rows, None])
+    ends = index[rows, None].expand_as(near)[joined].cpu(), index[near][joined].cpu()
     ones = torch.ones(len(ends[0]), dtype=torch.int8)
     graph = coo_array((ones.numpy(), ends), shape=(len(rows), len(rows)))
-    found = torch.from_numpy(connected_components(graph, directed=False)[1]).to(groups)
-    return number.index_copy_(0, rows, found)
+    components = torch.from_numpy(connected_components(graph, directed=False)[1]).to(groups)
+    return index.index_copy_(0, rows, components)
 
 
-def _steps(level: Tensor, residual: Tensor) -> Tensor:
-    """Return the median absolute residual of each level, and infinity for points of none."""
+def _median_steps(level: Tensor, residual: Tensor) -> Tensor:
+    """Return the median absolute residual of each level, plus infinity for unlabeled points."""
     segments = Segments(level)
     steps = segments.median(segments.take(residual.abs()))
     return torch.cat([steps, steps.new_tensor([torch.inf])])
 
 
 def _have_valleys(
-    level: Tensor, step: Tensor, average: Tensor, region: Tensor, beside: NearestPoints
+    level: Tensor, step: Tensor, average: Tensor, region: Tensor, adjacency: NearestPoints
 ) -> Tensor:
-    """Return whether fewer points lie halfway to each level than on it, in rings around it."""
+    """Return a mask of levels with fewer points halfway to them than on them, in rings around."""
     ring = places_of(level >= 0)
     owner, side = level.clone(), Segments(level).first(average).sign()
     for _ in range(_NUM_RINGS):
-        near = beside.around(ring).long()
+        near = adjacency.neighbor_rows(ring).long()
         source = owner[ring, None].expand_as(near)
         is_new = (owner[near] < 0) & (region[near] == region[ring, None])
-        # Of several levels that reach a point the first takes it, whatever the order of the points.
+        # If several levels reach a point, the first wins, independent of the point order.
         target, source = near[is_new], source[is_new]
         first = torch.full_like(owner, len(step)).scatter_reduce_(0, target, source, "amin")
         ring = torch.unique(target)

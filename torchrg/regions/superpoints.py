@@ -1,7 +1,4 @@
-"""Superpoints: a partition of all points into connected parts of one orientation, in levels.
-
-Regions of a graph of neighbours merge pair by pair, the pair that costs the energy least first.
-"""
+"""Hierarchical superpoint partition by greedy region merging in a neighbor graph."""
 
 import math
 from collections import deque
@@ -26,46 +23,45 @@ from torchrg.regions.growth import number_by_count
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
 _NUM_NEIGHBORS = 1 + NUM_CONTACTS
-"""The point itself, and those that surround it on a surface."""
+"""The point itself and its adjacent neighbors."""
 
-_SPACINGS_IN_REACH = 1.6
-"""A circle around 8 points that are one spacing apart has this many spacings for its radius."""
+_RADIUS_SPACINGS = 1.6
+"""Radius, in spacings, of a circle around 8 points that are one spacing apart."""
 
 _COLOR_WEIGHT = 3.0
-"""Weight of a squared difference of colours in [0, 1] against one of unit normals: colours that are
-a third of the range apart in each channel weigh as much as a squared difference of normals of 1."""
+"""Weight of a squared color difference, channels in [0, 1], relative to unit normals. Colors a
+third of the range apart in each channel weigh as much as a squared normal difference of 1."""
 
 _PLANE_FRACTION, _MAX_SPREAD_DEG = 0.5, 20.0
-"""How far the normal of a point is turned to the mean normal of its plane, where the normals of the
-plane have at most this RMS angle to it. Noise turns normals by chance, and edges bend them; a plane
-has neither. In a column, the RMS angle is 45 degrees."""
+"""Fraction by which a point normal is turned to the mean normal of its plane, and the maximum RMS
+angle of the normals of such a plane. Noise and edges perturb normals, but not a plane's mean. In a
+column, the RMS angle is 45 degrees."""
 
-_PLACE_SPACINGS = 150.0
-"""Length by which places are divided to become features, in spacings. It tells boards, pictures and
-doors apart that are flush with a wall."""
+_POSITION_SPACINGS = 150.0
+"""Length, in spacings, that scales positions to features. It separates boards, pictures and doors
+that are flush with a wall."""
 
 _STEP_WEIGHT = 0.25
-"""Weight of the squared sine of the angle between a contact and the surface: one that leads off the
-surface at a right angle, as down a step, weighs as much as normals that differ by 29 degrees."""
+"""Weight of the squared sine of the angle between a contact and the surface. A perpendicular
+contact, as at a step, weighs as much as normals that differ by 29 degrees."""
 
 _PLANE_WEIGHT = 0.25
-"""Weight of a contact between points of different planes, as of normals that differ by 29
+"""Weight of a contact between points of different planes, equal to normals that differ by 29
 degrees."""
 
 _MIN_DIFFERENCE = 0.01
-"""Squared difference of normals, that of 6 degrees, which counts even between regions of one
-surface."""
+"""Squared normal difference, equal to 6 degrees, added even between regions of one surface."""
 
 _MAX_EDGES = 64
-"""Edges of a vertex that it lists at most, which bounds the memory; reconstructions have 6."""
+"""Maximum number of listed edges per vertex, which bounds the memory; reconstructions have 6."""
 
-_BORDERS_A_TURN = 8
-"""Towards a given number of superpoints one of so many borders, the cheapest, may vanish at a
-time."""
+_MERGE_DIVISOR = 8
+"""When merging to a number of superpoints, the cheapest 1/8 of the boundaries are eligible per
+round."""
 
-_MUCH_LARGER = 16
-"""A region of so many times the points of another hardly changes by it, so it takes in all such
-that would rather join it than any other at a time. Else a floor takes in one speck at a time."""
+_MIN_SIZE_RATIO = 16
+"""Minimum size ratio at which a region merges, in one round, with all smaller ones that prefer it:
+they hardly change it. Otherwise a floor would take one speck per round."""
 
 
 def partition_points(
@@ -79,30 +75,29 @@ def partition_points(
 ) -> Superpoints:
     r"""Partition a cloud; see :func:`torchrg.make_superpoints`.
 
-    The first regions are single points, or whole planes and points. Of two regions that touch, of
-    :math:`n_a` and :math:`n_b` points, merging costs
+    Initial regions are single points, or complete planes and single points. Merging two adjacent
+    regions of :math:`n_a` and :math:`n_b` points costs
 
     .. math:: \frac{n_a n_b}{n_a + n_b} (d_{ab} + \epsilon) / \sqrt{c_{ab}},
 
-    where d is the squared difference of what the regions are (mean of :math:`n n^T` [1], of the
-    colour, and of the place in units of 150 spacings) and the mean of what parts the points at
-    their contacts (normals, a step between parallel surfaces, different planes), and c the number
-    of contacts. The first factor is Ward's [2]: the
-    increase of the variance within regions. Divided by the length of the border that vanishes it is
-    the strength of regularisation at which the energy of Mumford and Shah falls [3], the energy
-    that cut pursuit minimises [4] and, with places and normals, the supervoxels of [5] and [6];
-    normals come first as in [7]. Contacts are that length up to noise, hence their root. Pairs
-    merge up to each strength of the configuration, or until each of its numbers of superpoints is
-    left. Regions that are each other's cheapest partner merge at a time, and small ones with a much
-    larger one that is theirs: this needs no order of visits.
+    where c is the number of contacts and d the difference. The difference is the squared difference
+    of the region features (mean of :math:`n n^T` [1], color, and position in units of 150 spacings)
+    plus the mean difference along contacts (normals, steps between parallel surfaces, different
+    planes). The first factor is Ward's [2], the increase of the variance within regions. Divided by
+    the length of the removed boundary, it is the regularization strength at which the Mumford-Shah
+    energy falls [3]. Cut pursuit minimizes this energy [4], and, with positions and normals, so do
+    the supervoxels of [5] and [6]; normals come first as in [7]. Contacts measure the boundary
+    length up to noise, hence the root. Pairs merge up to each configured strength, or until each
+    configured number of superpoints remains. Each round merges mutually cheapest partners, and
+    small regions into a much larger cheapest partner, so no visiting order is needed.
 
-    Where the normals of a plane agree, the normal of a point counts halfway between its own and
-    that of the plane, so noise decides less and places more.
+    If the normals of a plane agree, each point normal is moved halfway to the plane normal, which
+    gives noise less weight and positions more.
 
-    ``labels`` ``(N,)`` are those of planes, negative for none, ``colors`` ``(N, 3)`` are in [0, 1],
-    floating point and finite. Of a mesh with ``faces`` ``(F, 3)`` contacts are its edges, else
-    those of a point to the 8 nearest: ``neighbors`` of the distinct finite points in canonical
-    order, searched by default.
+    ``labels`` ``(N,)`` are plane IDs, negative if unlabeled; ``colors`` ``(N, 3)`` are in [0, 1],
+    floating point and finite. For a mesh with ``faces`` ``(F, 3)`` contacts are its edges,
+    otherwise edges to the 8 nearest points. These are ``neighbors`` of the distinct finite points
+    in canonical order, searched by default.
 
     References:
         [1] H. Knutsson. Representing local structure using tensors. SCIA, 1989.
@@ -118,16 +113,16 @@ def partition_points(
         [7] J. Walczak et al. Normal grouping density separation (NGDS): a novel object-driven
         indoor point cloud partition method. ICCS, 2020.
     """
-    distinct, shades = merge_copies(points, normals, labels, colors)
+    distinct, unique_colors = merge_copies(points, normals, labels, colors)
     edges = None
     if faces is not None:
         edges = _mesh_edges(faces.cpu(), distinct.inverse.cpu())
-    partitions = _partition_places(
+    partitions = _partition_distinct(
         distinct.points.detach().cpu(),
         normals[distinct.rows].detach().cpu(),
         labels[distinct.rows].long().cpu(),
         config,
-        None if shades is None else shades.cpu(),
+        None if unique_colors is None else unique_colors.cpu(),
         edges,
         neighbors,
     )
@@ -143,19 +138,19 @@ def merge_copies(
 ) -> tuple[DistinctPoints, Tensor | None]:
     """Return the distinct points of a cloud, and their colors.
 
-    Of copies with other values the one on the largest plane stands for all. Their color is halfway
-    between the least and the largest of each channel, in whatever order they come.
+    Among duplicates with different values, the point on the largest plane represents all. Their
+    color is the midpoint of the channel minimum and maximum, independent of the order.
     """
     last = torch.iinfo(labels.dtype).max
     ties = labels.where(labels >= 0, last), *normals.detach().unbind(dim=1)
     distinct = distinct_points(points, ties)
     if colors is None:
         return distinct, None
-    shades = colors.detach()
+    unique_colors = colors.detach()
     if not distinct.num_copies:
-        return distinct, shades[distinct.rows]
+        return distinct, unique_colors[distinct.rows]
     rows = finite_rows(points)
-    counts, columns = torch.bincount(distinct.inverse[rows]), shades[rows].unbind(dim=1)
+    counts, columns = torch.bincount(distinct.inverse[rows]), unique_colors[rows].unbind(dim=1)
     low, high = (
         torch.stack([reduce_runs(column, counts, side) for column in columns], dim=1)
         for side in ("min", "max")
@@ -163,8 +158,8 @@ def merge_copies(
     return distinct, (low + high) / 2
 
 
-def _partition_places(
-    places: Tensor,
+def _partition_distinct(
+    positions: Tensor,
     normals: Tensor,
     labels: Tensor,
     config: SuperpointsConfig,
@@ -172,26 +167,26 @@ def _partition_places(
     edges: Tensor | None,
     neighbors: Neighbors | None,
 ) -> list[Tensor]:
-    """Return the region of each of distinct points ``(n,)`` in canonical order, level by level."""
-    if len(places) == 0:
+    """Return the region of each distinct point ``(n,)`` in canonical order, level by level."""
+    if len(positions) == 0:
         return [torch.zeros(0, dtype=torch.int64) for _ in range(config.num_levels)]
-    k = min(_NUM_NEIGHBORS, len(places))
+    k = min(_NUM_NEIGHBORS, len(positions))
     if neighbors is None or neighbors.indices.shape[1] < k:
-        neighbors = search_knn(places, k, canonical=True)
+        neighbors = search_knn(positions, k, canonical=True)
     neighbors = Neighbors(neighbors.indices[:, :k].cpu())
-    spacing = _median_spacing(places, neighbors)
-    normals = _lean_on_planes(normals, labels)
+    spacing = _median_spacing(positions, neighbors)
+    normals = _blend_with_planes(normals, labels)
     if colors is not None:
         colors = math.sqrt(_COLOR_WEIGHT) * colors
     nearest = NearestPoints(neighbors).neighbors.indices
-    nearest = nearest if edges is None else _listed(edges, len(places))
-    regions = torch.arange(len(places))
+    nearest = nearest if edges is None else _edge_lists(edges, len(positions))
+    regions = torch.arange(len(positions))
     if config.planes == "whole":
-        regions = _whole_planes(labels, nearest)
+        regions = _plane_components(labels, nearest)
     graphs = [
         _Graph(
-            _describe(regions, places, spacing, normals, colors, config),
-            _describe_borders(regions, places, normals, labels, nearest),
+            _initial_regions(regions, positions, spacing, normals, colors, config),
+            _initial_boundaries(regions, positions, normals, labels, nearest),
         )
     ]
     levels: list[Callable[..., tuple[_Graph, Tensor]]]
@@ -208,48 +203,48 @@ def _partition_places(
     return partitions
 
 
-def _lean_on_planes(normals: Tensor, labels: Tensor) -> Tensor:
-    """Return normals halfway between a point's own and that of its plane, where this is flat."""
+def _blend_with_planes(normals: Tensor, labels: Tensor) -> Tensor:
+    """Return normals halfway between the point normal and the plane normal of flat planes."""
     rows = (labels >= 0).nonzero().squeeze(1)
     if len(rows) == 0:
         return normals
     plane = torch.unique(labels[rows], return_inverse=True)[1]
-    own = normals[rows].double()
-    segments, columns = Segments(plane), own.unbind(dim=1)
+    inputs = normals[rows].double()
+    segments, columns = Segments(plane), inputs.unbind(dim=1)
     products = [segments.mean(segments.take(a * b)) for a in columns for b in columns]
     values, axes = eigh3_of_few(torch.stack(products, dim=1).view(-1, 3, 3))
     flat = values[:, 2] >= math.cos(math.radians(_MAX_SPREAD_DEG)) ** 2
     shared = torch.where(flat[:, None], axes[:, :, 2], 0.0)[plane]
-    shared = torch.where((own * shared).sum(dim=1, keepdim=True) < 0, -shared, shared)
-    leaning = functional.normalize(torch.lerp(own, shared, _PLANE_FRACTION), dim=1)
-    return normals.index_copy(0, rows, torch.where(flat[plane, None], leaning, own).to(normals))
+    shared = torch.where((inputs * shared).sum(dim=1, keepdim=True) < 0, -shared, shared)
+    blended = functional.normalize(torch.lerp(inputs, shared, _PLANE_FRACTION), dim=1)
+    return normals.index_copy(0, rows, torch.where(flat[plane, None], blended, inputs).to(normals))
 
 
-def _mesh_edges(faces: Tensor, places: Tensor) -> Tensor:
-    """Return the pairs of places ``(E, 2)`` that edges of a mesh lead from and to, ascending."""
-    corners = places[faces.long()]
+def _mesh_edges(faces: Tensor, positions: Tensor) -> Tensor:
+    """Return the directed mesh edges as distinct pairs of points ``(E, 2)``, ascending."""
+    corners = positions[faces.long()]
     pairs = torch.cat([corners[:, [i, j]] for i in range(3) for j in range(3) if i != j])
     pairs = pairs[(pairs >= 0).all(dim=1) & (pairs[:, 0] != pairs[:, 1])]
-    width = len(places) + 1
+    width = len(positions) + 1
     keys = torch.unique(pairs[:, 0] * width + pairs[:, 1])
     return torch.stack([keys // width, keys % width], dim=1)
 
 
-def _listed(edges: Tensor, num_places: int) -> Tensor:
-    """Return the first 64 places that edges lead to from each ``(n, K)``; itself where fewer."""
-    counts = torch.bincount(edges[:, 0], minlength=num_places)
+def _edge_lists(edges: Tensor, num_points: int) -> Tensor:
+    """Return up to 64 edge targets of each point ``(n, K)``, padded with the point itself."""
+    counts = torch.bincount(edges[:, 0], minlength=num_points)
     column = torch.arange(len(edges)) - (counts.cumsum(0) - counts)[edges[:, 0]]
     first = column < _MAX_EDGES
     width = max(int(counts.max()), 1) if len(edges) else 1
-    listed = torch.arange(num_places, dtype=torch.int32)[:, None].repeat(1, min(width, _MAX_EDGES))
-    listed[edges[first, 0], column[first]] = edges[first, 1].to(torch.int32)
-    return listed
+    lists = torch.arange(num_points, dtype=torch.int32)[:, None].repeat(1, min(width, _MAX_EDGES))
+    lists[edges[first, 0], column[first]] = edges[first, 1].to(torch.int32)
+    return lists
 
 
 class _Regions(NamedTuple):
-    """Points of R regions, sums of their features ``(R, F)``, boxes about them ``(R, 3)``, float64.
+    """Sizes of R regions, feature sums ``(R, F)`` and bounding boxes ``(R, 3)``, float64.
 
-    Without a bound on their extent boxes have no columns.
+    Without an extent bound the boxes have no columns.
     """
 
     size: Tensor
@@ -258,8 +253,8 @@ class _Regions(NamedTuple):
     high: Tensor
 
 
-class _Borders(NamedTuple):
-    """Pairs of regions that touch, ``first < second``, ascending, and sums over their contacts.
+class _Boundaries(NamedTuple):
+    """Adjacent pairs of regions, ``first < second``, ascending, and sums over their contacts.
 
     The pairs are int32, the sums float64.
     """
@@ -271,21 +266,21 @@ class _Borders(NamedTuple):
 
 
 class _Graph(NamedTuple):
-    """Regions and their borders."""
+    """Regions and their boundaries."""
 
     regions: _Regions
-    borders: _Borders
+    boundaries: _Boundaries
 
 
-def _median_spacing(places: Tensor, neighbors: Neighbors) -> float:
-    """Return the median distance to the nearest point that evenly spread points would have."""
+def _median_spacing(positions: Tensor, neighbors: Neighbors) -> float:
+    """Return the median point spacing, assuming evenly spread points."""
     last = neighbors.indices[:, -1].long()
-    reach = (places[last].double() - places.double()).norm(dim=1).median()
-    return float(reach) / _SPACINGS_IN_REACH
+    reach = (positions[last].double() - positions.double()).norm(dim=1).median()
+    return float(reach) / _RADIUS_SPACINGS
 
 
-def _whole_planes(labels: Tensor, nearest: Tensor) -> Tensor:
-    """Return the first region of each point ``(n,)``: connected parts of planes, and points."""
+def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
+    """Return the initial region of each point ``(n,)``: connected parts of planes, or the point."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -299,45 +294,45 @@ def _whole_planes(labels: Tensor, nearest: Tensor) -> Tensor:
     links = np.ones(len(targets), dtype=np.int8)
     shape = (len(labels), len(labels))
     edges = csr_array((links, targets.numpy(), starts.numpy()), shape=shape)
-    numbers = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
-    return _by_first_point(numbers)
+    indices = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
+    return _by_first_point(indices)
 
 
-def _by_first_point(numbers: Tensor) -> Tensor:
+def _by_first_point(indices: Tensor) -> Tensor:
     """Number regions by their first points, so that ties do not depend on scipy's numbering."""
-    first = torch.full((int(numbers.max()) + 1,), len(numbers))
-    first = first.scatter_reduce(0, numbers, torch.arange(len(numbers)), "amin")
-    return first.argsort().argsort()[numbers]
+    first = torch.full((int(indices.max()) + 1,), len(indices))
+    first = first.scatter_reduce(0, indices, torch.arange(len(indices)), "amin")
+    return first.argsort().argsort()[indices]
 
 
-def _describe(
+def _initial_regions(
     regions: Tensor,
-    places: Tensor,
+    positions: Tensor,
     spacing: float,
     normals: Tensor,
     colors: Tensor | None,
     config: SuperpointsConfig,
 ) -> _Regions:
-    """Return sums and boxes of the first regions."""
-    places = places.double()
+    """Return the feature sums and boxes of the initial regions."""
+    positions = positions.double()
     x, y, z = normals.double().unbind(dim=1)
     off = math.sqrt(2)
     features = [x * x, y * y, z * z, off * x * y, off * y * z, off * z * x]
-    length = _PLACE_SPACINGS * spacing
+    length = _POSITION_SPACINGS * spacing
     if config.max_extent is not None:
         length = min(length, config.max_extent)
     if length > 0:
-        features += ((places - places.amin(dim=0)) / length).unbind(dim=1)
+        features += ((positions - positions.amin(dim=0)) / length).unbind(dim=1)
     if colors is not None:
         features += colors.double().unbind(dim=1)
-    corners = places[:, : 0 if config.max_extent is None else 3]
+    corners = positions[:, : 0 if config.max_extent is None else 3]
     points = _Regions(torch.ones_like(x), torch.stack(features, dim=1), corners, corners)
-    return _joined(points, regions)
+    return _merged_regions(points, regions)
 
 
-def _joined(regions: _Regions, new: Tensor) -> _Regions:
-    """Return regions of regions: the sums and boxes of those that become the same one ``(R,)``."""
-    # bincount adds one element after the other.
+def _merged_regions(regions: _Regions, new: Tensor) -> _Regions:
+    """Return merged regions: sums and boxes of regions with the same new index ``(R,)``."""
+    # bincount adds the elements in order.
     size = torch.bincount(new, weights=regions.size)
     features = regions.features.new_empty(len(size), regions.features.shape[1])
     for column, sums in zip(features.unbind(dim=1), regions.features.unbind(dim=1), strict=True):
@@ -352,44 +347,44 @@ def _joined(regions: _Regions, new: Tensor) -> _Regions:
     return _Regions(size, features, low, high)
 
 
-def _describe_borders(
-    regions: Tensor, places: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
-) -> _Borders:
-    """Return the borders of the first regions: a contact leads from a point to a near one."""
+def _initial_boundaries(
+    regions: Tensor, positions: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
+) -> _Boundaries:
+    """Return the boundaries of the initial regions: contacts lead from a point to a near one."""
     difference = torch.empty(nearest.shape, dtype=torch.float64)
 
     def measure(rows: slice) -> None:
-        difference[rows] = _contact_differences(rows, places, normals, labels, nearest)
+        difference[rows] = _contact_differences(rows, positions, normals, labels, nearest)
 
     map_chunks(measure, len(regions), ROWS_AT_ONCE, regions.device)
     regions = regions.int()
     source = regions[:, None].expand(nearest.shape).reshape(-1)
     target = regions.index_select(0, nearest.reshape(-1))
-    return _gather_borders(source, target, None, difference.flatten())
+    return _aggregate(source, target, None, difference.flatten())
 
 
 def _contact_differences(
-    rows: slice, places: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
+    rows: slice, positions: Tensor, normals: Tensor, labels: Tensor, nearest: Tensor
 ) -> Tensor:
-    """Return what parts points from those near them, shape ``(n, K)``, float64; see the formula.
+    """Return the differences between points and near points, shape ``(n, K)``, float64.
 
-    That is the squared difference of their normals, the squared sine of the angle at which the way
-    between them leaves the flatter of the surfaces, and whether they are on different planes.
+    See the formula: squared normal difference, squared sine of the angle between the contact and
+    the flatter surface, and whether the planes differ.
     """
     near = nearest[rows]
-    if kernels.serve(places, normals):
+    if kernels.serve(positions, normals):
         weights = _STEP_WEIGHT, _PLANE_WEIGHT
         first = torch.arange(rows.start, rows.stop)
-        arguments = places, normals, labels, first, near, *weights
+        arguments = positions, normals, labels, first, near, *weights
         return kernels.call("contact_differences", *arguments)[0]
-    columns = [column.double() for column in (*places.unbind(dim=1), *normals.unbind(dim=1))]
+    columns = [column.double() for column in (*positions.unbind(dim=1), *normals.unbind(dim=1))]
     here = [column[rows, None] for column in columns]
     there = [column[near] for column in columns]
-    way = [b - a for a, b in zip(here[:3], there[:3], strict=True)]
+    offset = [b - a for a, b in zip(here[:3], there[:3], strict=True)]
     ends = here[3:], there[3:]
-    step = torch.minimum(*(_dot(way, normal).square() for normal in ends)) / _dot(way, way)
-    is_other = (labels[rows, None] != labels[near]).double()
-    return sq_chords(*ends) + _STEP_WEIGHT * step + _PLANE_WEIGHT * is_other
+    step = torch.minimum(*(_dot(offset, normal).square() for normal in ends)) / _dot(offset, offset)
+    is_different = (labels[rows, None] != labels[near]).double()
+    return sq_chords(*ends) + _STEP_WEIGHT * step + _PLANE_WEIGHT * is_different
 
 
 def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
@@ -398,58 +393,58 @@ def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
     return x * u + y * v + z * w
 
 
-def _gather_borders(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor) -> _Borders:
-    """Return one row for each pair of different regions, with the sums of its rows.
+def _aggregate(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor) -> _Boundaries:
+    """Return one row per pair of different regions, with the sums of its rows.
 
-    Without numbers of contacts each row is one.
+    Without ``contacts`` each row counts as one.
     """
     if len(a) == 0:
-        return _Borders(a, b, difference, difference)
+        return _Boundaries(a, b, difference, difference)
     width = int(torch.maximum(a.max(), b.max())) + 1
     if kernels.serve():
         buffers = torch.empty(2, width + 1, dtype=torch.int64)
         rows = kernels.call("gather_borders", a, b, contacts, difference, *buffers)
-        return _Borders(*(column[: int(rows[-1])] for column in rows[1:-1]))
+        return _Boundaries(*(column[: int(rows[-1])] for column in rows[1:-1]))
     contacts = torch.ones_like(difference) if contacts is None else contacts
     different = places_of(a != b)
     a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
     if len(a) == 0:
-        return _Borders(a, b, contacts, difference)
+        return _Boundaries(a, b, contacts, difference)
     a, b = a.long(), b.long()
     keys, order = (torch.minimum(a, b) * width + torch.maximum(a, b)).sort(stable=True)
     keys, counts = torch.unique_consecutive(keys, return_counts=True)
     contacts, difference = (
         torch.segment_reduce(part[order], "sum", lengths=counts) for part in (contacts, difference)
     )
-    return _Borders((keys // width).int(), (keys % width).int(), contacts, difference)
+    return _Boundaries((keys // width).int(), (keys % width).int(), contacts, difference)
 
 
 def _merge_to_strength(
     strength: float, graphs: list[_Graph], min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
-    """Merge pairs that cost at most ``strength``, then small regions; return what each became."""
-    graph, become = _last(_merging(graphs, bound, lambda cost, graph: cost <= strength))
-    graph, merged = _last(_merging([graph], bound, partial(_joins_small, min_size)))
-    return graph, merged[become]
+    """Merge pairs that cost at most ``strength``, then small regions; return graph and indices."""
+    graph, assignment = _last(_merge_rounds(graphs, bound, lambda cost, graph: cost <= strength))
+    graph, merged = _last(_merge_rounds([graph], bound, partial(_is_small, min_size)))
+    return graph, merged[assignment]
 
 
 def _merge_to_count(
     count: int, graphs: list[_Graph], min_size: int, bound: float
 ) -> tuple[_Graph, Tensor]:
-    """Merge the pairs that cost least until ``count`` regions are left, none of them too small.
+    """Merge the cheapest pairs until ``count`` regions remain, all of them large enough.
 
-    Those that are too small join others at the last time when enough of the rest are left: so late
-    that points have become regions, and early enough to count only what stays. Returns what
-    :func:`_merge_to_strength` returns.
+    Small regions are merged at the last round with enough large regions: late enough that points
+    have become regions, early enough that only final regions count. Returns the same as
+    :func:`_merge_to_strength`.
     """
     num_large = 0
-    for state in _merging(graphs, bound, _is_cheap, count):
+    for state in _merge_rounds(graphs, bound, _is_cheap, count):
         num_enough = int((state[0].regions.size >= min_size).sum())
         if num_enough >= min(num_large, count):
-            num_large, (graph, become) = num_enough, state
-    graph, merged = _last(_merging([graph], bound, partial(_joins_small, min_size)))
-    graph, again = _last(_merging([graph], bound, _is_cheap, count))
-    return graph, again[merged[become]]
+            num_large, (graph, assignment) = num_enough, state
+    graph, merged = _last(_merge_rounds([graph], bound, partial(_is_small, min_size)))
+    graph, remapped = _last(_merge_rounds([graph], bound, _is_cheap, count))
+    return graph, remapped[merged[assignment]]
 
 
 def _last(states: Iterator[tuple[_Graph, Tensor]]) -> tuple[_Graph, Tensor]:
@@ -457,63 +452,63 @@ def _last(states: Iterator[tuple[_Graph, Tensor]]) -> tuple[_Graph, Tensor]:
     return deque(states, maxlen=1).pop()
 
 
-def _joins_small(min_size: int, cost: Tensor, graph: _Graph) -> Tensor:
-    """Return which borders are those of a region with fewer points."""
+def _is_small(min_size: int, cost: Tensor, graph: _Graph) -> Tensor:
+    """Return a mask of boundaries of a region smaller than ``min_size``."""
     size = graph.regions.size
-    return torch.minimum(size[graph.borders.first], size[graph.borders.second]) < min_size
+    return torch.minimum(size[graph.boundaries.first], size[graph.boundaries.second]) < min_size
 
 
 def _is_cheap(cost: Tensor, graph: _Graph) -> Tensor:
-    """Return which borders are among those that cost least."""
-    return cost <= cost.kthvalue(-(-len(cost) // _BORDERS_A_TURN)).values
+    """Return a mask of the cheapest boundaries."""
+    return cost <= cost.kthvalue(-(-len(cost) // _MERGE_DIVISOR)).values
 
 
-def _merging(
+def _merge_rounds(
     graphs: list[_Graph],
     bound: float,
     is_eligible: Callable[[Tensor, _Graph], Tensor],
     count: int = 1,
 ) -> Iterator[tuple[_Graph, Tensor]]:
-    """Yield the graph and what regions become while eligible pairs merge to ``count``.
+    """Yield the graph and the new region indices while eligible pairs merge down to ``count``.
 
-    The graph leaves its list, so that nobody else keeps the first, which is the largest.
+    The list is emptied so that the initial (largest) graph can be freed.
     """
     graph = graphs.pop()
-    # Two that fit into the box of a third one by one may not fit together.
-    ratio = _MUCH_LARGER if bound == math.inf else math.inf
-    become = torch.arange(len(graph.regions.size))
+    # Merging several regions into one at a time could exceed the extent bound.
+    ratio = _MIN_SIZE_RATIO if bound == math.inf else math.inf
+    assignment = torch.arange(len(graph.regions.size))
     while True:
-        yield graph, become
-        regions, borders = graph
-        most = len(regions.size) - count
-        if most <= 0 or len(borders.first) == 0:
+        yield graph, assignment
+        regions, boundaries = graph
+        max_merges = len(regions.size) - count
+        if max_merges <= 0 or len(boundaries.first) == 0:
             return
-        cost = _costs(regions, borders, bound)
+        cost = _merge_costs(regions, boundaries, bound)
         cost.masked_fill_(~is_eligible(cost, graph), math.inf)
         if not bool((cost < math.inf).any()):
             return
-        chosen = _choose_pairs(borders, cost, regions.size, ratio, most)
+        chosen = _choose_pairs(boundaries, cost, regions.size, ratio, max_merges)
         del cost
-        regions, borders, new = _merge(regions, borders, *chosen)
-        graph, become = _Graph(regions, borders), new[become]
+        regions, boundaries, new = _merge(regions, boundaries, *chosen)
+        graph, assignment = _Graph(regions, boundaries), new[assignment]
 
 
-def _costs(regions: _Regions, borders: _Borders, bound: float) -> Tensor:
-    """Return what merging at each border costs, infinite where the box would exceed the bound."""
+def _merge_costs(regions: _Regions, boundaries: _Boundaries, bound: float) -> Tensor:
+    """Return the merge cost of each boundary, infinite if the box would exceed the bound."""
     means = regions.features / regions.size[:, None]
     if kernels.serve():
         boxes = regions.low, regions.high
         limits = _MIN_DIFFERENCE, bound
-        return kernels.call("merging_costs", regions.size, means, *boxes, *borders, *limits)[0]
-    cost = torch.empty_like(borders.contacts)
+        return kernels.call("merging_costs", regions.size, means, *boxes, *boundaries, *limits)[0]
+    cost = torch.empty_like(boundaries.contacts)
     for rows in chunks_of(len(cost), ROWS_AT_ONCE):
-        a, b = borders.first[rows], borders.second[rows]
-        difference = borders.difference[rows] / borders.contacts[rows] + _MIN_DIFFERENCE
+        a, b = boundaries.first[rows], boundaries.second[rows]
+        difference = boundaries.difference[rows] / boundaries.contacts[rows] + _MIN_DIFFERENCE
         for step in (means[a] - means[b]).unbind(dim=1):
             difference += step * step
         size_a, size_b = regions.size[a], regions.size[b]
         ward = size_a * size_b / (size_a + size_b)
-        cost[rows] = ward * difference / borders.contacts[rows].sqrt()
+        cost[rows] = ward * difference / boundaries.contacts[rows].sqrt()
         if bound < math.inf:
             high = torch.maximum(regions.high[a], regions.high[b])
             low = torch.minimum(regions.low[a], regions.low[b])
@@ -522,71 +517,73 @@ def _costs(regions: _Regions, borders: _Borders, bound: float) -> Tensor:
 
 
 def _choose_pairs(
-    borders: _Borders, cost: Tensor, size: Tensor, ratio: float, most: int
+    boundaries: _Boundaries, cost: Tensor, size: Tensor, ratio: float, max_merges: int
 ) -> tuple[Tensor, Tensor]:
-    """Return regions, and those that they are to become part of, each of which stays itself.
+    """Return regions to merge and their targets, which remain.
 
-    Those are each other's cheapest, or the cheapest of one that has ``ratio`` times fewer points;
-    at most so many, those that cost least. Of equal costs the first border's counts.
+    A pair is mutually cheapest, or the source's cheapest partner has ``ratio`` times its points.
+    Returns at most ``max_merges`` pairs, cheapest first; ties go to the first boundary.
     """
-    num_regions, num_borders = len(size), len(cost)
-    least, best = _cheapest_borders(borders, cost, num_regions)
-    asking = (best < num_borders).nonzero().squeeze(1)
-    wanted = borders.first[best[asking]] - asking + borders.second[best[asking]]
-    joins = size[wanted] >= ratio * size[asking]
-    is_joining = torch.zeros(num_regions, dtype=torch.bool).index_copy(0, asking, joins)
-    joins &= ~is_joining[wanted]
-    mutual = (best[wanted] == best[asking]) & ~is_joining[asking] & ~is_joining[wanted]
-    joins |= mutual & (asking > wanted)
-    asking, wanted = asking[joins], wanted[joins]
-    if len(asking) > most:
-        cheapest = least[asking].argsort(stable=True)[:most]
-        asking, wanted = asking[cheapest], wanted[cheapest]
-    owner = torch.arange(num_regions).index_copy(0, asking, wanted)
-    gone = asking
-    # What joins one of a mutual pair may find it gone.
-    return gone, owner[owner[gone]]
+    num_regions, num_boundaries = len(size), len(cost)
+    min_cost, best = _cheapest(boundaries, cost, num_regions)
+    source = (best < num_boundaries).nonzero().squeeze(1)
+    target = boundaries.first[best[source]] - source + boundaries.second[best[source]]
+    joins = size[target] >= ratio * size[source]
+    is_joining = torch.zeros(num_regions, dtype=torch.bool).index_copy(0, source, joins)
+    joins &= ~is_joining[target]
+    mutual = (best[target] == best[source]) & ~is_joining[source] & ~is_joining[target]
+    joins |= mutual & (source > target)
+    source, target = source[joins], target[joins]
+    if len(source) > max_merges:
+        cheapest = min_cost[source].argsort(stable=True)[:max_merges]
+        source, target = source[cheapest], target[cheapest]
+    owner = torch.arange(num_regions).index_copy(0, source, target)
+    sources = source
+    # The target may itself have merged into its mutual partner.
+    return sources, owner[owner[sources]]
 
 
-def _cheapest_borders(borders: _Borders, cost: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
-    """Return the least cost at each region's borders, and its first border of that cost, or E."""
-    least = cost.new_full((num_regions,), math.inf)
+def _cheapest(boundaries: _Boundaries, cost: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
+    """Return each region's minimum boundary cost, and its first boundary of that cost, or E."""
+    min_cost = cost.new_full((num_regions,), math.inf)
     if kernels.serve():
-        (best,) = kernels.call("cheapest_borders", borders.first, borders.second, cost, least)
-        return least, best
-    ends, costs = torch.cat([borders.first, borders.second]).long(), cost.repeat(2)
-    least = least.scatter_reduce(0, ends, costs, "amin")
+        (best,) = kernels.call(
+            "cheapest_borders", boundaries.first, boundaries.second, cost, min_cost
+        )
+        return min_cost, best
+    ends, costs = torch.cat([boundaries.first, boundaries.second]).long(), cost.repeat(2)
+    min_cost = min_cost.scatter_reduce(0, ends, costs, "amin")
     rows = torch.arange(len(cost)).repeat(2)
-    is_least = (costs == least[ends]) & costs.isfinite()
+    is_min = (costs == min_cost[ends]) & costs.isfinite()
     best = torch.full((num_regions,), len(cost))
-    return least, best.scatter_reduce(0, ends[is_least], rows[is_least], "amin")
+    return min_cost, best.scatter_reduce(0, ends[is_min], rows[is_min], "amin")
 
 
 def _merge(
-    regions: _Regions, borders: _Borders, gone: Tensor, owners: Tensor
-) -> tuple[_Regions, _Borders, Tensor]:
-    """Make regions part of others that stay; return the new number of each region too."""
+    regions: _Regions, boundaries: _Boundaries, sources: Tensor, targets: Tensor
+) -> tuple[_Regions, _Boundaries, Tensor]:
+    """Merge regions into their targets; also return the new index of each region."""
     num_regions = len(regions.size)
-    owner = torch.arange(num_regions).index_copy(0, gone, owners)
+    owner = torch.arange(num_regions).index_copy(0, sources, targets)
     stays = owner == torch.arange(num_regions)
     new = (stays.cumsum(0) - 1)[owner]
     narrow = new.int()
-    merged = _gather_borders(
-        narrow.index_select(0, borders.first),
-        narrow.index_select(0, borders.second),
-        borders.contacts,
-        borders.difference,
+    merged = _aggregate(
+        narrow.index_select(0, boundaries.first),
+        narrow.index_select(0, boundaries.second),
+        boundaries.contacts,
+        boundaries.difference,
     )
-    return _joined(regions, new), merged, new
+    return _merged_regions(regions, new), merged, new
 
 
 def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
-    """Return the plane that more than half of the points of each superpoint are on, or -1."""
-    has_one = superpoints >= 0
-    count = int(superpoints.max()) + 1 if bool(has_one.any()) else 0
-    sizes = torch.bincount(superpoints[has_one], minlength=count)
+    """Return the plane ID of more than half of each superpoint's points, or -1."""
+    is_assigned = superpoints >= 0
+    count = int(superpoints.max()) + 1 if bool(is_assigned.any()) else 0
+    sizes = torch.bincount(superpoints[is_assigned], minlength=count)
     main = torch.full((count,), UNLABELED, device=labels.device)
-    on_plane = has_one & (labels >= 0)
+    on_plane = is_assigned & (labels >= 0)
     if not bool(on_plane.any()):
         return main
     planes, rows = torch.unique(labels[on_plane].long(), return_inverse=True)

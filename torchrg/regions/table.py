@@ -1,4 +1,4 @@
-"""The plane table: what each region measures, and which others it meets."""
+"""Plane table: fits, measurements and adjacency of regions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,10 +19,10 @@ from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
-from torchrg.regions.polygons import trace_outline
+from torchrg.regions.polygons import trace_polygon
 from torchrg.structures import Neighbors, PlaneAdjacency, Planes, Rows
 
-_Outlines = tuple[tuple[Tensor, ...], ...]
+_Polygons = tuple[tuple[Tensor, ...], ...]
 
 
 def summarize_planes(
@@ -38,27 +38,28 @@ def summarize_planes(
 ) -> Planes:
     """Fit a plane to each region and measure it.
 
-    Copies of a point in one region count once, except in ``count``. The table does not depend on
-    the order of the points, but for which planes meet, which the neighbors say.
+    Duplicates in one region count once, except in ``count``. The table does not depend on the point
+    order, except the adjacency, which depends on ``neighbors``.
 
     Args:
-        points: Points, shape ``(N, 3)``; those without a label may hold anything.
-        normals: Unit normals of any sign, shape ``(N, 3)``. They tell curved regions from flat
-            ones, and decide where points do not: in regions of one or two points, or along a line.
+        points: Points, shape ``(N, 3)``; unlabeled points may have any value.
+        normals: Unit normals of any sign, shape ``(N, 3)``. They distinguish curved from flat
+            regions, and define the planes of degenerate ones (one or two points, or collinear).
         labels: Region of each point, shape ``(N,)``: 0 to M-1, each at least once, or negative.
-        neighbors: Neighbours of each point, to tell which planes meet.
-        up: The upward direction, to tell floors, ceilings and walls: three numbers, or an axis such
-            as ``"z"`` or ``"-y"``.
-        outline: Whether to trace outlines; needs shapely (``torchrg[outline]``).
-        canonical: Whether the points already are finite and in canonical order, copies of one
-            region side by side; saves a sort.
-        facet_tolerance: Of faces in facets, whose normals are spread, in the unit of the points:
-            regions within 1.5 of it, root mean square, are planes. Default: normals decide alone.
+        neighbors: Neighbors of each point. Default: no adjacency.
+        up: Upward direction for the classification: three numbers, or an axis such as ``"z"`` or
+            ``"-y"``. Default: no classes.
+        outline: Whether to trace polygons; requires shapely (``torchrg[outline]``).
+        canonical: Whether the points are finite and in canonical order with duplicates of a region
+            adjacent; saves a sort.
+        facet_tolerance: For faceted surfaces with spread normals, in the unit of the points:
+            regions within an RMS distance of 1.5 times this value are planes. Default: the normals
+            alone decide.
 
     Raises:
         ShapeError: If a shape or dtype is not as above, or a labeled point is not finite.
         ConfigError: If ``up`` is not a direction.
-        MissingDependencyError: If outlines are asked for and shapely is not installed.
+        MissingDependencyError: If polygons are requested and shapely is not installed.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]])
@@ -76,14 +77,14 @@ def summarize_planes(
     check_floating("summarize_planes", points=points, normals=normals)
     if neighbors is not None and not canonical:
         check_neighbors("summarize_planes", neighbors, points)
-    rows = _distinct_members(points, labels, canonical=canonical)
-    segments, places = Segments(labels[rows]), points[rows]
-    fit = fit_planes(segments, places, normals[rows]).flattened(facet_tolerance)
-    planes = measure_planes(segments, places, fit, outline=outline)
+    rows = _distinct_rows(points, labels, canonical=canonical)
+    segments, positions = Segments(labels[rows]), points[rows]
+    fit = fit_planes(segments, positions, normals[rows]).flattened(facet_tolerance)
+    planes = measure_planes(segments, positions, fit, outline=outline)
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
         direction = unit_direction("summarize_planes", up)
-        planes = replace(planes, kind=classify_planes(planes, places, labels[rows], direction))
+        planes = replace(planes, kind=classify_planes(planes, positions, labels[rows], direction))
     if neighbors is not None:
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
@@ -94,17 +95,17 @@ def summarize_planes(
     return planes
 
 
-def _distinct_members(points: Tensor, labels: Tensor, *, canonical: bool) -> Rows:
+def _distinct_rows(points: Tensor, labels: Tensor, *, canonical: bool) -> Rows:
     """Return the rows of the distinct points of each region, in canonical order."""
     if canonical:
         is_first = mark_first(*points.unbind(dim=1), labels)
         return slice(None) if bool(is_first.all()) else places_of(is_first)
     members = places_of(labels >= 0)
-    num_bad = int(torch.count_nonzero(~points[members].isfinite().all(dim=1)))
-    if num_bad:
+    num_nonfinite = int(torch.count_nonzero(~points[members].isfinite().all(dim=1)))
+    if num_nonfinite:
         raise ShapeError(
-            f"summarize_planes: expected finite points in regions, got {num_bad:,} that are not; "
-            "label them -1."
+            f"summarize_planes: expected finite labeled points, got {num_nonfinite:,} non-finite. "
+            "Label them -1."
         )
     return members[distinct_rows(points[members], labels[members])]
 
@@ -112,7 +113,7 @@ def _distinct_members(points: Tensor, labels: Tensor, *, canonical: bool) -> Row
 def measure_planes(
     segments: Segments, points: Tensor, fit: RegionPlanes, *, outline: bool = False
 ) -> Planes:
-    """Measure regions on the planes that were fitted to them; see :func:`summarize_planes`."""
+    """Measure regions on their fitted planes; see :func:`summarize_planes`."""
     first, second = _plane_axes(fit)
     chunks = segments.chunks(POINTS_AT_ONCE)
     sizes = [len(chunk.counts) for chunk in chunks]
@@ -123,34 +124,35 @@ def measure_planes(
         list(zip(chunks, frames, strict=True)),
         points.device,
     )
-    numbers, outlines = zip(*measures, strict=True)
-    mean, area, sides, directions, middle = map(torch.cat, zip(*numbers, strict=True))
+    measured, polygons = zip(*measures, strict=True)
+    mean, area, sides, directions, middle = map(torch.cat, zip(*measured, strict=True))
     axes = directions @ torch.stack([first, second], dim=1)
 
-    def as_given(values: Tensor) -> Tensor:
+    def to_input_dtype(values: Tensor) -> Tensor:
         return values.to(points.dtype)
 
     return Planes(
-        normal=as_given(fit.normal),
-        offset=as_given((fit.center * fit.normal).sum(dim=1)),
-        centroid=as_given(fit.center + mean),
-        area=as_given(area),
+        normal=to_input_dtype(fit.normal),
+        offset=to_input_dtype((fit.center * fit.normal).sum(dim=1)),
+        centroid=to_input_dtype(fit.center + mean),
+        area=to_input_dtype(area),
         count=fit.num_points,
-        rms=as_given(fit.rms),
-        extent=as_given(sides),
-        axes=as_given(axes),
-        center=as_given(fit.center + (middle[:, None] @ axes).squeeze(1)),
+        rms=to_input_dtype(fit.rms),
+        extent=to_input_dtype(sides),
+        axes=to_input_dtype(axes),
+        center=to_input_dtype(fit.center + (middle[:, None] @ axes).squeeze(1)),
         curved=fit.curved,
-        outline=sum(outlines, ()) if outline else None,
+        outline=sum(polygons, ()) if outline else None,
     )
 
 
 def _measure(
     points: Tensor, segments: Segments, frame: tuple[Tensor, Tensor], *, outline: bool
-) -> tuple[list[Tensor], _Outlines]:
-    """Return mean, area, rectangle and outlines of regions, by centers ``(M, 3)`` and axes.
+) -> tuple[list[Tensor], _Polygons]:
+    """Return mean, area, rectangle and polygons of regions, given their plane frames.
 
-    The axes ``(M, 3, 3)`` are two in the plane and its normal; the mean is in space.
+    A frame is the centers ``(M, 3)`` and the axes ``(M, 3, 3)``: two in the plane, then its normal.
+    The mean is in space.
     """
     u, v, height = segments.along(points, *frame)
     mean = torch.stack([segments.mean(column) for column in (u, v, height)], dim=1)
@@ -158,43 +160,43 @@ def _measure(
     del height
     boxes = fit_rectangles(segments, u, v)
     area, width = covered_areas(segments, u, v, boxes)
-    rings = _outlines(segments, u, v, width, frame, points.dtype) if outline else ()
+    rings = _trace_polygons(segments, u, v, width, frame, points.dtype) if outline else ()
     return [mean, area, *boxes], rings
 
 
 def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
     """Return two unit directions that span each plane, the first along the region."""
-    first = _without(eigh3_of_few(fit.covariance)[1][:, :, 2], fit.normal)
-    # The points of one place have no direction of their own: any in the plane will do.
-    least = fit.normal.abs().argmin(dim=1)
-    other = _without(torch.eye(3, dtype=first.dtype, device=first.device)[least], fit.normal)
+    first = _reject(eigh3_of_few(fit.covariance)[1][:, :, 2], fit.normal)
+    # A region at a single position has no direction: any direction in the plane will do.
+    min_axis = fit.normal.abs().argmin(dim=1)
+    other = _reject(torch.eye(3, dtype=first.dtype, device=first.device)[min_axis], fit.normal)
     first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
     first = first / first.norm(dim=1, keepdim=True)
     return first, torch.linalg.cross(fit.normal, first)
 
 
-def _without(vectors: Tensor, normals: Tensor) -> Tensor:
-    """Return vectors less their component along the normals."""
+def _reject(vectors: Tensor, normals: Tensor) -> Tensor:
+    """Return vectors without their component along the normals."""
     return vectors - (vectors * normals).sum(dim=1, keepdim=True) * normals
 
 
-def _outlines(
+def _trace_polygons(
     segments: Segments,
     u: Tensor,
     v: Tensor,
     width: Tensor,
     frame: tuple[Tensor, Tensor],
     dtype: torch.dtype,
-) -> _Outlines:
-    """Trace the outline of each region, and lift it into space."""
-    outlines = []
+) -> _Polygons:
+    """Trace the polygons of each region, and lift them into space."""
+    polygons = []
     counts = segments.counts.tolist()
     parts = torch.split(torch.stack([u, v], dim=1), counts)
-    for places, size, center, axes in zip(parts, width.tolist(), *frame, strict=True):
+    for positions, size, center, axes in zip(parts, width.tolist(), *frame, strict=True):
         rings = (
             torch.from_numpy(ring).to(u.device)
-            for ring in trace_outline(places.cpu().numpy(), size)
+            for ring in trace_polygon(positions.cpu().numpy(), size)
         )
         lifted = (center + ring[:, :1] * axes[0] + ring[:, 1:] * axes[1] for ring in rings)
-        outlines.append(tuple(ring.to(dtype) for ring in lifted))
-    return tuple(outlines)
+        polygons.append(tuple(ring.to(dtype) for ring in lifted))
+    return tuple(polygons)

@@ -1,7 +1,7 @@
-"""Consensus normals: flat, curved or broken, told apart by the noise of the cloud itself.
+"""Consensus normals: flat, curved or broken neighborhoods, distinguished by noise.
 
-Read in this order: ``noise``, ``hypotheses`` (planes at broken points), ``surfaces`` (which one
-explains the neighbours), ``smoothing``; ``constants`` has every number with its reason.
+Modules in reading order: ``noise``, ``hypotheses`` (planes at broken points), ``surfaces`` (model
+selection), ``smoothing``; ``constants`` documents every number.
 """
 
 import torch
@@ -27,35 +27,34 @@ from torchrg.structures import Neighbors, NormalFit
 def estimate_consensus(
     points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
 ) -> NormalFit:
-    """Estimate normals that are right up to the edges and stay smooth on curved surfaces.
+    """Estimate normals that are accurate up to edges and smooth on curved surfaces.
 
-    Every point gets the simplest surface that explains its neighbours, given their noise:
+    Every point gets the simplest surface that explains its neighbors, given their noise:
 
-    1. *Noise.* PCA at every point, and the noise ``s`` from small neighbourhoods; see
-       :func:`torchrg.normals.consensus.noise.survey_noise`. Nothing is assumed of the sensor.
-    2. *Flat.* Where the deviation from the plane is at most 1.05 s, PCA stands.
-    3. *Curved.* The others get a paraboloid. Its normal stands where its deviation ``J`` is at
-       most 1.2 s, or at most 0.15 of the deviation of the plane; a symmetric edge has 0.27.
-    4. *Broken.* At the points that are left, the plane with the most votes starts the fit of two
+    1. *Noise.* PCA at every point, and the noise ``s`` from small neighborhoods; see
+       :func:`torchrg.normals.consensus.noise.survey_noise`. No sensor model is assumed.
+    2. *Flat.* If the deviation from the plane is at most 1.05 s, the PCA normal is kept.
+    3. *Curved.* Other points get a paraboloid. Its normal is kept if its deviation ``J`` is at most
+       1.2 s, or at most 0.15 of the deviation of the plane; a symmetric edge has 0.27.
+    4. *Broken.* At the remaining points, the plane with the most votes initializes the fit of two
        planes that meet, and of three. The point takes its plane of these if they explain the
-       neighbours, and significantly better than the paraboloid does. Where they do not, and the
-       paraboloid is far off, it takes the plane of the votes. See
-       :func:`torchrg.normals.consensus.surfaces.fit_surfaces`. These points are ``sharp``.
-    5. *Smoothing.* The normals are smoothed bilaterally
-       (:func:`torchrg.normals.consensus.smoothing.smooth_planes`) where their standard error is
-       0.17 degrees and more, and points that took the plane of the votes choose again among the
-       planes of their neighbours (:func:`torchrg.normals.consensus.smoothing.choose_planes`). Both
-       are done twice.
+       neighbors, and significantly better than the paraboloid. Otherwise, if the paraboloid is far
+       off, it takes the voted plane. See :func:`torchrg.normals.consensus.surfaces.fit_surfaces`.
+       These points are ``sharp``.
+    5. *Smoothing.* Normals with a standard error of at least 0.17 degrees are smoothed bilaterally
+       (:func:`torchrg.normals.consensus.smoothing.smooth_planes`). Points with a voted plane choose
+       again among the planes of their neighbors
+       (:func:`torchrg.normals.consensus.smoothing.choose_planes`). Both steps run twice.
 
-    With ``config.adaptive_k`` the neighbourhoods grow with the noise before all this. If ``u`` is
-    the median of noise by radius, they grow by the factor ``(u / 0.15)^2``, up to that many
-    neighbours. That and ``noise_scope`` are all that is used of the settings.
+    With ``config.adaptive_k`` the neighborhoods first grow with the noise: by the factor ``(u /
+    0.15)^2``, where ``u`` is the median ratio of noise to radius, up to ``adaptive_k`` neighbors.
+    Only this parameter and ``noise_scope`` are used.
 
     Returns:
-        The fit, with ``sharp``. At sharp points curvature and residual are those of the neighbours
-        within three times the noise of the plane; what the noise explains is taken from the
-        curvature, as the small width of a narrow face would make it large. Elsewhere they are those
-        of PCA. ``valid`` is that of PCA; with fewer than 12 neighbours so is all else.
+        The fit, with ``sharp``. At sharp points, curvature and residual are from the neighbors
+        within three times the noise of the plane. The curvature excludes noise, which the small
+        width of a narrow face would amplify. At other points both are from PCA. ``valid`` is from
+        PCA, as is everything with fewer than 12 neighbors.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
@@ -70,7 +69,7 @@ def estimate_consensus(
         return fit._replace(sharp=torch.zeros_like(fit.valid))
     survey = survey_noise(points, neighbors, fit, chunk_size=size)
     if config.adaptive_k is not None:
-        count = wanted_neighbors(_noise_fraction(survey), neighbors.indices.shape[1], config)
+        count = adapted_count(_noise_fraction(survey), neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
             fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
@@ -87,10 +86,10 @@ def estimate_consensus(
 
     errors = standard_errors(points, neighbors, planes, survey, sharp, chunk_size=size)
     uncertain = (fit.valid & (errors > constants.MIN_ERROR)).nonzero().squeeze(-1)
-    voters = voted.nonzero().squeeze(-1)
+    voted_rows = voted.nonzero().squeeze(-1)
     for _ in range(constants.NUM_PASSES):
         planes = smooth_planes(points, neighbors, planes, noise, errors, uncertain, chunk_size=size)
-        planes = choose_planes(points, neighbors, planes, noise, voters, chunk_size=size)
+        planes = choose_planes(points, neighbors, planes, noise, voted_rows, chunk_size=size)
     curvature, residual_rms = describe_inliers(
         points, neighbors, planes, noise, fit, sharp, chunk_size=size
     )
@@ -98,24 +97,24 @@ def estimate_consensus(
 
 
 def _noise_fraction(survey: Survey) -> Tensor:
-    """Return the noise by the radius of each neighbourhood, shape ``(N,)``; NaN where unknown."""
-    is_told = survey.noise.isfinite() & (survey.radius > 0)
-    return torch.where(is_told, survey.noise / survey.radius, torch.nan)
+    """Return the ratio of noise to neighborhood radius, shape ``(N,)``; NaN if unknown."""
+    is_known = survey.noise.isfinite() & (survey.radius > 0)
+    return torch.where(is_known, survey.noise / survey.radius, torch.nan)
 
 
-def wanted_neighbors(fractions: Tensor, count: int, config: NormalsConfig) -> int:
-    """Return the number of neighbours with which noise is a small share of the radius.
+def adapted_count(fractions: Tensor, count: int, config: NormalsConfig) -> int:
+    """Return the number of neighbors for which noise is a small fraction of the radius.
 
-    ``fractions`` are noise by radius of all points with ``count`` neighbours, NaN where unknown;
-    ``config.adaptive_k`` is the most there may be.
+    ``fractions`` are the ratios of noise to radius of all points with ``count`` neighbors, NaN if
+    unknown; ``config.adaptive_k`` is the maximum.
 
     Example:
-        >>> shares = torch.full((500,), 0.3)
-        >>> wanted_neighbors(shares, 50, NormalsConfig(adaptive_k=300))
+        >>> fractions = torch.full((500,), 0.3)
+        >>> adapted_count(fractions, 50, NormalsConfig(adaptive_k=300))
         200
     """
     finite = fractions[~fractions.isnan()]
     if config.adaptive_k is None or len(finite) == 0:
         return count
-    wanted = round(count * (float(finite.median()) / constants.ADAPTIVE_NOISE) ** 2)
-    return min(max(count, wanted), config.adaptive_k, len(fractions))
+    adapted = round(count * (float(finite.median()) / constants.ADAPTIVE_NOISE) ** 2)
+    return min(max(count, adapted), config.adaptive_k, len(fractions))

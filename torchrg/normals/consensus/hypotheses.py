@@ -1,4 +1,4 @@
-"""Hypotheses at a broken point: the plane with the most votes, two planes that meet, and three."""
+"""Hypotheses at a broken point: the voted plane, two meeting planes, and three."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -28,21 +28,21 @@ _PLANE_PARAMETERS = 3
 def vote_planes(
     columns: Columns, noise: Tensor, start: Tensor, counted: Tensor
 ) -> tuple[Tensor, Tensor]:
-    r"""Find the plane through each point that the most neighbours support on one side.
+    r"""Find the plane through each point with the most one-sided support of its neighbors.
 
-    Candidates are the plane of normal ``start`` and 32 planes through the point and two neighbours
-    of fixed ranks. With residuals ``r_j`` in units of twice the noise and weights
-    ``w_j = 1 - 0.9 d_j^2 / d_max^2``, the score of a candidate is
+    Candidates are the plane of normal ``start`` and 32 planes through the point and two neighbors
+    of fixed ranks. With residuals ``r_j`` in units of twice the noise and weights ``w_j = 1 - 0.9
+    d_j^2 / d_max^2``, the score of a candidate is
 
     .. math:: \sum_j w_j \max(0, 1 - r_j^2) - \min\big(\sum_{r_j > 1} w_j,\ \sum_{r_j < -1} w_j\big)
 
-    The second term prefers planes that have everything else on one side, as every face of an edge,
-    of a corner and of a plate has. The best candidate is fitted anew to the neighbours within reach
-    of it, first closely, then with the bisquare weights that use nearly all the points of a face.
+    The second term prefers planes with all other points on one side, like every face of an edge, a
+    corner and a plate. The best candidate is refitted to the neighbors within reach, first closely,
+    then with bisquare weights that use nearly all the points of a face.
 
-    The noise ``(n,)`` is positive, and ``counted`` ``(n, K)`` are weights 0 or 1 of the neighbours,
-    by columns about each point. Returns unit normals ``(n, 3)`` and offsets ``(n,)`` of the planes
-    ``normal . q = offset``.
+    The noise ``(n,)`` is positive, and ``counted`` ``(n, K)`` are weights 0 or 1 of the neighbors,
+    in columns relative to each point. Returns unit normals ``(n, 3)`` and offsets ``(n,)`` of the
+    planes ``normal . q = offset``.
     """
     sq_distances = sq_lengths(columns)
     farthest = (sq_distances * counted).amax(dim=1, keepdim=True)
@@ -53,45 +53,45 @@ def vote_planes(
     normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
     for chunk in chunks_of(len(noise), max(ROWS_IN_CACHE // (1 + len(ranks)), 1)):
         near = columns[0][chunk], columns[1][chunk], columns[2][chunk]
-        normals[chunk] = _most_supported(near, weights[chunk], start[chunk], reach[chunk], ranks)
+        normals[chunk] = _best_normals(near, weights[chunk], start[chunk], reach[chunk], ranks)
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach)
+        normals, offsets = _refit(*columns, weights, normals, offsets, reach)
     weights = (1 - constants.FIT_FALLOFF * nearness) * counted
     reach = constants.FIT_REACH * noise
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refitted(*columns, weights, normals, offsets, reach, bisquare=True)
+        normals, offsets = _refit(*columns, weights, normals, offsets, reach, bisquare=True)
     return normals, offsets
 
 
-def support_scores(rests: Tensor, weights: Tensor) -> Tensor:
-    """Return the score ``(*, n)`` of planes by their residuals ``(*, n, K)`` per reach."""
-    support = sum_neighbors((1 - rests * rests).clamp_(min=0).mul_(weights))
-    over = sum_neighbors(above(rests, 1).mul_(weights))
-    under = sum_neighbors(above(-rests, 1).mul_(weights))
+def support_scores(distances: Tensor, weights: Tensor) -> Tensor:
+    """Return the scores ``(*, n)`` of planes from residuals ``(*, n, K)`` in units of the reach."""
+    support = sum_neighbors((1 - distances * distances).clamp_(min=0).mul_(weights))
+    over = sum_neighbors(above(distances, 1).mul_(weights))
+    under = sum_neighbors(above(-distances, 1).mul_(weights))
     return support - torch.minimum(over, under)
 
 
-def _most_supported(
+def _best_normals(
     columns: Columns, weights: Tensor, start: Tensor, reach: Tensor, ranks: Tensor
 ) -> Tensor:
-    """Return the normals of the best planes through the points: the first ones, or by ranks."""
+    """Return the normals of the best planes through the points: ``start``, or by ranks."""
     candidates, spanned = _planes_through(columns, ranks)
     candidates = torch.cat([start[:, None], candidates], dim=1)
     x, y, z = columns
-    rests = along((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
-    scores = support_scores(rests, weights[:, None])
+    distances = along((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
+    scores = support_scores(distances, weights[:, None])
     spanned = torch.cat([torch.ones_like(spanned[:, :1]), spanned], dim=1)
     best = torch.where(spanned, scores, -torch.inf).argmax(dim=1, keepdim=True)
     return candidates.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
 
 
-def _within(rests: Tensor, reach: Tensor) -> Tensor:
+def _parabolic_weights(distances: Tensor, reach: Tensor) -> Tensor:
     """Return ``max(0, 1 - (r / reach)^2)``."""
-    rests = rests / reach[:, None]
-    return (1 - rests * rests).clamp_(min=0)
+    distances = distances / reach[:, None]
+    return (1 - distances * distances).clamp_(min=0)
 
 
-def _refitted(
+def _refit(
     x: Tensor,
     y: Tensor,
     z: Tensor,
@@ -102,17 +102,17 @@ def _refitted(
     *,
     bisquare: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Return planes fitted to the points near planes; those where these points span none."""
-    near = _within(residuals((x, y, z), normals, offsets), reach)
+    """Return planes fitted to the points near planes; unchanged if these points span none."""
+    near = _parabolic_weights(residuals((x, y, z), normals, offsets), reach)
     if bisquare:
         near *= near
-    fitted, moved, values = fit_weighted_planes((x, y, z), weights * near)
+    fitted, shifted, values = fit_weighted_planes((x, y, z), weights * near)
     spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
-    return torch.where(spread[:, None], fitted, normals), torch.where(spread, moved, offsets)
+    return torch.where(spread[:, None], fitted, normals), torch.where(spread, shifted, offsets)
 
 
 def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
-    """Return normals ``(n, P, 3)`` of planes through neighbours, and if these span one."""
+    """Return normals ``(n, P, 3)`` of planes through neighbors, and whether they span a plane."""
     a, b, c = (column.index_select(1, ranks[:, 0]) for column in columns)
     d, e, f = (column.index_select(1, ranks[:, 1]) for column in columns)
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
@@ -123,14 +123,14 @@ def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def candidate_ranks(num_neighbors: int) -> Tensor:
-    """Return the ranks ``(P, 2)`` of the neighbours that span candidates with the point."""
+    """Return the ranks ``(P, 2)`` of the neighbors that span candidates with the point."""
     pairs = _pairs(num_neighbors, constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
     return torch.tensor(pairs, dtype=torch.int64, device="cpu").view(-1, 2)
 
 
 @cache
 def _pairs(num_neighbors: int, num_pairs: int, power: float) -> tuple[tuple[int, int], ...]:
-    """Return pairs of ranks: spread over all neighbours, the near ones more often."""
+    """Return pairs of ranks: spread over all neighbors, near ones more often."""
     last = num_neighbors - 1
     if last < 2:
         return ()
@@ -142,11 +142,11 @@ def _pairs(num_neighbors: int, num_pairs: int, power: float) -> tuple[tuple[int,
 
 
 class MeetingPlanes(NamedTuple):
-    """The plane of each point, one of several that explain its neighbourhood.
+    """The plane of each point among several planes that explain its neighborhood.
 
-    Unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset`` about the point,
-    and the standard deviation of all neighbours ``(n,)``, three degrees of freedom less for each
-    plane; infinite where one has fewer than five points.
+    Unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset`` relative to the
+    point, and the standard deviation over all neighbors ``(n,)``. The latter has three degrees of
+    freedom less per plane and is infinite if a plane has fewer than five points.
     """
 
     normals: Tensor
@@ -155,10 +155,10 @@ class MeetingPlanes(NamedTuple):
 
 
 class Wedge(NamedTuple):
-    """Two planes that meet, and their plane of each point.
+    """Two meeting planes, and the plane of each point.
 
-    ``first`` are the points of the first plane, weights 0 or 1; ``outer`` signed distances of the
-    neighbours from the surface, both ``(n, K)``.
+    ``first`` are the points of the first plane, weights 0 or 1; ``outer`` are signed distances of
+    the neighbors to the surface, both ``(n, K)``.
     """
 
     planes: MeetingPlanes
@@ -169,32 +169,32 @@ class Wedge(NamedTuple):
 def fit_meeting_planes(
     columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
 ) -> MeetingPlanes:
-    """Fit two planes that meet, and three where two do not explain the neighbours.
+    """Fit two meeting planes, and three if two do not explain the neighbors.
 
-    Two planes start from one plane of each neighbourhood, normal ``(n, 3)`` and offset ``(n,)``.
-    Three start once from the two planes and the points off them, and once from that one plane and
-    the planes with the most votes of what it leaves.
+    Two planes start from one plane of each neighborhood, normal ``(n, 3)`` and offset ``(n,)``.
+    Three planes have two starts: the two planes and the points off them; and that one plane with
+    the voted planes of its outliers.
     """
     wedge = fit_wedges(columns, normals, offsets, noise)
     two = wedge.planes
     rows = (two.deviations > constants.CORNER_LIMIT * noise).nonzero().squeeze(-1)
     corners = (columns[0][rows], columns[1][rows], columns[2][rows])
     start = MeetingPlanes(*(values[rows] for values in two))
-    least = constants.CORNER_FRACTION * start.deviations
-    best = start._replace(deviations=least)
+    limit = constants.CORNER_FRACTION * start.deviations
+    best = start._replace(deviations=limit)
     for groups in (
         split_off(wedge.first[rows], wedge.outer[rows], noise[rows]),
         split_by_votes(corners, normals[rows], offsets[rows], noise[rows]),
     ):
-        best = _better(best, fit_corners(corners, groups))
-    improved = best.deviations < least
+        best = _select_better(best, fit_corners(corners, groups))
+    improved = best.deviations < limit
     rows = rows[improved]
     merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(two, best, strict=True)]
     return MeetingPlanes(*merged)
 
 
-def _better(one: MeetingPlanes, other: MeetingPlanes) -> MeetingPlanes:
-    """Return, for each point, the fit that deviates less."""
+def _select_better(one: MeetingPlanes, other: MeetingPlanes) -> MeetingPlanes:
+    """Return the fit with the smaller deviation for each point."""
     less = other.deviations < one.deviations
     return MeetingPlanes(
         torch.where(less[:, None], other.normals, one.normals),
@@ -204,18 +204,18 @@ def _better(one: MeetingPlanes, other: MeetingPlanes) -> MeetingPlanes:
 
 
 def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor) -> Wedge:
-    r"""Fit the surface of the intersection of two half-spaces to each neighbourhood.
+    """Fit the surface of the intersection of two half-spaces to each neighborhood.
 
     Let ``e_1`` and ``e_2`` be the distances of a point inside the two planes, each towards the side
-    where the points of the other plane are. The solid between them has the signed distance
-    ``min(e_1, e_2)``: each point belongs to the plane where it is least inside (ridges and valleys,
-    sharp or blunt, alike). Planes and sides are fitted in turn, from one plane and the points
-    beyond twice the noise on its fuller side. The point itself belongs to a plane by the same rule,
-    which, unlike the nearest of two unbounded planes, is right for points that noise has moved out
-    of the solid. Arguments as for :func:`fit_meeting_planes`.
+    with the points of the other plane. The solid between them has the signed distance ``min(e_1,
+    e_2)``: each point belongs to the plane with the smaller one (for ridges and valleys, sharp or
+    blunt). Planes and sides are fitted alternately, from one plane and the points off it by more
+    than twice the noise on its fuller side. The point itself is assigned by the same rule. Unlike
+    the nearest of two unbounded planes, this is correct for points that noise has moved out of the
+    solid. For arguments see :func:`fit_meeting_planes`.
     """
-    rests = residuals(columns, normals, offsets)
-    second, first = _beyond(rests, noise), _near(rests, noise)
+    distances = residuals(columns, normals, offsets)
+    second, first = _off_surface(distances, noise), _near(distances, noise)
     present = torch.ones_like(noise, dtype=torch.bool)
     for _ in range(constants.NUM_ALTERNATIONS):
         first, second, outer, present, *planes = _wedge(*columns, first, second, present)
@@ -226,7 +226,7 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
 def _wedge(
     x: Tensor, y: Tensor, z: Tensor, first: Tensor, second: Tensor, present: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return the points of two planes that meet, anew, their distances, and the planes."""
+    """Return updated points of two meeting planes, their distances, and the planes."""
     columns = x, y, z
     present = present & _all_present((first, second))
     planes = fit_planes_to_each(columns, (first, second))
@@ -239,13 +239,12 @@ def _wedge(
 
 
 def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
-    r"""Fit three half-spaces, from a first guess which points ``(n, K)``, 0 or 1, lie on which.
+    """Fit three half-spaces, from an initial assignment of points ``(n, K)``, 0 or 1.
 
-    These are corners where three faces meet, rims of plates, where both faces of the plate are
-    among the neighbours, steps and reveals. The first two planes are a wedge, as in
-    :func:`fit_wedges`. If the third group begins inside of it, its half-space cuts the wedge,
-    ``min(e_1, e_2, e_3)``; otherwise it is added, ``max(min(e_1, e_2), -e_3)``, where ``e_3`` is
-    positive on the side of the first two groups.
+    These are corners of three faces, rims of plates with both faces among the neighbors, steps and
+    reveals. The first two planes are a wedge, see :func:`fit_wedges`. If the third group begins
+    inside the wedge, its half-space cuts it, ``min(e_1, e_2, e_3)``. Otherwise it is added,
+    ``max(min(e_1, e_2), -e_3)``. Here ``e_3`` is positive on the side of the first two groups.
     """
     first, second, third = groups
     present = torch.ones_like(first[:, 0], dtype=torch.bool)
@@ -268,16 +267,16 @@ def _corner(
     present: Tensor,
     side: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Return the points of three planes, anew, their distances, the side, and the planes.
+    """Return updated points of three planes, their distances, the side, and the planes.
 
-    ``side`` tells whether the third cuts the wedge or is added to it, 0 where that is to be found.
+    ``side`` is 1 if the third plane cuts the wedge, -1 if it is added, 0 if undetermined.
     """
     columns = x, y, z
     present = present & _all_present((first, second, third))
     planes = fit_planes_to_each(columns, (first, second, third))
-    rests = [residuals(columns, *plane) for plane in planes]
-    inside = _inside(rests[0], second), _inside(rests[1], first)
-    wedge, added = torch.minimum(*inside), _inside(rests[2], first + second)
+    distances = [residuals(columns, *plane) for plane in planes]
+    inside = _inside(distances[0], second), _inside(distances[1], first)
+    wedge, added = torch.minimum(*inside), _inside(distances[2], first + second)
     side = torch.where(side == 0, _side(sum_neighbors(wedge * third)).squeeze(1), side)
     wedge *= side[:, None]
     outer = torch.minimum(added, wedge) * side[:, None]
@@ -288,44 +287,44 @@ def _corner(
 
 
 def split_off(first: Tensor, outer: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the two groups of a wedge, and as a third the points off it on its fuller side."""
-    third = _beyond(outer, noise)
+    """Return the two groups of a wedge, and the points off it on its fuller side as a third."""
+    third = _off_surface(outer, noise)
     return first * (1 - third), (1 - first) * (1 - third), third
 
 
 def split_by_votes(
     columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the points near a plane, those near the most voted plane of the rest, and the others.
+    """Return points near a plane, near the voted plane of the remaining ones, and outliers.
 
-    The plane of the rest passes through the nearest of its points.
+    The voted plane passes through the nearest of the remaining points.
     """
     first = _near(residuals(columns, normals, offsets), noise)
-    others = 1 - first
-    anchor = others.argmax(dim=1, keepdim=True)
-    moved = tuple(column - column.gather(1, anchor) for column in columns)
-    about: Columns = (moved[0], moved[1], moved[2])
-    plane = vote_planes(about, noise, fit_weighted_planes(about, others)[0], others)
-    second = _near(residuals(about, *plane), noise) * others
-    return first, second, others - second
+    remaining = 1 - first
+    anchor = remaining.argmax(dim=1, keepdim=True)
+    shifted = tuple(column - column.gather(1, anchor) for column in columns)
+    about: Columns = (shifted[0], shifted[1], shifted[2])
+    plane = vote_planes(about, noise, fit_weighted_planes(about, remaining)[0], remaining)
+    second = _near(residuals(about, *plane), noise) * remaining
+    return first, second, remaining - second
 
 
-def _near(rests: Tensor, noise: Tensor) -> Tensor:
-    """Return which points are within twice the noise of a plane, as 0 or 1."""
-    return at_most(rests.abs(), (constants.MEETING_GAP * noise)[:, None])
+def _near(distances: Tensor, noise: Tensor) -> Tensor:
+    """Return a mask of points within twice the noise of a plane, as 0 or 1."""
+    return at_most(distances.abs(), (constants.MEETING_GAP * noise)[:, None])
 
 
-def _beyond(rests: Tensor, noise: Tensor) -> Tensor:
+def _off_surface(distances: Tensor, noise: Tensor) -> Tensor:
     """Return the points off a surface by more than twice the noise, on the side with more."""
     gap = constants.MEETING_GAP * noise[:, None]
-    over, under = above(rests, gap), above(-rests, gap)
+    over, under = above(distances, gap), above(-distances, gap)
     more = at_most(under.sum(dim=1), over.sum(dim=1))[:, None]
     return over.mul_(more).add_(under.mul_(1 - more))
 
 
-def _inside(rests: Tensor, others: Tensor) -> Tensor:
-    """Return distances from a plane, positive on the side where other points are."""
-    return rests * _side(sum_neighbors(rests * others))
+def _inside(distances: Tensor, others: Tensor) -> Tensor:
+    """Return distances to a plane, positive on the side of ``others``."""
+    return distances * _side(sum_neighbors(distances * others))
 
 
 def _side(totals: Tensor) -> Tensor:
@@ -334,7 +333,7 @@ def _side(totals: Tensor) -> Tensor:
 
 
 def _all_present(groups: Sequence[Tensor]) -> Tensor:
-    """Return where every group has enough points for a plane of its own."""
+    """Return whether every group has enough points for a plane."""
     smallest = torch.stack([group.sum(dim=1) for group in groups]).amin(dim=0)
     return smallest >= constants.MIN_PLANE_POINTS
 
@@ -345,7 +344,7 @@ def _summary(
     outer: Tensor,
     present: Tensor,
 ) -> MeetingPlanes:
-    """Return the plane whose group each point is in, and the deviation from all planes."""
+    """Return the plane of each point's group, and the deviation from all planes."""
     normals, offsets = planes[0]
     for (normal, offset), group in zip(planes[1:], groups[1:], strict=True):
         has_group = group[:, 0] > 0

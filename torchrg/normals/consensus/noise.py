@@ -1,4 +1,4 @@
-"""How noisy the points are, from neighbourhoods of several sizes."""
+"""Noise estimation from neighborhoods of several sizes."""
 
 import math
 from typing import NamedTuple
@@ -28,11 +28,11 @@ _LAYER_PARAMETERS = 4
 
 
 class Survey(NamedTuple):
-    """What the plane of each neighbourhood leaves unexplained, each of shape ``(N,)``.
+    """Plane residuals and noise of each neighborhood, each of shape ``(N,)``.
 
-    Distance of the plane from the point along the normal; standard deviation of the residuals (3
-    degrees of freedom less) and of the noise, infinite where too few neighbours have a plane; and
-    the distance of the farthest neighbour.
+    Fields: the distance of the plane from the point along the normal; the standard deviation of the
+    residuals (3 degrees of freedom less); the noise, infinite if too few neighbors have a plane;
+    and the distance of the farthest neighbor.
     """
 
     offsets: Tensor
@@ -44,22 +44,22 @@ class Survey(NamedTuple):
 def survey_noise(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = CHUNK_SIZE
 ) -> Survey:
-    """Estimate the noise about each point, at edges and on curved surfaces too.
+    """Estimate the local noise, also at edges and on curved surfaces.
 
-    The deviation ``T_m`` of the ``m`` nearest points from their own plane is noise where those
-    points lie on one smooth face, and more elsewhere. Small neighbourhoods lie on one face more
-    often, so the estimate is the least of three, for m = 8, 16 and all neighbours, of
-    ``s_m = c_m q(T_m) / sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``. Here ``q`` is the 35th percentile
-    over the neighbours, and ``c_m`` the factor that makes it unbiased for a plane. A plane of few
-    points turns with their noise, which the root makes good: ``R_m = R (m / K)^(1/2)`` is their
-    radius, from that of all, and ``a_m`` was measured on noisy planes.
+    The deviation ``T_m`` of the ``m`` nearest points from their plane is noise if these points lie
+    on one smooth face, and larger otherwise. Small neighborhoods lie on one face more often, so the
+    estimate is the minimum of three, for m = 8, 16 and all neighbors, of ``s_m = c_m q(T_m) /
+    sqrt(1 - (c_m q(T_m) / (a_m R_m))^2)``. Here ``q`` is the 35th percentile over the neighbors,
+    and the factor ``c_m`` makes it unbiased for a plane. The root corrects for planes of few
+    points, which turn with their noise. Their radius is ``R_m = R (m / K)^(1/2)``, from the radius
+    of all, and ``a_m`` was measured on noisy planes.
 
-    A place counts once, however many points are there, and neighbourhoods that lie almost on one
-    line, as on scan lines, do not count. At corners, where none of the three finds a face, the
-    noise is at most 3 times the 15th percentile of the noise of the neighbours. Where points are so
-    few that even the nearest are of both faces of a plate, two parallel planes take the place of
-    the one of all neighbours, if they leave 0.35 of its deviation or less. ``fit`` are the planes
-    of all neighbours; noise is at least the rounding of the coordinates.
+    Duplicates count once, and nearly collinear neighborhoods, such as scan lines, do not count. At
+    corners, where none of the three finds a face, the noise is at most 3 times the 15th percentile
+    of the neighbors' noise. Points may be so sparse that even the nearest lie on both faces of a
+    plate. Two parallel planes then replace the plane of all neighbors if they leave at most 0.35 of
+    its deviation. ``fit`` are the planes of all neighbors; noise is at least the coordinate
+    rounding.
     """
     points = points.contiguous()
     offsets, radius = torch.empty_like(points[:, 0]), torch.empty_like(points[:, 0])
@@ -67,21 +67,21 @@ def survey_noise(
 
     def work(block: slice) -> None:
         near = neighbors.at(block)
-        offsets[block], radius[block], whole, layered, again, *nearest = _survey(
+        offsets[block], radius[block], single, layered, repeats, *nearest = _survey(
             points, near, fit.normals[block], fit.valid[block]
         )
-        if len(rows := places_of(again)):
-            patches, counted = _each_place_once(points, near.at(rows))
+        if len(rows := places_of(repeats)):
+            patches, counted = _move_duplicates(points, near.at(rows))
             for values, size in zip(nearest, constants.NOISE_COUNTS, strict=True):
                 values[rows] = _small_deviations(patches, counted, size)
-        torch.stack([whole, layered, *nearest], dim=1, out=deviations[block])
+        torch.stack([single, layered, *nearest], dim=1, out=deviations[block])
 
     map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
-    whole, layered, *small = _neighbor_quantiles(
+    single, layered, *small = _neighbor_quantiles(
         deviations, neighbors, constants.NOISE_QUANTILE
     ).unbind(dim=1)
-    noise = constants.NOISE_FACTOR_OF_ALL * torch.minimum(whole, layered)
+    noise = constants.NOISE_FACTOR_OF_ALL * torch.minimum(single, layered)
     count: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
         count = neighbors.valid.sum(dim=1)
@@ -104,15 +104,15 @@ def survey_noise(
 
 
 def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
-    """Return the noise ``(N,)`` of the region around each point from the noise about single ones.
+    """Return the noise ``(N,)`` of the region around each point from point-wise noise.
 
-    Where a reconstruction has rounded the step between two parallel faces into a ramp, no
-    neighbourhood on it is of one face, not even the smallest, and all of them find the step to be
-    noise. Beside it they do not. The noise of the region is a low quantile over the neighbours, of
-    that over theirs, and so on: each step brings in what is one neighbourhood farther away.
+    A reconstruction may round the step between two parallel faces into a ramp. No neighborhood on
+    the ramp lies on one face, and all of them mistake the step for noise. Neighborhoods next to the
+    ramp do not. The regional noise is a low quantile over the neighbors, iterated: each step
+    extends the region by one neighborhood.
 
-    Where the noise of each point is its own, as scanners have it, estimates scatter, and this is
-    about three quarters of it.
+    For scanner noise, which is independent per point, estimates scatter, and this is about three
+    quarters of the noise.
 
     Example:
         >>> line = torch.arange(8)
@@ -127,9 +127,9 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
 
 
 def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
-    """Return parts of a survey, deviations from two layers, where places repeat, and deviations.
+    """Return survey parts, deviations from two layers, a duplicate mask, and small deviations.
 
-    These are of the nearest neighbours, for each of the counts.
+    The last ones are those of the nearest neighbors, for each of the counts.
     """
     counts = constants.NOISE_COUNTS
     if kernels.serve(points, *near, normals, valid, k=near.indices.shape[1]):
@@ -146,37 +146,37 @@ def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> 
             constants.NUM_REFITS,
             constants.MIN_PLANE_POINTS,
         )
-    offsets, radius, whole, looks_layered, again = _deviations(points, *near, normals, valid)
-    layered = torch.full_like(whole, torch.inf)
+    offsets, radius, single, looks_layered, repeats = _deviations(points, *near, normals, valid)
+    layered = torch.full_like(single, torch.inf)
     if len(rows := places_of(looks_layered)):
-        layered[rows] = _layered_deviations(points, near.at(rows), normals[rows], whole[rows])
-    of_nearest = [_of_nearest(points, near, count) for count in counts]
-    return offsets, radius, whole, layered, again, *of_nearest
+        layered[rows] = _layered_deviations(points, near.at(rows), normals[rows], single[rows])
+    nearest = [_nearest_deviations(points, near, count) for count in counts]
+    return offsets, radius, single, layered, repeats, *nearest
 
 
 def _deviations(
     points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return parts of a survey, where residuals are layered, and where places repeat."""
+    """Return survey parts, a mask of layered residuals, and a mask of duplicate positions."""
     columns = gather_columns(points, indices)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
     count = counted.sum(dim=1)
     center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
     offsets = dot(normals, torch.stack(center, dim=-1))
-    rests = residuals(columns, normals, offsets)
-    squares = rests * rests * counted
+    distances = residuals(columns, normals, offsets)
+    squares = distances * distances * counted
     second, fourth = sum_neighbors(squares), sum_neighbors(squares.square())
     deviations = square_root(second / (count - 3).clamp(min=1))
-    whole = torch.where(valid & (count > 3), deviations, torch.inf)
+    single = torch.where(valid & (count > 3), deviations, torch.inf)
     radius = square_root((sq_lengths(columns) * counted).amax(dim=1))
     low = fourth * count < constants.MAX_LAYERED_KURTOSIS * second * second
     moves = sum((column[:, 1:] - column[:, :-1]).abs_() for column in columns)
     assert isinstance(moves, Tensor)  # noqa: S101
-    return offsets, radius, whole, low & whole.isfinite(), (moves == 0).any(dim=1)
+    return offsets, radius, single, low & single.isfinite(), (moves == 0).any(dim=1)
 
 
-def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole: Tensor) -> Tensor:
-    """Return deviations from two parallel planes, the faces of a plate; inf without any."""
+def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, single: Tensor) -> Tensor:
+    """Return deviations from two parallel planes, the faces of a plate; inf if there are none."""
     columns = gather_columns(points, near.indices)
     counted = near.counted().to(points.dtype)
     count = counted.sum(dim=1)
@@ -189,22 +189,22 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, whole:
     num_upper = upper.sum(dim=1)
     deviations = square_root(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
-    layered &= deviations <= constants.MAX_LAYERED_FRACTION * whole
+    layered &= deviations <= constants.MAX_LAYERED_FRACTION * single
     return torch.where(layered, deviations, torch.inf)
 
 
-def _each_place_once(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
-    """Move neighbours at the place of the one before to the end, where they do not count."""
+def _move_duplicates(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
+    """Move duplicates of the previous neighbor to the end, where they do not count."""
     patches, counted = gather_patches(points, near.indices), near.counted()
-    again = torch.zeros_like(counted)
-    again[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=-1)
-    order = again.to(torch.uint8).argsort(dim=1, stable=True)
-    once = (counted & ~again).gather(1, order).to(points.dtype)
+    repeats = torch.zeros_like(counted)
+    repeats[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=-1)
+    order = repeats.to(torch.uint8).argsort(dim=1, stable=True)
+    once = (counted & ~repeats).gather(1, order).to(points.dtype)
     return patches.gather(1, order[:, :, None].expand(-1, -1, 3)), once
 
 
-def _of_nearest(points: Tensor, near: Neighbors, count: int) -> Tensor:
-    """Return deviations of so many nearest points from their plane."""
+def _nearest_deviations(points: Tensor, near: Neighbors, count: int) -> Tensor:
+    """Return deviations of the ``count`` nearest points from their plane."""
     patches = gather_patches(points, near.indices[:, :count])
     return _small_deviations(patches, near.counted()[:, :count].to(points.dtype), count)
 
@@ -212,21 +212,21 @@ def _of_nearest(points: Tensor, near: Neighbors, count: int) -> Tensor:
 def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     """Return deviations of the nearest points from their plane.
 
-    They are infinite where these points span none, or the last of them does not count.
+    Infinite if these points do not span a plane, or the last of them does not count.
     """
     if patches.shape[1] < count:
         return patches.new_full(patches.shape[:1], torch.inf)
     columns = split_columns(patches[:, :count])
     counted = counted[:, :count]
     normals, offsets, values = fit_weighted_planes(columns, counted)
-    rests = residuals(columns, normals, offsets)
-    spread = sum_neighbors(rests * rests) / (count - 3)
+    distances = residuals(columns, normals, offsets)
+    spread = sum_neighbors(distances * distances) / (count - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
     return torch.where(broad, square_root(spread), torch.inf)
 
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
-    """Return quantiles over the neighbours of each point, of each column of values ``(N, C)``."""
+    """Return quantiles over the neighbors of each point, for each column of values ``(N, C)``."""
     k, quantiles = neighbors.indices.shape[1], torch.empty_like(values)
     rank = max(math.ceil(quantile * k), 1)
 
@@ -235,19 +235,19 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
         if kernels.serve(values, *near, k=k):
             (quantiles[block],) = kernels.call("neighbor_quantiles", values, *near, quantile, rank)
             return
-        for column, into in zip(values.unbind(dim=1), quantiles[block].unbind(dim=1), strict=True):
-            of_neighbors = near.of(column)
+        for column, out in zip(values.unbind(dim=1), quantiles[block].unbind(dim=1), strict=True):
+            near_values = near.of(column)
             if near.valid is None and values.device.type == "cpu":
-                # A tenth of the time of torch's.
-                of_neighbors.numpy().partition(rank - 1, axis=1)
-                into[:] = of_neighbors[:, rank - 1]
+                # Ten times faster than torch.
+                near_values.numpy().partition(rank - 1, axis=1)
+                out[:] = near_values[:, rank - 1]
                 continue
             if near.valid is None:
-                into[:] = of_neighbors.kthvalue(rank, dim=1).values
+                out[:] = near_values.kthvalue(rank, dim=1).values
                 continue
             ranks = (quantile * near.valid.sum(dim=1, keepdim=True)).ceil().clamp(min=1)
-            ascending = torch.where(near.valid, of_neighbors, torch.inf).sort(dim=1).values
-            into[:] = ascending.gather(1, ranks.long() - 1).squeeze(1)
+            ascending = torch.where(near.valid, near_values, torch.inf).sort(dim=1).values
+            out[:] = ascending.gather(1, ranks.long() - 1).squeeze(1)
 
     map_chunks(work, len(values), ROWS_IN_CACHE, values.device)
     return quantiles

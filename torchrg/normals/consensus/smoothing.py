@@ -1,4 +1,4 @@
-"""Bilateral smoothing of normals, and the choice among the planes of the neighbours."""
+"""Bilateral smoothing of normals, and plane choice among neighbors."""
 
 import torch
 from torch import Tensor
@@ -34,22 +34,22 @@ def smooth_planes(
     *,
     chunk_size: int,
 ) -> TangentPlanes:
-    r"""Smooth normals bilaterally: average the planes of the neighbours that agree with a point's.
+    """Smooth normals bilaterally: average the neighbors' planes that agree with the point's.
 
-    Neighbour j agrees with point i as far as its plane passes through i, within 2.5 times the
-    noise, and the chord ``c_ij`` between the normals is within 4.2 times its standard error
-    ``a_ij = (a_i^2 + a_j^2)^(1/2)``. The weights are
-    ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 - d_ij^2 / (2 d_max^2)) / a_j^2``,
-    each factor at least 0. On a curved surface a mere average would lean towards the denser side;
-    the weights are therefore tilted by a linear function of the position, such that the weighted
-    mean of the positions is the point (local linear regression). ``errors`` are the ``a_i`` in
-    radians, ``(N,)``, positive; ``rows`` are the points to treat, ``(n,)``. Returns all planes.
+    Neighbor j agrees with point i if its plane passes within 2.5 times the noise of i. The chord
+    ``c_ij`` between the normals must be within 4.2 times its standard error ``a_ij = (a_i^2 +
+    a_j^2)^(1/2)``. The weights are ``(1 - (c_ij / 4.2 a_ij)^2)^2 (1 - (r_ij / 2.5 s_i)^2) (1 -
+    d_ij^2 / (2 d_max^2)) / a_j^2``, each factor at least 0. On a curved surface a plain average
+    would lean towards the denser side. The weights are therefore tilted by a linear function of the
+    position so that the weighted mean position is the point (local linear regression). ``errors``
+    are the ``a_i`` in radians, ``(N,)``, positive; ``rows`` are the points to smooth, ``(n,)``.
+    Returns all planes.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
     is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
     table = _table(points, planes, errors) if is_served else points
-    numbers = (
+    parameters = (
         constants.SMOOTHING_AGREEMENT,
         constants.SMOOTHING_REACH,
         constants.FIT_FALLOFF,
@@ -61,7 +61,7 @@ def smooth_planes(
         chosen = rows[block]
         if is_served:
             normals[chosen], offsets[chosen] = kernels.call(
-                "smooth_planes", table, *neighbors, noise, chosen, *numbers
+                "smooth_planes", table, *neighbors, noise, chosen, *parameters
             )
             return
         normals[chosen], offsets[chosen] = _smoothed(
@@ -73,7 +73,7 @@ def smooth_planes(
 
 
 def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
-    """Return rows of point, normal, offset and value ``(N, 8)``: one place in memory for each."""
+    """Return rows of point, normal, offset and value ``(N, 8)``, contiguous per point."""
     return torch.cat([points, planes.normals, planes.offsets[:, None], values[:, None]], dim=1)
 
 
@@ -87,32 +87,32 @@ def _smoothed(
     errors: Tensor,
     rows: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the smoothed planes of some points; ``parts`` are the columns of all normals."""
+    """Return the smoothed planes of points; ``parts`` are the columns of all normals."""
     near = Neighbors(indices, valid).at(rows)
     columns = gather_columns(points, near.indices)
     x, y, z = (near.of(column) for column in parts.unbind())
     a, b, c = (column.index_select(0, rows)[:, None] for column in parts.unbind())
     cosines = x * a + y * b + z * c
     sign = signs(cosines)
-    rests = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
+    distances = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
     sq_chords = 2 * (1 - cosines.abs())
     sq_error = near.of(errors).square()
     sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
     reach = constants.SMOOTHING_REACH * noise[rows][:, None]
     weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
-    weights *= (1 - (rests / reach).square_()).clamp_(min=0)
-    weights *= _falling(columns, constants.FIT_FALLOFF)
+    weights *= (1 - (distances / reach).square_()).clamp_(min=0)
+    weights *= _distance_weights(columns, constants.FIT_FALLOFF)
     if near.valid is not None:
         weights *= near.valid
     weights = _balanced(columns, weights) * sign
     mean = torch.stack([sum_neighbors(weights * column) for column in (x, y, z)], dim=-1)
     length = square_root(dot(mean, mean))
     has_mean = length > 0
-    safe = torch.where(has_mean, length, 1.0)
-    normals = torch.where(has_mean[:, None], mean / safe[:, None], torch.cat([a, b, c], dim=1))
+    divisor = torch.where(has_mean, length, 1.0)
+    normals = torch.where(has_mean[:, None], mean / divisor[:, None], torch.cat([a, b, c], dim=1))
     total = torch.where(has_mean, sum_neighbors(weights * sign), 1.0)
-    moved = -sum_neighbors(weights * rests) / total
-    return normals, torch.where(has_mean, moved, offsets[rows])
+    new_offsets = -sum_neighbors(weights * distances) / total
+    return normals, torch.where(has_mean, new_offsets, offsets[rows])
 
 
 def choose_planes(
@@ -124,12 +124,12 @@ def choose_planes(
     *,
     chunk_size: int,
 ) -> TangentPlanes:
-    """Give points the plane, among those of their neighbours, that their neighbourhood supports.
+    """Assign to points the neighboring plane with the most support in their neighborhood.
 
-    The score of a plane is that of :func:`torchrg.normals.consensus.hypotheses.vote_planes` per
-    weight, less a tenth of the square of the point's own residual in units of the noise; planes
-    from which the point is farther than three times the noise do not qualify. ``rows`` ``(n,)`` are
-    the points to treat; planes of all are returned.
+    The score is that of :func:`torchrg.normals.consensus.hypotheses.vote_planes` per weight, minus
+    a tenth of the point's squared residual in units of the noise. Planes farther from the point
+    than three times the noise are excluded. ``rows`` ``(n,)`` are the points to update. Returns all
+    planes.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
@@ -137,7 +137,7 @@ def choose_planes(
     is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
     is_served = is_served and len(rows) > 0
     table = _table(points, planes, noise) if is_served else points
-    numbers = (
+    parameters = (
         constants.CHOICE_STEP,
         constants.VOTE_REACH,
         constants.VOTE_FALLOFF,
@@ -149,7 +149,7 @@ def choose_planes(
         chosen = rows[block]
         if is_served:
             normals[chosen], offsets[chosen] = kernels.call(
-                "choose_planes", table, *neighbors, points, chosen, *numbers
+                "choose_planes", table, *neighbors, points, chosen, *parameters
             )
             return
         normals[chosen], offsets[chosen] = _chosen(
@@ -171,28 +171,28 @@ def _chosen(
     rows: Tensor,
     ranks: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the best planes for some points among those of their neighbours of some ranks."""
+    """Return the best planes of points among the planes of their neighbors at ``ranks``."""
     near = Neighbors(indices, valid).at(rows)
     columns = gather_columns(points, near.indices)
-    weights = _falling(columns, constants.VOTE_FALLOFF)
+    weights = _distance_weights(columns, constants.VOTE_FALLOFF)
     if near.valid is not None:
         weights *= near.valid
     scale = noise[rows][:, None]
     other = near.indices.index_select(1, ranks).long()
     axes = normals[other]
-    places = torch.stack([column.index_select(1, ranks) for column in columns], dim=-1)
-    moved = offsets[other] + dot(axes, places)
+    positions = torch.stack([column.index_select(1, ranks) for column in columns], dim=-1)
+    new_offsets = offsets[other] + dot(axes, positions)
     reach = constants.VOTE_REACH * scale
     x, y, z = (column[:, None] for column in columns)
-    rests = along((x, y, z), axes / reach[:, :, None]) - (moved / reach)[:, :, None]
-    away = moved / scale
-    support = support_scores(rests, weights[:, None]) / sum_neighbors(weights)[:, None]
-    score = support - constants.CHOICE_COST * away * away
-    usable = (away.abs() < constants.INLIER_REACH) & (dot(axes, axes) > 0)
+    distances = along((x, y, z), axes / reach[:, :, None]) - (new_offsets / reach)[:, :, None]
+    offset_ratio = new_offsets / scale
+    support = support_scores(distances, weights[:, None]) / sum_neighbors(weights)[:, None]
+    score = support - constants.CHOICE_COST * offset_ratio * offset_ratio
+    usable = (offset_ratio.abs() < constants.INLIER_REACH) & (dot(axes, axes) > 0)
     best = torch.where(usable, score, -torch.inf).argmax(dim=1, keepdim=True)
     has_choice = usable.gather(1, best)
     normal = axes.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
-    offset = torch.where(has_choice, moved.gather(1, best), offsets[rows][:, None])
+    offset = torch.where(has_choice, new_offsets.gather(1, best), offsets[rows][:, None])
     return torch.where(has_choice, normal, normals[rows]), offset.squeeze(1)
 
 
@@ -207,8 +207,8 @@ def standard_errors(
 ) -> Tensor:
     """Return the standard error of the normals in radians, shape ``(N,)``.
 
-    For a plane through ``n`` points it is the noise divided by ``(n l_1)^(1/2)``, where ``l_1`` is
-    the middle eigenvalue of their covariance, a quarter of the squared radius if they fill a disc.
+    For a plane through ``n`` points it is the noise divided by ``(n l_1)^(1/2)``. Here ``l_1`` is
+    the middle eigenvalue of their covariance, a quarter of the squared radius for a filled disk.
     """
     radius = torch.where(survey.radius > 0, survey.radius, 1.0)
     num_points: Tensor | int = neighbors.indices.shape[1]
@@ -236,7 +236,7 @@ def describe_inliers(
     *,
     chunk_size: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return curvature and residual of all points: at sharp ones those of the inliers alone."""
+    """Return curvature and residual of all points, at sharp points from the inliers only."""
     curvature, residual_rms = fit.curvature.clone(), fit.residual_rms.clone()
 
     def work(rows: Tensor) -> None:
@@ -259,26 +259,26 @@ def _inliers(
     noise: Tensor,
     rows: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Return number and covariance eigenvalues of the neighbours near the planes of some points."""
+    """Return the number and covariance eigenvalues of neighbors near the planes of points."""
     arguments = points, indices, valid, normals, offsets, noise
     if kernels.serve(*arguments, k=indices.shape[1]):
         return kernels.call("inliers", *arguments, rows, constants.INLIER_REACH)
     columns = gather_columns(points, indices[rows])
-    rests = residuals(columns, normals[rows], offsets[rows]).abs()
-    near = rests <= (constants.INLIER_REACH * noise[rows])[:, None]
+    distances = residuals(columns, normals[rows], offsets[rows]).abs()
+    near = distances <= (constants.INLIER_REACH * noise[rows])[:, None]
     weights = (near & Neighbors(indices, valid).counted(rows)).to(points.dtype)
     return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 
-def _falling(columns: Columns, fraction: float) -> Tensor:
-    """Return weights that fall with the squared distance, by a share at the farthest neighbour."""
+def _distance_weights(columns: Columns, fraction: float) -> Tensor:
+    """Return weights that decrease with the squared distance, by ``fraction`` at the farthest."""
     sq_distances = sq_lengths(columns)
     farthest = sq_distances.amax(dim=1, keepdim=True)
     return 1 - fraction * sq_distances / torch.where(farthest > 0, farthest, 1.0)
 
 
 def _balanced(columns: Columns, weights: Tensor) -> Tensor:
-    """Return weights tilted such that the weighted mean of the positions is nearly the point."""
+    """Return weights tilted so that the weighted mean position is nearly the point."""
     radius = square_root(sq_lengths(columns).amax(dim=1, keepdim=True))
     x, y, z = (column / torch.where(radius > 0, radius, 1.0) for column in columns)
     wx, wy, wz = weights * x, weights * y, weights * z

@@ -1,4 +1,4 @@
-"""The surface that explains each neighbourhood: a plane, a paraboloid, or planes that meet."""
+"""Surface selection per neighborhood: a plane, a paraboloid, or meeting planes."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ _PARABOLOID_PARAMETERS = 6
 
 
 class TangentPlanes(NamedTuple):
-    """A plane at each point: unit normals ``(N, 3)``, zero for none, and distances along them."""
+    """A plane at each point: unit normals ``(N, 3)``, zero if none, and offsets along them."""
 
     normals: Tensor
     offsets: Tensor
@@ -33,36 +33,36 @@ class TangentPlanes(NamedTuple):
 def fit_surfaces(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, survey: Survey, *, chunk_size: int
 ) -> tuple[TangentPlanes, Tensor, Tensor]:
-    r"""Give each point the plane, the paraboloid or the one of several planes that explains most.
+    r"""Select the plane, paraboloid or meeting planes that explain each neighborhood best.
 
-    With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. The others get a
-    paraboloid, of deviation ``J``; it stands where ``J`` is at most 1.2 s, or at most 0.15 of the
-    plane's deviation. Otherwise two planes that meet are fitted, and where these deviate by more
-    than 1.15 s, three, which replace the two if their deviation is below 0.9 of theirs. The point
-    takes its plane of these, of deviation ``W``, where ``W <= 1.3 s`` and the gain over the
-    paraboloid, a difference of chi-square with as many parameters in both models,
+    With ``s`` the noise, points whose plane deviates by at most 1.05 s keep it. Other points get a
+    paraboloid of deviation ``J``, accepted if ``J`` is at most 1.2 s, or at most 0.15 of the
+    plane's deviation. Otherwise two meeting planes are fitted, and three if these deviate by more
+    than 1.15 s. Three planes replace two if their deviation is below 0.9 times. The point takes its
+    plane of these, of deviation ``W``, if ``W <= 1.3 s`` and the gain over the paraboloid, a
+    difference of chi-square with equal numbers of parameters,
 
     .. math:: (K - 6) (J^2 - W^2) / \max(s, W)^2,
 
-    is above 8, and above 20 on average over the point's 16 nearest, where a neighbourhood that is
-    not broken counts as 0. Noise makes single points look broken; an edge does so to all of them.
-    Points that are left with ``J > 2 s`` take the plane of the votes. ``fit`` and ``survey`` are
-    those of all neighbours by PCA. Returns the tangent planes of all points, which points are
-    sharp, as their neighbourhood is broken, and which of them took the plane of the votes.
+    is above 8, and above 20 on average over the point's 16 nearest, where neighborhoods that are
+    not broken count as 0. Noise makes single points look broken; an edge does so to all of them.
+    Remaining points with ``J > 2 s`` take the voted plane. ``fit`` and ``survey`` are from PCA of
+    all neighbors. Returns the tangent planes of all points, a mask of sharp points (with broken
+    neighborhoods), and a mask of points with the voted plane.
     """
     noise, points = survey.noise, points.contiguous()
     normals, offsets = fit.normals.clone(), survey.offsets.clone()
-    bent = survey.deviations.clone()
+    deviations = survey.deviations.clone()
 
-    def bend(rows: Tensor) -> None:
+    def fit_curved(rows: Tensor) -> None:
         fitted = _paraboloids(points, *neighbors, fit.normals, rows)
-        normals[rows], offsets[rows], bent[rows] = fitted
+        normals[rows], offsets[rows], deviations[rows] = fitted
 
     not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
-    map_chosen(bend, not_flat, chunk_size)
-    broken = not_flat & (bent > constants.CURVED_LIMIT * noise)
-    broken &= bent > constants.CURVED_FRACTION * survey.deviations
-    far_off = bent > constants.FAR_OFF * noise
+    map_chosen(fit_curved, not_flat, chunk_size)
+    broken = not_flat & (deviations > constants.CURVED_LIMIT * noise)
+    broken &= deviations > constants.CURVED_FRACTION * survey.deviations
+    far_off = deviations > constants.FAR_OFF * noise
     gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
     by_votes, meeting = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
 
@@ -75,17 +75,17 @@ def fit_surfaces(
         has_planes = planes.deviations.isfinite()
         residual = torch.where(has_planes, planes.deviations, scale)
         unit = torch.maximum(scale, residual)
-        drop = (bent[rows] / unit).square() - (residual / unit).square()
+        drop = (deviations[rows] / unit).square() - (residual / unit).square()
         num_neighbors: int | Tensor = neighbors.indices.shape[1]
         if neighbors.valid is not None:
             num_neighbors = neighbors.valid[rows].sum(dim=1)
         drop *= num_neighbors - _PARABOLOID_PARAMETERS
-        most = constants.MAX_GAIN
-        gain[rows] = torch.where(has_planes, drop, -most).clamp_(-most, most)
+        upper = constants.MAX_GAIN
+        gain[rows] = torch.where(has_planes, drop, -upper).clamp_(-upper, upper)
 
-    asked = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
-    for same in _by_count(asked, neighbors):
-        map_chosen(split, same, chunk_size)
+    candidates = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
+    for group in _group_by_count(candidates, neighbors):
+        map_chosen(split, group, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meets = broken & explained & (gain > constants.MIN_GAIN) & (pooled > constants.MIN_POOLED_GAIN)
     voted = broken & ~meets & far_off
@@ -98,16 +98,16 @@ def fit_surfaces(
 def broken_planes(
     points: Tensor, near: Neighbors, noise: Tensor, normals: Tensor
 ) -> tuple[TangentPlanes, MeetingPlanes]:
-    """Return the planes of the votes and those that meet, of points with equally many neighbours.
+    """Return the voted planes and the meeting planes of points with equal neighbor counts.
 
-    ``near`` are the neighbours of the points, which have this noise ``(n,)`` and these normals
-    ``(n, 3)`` by PCA; see :func:`torchrg.normals.consensus.hypotheses.vote_planes` and
+    ``near`` are the neighbors of the points, with noise ``(n,)`` and PCA normals ``(n, 3)``; see
+    :func:`torchrg.normals.consensus.hypotheses.vote_planes` and
     :func:`torchrg.normals.consensus.hypotheses.fit_meeting_planes`.
     """
     if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
         count = near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
         fits = kernels.call(
-            "broken_planes", points, *near, noise, normals, candidate_ranks(count), _numbers()
+            "broken_planes", points, *near, noise, normals, candidate_ranks(count), _kernel_args()
         )
         return TangentPlanes(*fits[:2]), MeetingPlanes(*fits[2:])
     columns = _gather_counted(points, near)
@@ -115,8 +115,8 @@ def broken_planes(
     return TangentPlanes(*voted), fit_meeting_planes(columns, *voted, noise)
 
 
-def _numbers() -> Tensor:
-    """Return the constants that the kernel of :func:`broken_planes` reads, in its order."""
+def _kernel_args() -> Tensor:
+    """Return the constants for the kernel of :func:`broken_planes`, in its order."""
     return torch.tensor(
         [
             constants.VOTE_REACH,
@@ -137,7 +137,7 @@ def _numbers() -> Tensor:
 def _paraboloids(
     points: Tensor, indices: Tensor, valid: Tensor | None, normals: Tensor, rows: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return what :func:`torchrg.normals.jet.fit_paraboloids` does, of some points."""
+    """Apply :func:`torchrg.normals.jet.fit_paraboloids` to the given points."""
     arguments = points, indices, valid, normals
     if kernels.serve(*arguments, k=indices.shape[1]):
         return kernels.call("fit_paraboloids", *arguments, rows, FLAT_PIVOT)
@@ -145,8 +145,8 @@ def _paraboloids(
     return fit_paraboloids(gather_columns(points, indices[rows]), normals[rows], counted)
 
 
-def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
-    """Return the chosen points in sets whose points have equally many neighbours that count."""
+def _group_by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
+    """Return the chosen points grouped by their number of counted neighbors."""
     if neighbors.valid is None:
         return [chosen]
     count = neighbors.valid.sum(dim=1)
@@ -154,7 +154,7 @@ def _by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
 
 
 def _gather_counted(points: Tensor, near: Neighbors) -> Columns:
-    """Return columns of the neighbours that count, equally many for all of these points."""
+    """Return columns of the counted neighbors, of points with equal neighbor counts."""
     patches = gather_patches(points, near.indices)
     if near.valid is not None:
         counted = near.valid
@@ -165,15 +165,15 @@ def _gather_counted(points: Tensor, near: Neighbors) -> Columns:
 
 
 def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
-    """Return the points whose gain can make an average large enough, which spares most the fits."""
-    most = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
-    open_points = broken & (most > constants.MIN_POOLED_GAIN)
-    pooled = neighbors.indices[open_points, : constants.NUM_POOLED].reshape(-1)
+    """Return points whose gain can make an average large enough; spares most of the fits."""
+    upper = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
+    candidates = broken & (upper > constants.MIN_POOLED_GAIN)
+    pooled = neighbors.indices[candidates, : constants.NUM_POOLED].reshape(-1)
     return torch.zeros_like(broken).index_fill_(0, pooled.long(), True)
 
 
 def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
-    """Return the mean of values over the nearest neighbours."""
+    """Return the mean of values over the nearest neighbors."""
     means = torch.empty_like(values)
 
     def work(chunk: slice) -> None:
