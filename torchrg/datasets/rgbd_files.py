@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io.colors import narrow_colors
-from torchrg.io.files import DAMAGES, check_file, check_promise, read_text, refusing
+from torchrg.io.files import DAMAGES, check_available, check_file, read_text, refusing
 from torchrg.structures import FARTHEST, Array
 
 Value = TypeVar("Value")
@@ -165,7 +165,7 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
         )
     width, height, start = int(header[1]), int(header[2]), header.end()
     available = len(content) - start
-    check_promise(source, start, 2 * width * height, "its pixels", available=available)
+    check_available(source, start, 2 * width * height, "its pixels", available=available)
     if available > 2 * width * height:
         raise FormatError(
             f"{source}: expected {2 * width * height:,} bytes for {width} x {height} pixels, got "

@@ -360,12 +360,12 @@ def is_separable(sample: Sample) -> bool:
 
     One whose points were taken out by hand cannot; it counts as one sample with ``batch``.
     """
-    slices = getattr(sample, "_slice_dict", None)
-    if not slices or not callable(getattr(sample, "to_data_list", None)):
+    row_slices = getattr(sample, "_slice_dict", None)
+    if not row_slices or not callable(getattr(sample, "to_data_list", None)):
         return False
     return all(
         int(ends[-1]) == sample[key].shape[sample.__cat_dim__(key, sample[key]) or 0]
-        for key, ends in slices.items()
+        for key, ends in row_slices.items()
         # Matrices stacked along a diagonal have two axes of ends, and no row for a point.
         if key in sample and isinstance(sample[key], Tensor) and ends.ndim == 1
     )
