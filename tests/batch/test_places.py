@@ -58,7 +58,7 @@ def refused(convert, tmp_path):
 def test_scans_that_differ_in_the_suffix_alone_are_refused(root, convert, refused):
     save(root, "x.ply", "x.pcd", "x.ply.npz", "y.npy")
     for flags in ([], ["--dry-run"], ["--only", "y"]):
-        assert "expected one file for each scan, got x.pcd and x.ply; " in refused(*flags)
+        assert "expected one file per scan, got x.pcd and x.ply; " in refused(*flags)
     shown = convert("--suffixes", ".npy", ".npz", "--dry-run").out
     assert "2 scans to convert" in shown
 
@@ -95,7 +95,7 @@ FLAT = ("mmdet3d", "spformer", "isbnet", "mask3d", "npy")
 def test_files_of_two_scans_in_one_folder_are_refused(root, tmp_path, names):
     save(root, *(f"{name}.npy" for name in names))
     for layout in FLAT:
-        with pytest.raises(FormatError, match="expected files of its own for each scan") as error:
+        with pytest.raises(FormatError, match="file name collision in layout") as error:
             list_jobs(CloudSource(FolderOfClouds(root), CLASSIC, layout=layout), tmp_path / "out")
         assert all(name in str(error.value) for name in (*names, layout))
     for layout in ("pointcept", "scannet"):
@@ -118,7 +118,7 @@ def test_short_names_of_mask3d_are_compared_too(root, tmp_path, convert, refused
     out = tmp_path / "out"
     done = run("segment", *root.iterdir(), "--out", out, "--layout", "mask3d")
     assert (done.code, done.out) == (2, "")
-    assert "expected files of its own for each scan, got 0011_00 for " in done.error
+    assert "file name collision in layout mask3d: " in done.error
     assert not [*out.iterdir()]
 
 
@@ -169,7 +169,7 @@ def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
         list_jobs(source, tmp_path / "out")
 
 
-@pytest.mark.filterwarnings("ignore:.*get the built-in camera")
+@pytest.mark.filterwarnings("ignore:.*using the built-in camera")
 def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
     for name in ("seq-01", "seq-02"):
         (root / name).mkdir()
@@ -177,11 +177,11 @@ def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
     (root / "loop").symlink_to("seq-01")
     (root / "seq-01" / "self").symlink_to(".")
     source = RGBDSource(root, DepthConfig(), "7-scenes")
-    with pytest.warns(UserWarning, match=f"{root}: passed over loop and 1 more: a link leads"):
+    with pytest.warns(UserWarning, match=f"{root}: skipped loop and 1 more: links to"):
         jobs = list_jobs(source, tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["seq-01/frame-000000", "seq-02/frame-000000"]
     inside = RGBDSource(root / "seq-01", DepthConfig(), "7-scenes")
-    with pytest.warns(UserWarning, match="passed over self: a link leads there"):
+    with pytest.warns(UserWarning, match="skipped self: links to files"):
         jobs = list_jobs(inside, tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["seq-01/frame-000000"]
 

@@ -25,7 +25,7 @@ from torchrg.batch.records import (
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
 from torchrg.datasets.folder import SceneFiles
-from torchrg.datasets.pointcept import keeping_files
+from torchrg.datasets.pointcept import protecting_files
 from torchrg.errors import FormatError
 from torchrg.io.files import check_place, mark_of, marked_parts, remove_leftovers, sync_folder
 from torchrg.result import PLANES_FILE, write_table
@@ -166,7 +166,7 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
     (folder / RECORD).unlink(missing_ok=True)
     replaced, other_layouts = split_by_layout(earlier, layout_of(description))
     edited = [n for n, noted in replaced.items() if not is_unchanged(folder / n, noted)]
-    with marked_parts(job.mark), keeping_files(edited):
+    with marked_parts(job.mark), protecting_files(edited):
         report = job.source.convert(job.scan, folder, begin)
         if table is not None:
             described = json.loads((folder / PLANES_FILE).read_text("utf-8"))
