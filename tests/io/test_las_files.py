@@ -389,7 +389,7 @@ def test_points_that_the_header_does_not_count_are_told(scanned):
     data = bytearray(path.read_bytes())
     struct.pack_into("<Q", data, 247, 48)
     path.write_bytes(data)
-    with pytest.raises(FormatError, match="expected 48 points, as its header says, got 50 in its"):
+    with pytest.raises(FormatError, match="expected 48 points by its header, got 50 in its"):
         read_cloud(path)
 
 

@@ -1,4 +1,4 @@
-"""Provenance records, used to skip scans that are up to date."""
+"""Provenance records, used to skip up-to-date scans."""
 
 import dataclasses
 import hashlib
@@ -115,7 +115,7 @@ def read_record(folder: Path, *, strict: bool = False) -> Record | None:
 
 
 def split_by_layout(record: Record, layout: str) -> tuple[Record, Record]:
-    """Split the files of an earlier record into those that a layout replaces and those kept.
+    """Split the files of an earlier record into replaced files and kept files.
 
     The kept files belong to other layouts, in folders that scans share, and are keyed by layout.
 

@@ -1,4 +1,4 @@
-"""Sources of batch conversion: clouds of any data set, and depth frames."""
+"""Sources of batch conversion: clouds and depth frames."""
 
 import copy
 import dataclasses

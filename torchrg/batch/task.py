@@ -1,4 +1,4 @@
-"""Task reports: status, stage times, memory, and errors of a scan."""
+"""Task reports: status, stage times, memory and errors."""
 
 import os
 import platform

@@ -1,4 +1,4 @@
-"""Data sets: S3DIS, ScanNet, folders of clouds, Pointcept's layout, RGB-D frames.
+"""Data sets: S3DIS, ScanNet, cloud folders, Pointcept folders, RGB-D frames.
 
 Every data set is a map-style :class:`torch.utils.data.Dataset`: ``len(data)``; ``data[i]`` is a
 sample dict (``coord``, ``color``, ``segment``, ``instance``, ``name``, ...); ``transform=`` is

@@ -1,4 +1,4 @@
-"""Camera files of other programs, and the camera of a depth image folder."""
+"""Readers and search of camera files."""
 
 import json
 import os
@@ -85,9 +85,9 @@ _AMBIGUOUS = ("info", "metadata", "transforms")
 def read_camera(path: Path) -> Pinhole:
     """Read a camera file; its content determines the format.
 
-    Supported are unnamed numbers (``fx fy cx cy``, ``width height fx fy cx cy``, or a matrix of
-    3 x 3, 3 x 4 or 4 x 4, also as ``.npy``), JSON (Open3D, nerfstudio, Replica, RealSense,
-    Record3D), YAML (ROS, OpenCV, ORB-SLAM, Kalibr), ``name = numbers`` (BundleFusion, ScanNet), and
+    Supported formats: unnamed numbers (``fx fy cx cy``, ``width height fx fy cx cy``, or a matrix
+    of 3 x 3, 3 x 4 or 4 x 4, also as ``.npy``); JSON (Open3D, nerfstudio, Replica, RealSense,
+    Record3D); YAML (ROS, OpenCV, ORB-SLAM, Kalibr); ``name = numbers`` (BundleFusion, ScanNet);
     COLMAP's ``cameras.txt``.
 
     Raises:

@@ -104,9 +104,9 @@ class SceneDataset(Dataset[Sample]):
         if cloud.front is not None:
             fields["front"] = torch.from_numpy(cloud.front)
         header = cloud.header.items()
-        whole = {k: torch.from_numpy(v) for k, v in header if isinstance(v, np.ndarray)}
+        arrays = {k: torch.from_numpy(v) for k, v in header if isinstance(v, np.ndarray)}
         name = self.scenes[index].name
-        return {"coord": torch.from_numpy(cloud.coordinates), **fields, **whole, "name": name}
+        return {"coord": torch.from_numpy(cloud.coordinates), **fields, **arrays, "name": name}
 
     def count_points(self, scene: SceneFiles) -> int:
         """Return the approximate number of points of a scene, without reading it."""
@@ -134,10 +134,10 @@ class FolderOfClouds(SceneDataset):
 
     Links are followed and each file is read once; see :func:`find_files`.
 
-    A sample has ``coord`` ``(N, 3)`` float32 relative to ``origin`` ``(1, 3)`` float64, the fields
-    of the file (``normal``, ``color``, ``labels``, ``intensity``, ...), ``front`` if the file
-    stores which side of a surface was seen (see :attr:`torchrg.Cloud.front`), and ``name``, the
-    path below ``root`` without suffix. A folder with ``coord.npy`` is one cloud in Pointcept's
+    A sample has ``coord`` ``(N, 3)`` float32 relative to ``origin`` ``(1, 3)`` float64, and the
+    fields of the file (``normal``, ``color``, ``labels``, ``intensity``, ...). It has ``front`` if
+    the file stores which side of a surface was seen (see :attr:`torchrg.Cloud.front`). ``name`` is
+    the path below ``root`` without suffix. A folder with ``coord.npy`` is one cloud in Pointcept's
     layout; see :func:`torchrg.datasets.read_pointcept_scene`.
 
     Args:

@@ -1,4 +1,4 @@
-"""Index files of a converted data set, for programs that require them.
+"""Index files of converted data sets.
 
 Each scan has an entry file among its outputs, and a list contains its entries in natural order.
 Lists thus contain all existing scans, whichever command wrote them, and identical scans give

@@ -99,9 +99,9 @@ def write_pointcept_scene(
 ) -> list[str]:
     """Write a scene folder, or add results to a folder that Pointcept wrote.
 
-    Files not written by this function are never changed: their arrays must have as many rows, and
-    coordinates must equal the sample's. Its own files, as listed in ``planes.json``, are replaced
-    or removed. All files are complete before the first one appears.
+    Files not written by this function are never changed: their arrays must have the same number of
+    rows, and coordinates must equal the sample's. Its own files, as listed in ``planes.json``, are
+    replaced or removed. All files are complete before the first one appears.
 
     Args:
         folder: The scene, ``OUT/Area_i/<room>``; created if missing.

@@ -38,7 +38,7 @@ _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1
 _MAX_HEADER_BYTES = 512
 _MAX_8_BIT, _MAX_16_BIT = 255, 65535
 MAX_PIXELS = 1 << 26
-"""Maximum pixels of an image, 8192 x 8192. No depth camera has as many, and converting them to
+"""Maximum pixels of an image, 8192 x 8192. No depth camera has more, and converting them to
 meters takes 1.5 GB. A library that runs out of memory ends the process."""
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
 """Plausible range of the median depth, in meters. Depth cameras measure 0.1 to 20."""

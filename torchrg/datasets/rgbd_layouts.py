@@ -1,7 +1,7 @@
-"""Folder layouts of depth frames: benchmarks, data sets, and phone captures.
+"""Folder layouts of depth frames.
 
-A new layout needs a function that lists the frames of a recording, a row of :data:`LAYOUTS`, its
-name among the choices of ``torchrg convert rgbd``, and a test.
+A new layout needs a function that lists the frames of a recording, a row of :data:`LAYOUTS`, a
+choice of ``torchrg convert rgbd``, and a test.
 """
 
 import re

@@ -1,4 +1,4 @@
-r"""Stanford rooms (S3DIS) as released, with a text file per annotated object.
+r"""S3DIS rooms as released, with a text file per object.
 
 A file has ``x y z r g b`` on each line. The two releases contain six known corrupt bytes. Each of
 them lost its bit 0x20 (``\x10`` for ``0``, ``\x00`` for a space), so setting that bit repairs it
@@ -169,11 +169,11 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
 
     Returns:
         The cloud, in float32, with ``color`` ``(N, 3)`` uint8, ``segment`` ``(N,)`` int16, and
-        ``instance`` ``(N,)``, the object index in natural order of the file names, int16, or int32
-        if it does not fit. ``repairs`` has a line for each repaired byte: file, line and column
-        (from one), and the line before and after; the file itself is unchanged. ``notes`` has a
-        line for each folder entry that is not an object, and for each file whose class is not among
-        the 13, for example ``stairs``.
+        ``instance`` ``(N,)``. The latter is the object index in natural order of the file names,
+        int16, or int32 if it does not fit. ``repairs`` has a line for each repaired byte: file,
+        line and column (from one), and the line before and after; the file itself is unchanged.
+        ``notes`` has a line for each folder entry that is not an object, and for each file of an
+        unknown class, for example ``stairs``.
 
     Raises:
         FormatError: If there is no object, or a line is not a point.

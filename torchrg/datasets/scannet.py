@@ -77,8 +77,8 @@ class ScanNet(SceneDataset):
     annotations, are in ``test``.
 
     A sample has ``coord`` ``(N, 3)`` float32 in meters, in mesh coordinates, ``color`` ``(N, 3)``
-    uint8, ``axis_align_matrix`` ``(4, 4)`` float64, the rigid transform that makes the scan
-    upright, if known, and ``name``, as in ``train/scene0000_00``. With annotations: ``segment``
+    uint8, and ``name``, as in ``train/scene0000_00``. If known, ``axis_align_matrix`` ``(4, 4)``
+    float64 is the rigid transform that makes the scan upright. With annotations: ``segment``
     ``(N,)`` int64, an index into ``classes``, and ``instance`` ``(N,)`` int64, the object ID; -1
     for none. If the table ``scannetv2-labels.combined.tsv`` is next to the lists, also
     ``segment200``, an index into :data:`IDS_200`. ScanNet++ vertices of several objects are

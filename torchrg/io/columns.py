@@ -1,4 +1,4 @@
-"""Conversion of clouds to file columns with format-specific names and types."""
+"""Conversion of clouds to file columns."""
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path

@@ -1,8 +1,9 @@
-"""E57 reader based on pye57 (extra ``e57``); all scans of a file form one cloud.
+"""E57 reader based on pye57 (extra ``e57``).
 
-Points are read through pye57's ``libe57``, because ``pye57.E57`` (0.4.19) reads only color,
-intensity, row and column. Normals are the ``nor`` extension of the standard; fields of other
-extensions lose their prefix. Names and poses of scans and the coordinate system are read too.
+All scans of a file form one cloud. Points are read through pye57's ``libe57``, because
+``pye57.E57`` (0.4.19) reads only color, intensity, row and column. Normals are the ``nor``
+extension of the standard; fields of other extensions lose their prefix. Names and poses of scans
+and the coordinate system are read too.
 """
 
 import contextlib

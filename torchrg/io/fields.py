@@ -60,12 +60,12 @@ _SHOWN_NAMES = 8
 _GUESSED_ROWS = 1000
 """Rows from which the meaning of unnamed columns is guessed."""
 COLUMNS_RULE = (
-    "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
-    "a unit normal, or a color of integers from 0 to 255, where the first 1,000 rows fit; else a "
-    "color of integers from 0 to 65535, where all rows fit. Of seven, the same is asked of the "
-    "last three and of the three before the last; if one of both fits, it is taken, with intensity "
-    "before a color; in .pts, where colors come last, the last three alone are asked. Any other "
-    "column is column_4, column_5 and so on."
+    "Without names, columns are x y z; a fourth column alone is intensity. With six columns, the "
+    "last three are a unit normal, or a color of integers from 0 to 255, if the first 1,000 rows "
+    "fit; else a color of integers from 0 to 65535, if all rows fit. With seven columns, the last "
+    "three and the three before the last are tested in this way; if exactly one of them fits, it "
+    "is used, with intensity before a color. In .pts files, in which colors come last, only the "
+    "last three are tested. All other columns are named column_4, column_5 and so on."
 )
 """Naming rule for unnamed columns of text files and plain arrays, for help texts."""
 _UNIT_TOLERANCE = 2e-3

@@ -34,7 +34,7 @@ DAMAGES = (
     tokenize.TokenError,
     struct.error,
 )
-"""Exceptions that third-party readers raise on corrupt files, besides their own classes."""
+"""Exceptions that third-party readers raise on corrupt files, in addition to their own classes."""
 ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, *DAMAGES)
 """Exceptions raised on corrupt archives."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)

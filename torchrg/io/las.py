@@ -1,4 +1,4 @@
-"""LAS and LAZ reader and writer based on laspy (extra ``las``).
+"""LAS and LAZ files, based on laspy (extra ``las``).
 
 Scale, offset, reference system and dimensions are preserved. Normals, curvature and labels are
 extra dimensions ``NormalX``, ``NormalY``, ``NormalZ``, ``Curvature`` (PDAL's names) and ``label``.
@@ -64,8 +64,8 @@ _WIDE_SUFFIX = "_value"
 _WIDE_DESCRIPTION = "more than the standard one holds"
 """Description of such a dimension, at most 32 bytes. It marks dimensions written by torchrg."""
 _VERSION_AT, _START_AT, _COUNT_AT, _EXTENDED_AT, _COUNT14_AT = 25, 96, 107, 235, 247
-"""Header offsets: minor version, start of points and number of records, number of points, extended
-records, and the 64-bit number of points of version 1.4, in which the old number may be 0."""
+"""Header offsets: minor version; start of points and number of records; number of points; extended
+records; the 64-bit number of points of version 1.4, in which the old number may be 0."""
 _DATE_AT, _DATE_BYTES = 90, 4
 """Header offset of the day and year of creation, and their size in bytes."""
 
@@ -470,7 +470,7 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
         start += used + total
     if num_points != header.point_count:
         raise FormatError(
-            f"{path}: expected {header.point_count:,} points, as its header says, got "
+            f"{path}: expected {header.point_count:,} points by its header, got "
             f"{num_points:,} in its chunks; {_REPAIR}."
         )
 

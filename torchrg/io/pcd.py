@@ -1,8 +1,8 @@
 """PCD 0.7 reader and writer: ascii, binary and binary_compressed.
 
-It uses the LZF codec of pypcd4, but not pypcd4 itself (1.5.1, measured), which allocates the memory
-that a header announces, misreads fields of COUNT > 1 in compressed files, requires every header
-line in order, and writes ASCII with ten decimals.
+It uses the LZF codec of pypcd4, but not pypcd4 itself (1.5.1, measured). That one allocates the
+memory that a header announces, and misreads fields of COUNT > 1 in compressed files. It requires
+every header line in order, and writes ASCII with ten decimals.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""PLY reader and writer: ASCII, little and big endian, any properties.
+"""PLY files: ASCII, little and big endian, any properties.
 
 Other libraries lose data (measured with meshio 5.3.5 and trimesh 5.2.0): meshio reads ``uchar`` as
 signed, lacks ``short``, ends the process at elements other than vertex and face, and allocates the

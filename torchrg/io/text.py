@@ -1,10 +1,10 @@
-"""Point clouds as text: ``.xyz .txt .asc .pts .csv``, one point per line.
+"""Text files (``.xyz .txt .asc .pts .csv``), one point per line.
 
 The delimiter is a comma, semicolon, tab or blanks; the decimal separator may be a comma if that is
 not the delimiter. A first line of names (``x y z red green blue``, with or without ``#`` or ``//``)
 names the columns unless the caller does; otherwise :data:`torchrg.io.fields.COLUMNS_RULE` applies.
-A line of one number before the first point is the point count, as in Leica's ``.pts``, in which
-every further scan begins with its count. pyarrow, if installed, parses plain numbers. The slower
+A line of one number before the first point is the point count, as in Leica's ``.pts``. Further
+scans begin with their count. pyarrow, if installed, parses plain numbers. The slower
 parser here handles the remaining cases with bit-identical results and reports errors. It also
 reads the rows of other ASCII formats.
 """

@@ -1,4 +1,4 @@
-"""Transforms for data pipelines, on dicts of tensors and PyG ``Data`` or ``Batch``.
+"""Transforms of samples: dicts of tensors, PyG ``Data`` or ``Batch``.
 
 :mod:`torchrg.transforms.pointcept` registers them with Pointcept; for other loaders see
 :mod:`torchrg.datasets`.
@@ -7,7 +7,7 @@ All transforms accept ``keys``, which renames the entries of a sample, as in ``{
 Transforms that use neighbors accept ``keep_neighbors``, which stores them in the sample for the
 next transform, see :class:`torchrg.transforms.sample.NeighborSearch`.
 
-As in kornia, ``depth`` is channels-first, ``(B, 1, H, W)``, and ``intrinsics`` may be 4 x 4 or a
+``depth`` is channels-first, ``(B, 1, H, W)``, as in kornia, and ``intrinsics`` may be 4 x 4 or a
 ``PinholeCamera``. The results of :class:`SegmentDepth` differ: ``plane`` and ``curvature`` are
 ``(B, H, W)`` and ``normal`` is ``(B, H, W, 3)``, with vectors last as in clouds. The guide on depth
 cameras applies kornia's augmentations to them.

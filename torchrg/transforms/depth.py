@@ -131,8 +131,8 @@ def _colors(color: Tensor, seen: Tensor) -> Tensor:
 class SegmentDepth(DepthTransform):
     """Add plane labels, normals and curvature to depth images; see :func:`segment_depth`.
 
-    Reads ``depth``, of shape ``(H, W)``, ``(1, H, W)`` or ``(B, 1, H, W)``, ``intrinsics``
-    ``(3, 3)`` or ``(B, 3, 3)``, 4 x 4 or a kornia ``PinholeCamera``, and, if present, ``pose``
+    Reads ``depth``, of shape ``(H, W)``, ``(1, H, W)`` or ``(B, 1, H, W)``; ``intrinsics``
+    ``(3, 3)`` or ``(B, 3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; and, if present, ``pose``
     ``(4, 4)`` or ``(B, 4, 4)``. With a pose, normals and planes are in world coordinates, else in
     camera coordinates. Adds images, preceded by ``B`` for a batch:
 

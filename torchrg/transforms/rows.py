@@ -49,7 +49,7 @@ _INDEX_KEYS = {
 """Entries that contain point indices, which removing points would invalidate, and the fix."""
 _MAX_AMBIGUOUS_POINTS = 16
 """Maximum number of points of a cloud in which only names identify per-point entries: a pose or a
-box may have as many rows."""
+box may have the same number of rows."""
 
 
 def entries_of(sample: Sample) -> Entries:
@@ -221,7 +221,7 @@ def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
 
 
 def _has_length(value: object, num_points: int) -> bool:
-    """Return whether a value is, or contains, an array with as many rows as points.
+    """Return whether a value is, or contains, an array with one row per point.
 
     Lists of numbers and nested containers count, so that no per-point value is overlooked.
     """

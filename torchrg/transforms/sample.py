@@ -1,8 +1,8 @@
-"""Base classes for transforms of samples: dicts of arrays, or PyG ``Data`` and ``Batch``.
+"""Base classes and basic transforms of samples.
 
-A sample contains one cloud, or a ragged batch: ``offset`` ``(B,)``, the end row of each cloud
-(Pointcept), or ``batch`` ``(N,)``, the ascending cloud index of each point (PyG). Transforms treat
-each cloud separately. PyG is never imported here.
+A sample is a dict of arrays, or a PyG ``Data`` or ``Batch``, with one cloud or a ragged batch:
+``offset`` ``(B,)``, the end row of each cloud (Pointcept), or ``batch`` ``(N,)``, the ascending
+cloud index of each point (PyG). Transforms treat each cloud separately. PyG is never imported here.
 """
 
 import copy
