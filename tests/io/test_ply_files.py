@@ -155,7 +155,7 @@ def test_lists_of_vertices_have_any_length_and_place(tmp_path, order, place, len
 
 @pytest.mark.parametrize("order", ["ascii", *ORDERS])
 def test_lists_longer_than_a_block_are_read(tmp_path, order, monkeypatch):
-    monkeypatch.setattr(ply, "_BYTES_PER_READ", 64)
+    monkeypatch.setattr(ply, "_BYTES_AT_ONCE", 64)
     lists = [range(1000), range(3), range(1000)]
     cloud = read_cloud(write_lists(tmp_path / "a.ply", order, lists, 1, code="h"))
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
