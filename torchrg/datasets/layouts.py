@@ -156,10 +156,10 @@ def check_stems(layout: str, places: Mapping[str, str]) -> None:
 
     ``places`` contains the path of each scan in its data set, by name.
     """
-    taken: dict[str, str] = {}
+    owners: dict[str, str] = {}
     for name, path in places.items() if layout != "pointcept" else ():
         stem = layout_stem(layout, name, path)
-        other = taken.setdefault(folded_name(stem), name)
+        other = owners.setdefault(folded_name(stem), name)
         if other != name:
             raise FormatError(
                 f"file name collision in layout {layout}: {other} and {name} both use {stem}; "

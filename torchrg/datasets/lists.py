@@ -96,11 +96,11 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
         existing = [line.strip() for line in text.splitlines() if line.strip()]
         moved = removed.union(*listed_in.values()) - set(scans)
         listed = [name for name in existing if name not in moved]
-        others = set(listed) - set(scans)
+        foreign = set(listed) - set(scans)
         missing = [name for name in scans if name not in listed]
-        if missing or not others or listed != existing:
+        if missing or not foreign or listed != existing:
             # A list provided by the program keeps its order; ours has the order of the entries.
-            names = [*listed, *missing] if others else scans
+            names = [*listed, *missing] if foreign else scans
             _write(out, path.relative_to(out), "".join(f"{name}\n" for name in names))
 
 
@@ -150,11 +150,11 @@ def _mask3d(entries: Entries) -> dict[str, object]:
 def _mask3d_s3dis(entries: Entries) -> dict[str, object]:
     """Return Mask3D's database of each S3DIS area, and of its training areas (all others)."""
     contents: dict[str, object] = {f"{folder}.yaml": [*scans] for folder, scans in entries.items()}
-    for folder, own in entries.items():
-        others = [entry for name, scans in entries.items() if name != folder for entry in scans]
-        contents[f"train_{folder}.yaml"] = others
+    for folder, test in entries.items():
+        train = [entry for name, scans in entries.items() if name != folder for entry in scans]
+        contents[f"train_{folder}.yaml"] = train
         area = folder.removesuffix("_database")
-        contents[f"{area}_color_mean_std.yaml"] = _color_mean_std(others or own)
+        contents[f"{area}_color_mean_std.yaml"] = _color_mean_std(train or test)
     classes = enumerate(CLASS_ORDERS["pointcept"])
     contents["label_database.yaml"] = {n: {"name": name, "validation": True} for n, name in classes}
     return contents

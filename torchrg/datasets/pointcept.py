@@ -123,7 +123,7 @@ def write_pointcept_scene(
             ``superpoint`` or ``planes.json`` of other origin, or cannot be written.
     """
     target = Path(folder)
-    arrays = _arrays_of(target, sample, segmentation, superpoint=superpoint)
+    arrays = _convert_arrays(target, sample, segmentation, superpoint=superpoint)
     torchrg_files = _torchrg_files(target)
     # torchrg's own arrays are never kept as inputs: a file of other origin is an error.
     inputs = {
@@ -218,7 +218,7 @@ def write_files(
     return [*contents, PLANES_FILE]
 
 
-def _arrays_of(
+def _convert_arrays(
     target: Path,
     sample: Mapping[str, object],
     segmentation: Segmentation,

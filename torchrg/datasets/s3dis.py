@@ -102,7 +102,7 @@ class S3DIS(SceneDataset):
         self.class_order = class_order
         self.classes = class_names(class_order)
         self.transform = transform
-        self.scenes = [scene for area in areas for scene in _scenes_of_area(self.root, area)]
+        self.scenes = [scene for area in areas for scene in _list_area(self.root, area)]
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
         """Return the cloud of a room; see :func:`read_room`."""
@@ -128,7 +128,7 @@ class S3DIS(SceneDataset):
             )
 
 
-def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
+def _list_area(root: Path, area: int) -> list[SceneFiles]:
     """Return the rooms of an area, and warn if their number differs from the release."""
     if area not in ROOMS_PER_AREA:
         choices = ", ".join(map(str, ROOMS_PER_AREA))

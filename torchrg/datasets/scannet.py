@@ -266,11 +266,11 @@ def _read_lists(root: Path) -> dict[str, tuple[str, Path]]:
 
 def _warn_missing_scans(lists: Mapping[str, tuple[str, Path]], scans: set[str]) -> None:
     """Warn if the lists contain names of missing scans."""
-    others = [name for name in lists if name not in scans]
-    if others:
-        first = others[0]
+    missing = [name for name in lists if name not in scans]
+    if missing:
+        first = missing[0]
         warnings.warn(
-            f"{lists[first][1]}: {len(others):,} of {len(lists):,} listed scans are missing "
+            f"{lists[first][1]}: {len(missing):,} of {len(lists):,} listed scans are missing "
             f"(first: {shortened(first)}); download them, or correct the names.",
             stacklevel=3,
         )
@@ -356,11 +356,11 @@ def _scannetpp_labels(mesh: Path, root: Path, count: int) -> Arrays:
         slots = (rows, used[rows])
         segment[slots], instance[slots], sizes[slots] = label, number, len(rows)
         used[rows] += 1
-    every, smallest = np.arange(count), sizes.argmin(axis=1)
+    rows, smallest = np.arange(count), sizes.argmin(axis=1)
     for labels in (segment, instance):
         first = labels[:, 0].copy()
-        labels[:, 0] = labels[every, smallest]
-        labels[every, smallest] = np.where(smallest > 0, first, labels[:, 0])
+        labels[:, 0] = labels[rows, smallest]
+        labels[rows, smallest] = np.where(smallest > 0, first, labels[:, 0])
     return {"segment": segment, "instance": instance}
 
 
@@ -384,8 +384,8 @@ def _groups(
             f"{path}: expected a segment for each of {count:,} vertices, got {len(segments):,}; "
             "the file may be corrupt."
         )
-    of_vertices = _to_int64(path, "segIndices", segments)
-    known, path = np.unique(of_vertices), files["groups"]
+    vertex_segments = _to_int64(path, "segIndices", segments)
+    known, path = np.unique(vertex_segments), files["groups"]
     seen: set[int] = set()
     repeated = []
     for i, group in enumerate(_read_list(path, "segGroups")):
@@ -408,7 +408,12 @@ def _groups(
             )
         repeated += [numbers[0]] if numbers[0] in seen else []
         seen.add(numbers[0])
-        yield label, numbers, member_ids.tolist(), np.flatnonzero(np.isin(of_vertices, member_ids))
+        yield (
+            label,
+            numbers,
+            member_ids.tolist(),
+            np.flatnonzero(np.isin(vertex_segments, member_ids)),
+        )
     _warn_entries(path, "objects have the ID of another and are merged with it", repeated)
 
 

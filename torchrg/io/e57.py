@@ -210,13 +210,13 @@ def _concatenate(blocks: Sequence[_Block], name: str, counts: Sequence[int]) -> 
     parts = [block.pop(name, None) for block in blocks]
     dtype = np.result_type(*(np.uint8 if column is None else column for column in parts))
     joined = np.zeros(sum(counts), dtype)
-    for column, rows in zip(parts, _rows_of_scans(counts), strict=True):
+    for column, rows in zip(parts, _scan_rows(counts), strict=True):
         if column is not None:
             joined[rows] = column
     return joined
 
 
-def _rows_of_scans(counts: Sequence[int]) -> list[slice]:
+def _scan_rows(counts: Sequence[int]) -> list[slice]:
     """Return the row slice of each scan."""
     return [slice(*ends) for ends in pairwise(accumulate(counts, initial=0))]
 
@@ -241,7 +241,7 @@ def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud:
     if not inside.any():
         return None, notes
     front = np.zeros((len(cloud), 3), np.float32)
-    for position, is_inside, rows in zip(positions, inside, _rows_of_scans(counts), strict=True):
+    for position, is_inside, rows in zip(positions, inside, _scan_rows(counts), strict=True):
         if is_inside:
             front[rows] = position - cloud.coordinates[rows]
     front[~cloud.finite] = 0

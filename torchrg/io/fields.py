@@ -144,8 +144,8 @@ def assemble_table(
         is_pts = path.suffix.lower() == ".pts"
         names = guess_column_names(table, color_last=is_pts)
         if len(names) > 3:
-            many = len(names) > _SHOWN_NAMES
-            shown = [*names[: _SHOWN_NAMES - 1], "...", names[-1]] if many else names
+            is_long = len(names) > _SHOWN_NAMES
+            shown = [*names[: _SHOWN_NAMES - 1], "...", names[-1]] if is_long else names
             notes += (
                 f"its columns have no names and are taken as {' '.join(shown)}; if they are "
                 "others, name them with --columns",
@@ -328,13 +328,13 @@ def _field_columns(columns: Columns) -> dict[str, list[str]]:
     return fields
 
 
-def _unique_field_name(name: str, values: Values, taken: Collection[str]) -> str:
+def _unique_field_name(name: str, values: Values, existing: Collection[str]) -> str:
     """Return the field name of a column if its shape fits, changed if the name is taken."""
     target = _ALIASES.get(_normalize_name(name), name.removeprefix("scalar_") or name)
     shapes = {"normals": (3,), "color": (3,), "labels": ()}
     if target in shapes and values.shape[1:] != shapes[target]:
         target = name
-    while target in taken:
+    while target in existing:
         target = name = f"_{name}" if target == name else name
     return target
 

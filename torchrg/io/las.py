@@ -167,11 +167,11 @@ def _open_reader(laspy: ModuleType, path: Path) -> Iterator[Any]:
 def check_las(path: Path, cloud: Cloud | None) -> None:
     """Check that laspy is installed, and that the points of a known cloud are finite."""
     _import_laspy("write")
-    lost = np.flatnonzero([] if cloud is None else ~cloud.finite)
-    if len(lost):
+    non_finite = np.flatnonzero([] if cloud is None else ~cloud.finite)
+    if len(non_finite):
         raise FormatError(
-            f"{path}: expected finite coordinates, as LAS requires, got {len(lost)} non-finite "
-            f"points (first: {lost[0]}); write .npz, .ply or .pcd."
+            f"{path}: expected finite coordinates for LAS, got {len(non_finite)} non-finite "
+            f"points (first: {non_finite[0]}); write .npz, .ply or .pcd."
         )
 
 

@@ -38,7 +38,7 @@ from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.regions.growth import number_by_count
 from torchrg.structures import UNLABELED
-from torchrg.transforms.rows import Sample, rows_of_clouds
+from torchrg.transforms.rows import Sample, cloud_rows
 from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
 
 
@@ -87,13 +87,13 @@ class OrientedTransform(CloudTransform):
         values = super().read(sample, name)
         if name != "viewpoint":
             return values
-        parts = rows_of_clouds(sample, len(super().read(sample, "coord")))
+        parts = cloud_rows(sample, len(super().read(sample, "coord")))
         positions = values[None] if values.ndim == 1 else values
         if len(positions) not in (1, len(parts)):
             return positions
-        of_clouds = positions.expand(len(parts), -1)
+        per_cloud = positions.expand(len(parts), -1)
         counts = [rows.stop - rows.start for rows in parts]
-        return of_clouds.repeat_interleave(torch.tensor(counts, device=positions.device), dim=0)
+        return per_cloud.repeat_interleave(torch.tensor(counts, device=positions.device), dim=0)
 
     def side(self, cloud: Mapping[str, Tensor]) -> dict[str, Any]:
         """Return the keyword arguments for orienting the normals of a cloud."""
@@ -392,7 +392,7 @@ class AlignAxes(SampleTransform):
     def transform(self, sample: Sample) -> Sample:
         """Return a new sample with transformed coordinates and normals."""
         coord = self.read(sample, "coord")
-        parts = rows_of_clouds(sample, len(coord))
+        parts = cloud_rows(sample, len(coord))
         transforms = [
             align_axes(segment_planes(coord[rows], self.config, orient="none"), up=self.up).to(
                 coord.device

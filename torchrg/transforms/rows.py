@@ -52,7 +52,7 @@ _MAX_AMBIGUOUS_POINTS = 16
 box may have the same number of rows."""
 
 
-def entries_of(sample: Sample) -> Entries:
+def get_entries(sample: Sample) -> Entries:
     """Return the entries of a sample by key."""
     entries: Entries = sample if isinstance(sample, Mapping) else sample.to_dict()
     return entries
@@ -150,7 +150,7 @@ def select_points(
     Raises:
         ConfigError: If an entry is ambiguous or contains point indices.
     """
-    entries = entries_of(sample)
+    entries = get_entries(sample)
     for key, repair in _INDEX_KEYS.items():
         if entries.get(key) is not None:
             raise ConfigError(
@@ -192,14 +192,14 @@ def remap_rows(caller: str, inverse: Tensor, new_rows: Tensor) -> Tensor:
     return remapped
 
 
-def rows_of_clouds(sample: Sample, num_points: int) -> list[slice]:
+def cloud_rows(sample: Sample, num_points: int) -> list[slice]:
     """Return the rows of each cloud of a sample, from its ``offset`` or ``batch`` if present."""
     return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]
 
 
 def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
     """Return the end row of each cloud of a sample."""
-    entries = entries_of(sample)
+    entries = get_entries(sample)
     if entries.get("offset") is not None:
         ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
         if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:

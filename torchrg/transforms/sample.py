@@ -1,7 +1,7 @@
 """Base classes and basic transforms of samples.
 
 A sample is a dict of arrays, or a PyG ``Data`` or ``Batch``, with one cloud or a ragged batch:
-``offset`` ``(B,)``, the end row of each cloud (Pointcept), or ``batch`` ``(N,)``, the ascending
+``offset`` ``(B,)``, the row after each cloud (Pointcept), or ``batch`` ``(N,)``, the ascending
 cloud index of each point (PyG). Transforms treat each cloud separately. PyG is never imported here.
 """
 
@@ -26,11 +26,11 @@ from torchrg.transforms.rows import (
     SampleDict,
     check_lengths,
     check_sample,
-    entries_of,
+    cloud_rows,
     extend_list,
+    get_entries,
     per_point_keys,
     remap_rows,
-    rows_of_clouds,
     select_points,
 )
 
@@ -89,7 +89,7 @@ class SampleTransform(nn.Module):
         if can_split(sample):
             return map_clouds(sample, self.forward)
         num_points = len(self.read(sample, "coord"))
-        check_lengths(type(self).__name__, entries_of(sample), num_points)
+        check_lengths(type(self).__name__, get_entries(sample), num_points)
         return self.transform(sample)
 
     def transform(self, sample: Sample) -> Sample:
@@ -104,7 +104,7 @@ class SampleTransform(nn.Module):
     def read(self, sample: Sample, name: str) -> Tensor:
         """Return an entry of a sample as a tensor, or raise ConfigError."""
         key, caller = self.key(sample, name), type(self).__name__
-        entries = entries_of(sample)
+        entries = get_entries(sample)
         if key not in entries:
             raise ConfigError(
                 f"{caller}: expected a sample with {key!r}, got {', '.join(map(str, entries))}; "
@@ -156,7 +156,7 @@ class SampleTransform(nn.Module):
     def update_inverse(self, sample: Sample, new_rows: Tensor) -> dict[str, Tensor]:
         """Return ``inverse`` updated for rows moved to ``new_rows``, if the sample has one."""
         key = self.key(sample, "inverse")
-        if entries_of(sample).get(key) is None:
+        if get_entries(sample).get(key) is None:
             return {}
         inverse = self.read(sample, "inverse")
         return {key: remap_rows(type(self).__name__, inverse, new_rows)}
@@ -230,7 +230,7 @@ class CloudTransform(SampleTransform):
 
     def transform(self, sample: Sample) -> Sample:
         """Return a new sample with the new entries."""
-        entries = entries_of(sample)
+        entries = get_entries(sample)
         present = [name for name in self.optional_reads if self.key(sample, name) in entries]
         values = {name: self.read(sample, name) for name in (*self.reads, *present)}
         key = self.key(sample, "neighbors")
@@ -238,7 +238,7 @@ class CloudTransform(SampleTransform):
         search = NeighborSearch(carried.known if isinstance(carried, NeighborSearch) else ())
         parts = [
             self.add({name: value[rows] for name, value in values.items()}, search)
-            for rows in rows_of_clouds(sample, len(values["coord"]))
+            for rows in cloud_rows(sample, len(values["coord"]))
         ]
         added = {
             self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
@@ -268,7 +268,7 @@ class CenterCloud(SampleTransform):
     def transform(self, sample: Sample) -> Sample:
         """Return a new sample with shifted coordinates."""
         coord = self.read(sample, "coord")
-        clouds = [coord[rows] for rows in rows_of_clouds(sample, len(coord))]
+        clouds = [coord[rows] for rows in cloud_rows(sample, len(coord))]
         centers = torch.stack([_center(cloud) for cloud in clouds])
         shifted = [
             (cloud.double() - center).to(cloud.dtype)
@@ -339,14 +339,16 @@ class SampleVoxels(SampleTransform):
         """Return a new sample of voxels."""
         coord = self.read(sample, "coord")
         rows, inverse, num_voxels = [], [], 0
-        for cloud in rows_of_clouds(sample, len(coord)):
+        for cloud in cloud_rows(sample, len(coord)):
             voxels = sample_voxels(coord[cloud], self.size)
             rows.append(voxels.rows + cloud.start)
             inverse.append(torch.where(voxels.inverse >= 0, voxels.inverse + num_voxels, UNLABELED))
             num_voxels += len(voxels.rows)
-        voxel_of = torch.cat(inverse)
+        voxel_index = torch.cat(inverse)
         selected = self.select_rows(sample, torch.cat(rows), len(coord))
-        added = {self.key(sample, "inverse"): voxel_of} | self.update_inverse(sample, voxel_of)
+        added = {self.key(sample, "inverse"): voxel_index} | self.update_inverse(
+            sample, voxel_index
+        )
         return self.replace(sample, selected | added)
 
     def extra_repr(self) -> str:
@@ -378,8 +380,8 @@ def map_clouds(batch: Sample, change: Callable[[Sample], Sample]) -> Sample:
     """
     clouds, unsplit = batch.to_data_list(), {}
     followed = [key for key in batch._slice_dict if f"{key}_ptr" in batch]  # noqa: SLF001
-    made = {*_BATCH_KEYS, *(f"{key}_{end}" for key in followed for end in ("batch", "ptr"))}
-    for key in set(batch.keys()) - set(batch._slice_dict) - made:  # noqa: SLF001
+    created = {*_BATCH_KEYS, *(f"{key}_{end}" for key in followed for end in ("batch", "ptr"))}
+    for key in set(batch.keys()) - set(batch._slice_dict) - created:  # noqa: SLF001
         value = batch[key]
         if isinstance(value, Tensor) and value.ndim and len(value) == batch.num_nodes:
             counts = torch.bincount(batch.batch, minlength=batch.num_graphs).tolist()
