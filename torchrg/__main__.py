@@ -1,7 +1,12 @@
 """The process of a command: ``torchrg`` and ``python -m torchrg``."""
 
+import gc
 import os
 import sys
+
+# The collector would go through the objects of torch several times while they are made: a fifth
+# of the time until a command begins. Commands and workers enable it again.
+gc.disable()
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):
     # Python has put the folder of the command first; what lies there is data, but for this package.

@@ -50,15 +50,15 @@ PLANES_FILE, RECORD = "planes.json", "provenance.json"
 last, so that a scan without it is not done."""
 _FOLDER_FIELDS = {
     "plane": "labels",
+    "superpoint": "superpoint",
     "normal": "normals",
     "curvature": "curvature",
     "color": "color",
-    "superpoint": "superpoints",
 }
 """Fields of a cloud by the arrays of a folder that hold them."""
 _KINDS = {
     "labels": ("iu", ()),
-    "superpoints": ("iu", ()),
+    "superpoint": ("iu", ()),
     "color": ("u", (3,)),
     "normals": ("f", (3,)),
     "curvature": ("f", ()),
@@ -80,7 +80,7 @@ class Result:
     Args:
         cloud: The points. Among its fields are those of the result, as far as they are known:
             ``labels``, ``normals``, ``curvature``, the masks ``sharp`` and ``valid``, and
-            ``superpoints``, with coarser levels as ``superpoints_1`` and so on.
+            ``superpoint``, with coarser levels as ``superpoint_1`` and so on.
         table: The plane table that came with them, about :attr:`Cloud.origin`; its rows are the
             labels, ascending. Default: there is none.
         plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
@@ -260,10 +260,10 @@ class Result:
 
         Numbers that are not below that of points, as where some were left out since, are made anew.
         """
-        if "superpoints" not in self.fields:
+        if "superpoint" not in self.fields:
             return None
-        fields, labels = self.cloud.fields, self.fields["superpoints"].long()
-        coarser = (f"superpoints_{i}" for i in range(1, len(fields)))
+        fields, labels = self.cloud.fields, self.fields["superpoint"].long()
+        coarser = (f"superpoint_{i}" for i in range(1, len(fields)))
         levels = (torch.from_numpy(fields[name]).long() for name in coarser if name in fields)
         plane = self.plane_of_superpoint
         if len(labels) and labels.max() >= len(labels):
@@ -317,7 +317,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         whole = {
             name: values.astype(np.int64)
             for name, values in cloud.fields.items()
-            if name.startswith("superpoints") and values.dtype.kind == "f" and are_whole(values)
+            if name.startswith("superpoint") and values.dtype.kind == "f" and are_whole(values)
         }
         cloud = replace(cloud, fields={**cloud.fields, **whole})
         beside = read_beside(source) if source.suffix.lower() == ".npz" else {}
@@ -351,7 +351,7 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
         for name, values in arrays.items()
         if name in _FOLDER_FIELDS
     }
-    for name in fields.keys() & {"labels", "superpoints"}:
+    for name in fields.keys() & {"labels", "superpoint"}:
         fields[name] = fields[name].astype(np.int64)
     notes: tuple[str, ...] = ()
     if "color" in fields:

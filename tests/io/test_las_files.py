@@ -216,7 +216,9 @@ def test_a_cloud_of_one_place_is_written(tmp_path):
 
 def test_points_that_are_not_finite_are_refused_before_the_work(tmp_path):
     cloud = Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]]))
-    message = r"a\.las: expected finite coordinates for LAS, got 1 non-finite points \(first: 1\); wr"
+    message = (
+        r"a\.las: expected finite coordinates for LAS, got 1 non-finite points \(first: 1\); wr"
+    )
     with pytest.raises(FormatError, match=message):
         check_output(tmp_path / "a.las", cloud)
     with pytest.raises(FormatError, match=message):

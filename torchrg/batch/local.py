@@ -1,6 +1,7 @@
 """Local engine: single-threaded worker processes within a memory limit."""
 
 import contextlib
+import gc
 import os
 import signal
 from collections.abc import Iterator, Sequence
@@ -147,6 +148,8 @@ def _serve(pipe: Connection, stderr: Connection | None) -> None:
     """Convert scans until the pipe closes; from the first scan on, errors go to ``stderr``."""
     import torch
 
+    gc.freeze()  # Loaded modules are not garbage.
+    gc.enable()
     Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     # The pipe fails once the parent process is gone.

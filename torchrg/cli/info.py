@@ -13,7 +13,7 @@ from torchrg.cli.ending import say
 from torchrg.cli.flags import ColumnsFlag, check_columns, choice_of, columns_of
 from torchrg.config import load_config
 from torchrg.io import read_cloud
-from torchrg.neighbors import distinct_points, measure_sampling, search_knn
+from torchrg.neighbors import distinct_points, measure_sampling, prepare_search
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
@@ -22,7 +22,10 @@ millimetres at a thousand kilometres."""
 
 
 _NUM_NEIGHBORS = 50
-"""Neighbours that the surfaces are measured by, as by the default."""
+"""Neighbors by which surfaces are measured, as by the default settings."""
+
+_NUM_FOR_SPACING = 10_000
+"""Points, evenly along the canonical order, whose nearest neighbors give the spacing."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +67,17 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         digits = _DIGITS[cloud.coordinates.dtype.itemsize]
         for name, values in (("lowest", low), ("highest", high), ("extent", high - low)):
             facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
-        distinct = distinct_points(torch.from_numpy(finite - cloud.origin))
+        centered = finite - cloud.origin if cloud.origin.any() else finite
+        distinct = distinct_points(torch.from_numpy(centered))
         facts["duplicates"] = f"{distinct.num_copies:,}"
         places = distinct.points.numpy()
         facts["spacing"] = "none"
         if len(places) > 1:
-            near = search_knn(places, min(_NUM_NEIGHBORS, len(places)), canonical=True)
-            nearest = places[near.indices[:, 1].numpy()]
-            spacing = np.median(np.linalg.norm(places - nearest, axis=1))
+            search = prepare_search(places, min(_NUM_NEIGHBORS, len(places)))
+            rows = np.arange(0, len(places), -(-len(places) // _NUM_FOR_SPACING))
+            spacing = np.median(np.linalg.norm(places[rows] - places[search(rows)[:, 1]], axis=1))
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
-            sampling = measure_sampling(torch.from_numpy(places), near)
+            sampling = measure_sampling(torch.from_numpy(places), search)
             chosen = load_config().measured(sampling)["settings"]
             facts["height"] = f"{sampling.height:g} (least extent along the principal axes)"
             facts["density"] = f"{sampling.density:g} points on a square of side 1"

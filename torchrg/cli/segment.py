@@ -86,8 +86,8 @@ class Arguments:
     """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
     has the result of its voxel. Default: all points are segmented."""
     superpoints: bool = False
-    """Add superpoints, a partition of all points, to the result: the finest as "superpoints", the
-    coarser ones as "superpoints_1" and so on. Numbers say how many there are in each, as in
+    """Add superpoints, a partition of all points, to the result: the finest as "superpoint", the
+    coarser ones as "superpoint_1" and so on. Numbers say how many there are in each, as in
     --superpoints 1000,300. Colours of the cloud play a part, and a picture shows superpoints
     instead of planes."""
     level: int = 0
@@ -278,7 +278,7 @@ def _arrays_of(
 def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:
     """Warn of what is not as it seems, before the work; refuse what cannot be written."""
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
-    parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
+    parts = [f"superpoint_{i}" if i else "superpoint" for i in levels]
     written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
     note_input(source, cloud, target, written)
     if arguments.layout is None:

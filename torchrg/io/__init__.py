@@ -173,7 +173,7 @@ def write_cloud(
         ``.npz`` contains ``points``, the cloud's ``color``, ``labels``, ``normals``, ``curvature``,
         ``sharp``, ``valid``, the plane table in input coordinates (see
         :func:`torchrg.plane_table.planes_to_arrays`), and ``provenance``. Identical input gives
-        byte-identical files. Superpoints are ``superpoints``, and ``superpoints_1`` and so on for
+        byte-identical files. Superpoints are ``superpoint``, and ``superpoint_1`` and so on for
         the coarser levels; ``.npz`` also contains ``plane_of_superpoint``. ``.vg`` contains
         coordinates, colors, normals and the planes as vertex groups (see :mod:`torchrg.io.vg`); it
         cannot be read back.

@@ -22,7 +22,7 @@ from torchrg.structures import UNLABELED
 
 MODES = {
     "plane": ("planes", "labels"),
-    "superpoint": ("superpoints", "superpoints"),
+    "superpoint": ("superpoints", "superpoint"),
     "color": ("own colours", "color"),
     "normal": ("normals", "normals"),
     "curvature": ("curvature", "curvature"),
@@ -88,8 +88,8 @@ def channels_of(
     """
     if "labels" in fields:
         yield _of_regions("plane", fields["labels"], *palettes["plane"])
-    if "superpoints" in fields:
-        yield _of_regions("superpoint", fields["superpoints"], *palettes["superpoint"])
+    if "superpoint" in fields:
+        yield _of_regions("superpoint", fields["superpoint"], *palettes["superpoint"])
     if "color" in fields:
         yield Channel("color", fields["color"].numpy(), None, [])
     if "normals" in fields:

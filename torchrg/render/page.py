@@ -96,7 +96,7 @@ def make_page(
     """Make a page that shows a result, or two of them with one camera.
 
     What can be seen depends on the fields of its cloud: ``labels`` (planes, with the table of the
-    result), ``superpoints``, ``color``, ``normals``, ``curvature``, ``sharp``. The page holds no
+    result), ``superpoint``, ``color``, ``normals``, ``curvature``, ``sharp``. The page holds no
     time and no path: equal input gives equal bytes.
 
     Args:
@@ -285,8 +285,8 @@ def _palettes(
     regions = {}
     if "labels" in result.fields:
         regions["plane"] = result.labels, reference
-    if "superpoints" in result.fields:
-        regions["superpoint"] = result.fields["superpoints"].long().clamp(min=-1), None
+    if "superpoint" in result.fields:
+        regions["superpoint"] = result.fields["superpoint"].long().clamp(min=-1), None
     palettes = {}
     for mode, (labels, same) in regions.items():
         rows, colors = palette_of_planes(labels, result.cloud.points, reference=same)
