@@ -105,7 +105,7 @@ def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, convert, m
     monkeypatch.setattr("torchrg.io.files.free_space", lambda _: 1000)
     done = convert("folder", rooms, tmp_path / "out", *flags)
     assert done.code == 2
-    assert "MB of free disk for 2 scans, got 0.0 MB; make room" in done.err
+    assert "MB of free disk for 2 scans, got 0.0 MB; free some space" in done.err
 
 
 def test_a_finished_set_has_nothing_to_do(rooms, converted, convert):
@@ -114,10 +114,10 @@ def test_a_finished_set_has_nothing_to_do(rooms, converted, convert):
 
 
 def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, convert, monkeypatch):
-    monkeypatch.setattr("torchrg.batch.run.PATIENCE_SECONDS", 0)
+    monkeypatch.setattr("torchrg.batch.run.LOCK_TIMEOUT_SECONDS", 0)
     with lock_folder(tmp_path):
         error = convert("folder", rooms, tmp_path).error
-    assert f"{tmp_path}: another torchrg command writes here; " in error
+    assert f"{tmp_path}: locked by another torchrg process; " in error
     assert not results_of(tmp_path)
 
 

@@ -24,11 +24,11 @@ with lock_folder(Path(sys.argv[1])):
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch):
     """Do not wait for a lock."""
-    monkeypatch.setattr(run, "PATIENCE_SECONDS", 0)
+    monkeypatch.setattr(run, "LOCK_TIMEOUT_SECONDS", 0)
 
 
 def check_refused(folder):
-    with pytest.raises(FormatError, match="another torchrg command writes here; wait") as error:
+    with pytest.raises(FormatError, match="locked by another torchrg process; wait") as error:
         lock_folder(folder).__enter__()
     assert str(error.value).startswith(f"{folder}: ")
 

@@ -58,7 +58,7 @@ def refused(convert, tmp_path):
 def test_scans_that_differ_in_the_suffix_alone_are_refused(root, convert, refused):
     save(root, "x.ply", "x.pcd", "x.ply.npz", "y.npy")
     for flags in ([], ["--dry-run"], ["--only", "y"]):
-        assert "expected one file for each scan, got x.pcd and x.ply; " in refused(*flags)
+        assert "expected one file per scan, got x.pcd and x.ply; " in refused(*flags)
     shown = convert("--suffixes", ".npy", ".npz", "--dry-run").out
     assert "2 scans to convert" in shown
 
@@ -66,15 +66,21 @@ def test_scans_that_differ_in_the_suffix_alone_are_refused(root, convert, refuse
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["Hall.npy", "hall.npy"], "got one for Hall and hall, which many file systems"),
-        (["a/b.npy", "A/B.npy"], "got one for"),
+        (["Hall.npy", "hall.npy"], "got Hall and hall, which are the same on many"),
+        (["a/b.npy", "A/B.npy"], "expected distinct scan names, got"),
         (
             [f"{unicodedata.normalize(form, UMLAUT)}.npy" for form in ("NFC", "NFD")],
-            "got one for",
+            "expected distinct scan names, got",
         ),
-        (["straße.npy", "STRASSE.npy"], "got one for"),
-        (["report.json.npy"], "no scan called report.json, as OUT/report.json is a file"),
-        (["Report.JSON/x.npy"], "no scan called Report.JSON/x, as OUT/report.json is a file"),
+        (["straße.npy", "STRASSE.npy"], "expected distinct scan names, got"),
+        (
+            ["report.json.npy"],
+            "a scan cannot be named report.json, because OUT/report.json is a file",
+        ),
+        (
+            ["Report.JSON/x.npy"],
+            "a scan cannot be named Report.JSON/x, because OUT/report.json is a file",
+        ),
     ],
 )
 def test_names_that_lead_to_one_place_are_refused(root, refused, names, message):
@@ -95,7 +101,7 @@ FLAT = ("mmdet3d", "spformer", "isbnet", "mask3d", "npy")
 def test_files_of_two_scans_in_one_folder_are_refused(root, tmp_path, names):
     save(root, *(f"{name}.npy" for name in names))
     for layout in FLAT:
-        with pytest.raises(FormatError, match="expected files of its own for each scan") as error:
+        with pytest.raises(FormatError, match="file name collision in layout") as error:
             list_jobs(CloudSource(FolderOfClouds(root), CLASSIC, layout=layout), tmp_path / "out")
         assert all(name in str(error.value) for name in (*names, layout))
     for layout in ("pointcept", "scannet"):
@@ -107,18 +113,18 @@ def test_the_command_refuses_them_before_any_work(root, refused):
     save(root, "a/b_c.npy", "a_b/c.npy", "other.npy")
     for flags in (["--dry-run"], ["--only", "other"], []):
         error = refused("--layout", "npy", *flags)
-        assert "got a_b_c for a/b_c and a_b/c in layout npy; rename one" in error
+        assert "in layout npy: a/b_c and a_b/c both use a_b_c; rename one" in error
 
 
 def test_short_names_of_mask3d_are_compared_too(root, tmp_path, convert, refused, run):
     save(root, "scene0011_00.npy", "0011_00.npy")
     error = refused("--layout", "mask3d")
-    assert "got 0011_00 for 0011_00 and scene0011_00 in layout mask3d" in error
+    assert "in layout mask3d: 0011_00 and scene0011_00 both use 0011_00" in error
     assert convert("--layout", "npy", "--dry-run").code == 0
     out = tmp_path / "out"
     done = run("segment", *root.iterdir(), "--out", out, "--layout", "mask3d")
     assert (done.code, done.out) == (2, "")
-    assert "expected files of its own for each scan, got 0011_00 for " in done.error
+    assert "file name collision in layout mask3d: " in done.error
     assert not [*out.iterdir()]
 
 
@@ -126,10 +132,10 @@ def test_a_second_command_does_not_write_into_the_files_of_a_layout(
     root, tmp_path, run, monkeypatch
 ):
     save(root, "hall.npy")
-    monkeypatch.setattr("torchrg.batch.run.PATIENCE_SECONDS", 0)
+    monkeypatch.setattr("torchrg.batch.run.LOCK_TIMEOUT_SECONDS", 0)
     command = ("segment", root / "hall.npy", "--out", tmp_path, "--preset", "classic")
     with lock_folder(tmp_path):
-        assert "another torchrg command" in run(*command, "--layout", "npy").error
+        assert "another torchrg process" in run(*command, "--layout", "npy").error
         assert not (tmp_path / "superpoints").exists()
         # A folder for each scan is no place of others.
         assert run(*command, "--layout", "pointcept").code == 0
@@ -157,7 +163,7 @@ def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
     scan = job.scan._replace(name=name)
     source = job.source.__class__(job.source.root)
     object.__setattr__(source, "list_scans", lambda out: [scan])
-    with pytest.raises(FormatError, match="expected names of scans below a folder"):
+    with pytest.raises(FormatError, match="expected a scan name without"):
         list_jobs(source, tmp_path / "out")
 
 
@@ -169,7 +175,7 @@ def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
         list_jobs(source, tmp_path / "out")
 
 
-@pytest.mark.filterwarnings("ignore:.*get the built-in camera")
+@pytest.mark.filterwarnings("ignore:.*using the built-in camera")
 def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
     for name in ("seq-01", "seq-02"):
         (root / name).mkdir()
@@ -177,11 +183,11 @@ def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
     (root / "loop").symlink_to("seq-01")
     (root / "seq-01" / "self").symlink_to(".")
     source = RGBDSource(root, DepthConfig(), "7-scenes")
-    with pytest.warns(UserWarning, match=f"{root}: passed over loop and 1 more: a link leads"):
+    with pytest.warns(UserWarning, match=f"{root}: skipped loop and 1 more: links to"):
         jobs = list_jobs(source, tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["seq-01/frame-000000", "seq-02/frame-000000"]
     inside = RGBDSource(root / "seq-01", DepthConfig(), "7-scenes")
-    with pytest.warns(UserWarning, match="passed over self: a link leads there"):
+    with pytest.warns(UserWarning, match="skipped self: links to files"):
         jobs = list_jobs(inside, tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["seq-01/frame-000000"]
 
@@ -206,9 +212,9 @@ def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, convert):
     (root / "in" / "loop").symlink_to("..")
     (root / "in" / "second").symlink_to("..")
     done = convert("--dry-run")
-    assert done.err.startswith(f"torchrg: warning: {root}: passed over in/loop and 1 more")
+    assert done.err.startswith(f"torchrg: warning: {root}: skipped in/loop and 1 more")
     assert done.err.count("\n") == 1
     assert "1 scans to convert" in done.out
-    with pytest.warns(UserWarning, match="passed over in/loop"):
+    with pytest.warns(UserWarning, match="skipped in/loop"):
         jobs = list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["in/a"]

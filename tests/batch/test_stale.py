@@ -118,8 +118,8 @@ def test_a_scan_that_left_the_data_set_is_named(root, out, convert, layout, flag
     done = convert(*command, *flags)
     assert done.code == 2
     assert done.error == (
-        f"torchrg: {out}/train/{MOVED}: expected the scan of each result in {root}, got none; "
-        "remove such results with --prune, or keep them with --only '*'.\n"
+        f"torchrg: {out}/train/{MOVED}: no scan in {root} belongs to these results; "
+        "remove them with --prune, or keep them with --only '*'.\n"
     )
     assert files_of(out) == before
     assert convert(*command, "--only", "*").code == 0
@@ -158,14 +158,14 @@ def test_what_a_user_changed_or_added_is_never_removed(root, out, convert, layou
         for flags in ([], ["--dry-run"], ["--only", "val/*"]):
             done = convert(*command, *flags)
             assert done.code == 2
-            assert f"{path}: expected a file as torchrg wrote it, got another" in done.error
-            assert f"its scan is val/{MOVED} now; move it away.\n" in done.error
+            assert f"{path}: was changed or not written by torchrg" in done.error
+            assert f"its scan is val/{MOVED} now; move it.\n" in done.error
             assert files_of(out) == held
         path.unlink() if before is None else path.write_bytes(before)
     changed.unlink()
     changed.symlink_to(out.parent / "elsewhere")
     (out.parent / "elsewhere").write_bytes(whole)
-    assert f"{changed}: expected a file" in convert(*command).error
+    assert f"{changed}: was changed or not" in convert(*command).error
     changed.unlink()
     assert convert(*command).code == 0
     assert not folder.exists()
@@ -180,7 +180,7 @@ def test_a_file_that_a_user_changed_stays_when_options_change(root, out, convert
     assert done.code == 0
     for name in ("superpoint.npy", "planes.csv"):
         assert (out / "train" / FIRST / name).read_bytes() == b"by hand"
-        assert f"{name} stays, as it was changed since torchrg wrote it" in done.out
+        assert f"{name} is kept, as it was changed since torchrg wrote it" in done.out
     again = convert(*command, "--superpoints")
     assert again.code == 3
     assert "superpoint.npy" in again.err
@@ -259,7 +259,7 @@ def test_scans_that_were_not_asked_for_are_not_missing(tmp_path, out, convert):
     shutil.rmtree(tmp_path / "s3dis" / "Area_2")
     done = convert(*command)
     assert done.code == 2
-    assert f"{out}/Area_2/office_1: expected the scan" in done.err
+    assert f"{out}/Area_2/office_1: no scan in" in done.err
     assert convert(*command, "--prune").code == 0
     assert yaml.safe_load((out / "Area_2_database.yaml").read_text()) == []
 
@@ -278,17 +278,14 @@ def test_data_sets_share_a_directory(tmp_path, out, convert):
     # Copies of a data set are the same data set.
     copy = shutil.copytree(roots["one"], tmp_path / "copy")
     for root in (roots["one"], copy):
-        assert (
-            f"{out}/b: expected the scan of each result in {root}"
-            in convert("folder", root, out).error
-        )
+        assert f"{out}/b: no scan in {root} belongs" in convert("folder", root, out).error
     # Without the list of scans, those of which none was converted here are another data set.
     (out / DATA_SETS).unlink()
     save_rooms(tmp_path / "three", "f.npy")
     assert convert("folder", tmp_path / "three", out).code == 0
     (out / DATA_SETS).unlink()
     error = convert("folder", roots["one"], out).error
-    assert f"{out}/b, {out}/d, {out}/f and 1 more: expected" in error
+    assert f"{out}/b, {out}/d, {out}/f and 1 more: no scan in" in error
 
 
 def test_results_in_other_output_directories_and_of_other_kinds_are_left_alone(
@@ -320,7 +317,7 @@ def test_a_folder_of_results_may_be_a_link(root, out, tmp_path, convert):
     (out / "val" / LAST).symlink_to(tmp_path / "last")
     move(root, train=SCANS, val=[])
     assert (
-        f"{out}/val/{LAST}: expected a file as torchrg wrote it"
+        f"{out}/val/{LAST}: was changed or not written by torchrg"
         in convert("scannet", root, out).error
     )
     assert (tmp_path / "last" / RECORD).exists()
@@ -344,7 +341,7 @@ def test_files_of_other_layouts_go_with_their_scan(root, out, convert):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
     move(root, train=SCANS, val=[])
     error = convert("scannet", root, out, "--layout", "nag").error
-    assert f"{out}/planes/{MOVED}.npy: expected a file as torchrg wrote it" in error
+    assert f"{out}/planes/{MOVED}.npy: was changed or not written by torchrg" in error
 
 
 def test_a_scan_without_a_split_in_its_name_leaves_the_old_one_too(tmp_path, out, convert):
@@ -374,7 +371,7 @@ def test_a_damaged_list_of_scans_is_written_again(tmp_path, out, convert, text):
     if "x" not in text:
         assert (out / DATA_SETS).read_bytes() == whole
     (tmp_path / "in" / "b.npy").unlink()
-    assert f"{out}/b: expected the scan" in convert("folder", tmp_path / "in", out).error
+    assert f"{out}/b: no scan in" in convert("folder", tmp_path / "in", out).error
 
 
 @pytest.mark.parametrize(
@@ -399,7 +396,7 @@ def test_records_of_other_versions_end_in_no_loss(root, out, convert, change):
         assert (done.code, done.err) == (0, "")
         assert not path.exists()
     else:
-        assert "npy: expected a file as torchrg wrote it" in done.error
+        assert "npy: was changed or not written by torchrg" in done.error
         assert results_of(out) == before
 
 
@@ -409,7 +406,7 @@ def test_a_damaged_record_says_nothing_of_changes(root, out, convert):
     before = files_of(out)
     move(root)
     assert (
-        f"{MOVED}/{RECORD}: expected a file as torchrg wrote it"
+        f"{MOVED}/{RECORD}: was changed or not written by torchrg"
         in convert("scannet", root, out).error
     )
     assert files_of(out) == before

@@ -106,7 +106,7 @@ def test_any_other_bad_line_is_an_error_that_shows_it(file, line, extra):
     file.write_bytes(GOOD + GOOD + line + extra + b"\n" + GOOD)
     with pytest.raises(FormatError) as caught:
         read_annotation(file)
-    assert str(caught.value).startswith(f"{file}: line 3: expected x y z and colours")
+    assert str(caught.value).startswith(f"{file}: line 3: expected x y z and colors")
     assert repr(line + extra) in str(caught.value)
 
 
@@ -151,7 +151,7 @@ def test_any_byte_in_any_column_reads_by_the_rules_or_is_refused(file, column):
 
 def test_long_lines_are_shown_in_part(file):
     file.write_bytes(b"1 " * 10_000)
-    with pytest.raises(FormatError, match=r"got b'1 1.*\.\.\.'; repair"):
+    with pytest.raises(FormatError, match=r"got b'1 1.*\.\.\.'; correct"):
         read_annotation(file)
 
 

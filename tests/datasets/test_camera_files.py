@@ -69,7 +69,7 @@ def test_every_program_says_the_same_camera(tmp_path, name, content):
 def test_a_lens_that_bends_lines_is_told(tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps({**NERFSTUDIO, "k1": 0.03, "k2": 0, "p2": -1e-7}))
-    with pytest.warns(UserWarning, match=r"the distortion of the lens \(k1, p2\) is left"):
+    with pytest.warns(UserWarning, match=r"lens distortion \(k1, p2\) is not"):
         assert read_camera(path) == CAMERA
 
 
@@ -84,12 +84,12 @@ def test_a_lens_that_bends_lines_is_told(tmp_path):
         (
             "a.json",
             '{"fov": 60}',
-            "or a matrix, got none in fov; add it, or pass --intrinsics",
+            "or a matrix, got only fov; add it, or pass --intrinsics",
         ),
         (
             "a.json",
             '{"frames": [{"fl_x": 1}]}',
-            "expected one camera, got one for each frame, or none; give",
+            "expected one camera, got one per frame, or none; pass",
         ),
         (
             "a.json",
@@ -100,7 +100,11 @@ def test_a_lens_that_bends_lines_is_told(tmp_path):
         ("a.json", f'{{"K": {10**400}}}', "expected K to be a matrix, got 1000"),
         ("a.json", '{"K": [1, 0, 0, 0, 0, 0, 0, 0, 1]}', "expected intrinsics of rows"),
         ("a.json", '{"fx": 1, "fy": NaN, "cx": 0, "cy": 0}', "expected a number for fy, got nan"),
-        ("a.json", '{"fx": 1, "fy": 1, "cx": 0, "cy": 0, "w": 0, "h": 1}', "w and h above 0"),
+        (
+            "a.json",
+            '{"fx": 1, "fy": 1, "cx": 0, "cy": 0, "w": 0, "h": 1}',
+            "w and h must be positive",
+        ),
         ("a.json", '{"fx": 1, "fy": 1, "cx": 0, "cy": 0, "w": 4}', "expected a number for h"),
     ],
 )

@@ -88,7 +88,7 @@ def test_frames_may_have_cameras_of_their_own(tmp_path):
         frame["transform_matrix"] = frame["transform_matrix"][:3]
     shared["frames"].reverse()
     write_text(root / "transforms.json", {**shared, "fl_x": 1})
-    with pytest.warns(UserWarning, match=r"the distortion of the lens \(k1\) is left as it is"):
+    with pytest.warns(UserWarning, match=r"lens distortion \(k1\) is not corrected"):
         data = RGBDFrames.from_folder(root)
     for sample, frame in zip(data, FRAMES, strict=True):
         np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)
@@ -134,14 +134,14 @@ def with_a_huge_number(shared):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (without_camera, "expected a camera, as fl_x, fl_y, cx, cy or a matrix, got none in fl_y"),
+        (without_camera, "expected a camera, as fl_x, fl_y, cx, cy or a matrix, got only fl_y"),
         (with_fisheye, "expected images of a pinhole camera, got OPENCV_FISHEYE; undistort"),
-        (without_depth, "expected a list of frames, each with depth_file_path; name the depth"),
+        (without_depth, "expected a list of frames, each with depth_file_path; add the depth"),
         (without_frames, "expected a list of frames"),
         (with_wide_images, "as its camera's, or in their ratio, got 128 x 96; pass the camera"),
         (with_words, "expected transform_matrix to be a matrix, got [["),
         (with_a_turn_alone, "expected transform_matrix to be a matrix, got [["),
-        (with_no_focus, "expected fl_x and fl_y other than 0"),
+        (with_no_focus, "expected nonzero fl_x and fl_y"),
         (with_a_huge_number, "expected a number for cx, got 10000"),
     ],
 )
@@ -196,7 +196,9 @@ def test_an_image_of_replica_beyond_its_poses_has_none(tmp_path):
 def test_the_unit_of_floating_point_is_not_guessed(tmp_path, run):
     root = write_nerfstudio(tmp_path / "capture", ".npy", 1.0)
     error = run("convert", "rgbd", root, tmp_path / "out").error
-    assert "frame_00000.npy: expected depth_scale, which depth images do not hold; pass it" in error
+    assert (
+        "frame_00000.npy: expected depth_scale, which depth images do not store; pass it" in error
+    )
     data = RGBDFrames.from_folder(root, depth_scale=1.0)
     np.testing.assert_allclose(points_of(data[1]), FRAMES[1].points, atol=1e-5)
 
@@ -214,7 +216,10 @@ def test_other_captures_say_what_they_lack(tmp_path):
     info.write_text(info.read_text().replace("m_depthShift", "m_shift"))
     for name, message in (
         ("arkitscenes", "lowres_wide.traj: expected time rx ry rz tx ty tz in each row"),
-        ("scannetpp", "pose_intrinsic_imu.json: expected frame_000010, of which there is depth"),
+        (
+            "scannetpp",
+            "pose_intrinsic_imu.json: expected an entry for frame_000010, which has depth",
+        ),
         ("replica", "cam_params.json: cannot be read: No such file"),
         ("3rscan", "_info.txt: expected a number for m_depthShift, got None; add it"),
     ):
@@ -224,7 +229,9 @@ def test_other_captures_say_what_they_lack(tmp_path):
     with pytest.raises(FormatError, match=r"pincam: expected width height fx fy cx cy in each row"):
         RGBDFrames.from_folder(roots["arkitscenes"])
     (iphone / "depth").rename(iphone / "depth.bin")
-    with pytest.raises(FormatError, match=r"take them out of depth\.bin by iphone/prepare_iphone"):
+    with pytest.raises(
+        FormatError, match=r"extract them from depth\.bin with iphone/prepare_iphone"
+    ):
         RGBDFrames.from_folder(roots["scannetpp"])
 
 
@@ -250,11 +257,11 @@ def test_portable_graymaps_are_read_as_they_are_stored(tmp_path):
     for content, message in (
         (b"P5\n3 2\n65535\n" + bytes(11), "expected 12 bytes for its pixels, got 11"),
         (b"P5\n2 2\n65535\n" + bytes(12), "expected 8 bytes for 2 x 2 pixels, got 12; correct"),
-        (b"P5\n3 2\n255\n" + bytes(6), "expected a binary PGM of 16 bits, P5, got b'P5"),
-        (b"P2\n1 1\n65535\n7\n", "expected a binary PGM of 16 bits, P5, got b'P2"),
-        (b"P5\n0 2\n65535\n", "expected a binary PGM of 16 bits"),
-        (b"P5\n99999999 99999999\n65535\n", "for its pixels, got 0; the file is cut off"),
-        (b"P5 # " + b"9 " * 1000, "expected a binary PGM of 16 bits"),
+        (b"P5\n3 2\n255\n" + bytes(6), "expected a 16-bit binary PGM, P5, got b'P5"),
+        (b"P2\n1 1\n65535\n7\n", "expected a 16-bit binary PGM, P5, got b'P2"),
+        (b"P5\n0 2\n65535\n", "expected a 16-bit binary PGM"),
+        (b"P5\n99999999 99999999\n65535\n", "for its pixels, got 0; the file is truncated"),
+        (b"P5 # " + b"9 " * 1000, "expected a 16-bit binary PGM"),
     ):
         path.write_bytes(content)
         with pytest.raises(FormatError, match=message):

@@ -152,7 +152,9 @@ def test_a_camera_file_next_to_the_frames_wins(scene, name):
     assert only_frame(scene, depth_scale=500.0).depth_scale == 500
 
 
-BUILT_IN = "frames without a camera file get the built-in camera of 7-scenes, 585,585,320,240; pass"
+BUILT_IN = (
+    "using the built-in camera of 7-scenes, 585,585,320,240, for frames without a camera file; pass"
+)
 
 
 @pytest.mark.parametrize(("place", "up"), [("scene/seq-01", 0), ("scene", 1), ("", 2)])
@@ -168,7 +170,7 @@ def test_the_nearest_camera_file_counts(scene, place, up, start, down):
         assert frame.origin == "built in, 7-scenes"
         return
     if up > down:
-        with pytest.warns(DepthWarning, match=r"camera-intrinsics.txt, outside of this folder"):
+        with pytest.warns(DepthWarning, match=r"camera-intrinsics.txt, outside this folder"):
             frame = only_frame(root / start)
     else:
         frame = only_frame(root / start)
@@ -192,7 +194,7 @@ def test_a_camera_without_a_file_is_named_once(scene, tmp_path, run):
     assert f"{scene}: {BUILT_IN} --intrinsics" in done.err
 
 
-@pytest.mark.filterwarnings("ignore:.*get the built-in camera")
+@pytest.mark.filterwarnings("ignore:.*using the built-in camera")
 def test_the_record_names_the_camera_and_a_new_file_changes_the_input(scene, tmp_path):
     source = RGBDSource(scene, DepthConfig(), "7-scenes")
     (job,) = list_jobs(source, tmp_path / "out")
@@ -227,7 +229,7 @@ def test_two_camera_files_that_differ_are_told_apart(scene):
     (scene / "info.txt").write_text(INFO)
     assert only_frame(scene).origin == "camera-intrinsics.txt"
     (scene / "camera.json").write_text('{"fx": 20, "fy": 20, "cx": 15, "cy": 12}')
-    with pytest.warns(DepthWarning, match=r"camera-intrinsics.txt: taken .* camera.json has anoth"):
+    with pytest.warns(DepthWarning, match=r"camera-intrinsics.txt: used .* camera.json diff"):
         assert only_frame(scene).intrinsics[0].tolist() == [FX, 0, CX]
     np.savetxt(scene / "depth_intrinsics.txt", 2 * K - np.diag([0, 0, 1]))
     with pytest.raises(ConfigError, match=r"depth_intrinsics.txt: expected an optical axis within"):
@@ -285,7 +287,7 @@ def test_images_that_are_not_depth_by_their_names_are_left_out(tmp_path, names, 
     if (left := len(names) - len(expected)) == 0:
         assert len(RGBDFrames.from_folder(tmp_path, **given)) == len(expected)
         return
-    with pytest.warns(DepthWarning, match=f"left out {left} of {len(names)} images, which are not"):
+    with pytest.warns(DepthWarning, match=f"skipped {left} of {len(names)} images that are not"):
         data = RGBDFrames.from_folder(tmp_path, **given)
     assert [frame.name for frame in data.frames] == expected
 

@@ -47,7 +47,7 @@ def test_two_of_one_name_are_refused_whatever_their_suffixes(root, other):
     np.save(root / "array.npy", COORDINATES)
     (root / "array.npy").rename(root / other)
     names = sorted(["scan_10.ply", other.removesuffix("/coord.npy")], key=natural_key)
-    with pytest.raises(FormatError, match=f"one file for each scan, got {' and '.join(names)};"):
+    with pytest.raises(FormatError, match=f"one file per scan, got {' and '.join(names)};"):
         FolderOfClouds(root)
 
 
@@ -60,7 +60,7 @@ def test_a_name_does_not_depend_on_what_else_there_is(root):
     after = {scene.path: scene.name for scene in FolderOfClouds(root).scenes}
     assert after == {**before, root / "b" / "scan.pcd": "b/scan"}
     write_cloud(root / "b" / "scan.npz", Cloud(COORDINATES))
-    with pytest.raises(FormatError, match=r"got b/scan.npz and b/scan.pcd; .*by suffixes"):
+    with pytest.raises(FormatError, match=r"got b/scan.npz and b/scan.pcd; .*by suffix"):
         FolderOfClouds(root)
     assert "b/scan" in names_of(FolderOfClouds(root, suffixes=[".ply", ".pcd", ".xyz"]))
 
@@ -82,7 +82,7 @@ def test_links_in_a_loop_are_passed_over(root):
     (root / "above").symlink_to("../..")
     names, warning = warned(root)
     assert names == expected
-    assert warning.startswith(f"{root}: passed over above and 3 more: a link leads there")
+    assert warning.startswith(f"{root}: skipped above and 3 more: links to files")
 
 
 def test_links_to_other_places_are_followed_and_each_file_counts_once(root, tmp_path):
@@ -98,7 +98,7 @@ def test_links_to_other_places_are_followed_and_each_file_counts_once(root, tmp_
     names, warning = warned(root)
     # The link to the folder comes first; what it leads back to has a name without links.
     assert names == sorted([*expected, "c/sub/y", "c/x", "gone"], key=natural_key)
-    assert "passed over file.ply and 1 more: a link" in warning
+    assert "skipped file.ply and 1 more: links" in warning
     # A link comes after what is there itself, whatever their order.
     (root / "a").symlink_to("b")
     assert warned(root)[0] == names
@@ -113,7 +113,7 @@ def test_a_folder_of_links_is_a_data_set(root, tmp_path):
     (farm / "scans").symlink_to(root)
     names, warning = warned(farm)
     assert names == ["0", "1", "2", "scans/b/a", "scans/b/deep/x", "scans/scan_9"]
-    assert warning.startswith(f"{farm}: passed over scans/scan_10.ply: ")
+    assert warning.startswith(f"{farm}: skipped scans/scan_10.ply: ")
 
 
 def test_suffixes_can_be_chosen(root):

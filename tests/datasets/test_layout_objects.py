@@ -20,7 +20,7 @@ from torchrg.datasets.scannet import read_objects, read_scannet_scan
 from torchrg.errors import ConfigError, FormatError
 from torchrg.scenes import make_room
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*segments are in two objects:UserWarning")
+pytestmark = pytest.mark.filterwarnings("ignore:.*segments belong to two objects:UserWarning")
 SCAN = "scene0270_00"
 NUM_POINTS = 400
 # The first object is no wall, the third takes a segment of the second, the last one of the third.
@@ -107,14 +107,14 @@ class Release:
         """The scan as a layout takes it."""
         parts = {
             "name": SCAN,
-            "listed": "train",
+            "declared_split": "train",
             "folder": f"scans/{SCAN}",
             "dataset": "ScanNet",
             "coord": self.coord,
             "normal": np.zeros_like(self.coord),
             "superpoint": self.superpoint,
             "plane": self.superpoint % 3 - 1,
-            "given": given_of(self.mesh, root),
+            "inputs": given_of(self.mesh, root),
             "objects": read_objects(self.mesh, NUM_POINTS),
         }
         return LayoutScan(**(parts | changes))
@@ -196,7 +196,7 @@ def test_pointcepts_classes_of_scannet_become_categories_of_nyu40(release, root)
     given = given_of(release.mesh, root)
     del given["category"]
     given["segment20"] = np.arange(NUM_POINTS) % 21 - 1
-    files = LAYOUTS["mmdet3d"]["ScanNet"](release.scan(root, given=given))
+    files = LAYOUTS["mmdet3d"]["ScanNet"](release.scan(root, inputs=given))
     found = np.frombuffer(files[f"semantic_mask/{SCAN}.bin"], np.int64)
     numbers = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 24, 28, 33, 34, 36, 39]
     assert np.array_equal(found, np.resize(numbers, NUM_POINTS))
@@ -205,7 +205,7 @@ def test_pointcepts_classes_of_scannet_become_categories_of_nyu40(release, root)
 def as_one_object(release, root, number, category=5):
     """The scan with one object of one class."""
     labels = {"instance": np.full(NUM_POINTS, number), "category": np.full(NUM_POINTS, category)}
-    return release.scan(root, given={**given_of(release.mesh, root), **labels})
+    return release.scan(root, inputs={**given_of(release.mesh, root), **labels})
 
 
 def test_ground_truth_of_mask3d_tells_classes_and_objects(release, root):
@@ -219,8 +219,8 @@ def test_ground_truth_of_mask3d_tells_classes_and_objects(release, root):
 @pytest.mark.parametrize(
     ("number", "category", "words"),
     [
-        (999, 5, "numbers of objects from -1 to 998 for layout mask3d, .*, got 999"),
-        (-2, 5, "numbers of objects from -1 to 998 for layout mask3d, .*, got -2"),
+        (999, 5, "numbers of objects from -1 to 998 for layout mask3d, got 999"),
+        (-2, 5, "numbers of objects from -1 to 998 for layout mask3d, got -2"),
         (0, 2**24 + 1, "numbers of classes from 0 to 16,777,215 for layout mask3d, .*16,777,217"),
     ],
 )

@@ -365,7 +365,7 @@ def test_far_scans_are_about_their_origin_with_a_word(room, tmp_path, capsys):
     np.savez(scan, points=room.coord.astype(np.float64) + np.array([5e5, 4e6, 0]))
     command = ["segment", str(scan), "--out", str(tmp_path / "out"), "--layout", "mmdet3d"]
     assert main([*command, "--preset", "classic"]) == 0
-    assert "coordinates are written about 5000" in capsys.readouterr().err
+    assert "coordinates are written relative to 5000" in capsys.readouterr().err
     points = np.fromfile(tmp_path / "out" / "points" / "far.bin", dtype=np.float32).reshape(-1, 6)
     shift = points[:, :3] - room.coord
     assert np.ptp(shift, axis=0).max() < 1e-5
@@ -377,5 +377,8 @@ def test_points_that_are_not_finite_are_refused(room, tmp_path, capsys):
     np.save(tmp_path / "holes.npy", coord)
     command = ["segment", str(tmp_path / "holes.npy"), "--out", str(tmp_path / "out")]
     assert main([*command, "--layout", "npy", "--preset", "classic"]) == 2
-    assert "expected finite points for layout npy, got 1 of 4,000" in capsys.readouterr().err
+    assert (
+        "expected finite points for layout npy, got 1 non-finite of 4,000"
+        in capsys.readouterr().err
+    )
     assert not [*Path(tmp_path / "out").rglob("*.npy")]

@@ -155,7 +155,7 @@ def test_databases_of_others_are_refused_before_any_work(root, tmp_path, capsys,
     command = ["convert", "scannet", str(root), str(out), "--layout", "mask3d", *flags]
     assert main(command) == 2
     captured = capsys.readouterr()
-    assert "train_database.yaml: is of another data set or program; move it away" in captured.err
+    assert "train_database.yaml: is of another data set or program; move it" in captured.err
     assert (captured.err.count("\n"), captured.out) == (1, "")
     assert [path.name for path in out.iterdir()] == ["train_database.yaml"]
 

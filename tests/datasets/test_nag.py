@@ -77,17 +77,17 @@ def test_own_classes_of_the_transformer_are_used(nested):
 
 def test_points_without_a_superpoint_are_refused(nested):
     points = torch.cat([torch.rand(50, 3), torch.full((1, 3), torch.nan)])
-    with pytest.raises(ShapeError, match="expected a superpoint of every point, got 1 points"):
+    with pytest.raises(ShapeError, match="expected a superpoint for every point, got 1 points"):
         make_nag(points, make_superpoints(points))
 
 
 @pytest.mark.parametrize(
     ("fine", "coarse", "message"),
     [
-        ([0, 1, 3, 3], [], "superpoints of level 0 numbered from 0 without gaps, got 2 of no p"),
-        ([0, 1, 2, 2], [[0, 0, 2, 2]], "superpoints of level 1 numbered .*, got 1 of no point"),
-        ([0, 1, 2, 2], [[0, 0, 1, -1]], "superpoints of level 1 numbered .*, got -1 for a point"),
-        ([0, 1, 2, 2], [[0, 0, 1, 0]], "each superpoint in one of level 1, got 2 in two; make"),
+        ([0, 1, 3, 3], [], "consecutive superpoint IDs from 0 in level 0, got 2 for no p"),
+        ([0, 1, 2, 2], [[0, 0, 2, 2]], "superpoint IDs from 0 in level 1, got 1 for no point"),
+        ([0, 1, 2, 2], [[0, 0, 1, -1]], "superpoint IDs from 0 in level 1, got -1 for a point"),
+        ([0, 1, 2, 2], [[0, 0, 1, 0]], "each superpoint in one of level 1, got 2 in two; merge"),
         ([0, 1, 2, 2], [[0, 0, 1]], r"expected labels of shape \(N\), got \(3,\)|with N=4"),
     ],
 )

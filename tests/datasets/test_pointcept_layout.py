@@ -207,7 +207,7 @@ def test_labels_from_elsewhere_are_not_touched(foreign, sample, seg, name):
 @pytest.mark.parametrize("content", ["{}", "[", '{"written": 5}', '{"written": [[1]]}'])
 def test_a_table_from_elsewhere_is_not_touched(foreign, sample, seg, content):
     (foreign / "planes.json").write_text(content)
-    with pytest.raises(FormatError, match="expected a table of planes that torchrg wrote"):
+    with pytest.raises(FormatError, match="expected a plane table written by torchrg"):
         write_pointcept_scene(foreign, sample, seg)
     assert (foreign / "planes.json").read_text() == content
 
@@ -218,7 +218,7 @@ def test_pickles_and_wrong_sizes_are_never_loaded(foreign):
             return pytest.fail, ("a pickle was loaded",)
 
     np.save(foreign / "color.npy", np.array([Trap()], dtype=object), allow_pickle=True)
-    with pytest.raises(FormatError, match="pickled Python objects, which are never loaded"):
+    with pytest.raises(FormatError, match="pickled Python objects, which are not loaded"):
         read_pointcept_scene(foreign)
     header = b"\x93NUMPY\1\0v\0{'descr': '|u1', 'fortran_order': False, 'shape': (10**15, 3), }"
     (foreign / "color.npy").write_bytes(header.replace(b"10**15", b"1" + b"0" * 15).ljust(128))

@@ -70,7 +70,7 @@ def test_a_room_with_every_defect_reads_exactly(room):
         f"._wall_2.txt {unnamed}",
         f"Icon\r {unnamed}",
         f"notes.txt {unnamed}",
-        "stairs_1.txt taken as clutter",
+        "stairs_1.txt read as clutter",
         "wall_2 (2).txt not read: a copy of wall_2.txt by its name, but it differs",
         "wall_3 (1).txt not read: a copy of wall_3.txt",
     ]
@@ -91,7 +91,7 @@ def test_two_objects_of_the_same_points_are_told(room):
     objects = {"chair_1": rows[:20], "chair_2": rows[20:], "table_1": rows[20:]}
     write_objects(room, {f"{name}.txt": text_of(part) for name, part in objects.items()})
     found = read_room(room)
-    assert found.notes == ("table_1.txt has the points of chair_2.txt, too",)
+    assert found.notes == ("table_1.txt has the same points as chair_2.txt",)
     assert len(found) == 60
 
 

@@ -184,7 +184,7 @@ def test_databases_have_an_area_without_rooms_as_an_empty_one(converted):
         ),
         (
             ["--layout", "mask3d", "--class-order", "spt"],
-            "expected --class-order with --layout pointcept, got layout mask3d",
+            "--class-order requires --layout pointcept, got layout mask3d",
         ),
     ],
 )

@@ -12,7 +12,7 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.datasets import ScanNet, read_scannet_scan
-from torchrg.datasets.scannet import IDS_200, NYU_IDS, _places
+from torchrg.datasets.scannet import IDS_200, NYU_IDS, _index_in
 from torchrg.errors import ConfigError, FormatError
 
 SEGMENTS = np.array([40, 40, 7, 7, 3, 3, 12, 12])
@@ -109,7 +109,7 @@ def test_vertices_of_several_objects_have_the_smallest_first(scans, tmp_path):
 def test_what_is_wrong_names_the_file(tree, scans, tmp_path):
     path = tree / "scans" / "scene0010_00" / "scene0010_00_vh_clean_2.0.010000.segs.json"
     path.write_text(json.dumps({"segIndices": [1, 2]}))
-    with pytest.raises(FormatError, match=r"segs.json: expected a segment of each of 8 vertices"):
+    with pytest.raises(FormatError, match=r"segs.json: expected a segment for each of 8 vertices"):
         _ = ScanNet(tree, "train")[1]
     path.write_text("{")
     with pytest.raises(FormatError, match=r"segs.json: expected JSON with a list segIndices"):
@@ -117,7 +117,7 @@ def test_what_is_wrong_names_the_file(tree, scans, tmp_path):
     with pytest.raises(ConfigError, match="expected split to be one of train, val, test"):
         ScanNet(tree, "trainval")
     (tmp_path / "none").mkdir()
-    with pytest.raises(FormatError, match="pass the folder that holds scans or data"):
+    with pytest.raises(FormatError, match="pass the folder that contains scans or data"):
         ScanNet(tmp_path / "none")
 
 
@@ -143,7 +143,7 @@ def test_lists_and_tables_may_begin_with_a_mark(tree, scans, tmp_path):
 
 def test_names_on_lists_that_are_no_scans_are_told_in_one_line(tree):
     write_tables(tree, ["scene0010_00", "scene9\x1b[1m", "scene8"], ["scene0002_01", "scene7"])
-    message = r"scannetv2_train\.txt: 3 of 5 names on the lists .*\(first: 'scene9\\x1b\[1m'\)"
+    message = r"scannetv2_train\.txt: 3 of 5 listed scans are missing \(first: 'scene9\\x1b\[1m'\)"
     with pytest.warns(UserWarning, match=message) as caught:
         data = ScanNet(tree)
     assert len(caught) == 1
@@ -195,11 +195,11 @@ def groups(**changes):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        (SEGS, segments(1.7), "expected segIndices to be whole numbers, got: 1.7 as number 2"),
-        (SEGS, segments("7"), "expected segIndices to be whole numbers, got: '7' as number 2"),
-        (SEGS, segments(True), "expected segIndices to be whole numbers, got: True as number 2"),
-        (SEGS, segments([7]), r"expected segIndices to be whole numbers, got: \[7\] as number 2"),
-        (SEGS, segments(10**20), "expected segIndices to be whole numbers, got: Python int"),
+        (SEGS, segments(1.7), "expected segIndices to be integers, got: 1.7 as number 2"),
+        (SEGS, segments("7"), "expected segIndices to be integers, got: '7' as number 2"),
+        (SEGS, segments(True), "expected segIndices to be integers, got: True as number 2"),
+        (SEGS, segments([7]), r"expected segIndices to be integers, got: \[7\] as number 2"),
+        (SEGS, segments(10**20), "expected segIndices to be integers, got: Python int"),
         (SEGS, segments(7).replace("7", "1e400"), "expected segIndices .*, got: inf as number 2"),
         (SEGS, "7", "expected JSON with a list segIndices, got: 7"),
         (SEGS, '{"segIndices": 7}', "expected JSON with a list segIndices, got: {"),
@@ -208,14 +208,14 @@ def groups(**changes):
         (SEGS, b'{"segIndices": ["\xe9"]}', "byte 17: expected text in UTF-8"),
         (GROUPS, '{"segGroups": 5}', "expected JSON with a list segGroups, got"),
         (GROUPS, '{"segGroups": [5]}', "object 0: expected a label, .*, got 5"),
-        (GROUPS, groups(id=...), r"object 1: expected .* a number from 0 to [\d,]+ as id"),
+        (GROUPS, groups(id=...), r"object 1: expected .* an integer from 0 to [\d,]+ as id"),
         (GROUPS, groups(id="3"), "object 1: expected"),
         (GROUPS, groups(id=1.5), "object 1: expected"),
         (GROUPS, groups(id=-1), "object 1: expected"),
         (GROUPS, groups(id=10**20), "object 1: expected"),
         (GROUPS, groups(label=5), "object 1: expected a label"),
         (GROUPS, groups(segments=7), "object 1: expected .* and a list of segments"),
-        (GROUPS, groups(segments=[7, None]), "expected segments of object 1 to be whole numbers"),
+        (GROUPS, groups(segments=[7, None]), "expected segments of object 1 to be integers"),
         ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}nan", "expected 16 finite numbers"),
         ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}1e400", "expected 16 finite numbers"),
         ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}", "expected 16 finite numbers"),
@@ -235,7 +235,7 @@ def test_annotations_that_are_none_are_refused_by_file_and_place(tree, name, con
 @pytest.mark.parametrize(
     ("objects", "first"),
     [
-        ([("floor", [12345, 777])], "object 0: .* got 12345, which is not there; take the ann"),
+        ([("floor", [12345, 777])], "object 0: .* got 12345, which is missing there; use the ann"),
         ([("floor", [40, 555]), ("chair", [999])], "object 0: expected segments of .*, got 555,"),
         ([("floor", [40]), ("chair", [7, 8])], "object 1: expected segments of .*, got 8, which"),
     ],
@@ -252,22 +252,22 @@ def test_what_two_objects_claim_is_told_and_the_later_has_it(scans, tmp_path):
     objects = [("floor", [40, 7]), ("table", [7, 3, 40]), ("beanbag", [12])]
     write_scan(tmp_path / "in/scans", "scene0001_00", *scans, SEGMENTS, objects, with_labels=False)
     write_tables(tmp_path / "in", ["scene0001_00"], [])
-    with pytest.warns(UserWarning, match="segments are in two|objects have labels"):
+    with pytest.warns(UserWarning, match="segments belong to two|objects have labels"):
         sample = ScanNet(tmp_path / "in")[0]
     assert sample["instance"].tolist() == [1, 1, 1, 1, 1, 1, 2, 2]
     source = CloudSource(ScanNet(tmp_path / "in"), load_config("classic"), layout="scannet")
     (job,) = list_jobs(source, tmp_path / "out")
     notes = [note.partition("aggregation.json: ")[2] for note in convert_scan(job).warnings]
     assert [note for note in notes if note] == [
-        "segments are in two objects, of which the later is taken: 7 and 1 more.",
-        "objects have labels that scannetv2-labels.combined.tsv does not have: 'beanbag'.",
+        "segments belong to two objects, and the later is used: 7 and 1 more.",
+        "objects have labels that are not in scannetv2-labels.combined.tsv: 'beanbag'.",
     ]
 
 
 def test_two_objects_of_one_number_are_told(tree):
     path = tree / "scans" / "scene0010_00" / GROUPS
     path.write_text(groups(segments=[40]))
-    with pytest.warns(UserWarning, match=r"number of another and become one with it: 0\.$"):
+    with pytest.warns(UserWarning, match=r"ID of another and are merged with it: 0\.$"):
         assert ScanNet(tree)[1]["instance"].tolist() == [0, 0, 0, 0, -1, -1, -1, -1]
 
 
@@ -285,8 +285,8 @@ def test_a_label_above_any_table_is_refused_and_takes_no_memory(tree, scans, lab
 def test_classes_are_places_in_their_list():
     numbers = np.array([0, 1, 12, 13, 14, 39, 40, 65_535])
     expected = [NYU_IDS.index(number) if number in NYU_IDS else -1 for number in numbers]
-    assert _places(numbers, NYU_IDS).tolist() == expected
-    assert _places(np.array(IDS_200), IDS_200).tolist() == [*range(len(IDS_200))]
+    assert _index_in(numbers, NYU_IDS).tolist() == expected
+    assert _index_in(np.array(IDS_200), IDS_200).tolist() == [*range(len(IDS_200))]
 
 
 def test_object_numbers_of_scannetpp_fit_their_arrays(scans, tmp_path):

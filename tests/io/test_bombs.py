@@ -115,7 +115,7 @@ CONSTANT = rb'<cartesian\1 type="Integer" minimum="5" maximum="5">5</cartesian\1
         ),
         (
             [(rb"</e57Root>", b'<w type="Structure">' + FIELDS + FIELDS + b"</w></e57Root>")],
-            "1,000 fields of a structure, got more at",
+            "1,000 fields per structure, got more at",
         ),
         (
             [(rb"</e57Root>", b"<d>" * 9_000 + b"</d>" * 9_000 + b"</e57Root>")],

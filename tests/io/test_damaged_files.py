@@ -233,5 +233,5 @@ def test_points_far_into_a_file_are_read_from_their_place(tmp_path, offset):
 def test_a_cloud_beyond_memory_is_refused_by_its_name(tmp_path, make_cloud, monkeypatch):
     write_cloud(tmp_path / "large.npy", make_cloud(5))
     monkeypatch.setattr("torchrg.io.npy.assemble_cloud", Mock(side_effect=MemoryError))
-    with pytest.raises(FormatError, match=r"large\.npy: its points do not fit into memory"):
+    with pytest.raises(FormatError, match=r"large\.npy: not enough memory for its points"):
         read_cloud(tmp_path / "large.npy")

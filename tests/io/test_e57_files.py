@@ -71,7 +71,7 @@ def test_the_coordinate_system_is_kept_and_pictures_are_told(tmp_path, monkeypat
         picture.set("guid", pye57.libe57.StringNode(image, "{1}"))
         pictures.append(picture)
     found = read_cloud(tmp_path / "c.e57")
-    assert found.notes == ("pictures left out: 1",)
+    assert found.notes == ("images left out: 1",)
     assert "coordinate_metadata" not in found.header
 
 
@@ -252,8 +252,7 @@ def test_poses_that_are_no_places_of_scanners_are_not_taken_for_such(tmp_path):
     assert cloud.front[:50].any(axis=1).all()
     assert not cloud.front[50:].any()
     assert cloud.notes == (
-        "the poses of 1 of 2 scans lie outside of the points, and are not taken for places of the "
-        "scanner",
+        "the poses of 1 of 2 scans lie outside the points and are not used as scanner positions",
     )
     assert read_cloud(write_stations(tmp_path / "b.e57", points, [shift])).front is None
     # What is written where no pose is known, around the origin.
@@ -271,11 +270,11 @@ EIGHT = np.random.default_rng(1).integers(0, 256, (40, 3))
         ([(EIGHT * 257, (0, 65535))], EIGHT, None),
         ([(EIGHT * 200, (0, 65535))], EIGHT * 200, None),
         ([(EIGHT // 255, (0, 255))], EIGHT // 255, None),
-        ([(EIGHT, (0, 65535))], EIGHT // 129, "its colors are at most 255 of 65535, their limit"),
-        ([(EIGHT * 16, (0, 4080))], EIGHT, "its colors are scaled from 0..4080, their limits, to"),
-        ([(EIGHT * [1, 2, 3] + 7, (7, [262, 517, 772]))], EIGHT, "colors are scaled from 7..772"),
-        ([(EIGHT, (0, 1))], EIGHT, "the limits of its colors, 0..1, do not fit them and are not"),
-        ([(EIGHT, (0, 0))], EIGHT, "the limits of its colors, 0..0, do not fit them and are not"),
+        ([(EIGHT, (0, 65535))], EIGHT // 129, "its colors are almost black: at most 255 of"),
+        ([(EIGHT * 16, (0, 4080))], EIGHT, "its colors are scaled from their limits 0..4080"),
+        ([(EIGHT * [1, 2, 3] + 7, (7, [262, 517, 772]))], EIGHT, "scaled from their limits 7..772"),
+        ([(EIGHT, (0, 1))], EIGHT, "the color limits 0..1 do not fit its colors and are"),
+        ([(EIGHT, (0, 0))], EIGHT, "the color limits 0..0 do not fit its colors and are"),
         ([(EIGHT / 255, (0, 1)), (EIGHT, (0, 255)), (EIGHT, None)], np.tile(EIGHT, (3, 1)), None),
         (
             [(EIGHT * 200, (0, 65535)), (EIGHT, (0, 255))],
@@ -306,11 +305,14 @@ def test_poses_are_read_by_name_in_any_order(tmp_path, order):
 @pytest.mark.parametrize(
     ("pose", "message"),
     [
-        ((1e300, 0, 0, 0), r"a rotation of length 1 as pose of scan '', got 1e\+300; correct"),
-        ((1e300, 1e300, 0, 0), "a rotation of length 1 as pose"),
-        ((5e-324, 0, 0, 0), "a rotation of length 1 as pose"),
-        ((0.1, 0, 0.1, 0), "a rotation of length 1 as pose of scan '', got 0.141"),
-        ((1, 0, 0, 0, 0, -1e13, 0), r"a pose of scan '' within 1e\+12, got -1e\+13; correct"),
+        ((1e300, 0, 0, 0), r"a unit quaternion in scan '', got norm 1e\+300; correct"),
+        ((1e300, 1e300, 0, 0), "a unit quaternion in scan"),
+        ((5e-324, 0, 0, 0), "a unit quaternion in scan"),
+        ((0.1, 0, 0.1, 0), "a unit quaternion in scan '', got norm 0.141"),
+        (
+            (1, 0, 0, 0, 0, -1e13, 0),
+            r"a translation of scan '' within 1e\+12, got -1e\+13; correct",
+        ),
     ],
 )
 def test_poses_that_are_no_places_are_refused(tmp_path, pose, message):
@@ -325,7 +327,7 @@ def test_rotations_of_another_length_are_told(tmp_path, length, is_told):
     cloud = read_cloud(write_columns(tmp_path / "a.e57", columns, pose=length * QUARTER))
     expected = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] if length else np.eye(3)
     np.testing.assert_allclose(cloud.coordinates, expected, atol=1e-15)
-    told = [note for note in cloud.notes if note.startswith("the rotations of 1 of 1 scans have")]
+    told = [note for note in cloud.notes if note.startswith("the rotations of 1 of 1 scans are")]
     assert len(told) == is_told
 
 
@@ -345,5 +347,5 @@ def test_bounds_that_contradict_the_points_are_told(tmp_path):
     for name, bounds in {"right": [[0] * 3, [1] * 3], "wrong": [[0] * 3, [1, 1e-3, 1]]}.items():
         path = write_columns(tmp_path / f"{name}.e57", columns, bounds=bounds)
         notes[name] = read_cloud(path).notes
-    told = "the points of 1 of 1 scans lie outside of the bounds in its header; check the scales"
+    told = "the points of 1 of 1 scans lie outside the bounds in the header; check the scales"
     assert notes == {"right": (), "wrong": (told,)}

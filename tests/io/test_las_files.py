@@ -216,13 +216,15 @@ def test_a_cloud_of_one_place_is_written(tmp_path):
 
 def test_points_that_are_not_finite_are_refused_before_the_work(tmp_path):
     cloud = Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0]]))
-    message = r"a\.las: expected finite coordinates, .* got 1 points that are not \(first: 1\); wr"
+    message = (
+        r"a\.las: expected finite coordinates for LAS, got 1 non-finite points \(first: 1\); wr"
+    )
     with pytest.raises(FormatError, match=message):
         check_output(tmp_path / "a.las", cloud)
     with pytest.raises(FormatError, match=message):
         write_cloud(tmp_path / "a.las", cloud)
     # A code for no data would take the grid of all others.
-    with pytest.raises(FormatError, match="got 1 points that are not"):
+    with pytest.raises(FormatError, match="got 1 non-finite points"):
         write_cloud(tmp_path / "a.las", Cloud(np.array([[0.0, 0, 0], [1e30, 0, 0]])))
 
 
@@ -247,7 +249,7 @@ def test_names_that_have_no_place_are_refused(tmp_path, name):
         (247, "<Q", 0, "expected at least one point, got none"),
         (100, "<I", 2**32 - 1, "byte 100: expected 231,928,233,930 bytes for header records"),
         (243, "<I", 2**32 - 1, r"byte \d+: expected [\d,]+ bytes for 4,294,967,295 extended"),
-        (96, "<I", 2**31, r"byte 96: expected 2,147,483,648 bytes for what comes before points"),
+        (96, "<I", 2**31, r"byte 96: expected 2,147,483,648 bytes for the data before its points"),
         (104, "<B", 63, "expected a LAS or LAZ file, got: "),
     ],
 )
@@ -265,7 +267,7 @@ def test_promises_of_the_header_are_checked(scanned, suffix, place, layout, valu
     [
         ("table", 2**32 - 1, r"byte \d+: expected at least [\d,]+ bytes for 4,294,967,295 chunks"),
         ("offset", 2**31, r"byte 2147483648: expected 8 bytes for the table of chunks, got -"),
-        ("offset", -2, r"byte \d+: expected the place of the table of chunks"),
+        ("offset", -2, r"byte \d+: expected the offset of the table of chunks"),
         ("layer", 2**32 - 1, r"byte \d+: expected [\d,]+ bytes for the layers of a chunk, got"),
     ],
 )
@@ -312,14 +314,14 @@ def test_points_compressed_without_chunks_are_read(scanned, chunk_size):
     ("place", "value", "message"),
     [
         (38, 4, "compression version 3 or below, got 4; convert it to .las with LASzip or PDAL"),
-        (36, 29, r"compressed fields of \d+ bytes a point, got \d+; convert it"),
-        (32, 0, r"compressed fields of \d+ bytes a point, got 0; convert it"),
+        (36, 29, r"compressed points of \d+ bytes, got \d+; convert it"),
+        (32, 0, r"compressed points of \d+ bytes, got 0; convert it"),
     ],
 )
 def test_compression_that_lazrs_does_not_know_is_refused(scanned, place, value, message):
     path = scanned(7, "1.4", ".laz")
     put_in_record(path, place, "<H", value)
-    with pytest.raises(FormatError, match=rf"scan\.laz: expected (LAZ of )?{message}"):
+    with pytest.raises(FormatError, match=rf"scan\.laz: expected (LAZ )?{message}"):
         read_cloud(path)
 
 
@@ -353,9 +355,9 @@ def test_scales_of_extra_dimensions_are_checked(described, value):
 @pytest.mark.parametrize(
     ("changes", "note"),
     [
-        ([(131, "<d", 0.01)], "its points lie up to 8.9. outside of the box in its header; check"),
-        ([(131, "<d", -0.001)], "its points lie up to .* outside of the box in its header; check"),
-        ([(155, "<d", 7.0), (163, "<d", 5e5)], "its points lie up to .* outside of the box in its"),
+        ([(131, "<d", 0.01)], "its points lie up to 8.9. outside the box in its header; check"),
+        ([(131, "<d", -0.001)], "its points lie up to .* outside the box in its header; check"),
+        ([(155, "<d", 7.0), (163, "<d", 5e5)], "its points lie up to .* outside the box in its"),
         ([(219, "<d", np.nan)], None),
         ([(place, "<d", 0.0) for place in range(179, 227, 8)], None),
         ([(111, "<I", 99)], r"its header counts 50 points, but \d+ returns"),
@@ -383,13 +385,13 @@ def test_points_that_the_header_does_not_count_are_told(scanned):
     size = cloud.header["las"].point_format.size
     assert cloud.notes == (
         "its header counts 48 points, but 50 returns",
-        f"{2 * size} bytes after its last point left out, as its header counts no more",
+        f"{2 * size} bytes after its last point are ignored, beyond its header's count",
     )
     path = scanned(7, "1.4", ".laz")
     data = bytearray(path.read_bytes())
     struct.pack_into("<Q", data, 247, 48)
     path.write_bytes(data)
-    with pytest.raises(FormatError, match="expected 48 points, as its header says, got 50 in its"):
+    with pytest.raises(FormatError, match="expected 48 points by its header, got 50 in its"):
         read_cloud(path)
 
 
@@ -401,7 +403,7 @@ def test_bytes_that_no_record_describes_are_told(scanned):
     cloud = read_cloud(path)
     assert "Range" not in cloud.fields
     assert cloud.notes == (
-        "bytes that its header does not describe are kept as ExtraBytes: 18 of each point",
+        "bytes that its header does not describe are read as ExtraBytes: 18 of each point",
     )
 
 
@@ -433,7 +435,7 @@ def test_dimension_that_one_point_uses_is_a_field_of_all(tmp_path):
 def test_parts_of_any_size_are_the_same_cloud(tmp_path, scanned, assert_same, monkeypatch, kind):
     cloud = read_cloud(scanned(7, "1.4", kind))
     write_cloud(tmp_path / f"a{kind}", cloud)
-    monkeypatch.setattr(las, "_POINTS_AT_ONCE", 7)
+    monkeypatch.setattr(las, "_POINTS_PER_CHUNK", 7)
     assert_same(read_cloud(scanned(7, "1.4", kind)), cloud)
     write_cloud(tmp_path / f"b{kind}", cloud)
     assert (tmp_path / f"a{kind}").read_bytes() == (tmp_path / f"b{kind}").read_bytes()
@@ -503,7 +505,7 @@ def test_panic_of_the_decoder_is_a_format_error(scanned, monkeypatch):
 
     path = scanned()
     monkeypatch.setattr(laspy, "open", panic)
-    with pytest.raises(FormatError, match="expected whole compressed points, got: index out of b"):
+    with pytest.raises(FormatError, match="cannot decompress its points: index out of b"):
         read_cloud(path)
 
     def interrupt(*_, **__):

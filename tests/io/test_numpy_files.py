@@ -77,7 +77,7 @@ def test_columns_without_names_are_told_by_their_values(tmp_path, rest, names):
 def test_arrays_that_are_no_points_are_refused(tmp_path):
     pose = np.array([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
     wrong = {
-        "a.npy": (pose, "expected points, got a matrix of 4 x 4, a pose"),
+        "a.npy": (pose, "expected points, got a 4 x 4 pose matrix"),
         "b.npy": (POINTS.T.repeat(9, axis=1), "got 3 rows of 36 numbers; transpose them"),
         "c.npy": (np.full((9, 6), "x"), "expected real numbers as coordinates, got <U1"),
     }
@@ -111,7 +111,7 @@ def test_arrays_that_are_left_out_are_told(tmp_path):
     cloud = read_cloud(tmp_path / "a.npz")
     assert cloud.notes == ("scale, name left out: not of 4 rows",)
     assert list(cloud.fields) == ["plane_id"]
-    with pytest.raises(FormatError, match="expected fields beside points, got 'plane_area'; ren"):
+    with pytest.raises(FormatError, match="a field cannot be named 'plane_area'"):
         write_cloud(tmp_path / "b.npz", Cloud(POINTS, {"plane_area": np.ones(4)}))
 
 
@@ -167,12 +167,12 @@ def test_headers_of_fewer_bytes_than_there_are_are_refused(tmp_path, change):
 
 def test_pickles_are_never_loaded(tmp_path):
     bomb = np.array([Bomb()] * 4, dtype=object)
-    message = "got pickled Python objects, which are never loaded; convert them"
+    message = "contains pickled Python objects, which are not loaded for .*; convert them"
     np.save(tmp_path / "a.npy", bomb, allow_pickle=True)
-    with pytest.raises(FormatError, match=rf"a\.npy: expected numbers .* {message}"):
+    with pytest.raises(FormatError, match=rf"a\.npy: the array {message}"):
         read_cloud(tmp_path / "a.npy")
     np.savez(tmp_path / "a.npz", allow_pickle=True, points=POINTS, meta=bomb)
-    with pytest.raises(FormatError, match=rf"a\.npz: expected .* in 'meta\.npy', {message}"):
+    with pytest.raises(FormatError, match=rf"a\.npz: 'meta\.npy' {message}"):
         read_cloud(tmp_path / "a.npz")
     for kind in (".npy", ".npz"):
         (tmp_path / f"b{kind}").write_bytes(pickle.dumps(Bomb()))
@@ -190,13 +190,13 @@ def array_bytes(shape, descr="'<f8'", data=b""):
     [
         (array_bytes((10**12, 3)), r"byte \d+: expected 24,000,000,000,000 bytes for the array of"),
         (array_bytes((4, 3), data=b"0" * 95), r"byte \d+: expected 96 bytes .*, got 95; the file"),
-        (array_bytes((-4, 3)), r"byte 0: expected a shape and a type in the array, got \(-4, 3\)"),
-        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: expected a shape and a type in the array"),
-        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: expected a shape and a type in the array"),
+        (array_bytes((-4, 3)), r"byte 0: invalid shape or type in the array: \(-4, 3\)"),
+        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: invalid shape or type in the array"),
+        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: invalid shape or type in the array"),
         (array_bytes((4, 2), data=b"0" * 64), r"expected an array of shape \(N, 3\) or wider, got"),
         (array_bytes((), data=b"0" * 8), r"expected an array of shape \(N, 3\) or wider, got \(\)"),
         (array_bytes((0, 3)), "expected at least one point, got none"),
-        (array_bytes((4, 3), "'|O'", b"0" * 96), "expected numbers .*, got pickled Python objects"),
+        (array_bytes((4, 3), "'|O'", b"0" * 96), "the array contains pickled Python objects"),
         (array_bytes((4, 3), "'<q9'"), "byte 0: expected the header of a NumPy array"),
         (array_bytes("(4, 3", data=b"0" * 96), "byte 0: expected the header of a NumPy array"),
         (array_bytes("('a', 3)", data=b"0" * 96), "byte 0: expected the header of a NumPy array"),

@@ -117,7 +117,7 @@ def test_viewpoints_that_are_none_are_left_out(tmp_path, viewpoint, is_kept):
     check(cloud)
     expected = tuple(map(float, viewpoint.split())) if is_kept else (0, 0, 0, 1, 0, 0, 0)
     assert cloud.header["viewpoint"] == expected
-    left = "its VIEWPOINT left out, as it is not a position and a rotation"
+    left = "its VIEWPOINT is ignored, because it is not a position and a rotation"
     assert cloud.notes == (() if is_kept else (left,))
 
 
@@ -129,7 +129,7 @@ def test_points_that_the_header_does_not_count_are_told(tmp_path):
     text = read_cloud(save(tmp_path / "a.pcd", fewer.format(encoding="ascii"), body("ascii")))
     assert len(text) == 4
     (note,) = text.notes
-    assert note.endswith("bytes after its last point left out, as its header counts no more")
+    assert note.endswith("bytes after its last point are ignored, beyond its header's count")
     # PCL fills files up to a page.
     whole = HEADER.format(encoding="binary")
     check(read_cloud(save(tmp_path / "a.pcd", whole, body("binary") + bytes(3900))))
@@ -207,7 +207,7 @@ def test_truncated_files_are_refused_wherever_they_end(tmp_path, encoding):
         ((10**6, 174), r"expected 1,000,000 bytes for a block of 6 points, got \d+"),
         ((None, 175), r"expected 144 bytes for 6 points from a block of \d+, got 175"),
         ((1, 144), r"expected 144 bytes for 6 points from a block of 1, got 144"),
-        ((60, 144), "expected a block that unpacks to 144 bytes; the file is damaged"),
+        ((60, 144), "expected a block that decompresses to 144 bytes; the file is corrupt"),
     ],
 )
 def test_compressed_block_with_wrong_sizes_is_refused(tmp_path, sizes, message):
@@ -223,18 +223,22 @@ def test_compressed_block_with_wrong_sizes_is_refused(tmp_path, sizes, message):
     ("pattern", "replacement", "message"),
     [
         ("FIELDS.*", "FIELDS x y w rgb _ hist label", "expected fields x, y, z, got 'x', 'y', 'w'"),
-        ("FIELDS.*", "FIELDS x y x rgb _ hist label", "line 3: expected FIELDS to be names that"),
+        (
+            "FIELDS.*",
+            "FIELDS x y x rgb _ hist label",
+            "line 3: expected FIELDS to be distinct names",
+        ),
         ("FIELDS.*\n", "", "expected a header line FIELDS; write the file again"),
-        ("SIZE.*", "SIZE 4 4 4", "line 4: expected SIZE to be 7 whole numbers, got '4 4 4'"),
-        ("SIZE.*", "SIZE 4 4 4 4 1 2 four", "line 4: expected SIZE to be 7 whole numbers"),
+        ("SIZE.*", "SIZE 4 4 4", "line 4: expected SIZE to be 7 integers, got '4 4 4'"),
+        ("SIZE.*", "SIZE 4 4 4 4 1 2 four", "line 4: expected SIZE to be 7 integers"),
         ("SIZE.*", "SIZE 4 4 3 4 1 2 4", "line 5: expected TYPE to be F, I or U of a known SIZE"),
         ("TYPE.*", "TYPE F F F", "line 5: expected TYPE to be 7 letters, got 'F F F'"),
         ("TYPE.*", "TYPE F F Q F U I U", "line 5: expected TYPE to be F, I or U .* for z"),
         ("COUNT.*", "COUNT 0 0 0 0 0 0 0", "line 6: expected COUNT to be above 0 for a field"),
         ("COUNT.*", "COUNT 1 1 1 1 3 9999999 1", "line 6: expected COUNT to be sizes of at most"),
         ("SIZE.*", "SIZE 4 4 4 4 0 2 4", "line 5: expected TYPE to be F, I or U of a known SIZE"),
-        ("COUNT.*", "COUNT 1 2 1 1 1 1 1", "expected one number a point in each of x, y, z"),
-        ("WIDTH.*", "WIDTH -3", "line 7: expected WIDTH to be 1 whole number, got '-3'"),
+        ("COUNT.*", "COUNT 1 2 1 1 1 1 1", "expected x, y, z of one number per point"),
+        ("WIDTH.*", "WIDTH -3", "line 7: expected WIDTH to be 1 integer, got '-3'"),
         (
             "WIDTH.*",
             "WIDTH 1000000000000000000000",
@@ -244,7 +248,11 @@ def test_compressed_block_with_wrong_sizes_is_refused(tmp_path, sizes, message):
         ("VIEWPOINT.*", "VIEWPOINT 0 0 zero 1 0 0 0", "line 9: expected VIEWPOINT to be 7 numbers"),
         ("POINTS.*", "POINTS 5", r"line 10: expected POINTS to be WIDTH x HEIGHT = 6, got '5'"),
         ("DATA.*", "DATA zipped", "line 11: expected DATA to be one of ascii, binary, binary_c"),
-        ("DATA.*\n", "", r"line \d+: expected the header to end with a line DATA; the file is cut"),
+        (
+            "DATA.*\n",
+            "",
+            r"line \d+: expected the header to end with a line DATA; the file is truncated",
+        ),
         ("(WIDTH|HEIGHT|POINTS).*", r"\1 0", "expected at least one point, got none"),
     ],
 )
@@ -268,6 +276,6 @@ def test_broken_lines_are_named(tmp_path):
     lines = body("ascii").splitlines()
     lines[4] = b"1 2 3 oops 0 0 0 1 1 1"
     header = HEADER.format(encoding="ascii")
-    message = r"a\.pcd: line 16: expected 10 numbers, got '1 2 3 oops 0 0 0 1 1 1'; repair"
+    message = r"a\.pcd: line 16: expected 10 numbers, got '1 2 3 oops 0 0 0 1 1 1'; correct"
     with pytest.raises(FormatError, match=message):
         read_cloud(save(tmp_path / "a.pcd", header, b"\n".join(lines)))

@@ -167,14 +167,14 @@ def test_lists_that_the_file_cannot_hold_are_damage_or_a_cut(tmp_path, order, li
     whole = write_lists(tmp_path / "a.ply", order, lists, 3, length="b").read_bytes()
     start = whole.index(b"end_header\n") + 11
     (tmp_path / "a.ply").write_bytes(whole[:-1])
-    message = r"a\.ply: byte \d+: expected 1 more records of vertex, got \d+ bytes without a whole"
+    message = r"a\.ply: byte \d+: expected 1 more records of vertex, got \d+ bytes of an incompl"
     with pytest.raises(FormatError, match=message):
         read_cloud(tmp_path / "a.ply")
     for length in (-1, 127):
         damaged = bytearray(whole)
         struct.pack_into("b", damaged, start + 12, length)
         (tmp_path / "a.ply").write_bytes(damaged)
-        with pytest.raises(FormatError, match=r"expected 3 more records .*; the file is cut off"):
+        with pytest.raises(FormatError, match=r"expected 3 more records .*; the file is truncated"):
             read_cloud(tmp_path / "a.ply")
 
 
@@ -204,7 +204,7 @@ def test_records_that_the_header_does_not_count_are_told(tmp_path, order):
         assert len(cloud) == 2
         rest = len(text_body().splitlines()[2]) + 1
         assert cloud.notes == (
-            f"{rest} bytes after its last point left out, as its header counts no more",
+            f"{rest} bytes after its last point are ignored, beyond its header's count",
         )
     else:
         # pyntcloud calls columns of float64 "float".
@@ -256,7 +256,7 @@ def test_truncated_file_names_the_byte(tmp_path):
         (("vertex 3", "vertex -3"), "line 4: expected a line of a PLY header"),
         (("vertex 3", "vertex 1e3"), "line 4: expected a line of a PLY header"),
         (("float y", "quad y"), "line 6: expected a line of a PLY header, got 'property quad y'"),
-        (("float y", "float x"), "line 6: expected names that differ, got 'x' twice; rename one"),
+        (("float y", "float x"), "line 6: expected distinct names, got 'x' twice; rename one"),
         (("float y", "list float int y"), "line 6: expected a line of a PLY header"),
         (("vertex 3", "point 3"), "expected an element vertex with properties, got elements point"),
         (("float y", "float why"), "expected fields x, y, z, got 'x', 'why', 'z', 'red'"),
@@ -282,13 +282,13 @@ def test_header_without_end_is_cut_off(tmp_path):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (b"4 five -6 1 2 3 0", r"line 13: expected 7 numbers, got '4 five -6 1 2 3 0'; repair"),
+        (b"4 five -6 1 2 3 0", r"line 13: expected 7 numbers, got '4 five -6 1 2 3 0'; correct"),
         (b"4 5 -6 1 2 3", "line 13: expected 7 numbers, got '4 5 -6 1 2 3'"),
         (b"4 5 -6 1 2 3 4 5", "line 13: expected 7 numbers"),
         (b"4 5 -6 1 2 256 4", "line 13: expected 7 numbers, got '4 5 -6 1 2 256 4'"),
         (b"4 5 -6 1 2 0.5 4", "line 13: expected 7 numbers"),
         (b"", "line 16: expected 3 rows of numbers, got 2"),
-        (b"4" * 100, "line 13: expected 7 numbers, got '4444.*4...'; repair or delete"),
+        (b"4" * 100, "line 13: expected 7 numbers, got '4444.*4...'; correct or delete"),
     ],
 )
 def test_broken_lines_are_named(tmp_path, line, message):

@@ -10,7 +10,7 @@ import pytest
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, text, write_cloud
 from torchrg.io.arrow import parse_numbers
-from torchrg.io.text import LINES_AT_ONCE
+from torchrg.io.text import LINES_PER_CHUNK
 from torchrg.structures import Cloud
 
 POINTS = [[0.0, 1.5, -2.0], [3.0, 4.0, 1e3]]
@@ -54,7 +54,7 @@ def test_decimals_may_begin_with_commas_and_that_is_told(tmp_path, text):
     path = save(tmp_path / "a.txt", text)
     cloud = read_cloud(path)
     assert cloud.coordinates.tolist() == POINTS
-    assert cloud.notes == ("its commas are taken as decimal points",)
+    assert cloud.notes == ("its commas are read as decimal points",)
 
 
 @pytest.mark.parametrize(
@@ -168,9 +168,9 @@ def test_names_that_are_given_take_the_place_of_the_first_line(tmp_path):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        ("xy", "expected names of columns that differ, x, y and z among them, got x,y; _ leaves"),
-        ("xyzz", "expected names of columns that differ, x, y and z among them, got x,y,z,z"),
-        ("xyz", r"expected names for 4 columns, got 3 \(x,y,z\); _ leaves a column out"),
+        ("xy", "expected distinct column names that include x, y and z, got x,y; use _ to skip"),
+        ("xyzz", "expected distinct column names that include x, y and z, got x,y,z,z"),
+        ("xyz", r"expected names for 4 columns, got 3 \(x,y,z\); use _ to skip a column"),
     ],
 )
 def test_names_that_do_not_fit_are_refused(tmp_path, names, message):
@@ -184,9 +184,11 @@ def test_names_that_do_not_fit_are_refused(tmp_path, names, message):
 def test_names_for_files_that_have_their_own_are_refused(tmp_path):
     write_cloud(tmp_path / "a.ply", Cloud(np.eye(3)))
     write_cloud(tmp_path / "a.npy", Cloud(np.eye(3), {"a": np.ones(3)}))
-    with pytest.raises(FormatError, match=r"a\.ply: expected text or \.npy for names of columns"):
+    with pytest.raises(
+        FormatError, match=r"a\.ply: column names apply to text and \.npy files only"
+    ):
         read_cloud(tmp_path / "a.ply", columns=["x", "y", "z"])
-    with pytest.raises(FormatError, match=r"a\.npy: expected no names .* some: x, y, z, a; leave"):
+    with pytest.raises(FormatError, match=r"a\.npy: column names .* has fields x, y, z, a. Omit"):
         read_cloud(tmp_path / "a.npy", columns=["x", "y", "z", "b"])
 
 
@@ -208,7 +210,7 @@ def test_counts_come_before_the_points_of_each_scan(tmp_path, monkeypatch, has_a
     counted = "".join(f"{len(scan)}\n{''.join(scan)}" for scan in scans)
     expected = read_cloud(save(tmp_path / "a.pts", "".join(rows)))
     for at_once in (40, 1 << 22):
-        monkeypatch.setattr(text, "CHARACTERS_AT_ONCE", at_once)
+        monkeypatch.setattr(text, "CHARACTERS_PER_READ", at_once)
         cloud = read_cloud(save(tmp_path / "b.pts", counted))
         np.testing.assert_array_equal(cloud.coordinates, expected.coordinates)
         assert cloud.fields.keys() == expected.fields.keys()
@@ -219,7 +221,7 @@ def test_counts_come_before_the_points_of_each_scan(tmp_path, monkeypatch, has_a
 def test_more_points_than_their_count_are_told(tmp_path, count):
     cloud = read_cloud(save(tmp_path / "a.pts", f"{count}\n0 1.5 -2\n3 4 1e3\n"))
     assert cloud.coordinates.tolist() == POINTS
-    assert cloud.notes == (f"the line before its points says {count}, but 2 follow",)
+    assert cloud.notes == (f"the count before its points is {count}, but 2 follow",)
 
 
 def test_a_few_points_may_have_many_columns(tmp_path):
@@ -247,7 +249,7 @@ def test_infinite_and_missing_numbers_are_read(tmp_path):
 
 
 def test_files_longer_than_a_block_are_read_in_order(tmp_path):
-    num = 2 * LINES_AT_ONCE + 3
+    num = 2 * LINES_PER_CHUNK + 3
     table = np.arange(3.0 * num).reshape(num, 3)
     write_cloud(tmp_path / "a.xyz", Cloud(table))
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.xyz").coordinates, table)
@@ -271,7 +273,7 @@ def test_written_text_says_what_its_columns_are(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("0 1 2\n3 4 five\n", "line 2: expected 3 numbers, got '3 4 five'; repair or delete"),
+        ("0 1 2\n3 4 five\n", "line 2: expected 3 numbers, got '3 4 five'; correct or delete"),
         ("0 1 2\n3 4\n", "line 2: expected 3 numbers, got '3 4'"),
         ("0 1 2\n3 4 5 6\n", "line 2: expected 3 numbers, got '3 4 5 6'"),
         ("0 1 2\n\n3 4 5 6\n", "line 3: expected 3 numbers, got '3 4 5 6'"),
@@ -282,51 +284,51 @@ def test_written_text_says_what_its_columns_are(tmp_path):
         ("0;0;0\n1,5;2,5;3,5\n", "line 2: expected 3 numbers, got '1,5;2,5;3,5'; write all dec"),
         (
             "//X Y Z R G B Scalar field\n2\n0 1 2 3 4 5 6\n",
-            "line 3: expected 8 numbers, got '0 1 2 3 4 5 6', under names that may hold blanks: "
-            "'X Y Z R G B Scalar field'; name the 7 columns with --columns, or put _ in place",
+            "line 3: expected 8 numbers, got '0 1 2 3 4 5 6', for names that may contain blanks: "
+            "'X Y Z R G B Scalar field'; name the 7 columns with --columns, or replace the blanks",
         ),
-        ("9\n0 1 2\n3 4 5\n", "expected 9 points, as the line before them says, got 2; the file"),
-        ("3\n0 1 2\n3 4 5\n", "expected 3 points, as the line before them says, got 2; the file"),
-        ("1\n0 1 2\n2\n3 4 5\n", "expected 3 points, as the line before them says, got 2"),
-        ("-2\n0 1 2\n3 4 5\n", "line 1: expected a count of points or a point, got '-2'; corr"),
-        ("2.5\n0 1 2\n3 4 5\n", "line 1: expected a count of points or a point, got '2.5'"),
-        ("nan\n0 1 2\n3 4 5\n", "line 1: expected a count of points or a point, got 'nan'"),
-        (f"{10**20}\n0 1 2\n", "line 1: expected a count of points or a point, got '1000"),
-        ("0 1 2\n2\n3 4 5\n", "line 2: expected 3 numbers, got '2'; repair or delete"),
+        ("9\n0 1 2\n3 4 5\n", "expected 9 points by the count before them, got 2; the file"),
+        ("3\n0 1 2\n3 4 5\n", "expected 3 points by the count before them, got 2; the file"),
+        ("1\n0 1 2\n2\n3 4 5\n", "expected 3 points by the count before them, got 2"),
+        ("-2\n0 1 2\n3 4 5\n", "line 1: expected a point count or a point, got '-2'; corr"),
+        ("2.5\n0 1 2\n3 4 5\n", "line 1: expected a point count or a point, got '2.5'"),
+        ("nan\n0 1 2\n3 4 5\n", "line 1: expected a point count or a point, got 'nan'"),
+        (f"{10**20}\n0 1 2\n", "line 1: expected a point count or a point, got '1000"),
+        ("0 1 2\n2\n3 4 5\n", "line 2: expected 3 numbers, got '2'; correct or delete"),
         ("0,1,2\n3 4 5\n", "line 2: expected 3 numbers, got '3 4 5'; separate all numbers with c"),
         ("0 1 2\n3;4;5\n", "line 2: expected 3 numbers, got '3;4;5'; separate all .* with blanks"),
-        ("2\n1\n0 0 0\n", "line 2: expected a point after the count of points, got a second count"),
+        ("2\n1\n0 0 0\n", "line 2: expected a point after the point count, got a second count"),
         (
             "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n",
-            "expected points, got a matrix of 4 x 4, a pose; name the file of the cloud",
+            "expected points, got a 4 x 4 pose matrix; pass the point cloud file",
         ),
         (
             f"{'1 ' * 900}\n{'2 ' * 900}\n# z\n{'3 ' * 900}\n",
-            "expected a row for each point, got 3 rows of 900 numbers; transpose them",
+            "expected one row per point, got 3 rows of 900 numbers; transpose them",
         ),
-        ("a b c\n0 1 2\n", "line 1: expected numbers or names of columns with x, y and z, got 'a"),
-        ("x y z x\n0 1 2 3\n", "line 1: expected numbers or names of columns"),
+        ("a b c\n0 1 2\n", "line 1: expected numbers or column names with x, y and z, got 'a"),
+        ("x y z x\n0 1 2 3\n", "line 1: expected numbers or column names"),
         ("x y z\nx y z\n", "line 2: expected 3 numbers, got 'x y z'"),
-        ("solid ascii\n", "line 1: expected numbers or names of columns"),
+        ("solid ascii\n", "line 1: expected numbers or column names"),
         ("# nothing\n\n", "expected at least one point, got none"),
         ("x y z\n", "expected at least one point, got none"),
-        ("\0\0\0\n", "line 1: expected numbers or names"),
+        ("\0\0\0\n", "line 1: expected numbers or column names"),
         ("0 1 2\n" + "7" * 99 + "\n", "line 2: expected 3 numbers, got '7{57}...'"),
         (
             "x,y,z,room\n1,2,3,7\n4,5,6,hall\n",
-            "line 3: expected 4 numbers, got '4,5,6,hall'; repair or delete this line, or leave "
-            "a column of words out, _ in --columns",
+            "line 3: expected 4 numbers, got '4,5,6,hall'; correct or delete this line, or skip "
+            "a column of words with _ in --columns",
         ),
         (
             "# 3D point list with one line of data per point:\n#   POINT3D_ID, X, Y, Z, R, G, B, "
             "ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n63 1.6 0.1 0.7 115 121 122 1.33 16 6542\n",
-            "line 2: expected points, got those of COLMAP with their images; colmap model_conv",
+            "line 2: expected points, got COLMAP's points3D.txt; convert it: colmap model_conv",
         ),
         (
             "x y z label\n0 1 2 0.5\n",
-            "expected labels to be whole numbers of 64 bits, got others; rename",
+            "expected labels to be 64-bit integers, got fractions or larger values; rename",
         ),
-        ("x y z label\n0 1 2 1e30\n", "expected labels to be whole numbers of 64 bits"),
+        ("x y z label\n0 1 2 1e30\n", "expected labels to be 64-bit integers"),
     ],
 )
 def test_broken_text_names_the_line(tmp_path, text, message):
@@ -340,7 +342,7 @@ def test_broken_text_names_the_line(tmp_path, text, message):
 def test_whole_numbers_that_float64_rounds_are_not_written(tmp_path, number, name, suffix):
     path = tmp_path / f"cloud{suffix}"
     cloud = Cloud(np.eye(3), {name: np.array([0, number, -1])})
-    with pytest.raises(FormatError, match=rf"{suffix}: expected field \w+ within 2\^53, got"):
+    with pytest.raises(FormatError, match=rf"{suffix}: field \w+ contains integers beyond 2\^53"):
         write_cloud(path, cloud)
     assert not list(tmp_path.iterdir())
     largest = replace(cloud, fields={name: np.array([0, 2**53 - 1, 1 - 2**53])})
@@ -452,7 +454,7 @@ def bits_or_refusal(path):
 @pytest.mark.parametrize("at_once", [60, 1 << 22])
 def test_text_reads_the_same_with_pyarrow_and_without(tmp_path, monkeypatch, at_once):
     pytest.importorskip("pyarrow", reason="needs torchrg[text]")
-    monkeypatch.setattr(text, "CHARACTERS_AT_ONCE", at_once)
+    monkeypatch.setattr(text, "CHARACTERS_PER_READ", at_once)
     rng = random.Random(0)
     path, refused, taken = tmp_path / "a.txt", 0, []
     parse = text.parse_numbers

@@ -124,7 +124,7 @@ def test_empty_clouds_and_points_without_place_pass():
     ("make", "message"),
     [
         (lambda: OrientNormals("inwards"), "orient to be one of auto, .*none, got 'inwards'"),
-        (lambda: OrientNormals("up", (0, 0, 1)), "three numbers as viewpoint, with .* with 'up'"),
+        (lambda: OrientNormals("up", (0, 0, 1)), "viewpoint must be three numbers .* with 'up'"),
         (lambda: OrientNormals("viewpoint", (0, 1)), r"three numbers .*got \(0, 1\) with 'viewp"),
         (
             lambda: OrientNormals("viewpoint")({"coord": torch.eye(3), "normal": torch.eye(3)}),

@@ -126,9 +126,7 @@ def test_in_a_tiny_cloud_only_names_tell():
 def test_a_sample_that_is_out_of_step_already_is_refused(transform, key):
     shape = (60, 1) if key == "curvature" else (60,)
     sample = sample_of(**{key: np.zeros(shape)}, index_valid_keys=["coord", "mine"])
-    with pytest.raises(
-        ConfigError, match=f"expected {key} with a row for each of 40 points, got 60"
-    ):
+    with pytest.raises(ConfigError, match=f"expected {key} with 40 rows, .*, got 60"):
         transform(sample)
 
 
@@ -139,7 +137,7 @@ def test_images_may_have_the_names_of_entries():
 
 @pytest.mark.parametrize("key", ["edge_index", "sampled_index", "frame_pcd_offset"])
 def test_numbers_of_points_are_refused_by_who_takes_points_out(key):
-    with pytest.raises(ConfigError, match=f"expected a sample without {key}"):
+    with pytest.raises(ConfigError, match=f"cannot remove points from a sample with {key}"):
         KeepFinite()(sample_of(**{key: np.zeros((2, 5), dtype=int)}))
 
 

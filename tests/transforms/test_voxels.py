@@ -184,5 +184,7 @@ def test_points_that_leave_are_named_by_no_row():
     coord = torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1, 0, 0]])
     sample = KeepFinite()({"coord": coord, "inverse": torch.tensor([2, 1, 0, 2, -1])})
     assert sample["inverse"].tolist() == [1, -1, 0, 1, -1]
-    with pytest.raises(ConfigError, match="expected inverse to name rows of 3 points, got row 3"):
+    with pytest.raises(
+        ConfigError, match="expected inverse to contain rows of 3 points, got row 3"
+    ):
         KeepFinite()({"coord": coord, "inverse": torch.tensor([3])})

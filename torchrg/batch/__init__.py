@@ -1,12 +1,13 @@
-"""Whole data sets: many scans, on one machine or on a cluster, and a record of each.
+"""Conversion of data sets with provenance records.
 
-A source (:class:`~torchrg.batch.sources.CloudSource` of any :class:`~torchrg.datasets.SceneDataset`
-of clouds, or :class:`~torchrg.batch.sources.RGBDSource`) lists scans and converts one of them.
-:func:`~torchrg.batch.run.list_jobs` makes jobs of them,
-:func:`~torchrg.batch.run.make_plan` finds those that are not done,
-:func:`~torchrg.batch.stale.find_stale` finds results of scans that changed their name,
-:func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` do them,
-:func:`~torchrg.batch.run.run_plan` collects what becomes of them.
+A source (:class:`~torchrg.batch.sources.CloudSource` for any
+:class:`~torchrg.datasets.SceneDataset` of clouds, or
+:class:`~torchrg.batch.sources.RGBDSource`) lists scans and converts one of them.
+:func:`~torchrg.batch.run.list_jobs` creates a job per scan.
+:func:`~torchrg.batch.run.make_plan` selects the jobs to run.
+:func:`~torchrg.batch.stale.find_stale` finds results of renamed or removed scans.
+:func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` run the jobs.
+:func:`~torchrg.batch.run.run_plan` collects their reports.
 
 Example:
     >>> import tempfile

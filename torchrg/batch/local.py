@@ -1,4 +1,4 @@
-"""The local engine: processes of one thread each, as many as memory allows."""
+"""Local engine: single-threaded worker processes within a memory limit."""
 
 import contextlib
 import gc
@@ -14,32 +14,32 @@ from torchrg._parallel import CHILD_ENVIRONMENT, in_empty_folder
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
-BEAT_SECONDS = 0.5
-"""How often an engine yields while no scan ends, so that progress is shown and Ctrl-C is heard."""
+POLL_SECONDS = 0.5
+"""Interval at which an engine yields None, so that progress is shown and Ctrl-C is handled."""
 _STDERR = 2
-"""Number of the stream for errors, of every process."""
-_LONGEST_CAUSE = 300
-"""Characters, some lines of a terminal, that a report shows of what a process said last."""
+"""File descriptor of standard error."""
+_MAX_CAUSE_LENGTH = 300
+"""Maximum characters of a worker's last message in a report; a few lines of a terminal."""
 
 
 def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Reports:
-    """Convert scans in processes of this machine, those that take most memory first.
+    """Convert scans in local processes, largest memory first.
 
-    A scan starts when a worker is free and all that run stay within the limit; one that takes more
-    than the limit runs alone. When a worker dies, its scan waits until all others are done and is
-    tried once more, alone. Workers end with this process, however it ends.
+    A scan starts when a worker is free and all running scans fit the limit; a scan above the limit
+    runs alone. If a worker dies, its scan is retried once, alone, after all others. Workers always
+    end with this process.
 
     Args:
         jobs: The scans to convert.
-        workers: Most processes at a time.
-        memory_limit: Bytes that all scans at a time may take.
+        workers: Maximum number of processes.
+        memory_limit: Bytes that all running scans may use.
 
     Yields:
-        A report of each scan when it ends, and None while there is none, so that progress can be
-        shown. Closing the iterator stops the workers.
+        The report of each finished scan, and None while there is none, so that the caller can show
+        progress. Closing the iterator stops the workers.
     """
     waiting = sorted(jobs, key=lambda job: -job.memory)
-    lost: list[Job] = []
+    retries: list[Job] = []
     idle: list[_Worker] = []
     busy: dict[Connection, _Worker] = {}
 
@@ -49,18 +49,18 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
         worker.begin(job, attempt=attempt)
 
     try:
-        while waiting or lost or busy:
+        while waiting or retries or busy:
             while len(busy) < workers:
                 free = memory_limit - sum(worker.job.memory for worker in busy.values())
-                fitting = (job for job in waiting if job.memory <= free or not busy)
-                job = next(fitting, None)
+                candidates = (job for job in waiting if job.memory <= free or not busy)
+                job = next(candidates, None)
                 if job is None:
                     break
                 waiting.remove(job)
                 start(job, attempt=1)
             if not busy:
-                start(lost.pop(0), attempt=2)
-            ready = connection.wait(busy, timeout=BEAT_SECONDS)
+                start(retries.pop(0), attempt=2)
+            ready = connection.wait(busy, timeout=POLL_SECONDS)
             if not ready:
                 yield None
             for worker in [worker for pipe, worker in busy.items() if pipe in ready]:
@@ -70,7 +70,7 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
                     idle.append(worker)
                     yield report
                 elif worker.attempt == 1:
-                    lost.append(worker.job)
+                    retries.append(worker.job)
                 else:
                     yield worker.death_report()
     finally:
@@ -79,31 +79,31 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
 
 
 class _Worker:
-    """A process that converts one scan after another, and the pipe to it."""
+    """Process that converts scans one after another, and the pipe to it."""
 
     job: Job
     attempt: int
 
     def __init__(self) -> None:
         context = get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        # What ends it before its first scan is a line of a report, no traceback on the terminal.
+        self.pipe, child_pipe = context.Pipe()
+        # Errors before the first scan go to a report, not as a traceback to the terminal.
         self.errors, errors = os.pipe()
-        with in_empty_folder(), _environment(), _no_interrupts(), _stderr_to(errors) as stderr:
-            self.process = context.Process(target=_serve, args=(theirs, stderr))
+        with in_empty_folder(), _environment(), _block_sigint(), _redirect(errors) as stderr:
+            self.process = context.Process(target=_serve, args=(child_pipe, stderr))
             self.process.start()
         os.close(errors)
-        theirs.close()
+        child_pipe.close()
 
     def begin(self, job: Job, *, attempt: int) -> None:
-        """Hand over a scan."""
+        """Send a scan to the process."""
         self.job, self.attempt = job, attempt
-        # A worker that is dead already is noticed when its answer is collected.
+        # A dead worker is detected when its report is collected.
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.pipe.send(job)
 
     def collect(self) -> TaskReport | None:
-        """Return the report that is ready, or None if the process died instead."""
+        """Return the available report, or None if the process died."""
         try:
             report: TaskReport = self.pipe.recv()
         except (EOFError, OSError):
@@ -112,25 +112,25 @@ class _Worker:
         return replace(report, attempts=self.attempt)
 
     def death_report(self) -> TaskReport:
-        """Return the report of a scan whose worker died."""
+        """Return the report of a scan whose worker died twice."""
         code = self.process.exitcode or 0
         end = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-        reason = f"its process {end}, twice, the second time alone"
+        reason = f"its process {end}, twice (second attempt ran alone)"
         if cause := self._cause():
             reason = f"{reason}: {cause}"
         if code == -signal.SIGKILL or cause.startswith("MemoryError"):
-            reason = f"{reason}; is the memory enough?"
+            reason = f"{reason}; it may have run out of memory"
         return TaskReport(self.job.name, "failed", reason=reason, attempts=self.attempt)
 
     def _cause(self) -> str:
-        """Return what the process said last before its first scan, in one line, or nothing."""
-        lines = self.said.decode(errors="replace").splitlines()
-        # A message goes on in lines that are set in; before it is the traceback.
-        begins = [number for number, line in enumerate(lines) if line[:1].strip()]
-        return " ".join(" ".join(lines[begins[-1] :]).split())[:_LONGEST_CAUSE] if begins else ""
+        """Return the last message of the process before its first scan, in one line."""
+        lines = self.stderr_bytes.decode(errors="replace").splitlines()
+        # Continuation lines of a message are indented; the traceback precedes it.
+        starts = [number for number, line in enumerate(lines) if line[:1].strip()]
+        return " ".join(" ".join(lines[starts[-1] :]).split())[:_MAX_CAUSE_LENGTH] if starts else ""
 
     def stop(self) -> None:
-        """End the process, and remove what it was writing."""
+        """End the process, and remove its temporary files."""
         self.process.terminate()
         self.process.join(timeout=5)
         if self.process.is_alive():
@@ -139,20 +139,20 @@ class _Worker:
         self.pipe.close()
         os.set_blocking(self.errors, False)
         with os.fdopen(self.errors, "rb") as errors:
-            self.said = errors.read() or b""
+            self.stderr_bytes = errors.read() or b""
         if hasattr(self, "job"):
             self.job.clean()
 
 
 def _serve(pipe: Connection, stderr: Connection | None) -> None:
-    """Convert scans until the pipe closes; from the first on errors go to ``stderr``."""
+    """Convert scans until the pipe closes; from the first scan on, errors go to ``stderr``."""
     import torch
 
-    gc.freeze()  # Loaded modules are no garbage.
+    gc.freeze()  # Loaded modules are not garbage.
     gc.enable()
     Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
-    # Reading and writing fail once the process that hands over scans is gone.
+    # The pipe fails once the parent process is gone.
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
             job = pipe.recv()
@@ -164,7 +164,7 @@ def _serve(pipe: Connection, stderr: Connection | None) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process as soon as the one that started it is gone."""
+    """End this process as soon as its parent is gone."""
     parent = parent_process()
     if parent is not None:
         parent.join()
@@ -173,21 +173,21 @@ def _end_with_parent() -> None:
 
 @contextlib.contextmanager
 def _environment() -> Iterator[None]:
-    """Start processes in the environment for them."""
-    before = dict(os.environ)
+    """Set the environment of child processes while they start."""
+    original = dict(os.environ)
     os.environ.update(CHILD_ENVIRONMENT)
     try:
         yield
     finally:
-        for name in CHILD_ENVIRONMENT.keys() - before.keys():
+        for name in CHILD_ENVIRONMENT.keys() - original.keys():
             del os.environ[name]
-        os.environ.update(before)
+        os.environ.update(original)
 
 
 @contextlib.contextmanager
-def _no_interrupts() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach: this one hears it, and stops them."""
-    # Its start would undo the mask.
+def _block_sigint() -> Iterator[None]:
+    """Block Ctrl-C in processes that start here; the parent handles it and stops them."""
+    # Starting the tracker later would undo the mask.
     resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -197,19 +197,19 @@ def _no_interrupts() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _stderr_to(pipe: int) -> Iterator[Connection | None]:
-    """Start processes whose errors go to a pipe, and yield what they return to ours with.
+def _redirect(pipe: int) -> Iterator[Connection | None]:
+    """Redirect the errors of processes that start here to a pipe, and yield the original stream.
 
-    It is None where this process has closed its own.
+    It is None if this process has closed its own.
     """
     try:
-        ours = Connection(os.dup(_STDERR), readable=False)
+        original = Connection(os.dup(_STDERR), readable=False)
     except OSError:
         yield None
         return
     os.dup2(pipe, _STDERR)
     try:
-        yield ours
+        yield original
     finally:
-        os.dup2(ours.fileno(), _STDERR)
-        ours.close()
+        os.dup2(original.fileno(), _STDERR)
+        original.close()

@@ -1,4 +1,4 @@
-"""The Ray engine: what Ray knows about retries and nodes serves."""
+"""Ray engine, based on Ray's retries and node management."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,14 +7,14 @@ import torch
 
 from torchrg._optional import require
 from torchrg._parallel import CHILD_ENVIRONMENT, in_empty_folder
-from torchrg.batch.local import BEAT_SECONDS
+from torchrg.batch.local import POLL_SECONDS
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
 _RETRIES = 3
-"""How often Ray tries a task again whose process or node was lost."""
+"""Maximum retries of a task whose process or node was lost."""
 _OBJECT_STORE_BYTES = 100_000_000
-"""Only tasks and reports pass through Ray's object store, never points."""
+"""Object store size: only tasks and reports pass through it, never points."""
 
 
 def run_ray(
@@ -24,20 +24,20 @@ def run_ray(
     memory_limit: int,
     address: str | None = None,
 ) -> Reports:
-    """Convert scans on Ray, those that take most memory first.
+    """Convert scans on Ray, largest memory first.
 
-    Each asks for one CPU and the memory that it takes, at most what the largest node has, and Ray
-    finds it a place. Every node sees inputs and outputs under the same path, and has torchrg.
+    Each task requests one CPU and its memory, capped at the largest node. All nodes must see inputs
+    and outputs under the same path, and have torchrg installed.
 
     Args:
         jobs: The scans to convert.
-        workers: Most scans at a time. Default: as many as Ray has places for.
+        workers: Maximum number of concurrent scans. Default: decided by Ray.
         memory_limit: Memory of a cluster that is started here, in bytes.
         address: Cluster to use. Default: one is started here, and stopped at the end.
 
     Yields:
-        A report of each scan when it ends, and None while there is none. Closing the iterator
-        cancels what is not done.
+        The report of each finished scan, and None while there is none. Closing the iterator cancels
+        unfinished scans.
 
     Raises:
         MissingDependencyError: If Ray is not installed.
@@ -68,7 +68,7 @@ def run_ray(
             while waiting and (workers is None or len(pending) < workers):
                 job = waiting.pop()
                 pending[run.options(memory=min(job.memory, largest)).remote(job)] = job
-            ready, _ = ray.wait(list(pending), num_returns=1, timeout=BEAT_SECONDS)
+            ready, _ = ray.wait(list(pending), num_returns=1, timeout=POLL_SECONDS)
             if not ready:
                 yield None
             for reference in ready:
@@ -86,7 +86,7 @@ def _run(job: Job) -> TaskReport:
 
 
 def _collect(ray: Any, reference: Any, job: Job) -> TaskReport:  # noqa: ANN401
-    """Return the report of a scan, of its loss if Ray could not finish it."""
+    """Return the report of a scan, or a failure report if Ray could not finish it."""
     try:
         report: TaskReport = ray.get(reference)
     except ray.exceptions.RayError as error:

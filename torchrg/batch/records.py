@@ -1,4 +1,4 @@
-"""When a scan is done: its record is there, says what would be done now, and its files agree."""
+"""Provenance records, used to skip up-to-date scans."""
 
 import dataclasses
 import hashlib
@@ -21,28 +21,28 @@ from torchrg.io.files import DAMAGES
 from torchrg.result import RECORD as RECORD
 
 Record = dict[str, Any]
-"""A record, or a piece of one, as JSON holds it."""
-_USUAL = "pointcept"
-"""Layout of a source that names none."""
+"""A record, or a part of one, as JSON values."""
+_DEFAULT_LAYOUT = "pointcept"
+"""Default layout of a source."""
 _RESULTS = {"points": int, "regions": int, "repairs": list, "warnings": list}
-"""Types of the parts of a record that reports repeat."""
-_BYTES_AT_ONCE = 1 << 20
-"""Bytes of a file that are read together, which bounds the memory."""
+"""Types of the record entries that reports repeat."""
+_BYTES_PER_READ = 1 << 20
+"""Bytes of a file read together, which bounds the memory."""
 
 
 class Recorded(Protocol):
-    """A scan with a record in the folder of its results."""
+    """Scan with a record in the folder of its results."""
 
     @property
     def folder(self) -> Path:
-        """Where the results and the record of them are."""
+        """Folder of the results and their record."""
 
     def describe(self) -> Record:
-        """Return what decides the results, as JSON holds it."""
+        """Return everything that determines the results, as JSON values."""
 
 
 def describe_run(source: Path, settings: PipelineConfig | NormalsConfig | DepthConfig) -> Record:
-    """Return what is needed to make a result of one file again, as JSON holds it."""
+    """Return the provenance of a result of one file, as JSON values."""
     return {
         "versions": describe_versions(),
         "config": dataclasses.asdict(settings),
@@ -52,7 +52,7 @@ def describe_run(source: Path, settings: PipelineConfig | NormalsConfig | DepthC
 
 
 def describe_versions() -> dict[str, str]:
-    """Return the versions of what decides a result."""
+    """Return the versions of the software that determines results."""
     return {
         "torchrg": version.__version__,
         "torch": str(torch.__version__),
@@ -63,10 +63,10 @@ def describe_versions() -> dict[str, str]:
 
 
 def hash_file(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes as hexadecimal digits."""
+    """Return the SHA-256 of a file in hexadecimal."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
-        while block := stream.read(_BYTES_AT_ONCE):
+        while block := stream.read(_BYTES_PER_READ):
             digest.update(block)
     return digest.hexdigest()
 
@@ -74,9 +74,9 @@ def hash_file(path: Path) -> str:
 def write_record(
     folder: Path, description: Record, report: TaskReport, other_layouts: Record
 ) -> None:
-    """Write the record of a scan whose files are complete, with its description before the work.
+    """Write the record of a scan with complete files; ``description`` is from before the work.
 
-    ``other_layouts`` has the fingerprints of its files in other layouts, by the layout.
+    ``other_layouts`` contains the fingerprints of its files in other layouts, by layout.
     """
     record = {
         **description,
@@ -88,14 +88,14 @@ def write_record(
         "outputs": {name: fingerprint(folder / name) for name in report.files},
         **({"other_layouts": other_layouts} if other_layouts else {}),
     }
-    with atomic_path(folder / RECORD) as beside:
-        beside.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    with atomic_path(folder / RECORD) as temporary:
+        temporary.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def read_record(folder: Path, *, is_ours: bool = False) -> Record | None:
-    """Return the record in a folder, or None if there is none that can be read.
+def read_record(folder: Path, *, strict: bool = False) -> Record | None:
+    """Return the record in a folder, or None if it is missing or unreadable.
 
-    With ``is_ours``, a file of another program in its place is a FormatError.
+    With ``strict``, a record file of another program raises FormatError.
     """
     try:
         content = json.loads((folder / RECORD).read_bytes())
@@ -107,18 +107,17 @@ def read_record(folder: Path, *, is_ours: bool = False) -> Record | None:
         parts += layouts.values() if isinstance(layouts, dict) else ()
         if all(isinstance(part, dict) for part in parts):
             return content
-    if is_ours and content is not None:
+    if strict and content is not None:
         raise FormatError(
-            f"{folder / RECORD}: was not written by torchrg; move it away, or choose another "
-            "directory."
+            f"{folder / RECORD}: was not written by torchrg; move it, or choose another directory."
         )
     return None
 
 
 def split_by_layout(record: Record, layout: str) -> tuple[Record, Record]:
-    """Return the files of an earlier record that a layout replaces, and the files that stay.
+    """Split the files of an earlier record into replaced files and kept files.
 
-    The second has files of other layouts by the layout. These are in folders that scans share.
+    The kept files belong to other layouts, in folders that scans share, and are keyed by layout.
 
     Example:
         >>> record = {"source": {"layout": "nag"}, "outputs": {"planes.json": 1, "../a.h5": 2}}
@@ -127,41 +126,41 @@ def split_by_layout(record: Record, layout: str) -> tuple[Record, Record]:
     """
     layouts = dict(record["other_layouts"])
     replaced, outputs = dict(layouts.pop(layout, {})), record["outputs"]
-    earlier = layout_of(record) or layout
+    earlier = get_layout(record) or layout
     shared = {name: outputs[name] for name in outputs if "/" in name and earlier != layout}
     if shared:
         layouts[earlier] = shared
     return replaced | {name: outputs[name] for name in outputs.keys() - shared}, layouts
 
 
-def layout_of(record: Record) -> str:
-    """Return the layout that a record or a description of a scan names, "" without a source."""
+def get_layout(record: Record) -> str:
+    """Return the layout in a record or a description of a scan, "" without a source."""
     source = record.get("source")
-    return str(source.get("layout", _USUAL)) if isinstance(source, dict) else ""
+    return str(source.get("layout", _DEFAULT_LAYOUT)) if isinstance(source, dict) else ""
 
 
-def file_of_record(out: Path, folder: Path, name: str) -> Path | None:
-    """Return the path of a file that a record names, None outside the output directory."""
+def resolve_output(out: Path, folder: Path, name: str) -> Path | None:
+    """Return the path of a file in a record, or None outside the output directory."""
     path = Path(os.path.normpath(folder / name))
     return path if path.is_relative_to(out) else None
 
 
-def is_unchanged(path: Path, noted: Record) -> bool:
-    """Return whether a path is a regular file with the noted fingerprint."""
-    return path.is_file() and not path.is_symlink() and fingerprint(path) == noted
+def is_unchanged(path: Path, stored: Record) -> bool:
+    """Return whether a path is a regular file with the stored fingerprint."""
+    return path.is_file() and not path.is_symlink() and fingerprint(path) == stored
 
 
-def remove_earlier(out: Path, folder: Path, files: Mapping[str, Record]) -> list[str]:
+def remove_replaced(out: Path, folder: Path, files: Mapping[str, Record]) -> list[str]:
     """Remove earlier files of a scan by name and fingerprint; return the names of changed files.
 
-    Files that were changed since stay, and so does what is outside the output directory.
+    Changed files and files outside the output directory are kept.
     """
     changed = []
-    for name, noted in sorted(files.items()):
-        path = file_of_record(out, folder, name)
+    for name, stored in sorted(files.items()):
+        path = resolve_output(out, folder, name)
         if path is None or not os.path.lexists(path):
             continue
-        if is_unchanged(path, noted):
+        if is_unchanged(path, stored):
             path.unlink()
         else:
             changed.append(name)
@@ -169,10 +168,10 @@ def remove_earlier(out: Path, folder: Path, files: Mapping[str, Record]) -> list
 
 
 def reason_to_convert(job: Recorded) -> str:
-    """Return why a scan is not done, or nothing if it is.
+    """Return why a scan must be converted, or "" if it is up to date.
 
-    ``"new"`` without a record; else which of input, settings, version or results is another than
-    the record says, or that the record is damaged.
+    ``"new"`` without a record; else the first of version, settings, options, input or results that
+    differs from the record, or that the record is damaged.
     """
     record = read_record(job.folder)
     if record is None:
@@ -187,9 +186,9 @@ def reason_to_convert(job: Recorded) -> str:
             return f"{name} changed"
     if not all(isinstance(record.get(name), kind) for name, kind in _RESULTS.items()):
         return "record damaged"
-    for name, noted in record["outputs"].items():
+    for name, stored in record["outputs"].items():
         try:
-            if fingerprint(job.folder / name) != noted:
+            if fingerprint(job.folder / name) != stored:
                 return f"{name} changed"
         except OSError:
             return f"{name} missing"
@@ -197,5 +196,5 @@ def reason_to_convert(job: Recorded) -> str:
 
 
 def fingerprint(path: Path) -> Record:
-    """Return the size and the hash of a file."""
+    """Return the size and the SHA-256 of a file."""
     return {"bytes": path.stat().st_size, "sha256": hash_file(path)}

@@ -1,4 +1,4 @@
-"""A batch: its plan, checked before the first scan, its run on an engine, and its report."""
+"""Planning, execution and report of a batch."""
 
 import contextlib
 import json
@@ -24,41 +24,41 @@ from torchrg.io.files import check_space, folded_name, mark_of, marked_parts
 REPORT = "report.json"
 """Name of the report in the output directory."""
 LOCK = ".torchrg.lock"
-"""Name of the file in the output directory that is locked; it stays there, empty."""
+"""Name of the lock file in the output directory; it remains there, empty."""
 DATA_SETS = ".torchrg.scans.json"
 """Name of the file in the output directory that lists the scans of its data sets; see
 :mod:`torchrg.batch.stale`."""
 _BYTES_PER_SCAN = 32_768
-"""Space that files of a scan take beyond their content: six to eight, half a block of 4 KiB lost in
-each, and its tables."""
-PATIENCE_SECONDS = 5.0
-"""Seconds to wait for a lock: a command that is interrupted ends its workers by then."""
+"""Disk space of a scan's files beyond their content: its tables, and half a 4 KiB block for each of
+six to eight files."""
+LOCK_TIMEOUT_SECONDS = 5.0
+"""Timeout for the lock, in seconds: an interrupted command ends its workers by then."""
 
 
 @contextlib.contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Have the right to write into an existing directory, which one command has at a time.
+    """Lock an existing output directory for one command at a time.
 
-    The lock is the operating system's, which goes with the process however that ends; the workers
-    of a command end with it. Over a network it holds where the file system passes it on: see the
-    package filelock.
+    It is an operating system lock, released when the process ends, even on a crash; workers end
+    with their command. On network file systems it works if they support locking: see the package
+    filelock.
 
     Raises:
-        FormatError: If another command has the right, or the file of the lock cannot be written.
+        FormatError: If another command holds the lock, or the lock file cannot be written.
 
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder, lock_folder(Path(folder)):
-        ...     print("nobody else writes here")
-        nobody else writes here
+        ...     print("locked")
+        locked
     """
     lock = filelock.FileLock(folder / LOCK)
     try:
-        lock.acquire(timeout=PATIENCE_SECONDS)
+        lock.acquire(timeout=LOCK_TIMEOUT_SECONDS)
     except filelock.Timeout:
         raise FormatError(
-            f"{folder}: another torchrg command writes here; wait for it, stop it, or choose "
-            "another directory."
+            f"{folder}: locked by another torchrg process; wait for it, stop it, or choose another "
+            "directory."
         ) from None
     except (OSError, NotImplementedError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -70,24 +70,24 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 class Plan(NamedTuple):
-    """The scans of a batch in natural order, and why each that is not done is to be converted."""
+    """Scans of a batch in natural order, and the reasons to convert those not up to date."""
 
     jobs: tuple[Job, ...]
     reasons: dict[str, str]
 
     @property
     def to_convert(self) -> list[Job]:
-        """The jobs that are not done."""
+        """Jobs to run."""
         return [job for job in self.jobs if job.name in self.reasons]
 
     @property
     def done(self) -> list[Job]:
-        """The jobs that are done."""
+        """Jobs that are up to date."""
         return [job for job in self.jobs if job.name not in self.reasons]
 
     @property
     def num_bytes(self) -> int:
-        """The disk space that the jobs that are not done take, by the estimates of the scans."""
+        """Estimated disk space of the results of the jobs to run."""
         return sum(
             _BYTES_PER_SCAN + job.source.bytes_per_point * job.scan.num_points
             for job in self.to_convert
@@ -95,17 +95,17 @@ class Plan(NamedTuple):
 
 
 def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job]:
-    """Return a job for each scan of a source whose results go to ``out``, in natural order.
+    """Return a job for each scan of a source, in natural order, with results in ``out``.
 
-    With ``only``, for those whose names match a pattern as in a shell; ``*`` matches slashes too.
+    ``only`` selects names by a shell pattern; ``*`` also matches slashes.
 
     Raises:
-        ConfigError: If no name matches the pattern, or results would go in among the scans.
-        FormatError: If the source has no scans, or the results of one have no place of their own.
+        ConfigError: If no name matches the pattern, or results would be written among the scans.
+        FormatError: If the source has no scans, or results of two scans would collide.
     """
-    is_among = source.root in out.parents
-    scans = [] if is_among else source.list_scans(out)
-    if is_among or _is_among_scans(source, scans, out):
+    is_inside = source.root in out.parents
+    scans = [] if is_inside else source.list_scans(out)
+    if is_inside or _is_inside_scans(source, scans, out):
         raise ConfigError(
             f"{out}: expected a directory outside {source.root}, so that no result is read as a "
             "scan; choose another."
@@ -116,21 +116,21 @@ def list_jobs(source: Source, out: Path, *, only: str | None = None) -> list[Job
 
 
 def match_jobs(jobs: Sequence[Job], only: str | None) -> list[Job]:
-    """Return the jobs of the scans whose names match a pattern, all without one.
+    """Return the jobs of the scans whose names match a pattern; all if it is None.
 
     Raises:
         ConfigError: If no name matches.
     """
-    chosen = [job for job in jobs if only is None or fnmatchcase(job.name, only)]
-    if not chosen:
+    selected = [job for job in jobs if only is None or fnmatchcase(job.name, only)]
+    if not selected:
         names = ", ".join(job.name for job in jobs[:5])
         more = f" and {len(jobs) - 5:,} more" if len(jobs) > 5 else ""
         raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
-    return chosen
+    return selected
 
 
-def _is_among_scans(source: Source, scans: Sequence[SceneFiles], out: Path) -> bool:
-    """Whether results would be read as scans the next time, also through links."""
+def _is_inside_scans(source: Source, scans: Sequence[SceneFiles], out: Path) -> bool:
+    """Whether results would be read as scans by the next run, also through links."""
     if source.root == out:
         return False
     inputs = (Path(os.path.realpath(file)) for scan in scans for file in scan.files)
@@ -140,25 +140,25 @@ def _is_among_scans(source: Source, scans: Sequence[SceneFiles], out: Path) -> b
 
 
 def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
-    """Refuse scans whose results would share a folder, or replace files of the batch."""
+    """Raise FormatError if results would share a folder, or replace files of the batch."""
     batch_files = {folded_name(name): name for name in (REPORT, LOCK, DATA_SETS)}
-    taken: dict[str, str] = {}
+    owners: dict[str, str] = {}
     for name in (scan.name for scan in scans):
         key = folded_name(name)
         if name.startswith("/") or ".." in name.split("/"):
             raise FormatError(
-                f"{root}: expected names of scans below a folder, got {name!r}; rename it."
+                f"{root}: expected a scan name without '..' and leading /, got {name!r}; rename it."
             )
-        if key in taken:
+        if key in owners:
             raise FormatError(
-                f"{root}: expected a folder for each scan, got one for {taken[key]} and {name}, "
-                "which many file systems take for the same; rename one."
+                f"{root}: expected distinct scan names, got {owners[key]} and {name}, which are "
+                "the same on many file systems; rename one."
             )
-        taken[key] = name
+        owners[key] = name
         if (first := key.partition("/")[0]) in batch_files:
             raise FormatError(
-                f"{root}: expected no scan called {name}, as OUT/{batch_files[first]} is a file "
-                "of the command; rename it."
+                f"{root}: a scan cannot be named {name}, because OUT/{batch_files[first]} is a "
+                "file of the command; rename it."
             )
 
 
@@ -169,25 +169,25 @@ def make_plan(
     threads: int = 1,
     on_scan: Callable[[], object] = lambda: None,
 ) -> Plan:
-    """Find out which scans are to be converted, by :func:`reason_to_convert`.
+    """Determine the scans to convert with :func:`reason_to_convert`.
 
-    So many ``threads`` look at a scan each; ``on_scan`` is called when one has been looked at. With
-    ``force``, those that are done are converted too.
+    Each of ``threads`` checks one scan at a time; ``on_scan`` is called after each check. ``force``
+    selects all scans.
     """
 
-    def look(job: Job) -> str:
+    def check(job: Job) -> str:
         reason = "forced" if force else reason_to_convert(job)
         on_scan()
         return reason
 
     with ThreadPoolExecutor(threads) as pool:
-        reasons = list(pool.map(look, jobs))
+        reasons = list(pool.map(check, jobs))
     named = {job.name: reason for job, reason in zip(jobs, reasons, strict=True) if reason}
     return Plan(tuple(jobs), named)
 
 
 def check_room(plan: Plan) -> None:
-    """Raise FormatError if the disk has no room for the results, by the estimates of the scans."""
+    """Raise FormatError if the disk has too little space for the estimated results."""
     if num_scans := len(plan.to_convert):
         repair = "convert fewer with --only"
         check_space(plan.jobs[0].out, plan.num_bytes, f"{num_scans:,} scans", repair=repair)
@@ -195,14 +195,14 @@ def check_room(plan: Plan) -> None:
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What became of all scans of a batch.
+    """Results of all scans of a batch.
 
     Attributes:
-        scans: A report of each, in natural order.
-        started: When, in seconds since 1970.
-        seconds: How long it took.
-        engine: The name of the engine.
-        workers: Most scans at a time; None if the engine decides.
+        scans: Report of each scan, in natural order.
+        started: Start time, in seconds since 1970.
+        seconds: Duration.
+        engine: Name of the engine.
+        workers: Maximum number of concurrent scans; None if the engine decides.
         interrupted: Whether it was stopped by Ctrl-C or SIGTERM.
     """
 
@@ -215,21 +215,21 @@ class BatchReport:
 
     @property
     def disk_full(self) -> bool:
-        """Whether it stopped because there is no space left."""
+        """Whether the batch stopped because the disk is full."""
         return any(scan.disk_full for scan in self.scans)
 
     def with_status(self, status: str) -> list[TaskReport]:
-        """Return the scans of a status."""
+        """Return the reports with the given status."""
         return [scan for scan in self.scans if scan.status == status]
 
     @property
     def complete(self) -> list[TaskReport]:
-        """The scans whose results are there."""
+        """Reports of scans with complete results."""
         return [scan for scan in self.scans if scan.status in ("converted", "kept")]
 
     @property
     def stage_seconds(self) -> dict[str, float]:
-        """Time of each stage, of all scans converted now."""
+        """Total seconds per stage of the scans converted now."""
         total: dict[str, float] = {}
         for scan in self.with_status("converted"):
             for stage, seconds in scan.seconds.items():
@@ -238,11 +238,11 @@ class BatchReport:
 
     @property
     def num_points(self) -> int:
-        """Points converted now."""
+        """Number of points converted now."""
         return sum(scan.num_points for scan in self.with_status("converted"))
 
     def to_json(self) -> Record:
-        """Return the report as JSON can hold it."""
+        """Return the report as JSON values."""
         points, stages = self.num_points, self.stage_seconds
         return {
             "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started)),
@@ -262,8 +262,8 @@ class BatchReport:
         }
 
 
-def _kept_report(job: Job) -> TaskReport:
-    """Return the report of a task that an earlier run has done, from its record."""
+def _report_from_record(job: Job) -> TaskReport:
+    """Return the report of a scan that is up to date, from its record."""
     record = read_record(job.folder) or {}
     return TaskReport(
         job.name,
@@ -285,14 +285,14 @@ def run_plan(
     workers: int | None,
     on_report: Callable[[TaskReport | None], None] = lambda report: None,
 ) -> BatchReport:
-    """Take the reports of an engine that converts a plan, until all are there.
+    """Collect the reports of an engine that runs a plan.
 
-    A full disk ends it, as every further scan would fail after its work; so does an interrupt. What
-    is complete then stays, and the next run goes on from there. ``engine`` and ``workers`` are
-    noted; ``on_report`` is called with each report.
+    A full disk or an interrupt ends the run, because further scans would fail. Complete results are
+    kept, and the next run resumes from there. ``engine`` and ``workers`` are only noted;
+    ``on_report`` is called with each report.
     """
     started, begin = time.time(), time.perf_counter()
-    by_name = {job.name: _kept_report(job) for job in plan.done}
+    by_name = {job.name: _report_from_record(job) for job in plan.done}
     interrupted = False
     try:
         with contextlib.closing(reports):
@@ -311,6 +311,6 @@ def run_plan(
 
 
 def write_report(out: Path, report: BatchReport) -> None:
-    """Write ``report.json`` into the output directory; raise FormatError if it cannot be."""
-    with marked_parts(mark_of(REPORT)), atomic_path(out / REPORT) as beside:
-        beside.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")
+    """Write ``report.json`` into the output directory; raise FormatError on failure."""
+    with marked_parts(mark_of(REPORT)), atomic_path(out / REPORT) as temporary:
+        temporary.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")

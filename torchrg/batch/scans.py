@@ -1,4 +1,4 @@
-"""What a batch is made of: scans, where they come from, and the task of converting one of them."""
+"""Sources, jobs, and the conversion of a single scan."""
 
 import contextlib
 import json
@@ -15,72 +15,72 @@ from torchrg.batch.records import (
     Record,
     describe_versions,
     fingerprint,
+    get_layout,
     is_unchanged,
-    layout_of,
     read_record,
-    remove_earlier,
+    remove_replaced,
     split_by_layout,
     write_record,
 )
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
 from torchrg.datasets.folder import SceneFiles
-from torchrg.datasets.pointcept import keeping_files
+from torchrg.datasets.pointcept import protecting_files
 from torchrg.errors import FormatError
 from torchrg.io.files import check_place, mark_of, marked_parts, remove_leftovers, sync_folder
 from torchrg.result import PLANES_FILE, write_table
 
 
 class Source:
-    """A data set that can be converted: it lists its scans, and converts one of them.
+    """Convertible data set: lists its scans, and converts one of them.
 
-    Sources travel to other processes, so they hold settings and paths but no open files.
+    Sources are sent to other processes, so they hold settings and paths but no open files.
 
     Attributes:
         root: The directory of the data set.
-        settings: How to segment.
-        table: Name of a further table of planes in the folder of each scan. Default: none.
+        settings: Segmentation configuration.
+        table: Name of an additional plane table in the folder of each scan. Default: none.
     """
 
     root: Path
     settings: PipelineConfig | DepthConfig
     table: str | None
     bytes_per_point: ClassVar[int]
-    """Space that the results of one point take, to see beforehand whether the disk has it."""
+    """Disk space of the results per point, to check the free space in advance."""
 
     def describe(self) -> Record:
-        """Return the kind of the source and what else decides results, for JSON."""
+        """Return the type of the source and its options that affect results, for JSON."""
         raise NotImplementedError
 
     def list_scans(self, out: Path) -> list[SceneFiles]:
-        """Return the scans in natural order, whose results go to ``out``."""
+        """Return the scans in natural order; their results go to ``out``."""
         raise NotImplementedError
 
     def convert(self, scan: SceneFiles, folder: Path, begin: Begin) -> TaskReport:
-        """Read a scan, segment it, and write its results, each file whole or not at all.
+        """Read a scan, segment it, and write its results, each file atomically.
 
-        The folder exists; ``begin`` is to be called with the name of each stage when it starts.
+        The folder exists; ``begin`` must be called with the name of each stage when it starts.
         """
         raise NotImplementedError
 
     def check_results(self, scans: Sequence[SceneFiles], out: Path) -> None:
-        """Raise FormatError if files of the results would replace those of others."""
+        """Raise FormatError if result files would replace files of other origin."""
 
     def write_lists(self, out: Path, mark: str, *, without: Collection[Path] = ()) -> None:
-        """Write what results have for the data set as a whole, from all scans in ``out``.
+        """Write data-set-wide files from all scans in ``out``.
 
-        The scans of files in ``without`` are about to be removed.
+        ``without`` contains files of scans that are about to be removed.
         """
 
 
 @dataclass(frozen=True)
 class Job:
-    """The task of converting one scan, which any process can do.
+    """Conversion of one scan, which can run in any process.
 
     Attributes:
         source: The data set.
         scan: One of its scans.
-        out: Where results go.
+        out: Output directory.
     """
 
     source: Source
@@ -89,33 +89,33 @@ class Job:
 
     @property
     def name(self) -> str:
-        """The name of the scan."""
+        """Name of the scan."""
         return self.scan.name
 
     @property
     def memory(self) -> int:
-        """Bytes that a process with this scan takes at most."""
+        """Maximum memory of a process with this scan, in bytes."""
         return memory_of_scan(self.scan.num_points)
 
     @property
     def folder(self) -> Path:
-        """Where the results of the scan go, and the record of them."""
+        """Folder of the results of the scan and their record."""
         return self.out / self.scan.name
 
     @property
     def mark(self) -> str:
-        """Mark of the names that results are written under before they have their own."""
+        """Mark of the scan's temporary files."""
         return mark_of(self.scan.name)
 
     def input_name(self, path: Path) -> str:
-        """Return the path of an input file from the root of the data set, as records name it."""
+        """Return the path of an input file relative to the data set, as in records."""
         root = self.source.root
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
     def describe(self) -> Record:
-        """Return what decides the results, as JSON holds it; OSError if an input cannot be read."""
+        """Return what determines the results, as JSON values; OSError if an input is unreadable."""
         config, table = asdict(self.source.settings), self.source.table
-        # It never changes a result, and lowering it after running out of memory must cost nothing.
+        # It never changes results, so lowering it after a memory error must not reconvert scans.
         config.pop("chunk_size", None)
         inputs = [(self.input_name(path), path) for path in self.scan.files]
         return {
@@ -127,27 +127,27 @@ class Job:
         }
 
     def clean(self) -> None:
-        """Remove what a process that was killed left half-written."""
+        """Remove temporary files of a killed process."""
         if self.folder.is_dir():
             remove_leftovers(self.folder, self.mark)
 
 
 def convert_scan(job: Job) -> TaskReport:
-    """Convert one scan; what goes wrong with it is in the report and never raised.
+    """Convert one scan; errors are put into the report and never raised.
 
-    The record of an earlier run is removed first, and the new one written last: whoever finds a
-    record finds complete files.
+    The record of an earlier run is removed first, and the new one is written last, so that a record
+    implies complete files.
     """
     is_new = not os.path.lexists(job.folder)
     report = report_on(job.name, partial(_convert, job))
     if report.status == "failed" and is_new:
         with contextlib.suppress(OSError):
-            job.folder.rmdir()  # If it is empty.
+            job.folder.rmdir()  # Fails unless the folder is empty.
     return report
 
 
 def _convert(job: Job, begin: Begin) -> TaskReport:
-    """Convert one scan, between the record of an earlier run and the new one."""
+    """Convert one scan, after removing the earlier record, and write the new one."""
     begin("hash")
     description, folder = job.describe(), job.folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -156,27 +156,27 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         if path == job.out:
             break
     check_place(folder / RECORD)
-    earlier = read_record(folder, is_ours=True) or {"outputs": {}, "other_layouts": {}}
+    earlier = read_record(folder, strict=True) or {"outputs": {}, "other_layouts": {}}
     table = job.source.table
     if table is not None and table not in earlier["outputs"] and (folder / table).exists():
         raise FormatError(
-            f"{folder / table}: was not written by torchrg; move it away, or give another --table."
+            f"{folder / table}: was not written by torchrg; move it, or choose another --table."
         )
     job.clean()
     (folder / RECORD).unlink(missing_ok=True)
-    replaced, other_layouts = split_by_layout(earlier, layout_of(description))
-    edited = [n for n, noted in replaced.items() if not is_unchanged(folder / n, noted)]
-    with marked_parts(job.mark), keeping_files(edited):
+    replaced, other_layouts = split_by_layout(earlier, get_layout(description))
+    edited = [n for n, stored in replaced.items() if not is_unchanged(folder / n, stored)]
+    with marked_parts(job.mark), protecting_files(edited):
         report = job.source.convert(job.scan, folder, begin)
         if table is not None:
-            described = json.loads((folder / PLANES_FILE).read_text("utf-8"))
-            write_table(folder / table, {k: v for k, v in described.items() if k != "written"})
+            table_data = json.loads((folder / PLANES_FILE).read_text("utf-8"))
+            write_table(folder / table, {k: v for k, v in table_data.items() if k != "written"})
             report = replace(report, files=(*report.files, table))
         begin("record")
         for name in report.files:
             replaced.pop(name, None)
-        changed = remove_earlier(job.out, folder, replaced)
-        notes = [f"{name} stays, as it was changed since torchrg wrote it" for name in changed]
+        changed = remove_replaced(job.out, folder, replaced)
+        notes = [f"{name} is kept, as it was changed since torchrg wrote it" for name in changed]
         report = replace(report, warnings=(*report.warnings, *notes))
         write_record(folder, description, report, other_layouts)
     return report

@@ -1,4 +1,4 @@
-"""The kinds of data sets that are converted: clouds of any data set, and depth frames."""
+"""Sources of batch conversion: clouds and depth frames."""
 
 import copy
 import dataclasses
@@ -33,22 +33,22 @@ from torchrg.structures import Segmentation
 
 @dataclass(frozen=True)
 class CloudSource(Source):
-    """The clouds of a data set, with the settings of their conversion and their layout.
+    """Clouds of a data set, with their conversion settings and layout.
 
     Plain clouds become ``coord``, ``normal``, ``curvature`` and ``plane`` as ``.npy``, ``color``
-    too where there are colours, and ``planes.json``; coordinates are the input's own, points that
-    are not finite included. Scenes of a release or in Pointcept's layout: see
+    if there are colors, and ``planes.json``; coordinates are unchanged, including non-finite
+    points. For scenes of a release or in Pointcept's layout, see
     :func:`torchrg.datasets.write_pointcept_scene`.
 
     Args:
         data: The data set.
-        superpoint: Whether superpoints are written too; every layout but ``"pointcept"`` has them.
+        superpoint: Whether to write superpoints; every layout but ``"pointcept"`` includes them.
         layout: ``"pointcept"``, or a key of :data:`torchrg.datasets.layouts.LAYOUTS`.
-        partition: How superpoints are made.
-        level: Which of their levels is written.
-        orient: Side to which normals point; see :func:`torchrg.normals.orient_normals`.
-        within: Array of objects that planes are kept within; see
-            :func:`torchrg.clouds.find_objects`. Default: planes go across.
+        partition: Superpoint configuration.
+        level: Superpoint level to write.
+        orient: Orientation of normals; see :func:`torchrg.normals.orient_normals`.
+        within: Array of objects that planes must not cross; see
+            :func:`torchrg.clouds.find_objects`. Default: planes may cross objects.
     """
 
     data: SceneDataset
@@ -62,7 +62,7 @@ class CloudSource(Source):
     within: str | None = None
     table: str | None = None
     bytes_per_point: ClassVar[int] = 104
-    """Space of a point in the largest of the layouts."""
+    """Disk space per point in the largest layout."""
 
     @property
     def root(self) -> Path:  # type: ignore[override]
@@ -70,11 +70,11 @@ class CloudSource(Source):
         return self.data.root
 
     def list_scans(self, out: Path) -> list[SceneFiles]:
-        """Return the scenes in natural order, whose results go to ``out``."""
+        """Return the scenes in natural order; their results go to ``out``."""
         self.data.check_output(self.layout, out)
         for scene in self.data.scenes:
             what = scene.dataset or scene.name
-            check_layout(self.layout, _dataset_of(scene), what)
+            check_layout(self.layout, _layout_dataset(scene), what)
         in_place = out == self.root
         return [
             scene._replace(
@@ -84,17 +84,17 @@ class CloudSource(Source):
         ]
 
     def _inputs(self, scene: SceneFiles, in_place: bool) -> tuple[Path, ...]:
-        """Return the files that decide the results of a scene."""
+        """Return the files that determine the results of a scene."""
         if not (scene.path / "coord.npy").is_file():
             return scene.files
-        # In place, only coordinates, and colors for superpoints, decide the added arrays.
+        # In place, only coordinates (and colors for superpoints) determine the added arrays.
         within = self.within or "coord"
-        decisive = ("coord", *["color"] * self.superpoint, within, f"{within}20")
-        used = decisive if in_place else SOURCE_ARRAYS
+        inputs = ("coord", *["color"] * self.superpoint, within, f"{within}20")
+        used = inputs if in_place else SOURCE_ARRAYS
         return tuple(file for file in scene.files if file.stem in used)
 
     def convert(self, scan: SceneFiles, folder: Path, begin: Begin) -> TaskReport:
-        """Read a scene, segment it, and write its results, each file whole or not at all."""
+        """Read a scene, segment it, and write its results, each file atomically."""
         begin("read")
         with collecting_notes() as notes:
             cloud = self.data.read_scene(scan)
@@ -111,9 +111,9 @@ class CloudSource(Source):
         )
         notes += note_on_origin(self.layout, cloud)
         notes += note_on_copies(seg.num_copies, len(cloud))
-        others = [name for name in cloud.fields if name != "color"]
-        if others and scan.dataset is None:
-            notes.append(f"left out: {', '.join(others)}")
+        skipped = [name for name in cloud.fields if name != "color"]
+        if skipped and scan.dataset is None:
+            notes.append(f"left out: {', '.join(skipped)}")
         begin("write")
         what = (cloud, seg, superpoints)
         with collecting_notes() as more:
@@ -126,13 +126,13 @@ class CloudSource(Source):
         )
 
     def __getstate__(self) -> Record:
-        """Return what travels to other processes: each job has the scene it is about."""
+        """Return the state for other processes, without scenes: each job has its own."""
         data = copy.copy(self.data)
         data.scenes = []
         return vars(self) | {"data": data}
 
     def describe(self) -> Record:
-        """Return the kind of the source, and the settings that differ from their defaults."""
+        """Return the type of the source, and the settings that differ from their defaults."""
         kind = self.data.kind
         changed: Record = {"kind": kind, "superpoint": self.superpoint, "orient": self.orient}
         if self.layout != "pointcept":
@@ -145,41 +145,41 @@ class CloudSource(Source):
         return changed | self.data.describe()
 
     def check_results(self, scans: Sequence[SceneFiles], out: Path) -> None:
-        """Raise FormatError if a scan would write into files of another, or lists into others."""
+        """Raise FormatError if two scans, or lists of other origin, would be overwritten."""
         check_stems(self.layout, {scan.name: scan.place or scan.name for scan in scans})
-        check_lists(self.layout, self._listed, out)
+        check_lists(self.layout, self._list_dataset, out)
 
     def write_lists(self, out: Path, mark: str, *, without: Collection[Path] = ()) -> None:
-        """Write what the layout has for the data set as a whole, from all scans in ``out``."""
-        # A scan that is removed leaves the lists of all layouts that it was written in.
+        """Write the layout's data-set-wide files from all scans in ``out``."""
+        # A removed scan must disappear from the lists of all layouts.
         for layout in layouts.LAYOUTS if without else (self.layout,):
-            write_lists(layout, self._listed, out, mark, without=without)
+            write_lists(layout, self._list_dataset, out, mark, without=without)
 
     @property
-    def _listed(self) -> str:
-        """The data set whose lists its layouts have."""
+    def _list_dataset(self) -> str:
+        """Data set that determines the lists."""
         return "S3DIS" if self.data.kind == "s3dis" else "ScanNet"
 
 
-def _dataset_of(scene: SceneFiles) -> str:
-    """Return the data set as whose scenes layouts take one."""
+def _layout_dataset(scene: SceneFiles) -> str:
+    """Return the data set whose layouts apply to a scene."""
     return "ScanNet" if scene.dataset is None else scene.dataset
 
 
 @dataclass(frozen=True)
 class RGBDSource(Source):
-    """The depth frames of a folder.
+    """Depth frames of a folder.
 
-    Files of each frame, all of its height and width: ``coord`` ``(H, W, 3)``, ``normal``
-    ``(H, W, 3)``, ``curvature`` and ``plane`` ``(H, W)`` as ``.npy``, and ``planes.json``. In world
-    coordinates where the pose is known, else in camera coordinates; pixels without depth have zeros
-    and plane -1.
+    Files per frame, all of its height and width: ``coord`` ``(H, W, 3)``, ``normal``
+    ``(H, W, 3)``, ``curvature`` and ``plane`` ``(H, W)`` as ``.npy``, and ``planes.json``.
+    Coordinates are in the world if the pose is known, else in the camera; pixels without depth are
+    zero, with plane -1.
 
     Args:
-        layout: The shape of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
-        intrinsics: The camera. Default: that of a camera file, or the layout's.
-        depth_scale: Stored value of one metre. Default: that of a camera file, or the layout's.
-        orient: Side to which normals point; see :func:`torchrg.depth.segment_depth`.
+        layout: Layout of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
+        intrinsics: The camera. Default: from a camera file, or the layout's.
+        depth_scale: Depth units per meter. Default: from a camera file, or the layout's.
+        orient: Orientation of normals; see :func:`torchrg.depth.segment_depth`.
     """
 
     root: Path
@@ -192,7 +192,7 @@ class RGBDSource(Source):
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
     def describe(self) -> Record:
-        """Return the kind and what else decides results."""
+        """Return the type of the source and its options that affect results."""
         return {
             "kind": "rgbd",
             "layout": self.layout,
@@ -207,7 +207,7 @@ class RGBDSource(Source):
         data = RGBDFrames.from_folder(
             self.root, self.layout, intrinsics=self.intrinsics, depth_scale=self.depth_scale
         )
-        # A wrong scale is the same in all frames, and a warning helps before the work.
+        # A wrong scale affects all frames, so warn before the work.
         with suppress(FormatError, OSError):
             data.read_sample(0)
         return [
@@ -216,20 +216,20 @@ class RGBDSource(Source):
                 frame.depth,
                 (frame.depth, *frame.sources),
                 num_points=num_pixels(frame.depth),
-                item=_plain(frame),
+                item=_to_plain(frame),
             )
             for frame in data.frames
         ]
 
     def convert(self, scan: SceneFiles, folder: Path, begin: Begin) -> TaskReport:
-        """Read a frame, segment it, and write its results, each file whole or not at all."""
+        """Read a frame, segment it, and write its results, each file atomically."""
         begin("read")
-        frame = _frame(scan.item)
+        frame = _from_plain(scan.item)
         with collecting_notes() as notes:
             depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
         if not bool((depth > 0).any()):
             raise FormatError(
-                f"{frame.depth}: expected pixels with depth, got none; take this frame out."
+                f"{frame.depth}: expected pixels with depth, got none; remove this frame."
             )
         begin("planes")
         seg = segment_depth(
@@ -258,20 +258,20 @@ class RGBDSource(Source):
 def write_frame(folder: Path, depth: Tensor, points: Tensor, seg: Segmentation) -> list[str]:
     """Write a frame ``(H, W)`` and its points ``(H, W, 3)``; see :func:`write_results`.
 
-    Pixels without depth have zeros.
+    Pixels without depth are zero.
     """
     coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
     return write_results(folder, coord, seg)
 
 
-def _plain(frame: RGBDFrame) -> Record:
-    """Return a frame as plain values."""
+def _to_plain(frame: RGBDFrame) -> Record:
+    """Convert a frame to plain values."""
     pose = None if frame.pose is None else frame.pose.tolist()
     return vars(frame) | {"intrinsics": frame.intrinsics.tolist(), "pose": pose}
 
 
-def _frame(values: Record) -> RGBDFrame:
-    """Return the frame that plain values describe."""
+def _from_plain(values: Record) -> RGBDFrame:
+    """Convert plain values to a frame."""
     matrices = {
         name: None if values[name] is None else torch.tensor(values[name], dtype=torch.float64)
         for name in ("intrinsics", "pose")

@@ -1,7 +1,7 @@
-"""Stale results: results of scans that have another name now, or are not in the data set any more.
+"""Stale results: results of renamed or removed scans.
 
-A scan of ScanNet that moves from ``train`` to ``val`` would stay in ``train`` as well. An output
-directory may hold results of several data sets, so it lists the scans of each by name.
+Otherwise a ScanNet scan that moves from ``train`` to ``val`` would stay in ``train`` as well. An
+output directory may contain results of several data sets, so it lists the scan names of each.
 """
 
 import json
@@ -13,9 +13,9 @@ from typing import NamedTuple
 from torchrg.batch.records import (
     RECORD,
     Record,
-    file_of_record,
     is_unchanged,
     read_record,
+    resolve_output,
 )
 from torchrg.batch.run import DATA_SETS, LOCK, REPORT
 from torchrg.batch.scans import Job
@@ -34,20 +34,20 @@ from torchrg.io.files import (
 from torchrg.result import PLANES_FILE
 
 DataSet = dict[str, str]
-"""First input file of each scan of a data set, by the name of the scan."""
+"""First input file of each scan of a data set, by scan name."""
 _MAX_NAMED = 3
-"""Results that an error names, so that it stays one line."""
+"""Maximum number of results named in an error, so that it stays one line."""
 
 
 class StaleResult(NamedTuple):
-    """An earlier result whose name no scan of the data set has.
+    """Earlier result without a scan of that name in the data set.
 
     Attributes:
         out: The output directory.
-        name: Name of the result, which is its folder below the output directory.
-        scan: Name of the scan now, None if the data set does not have it any more.
-        files: Fingerprints of its files by their paths from the folder. They are None for the files
-            of a conversion that was killed, which has no record.
+        name: Name of the result, its folder below the output directory.
+        scan: Current name of the scan, None if it was removed from the data set.
+        files: Fingerprints of its files by path relative to the folder; None for the files of a
+            killed conversion, which has no record.
     """
 
     out: Path
@@ -57,27 +57,27 @@ class StaleResult(NamedTuple):
 
     @property
     def folder(self) -> Path:
-        """The folder of the result."""
+        """Folder of the result."""
         return self.out / self.name
 
     @property
     def paths(self) -> dict[Path, Record | None]:
-        """The files by their whole paths, without files outside the output directory."""
-        found = {file_of_record(self.out, self.folder, n): noted for n, noted in self.files.items()}
-        return {path: noted for path, noted in found.items() if path is not None}
+        """Files by absolute path, without files outside the output directory."""
+        found = {resolve_output(self.out, self.folder, n): data for n, data in self.files.items()}
+        return {path: data for path, data in found.items() if path is not None}
 
     @property
     def reason(self) -> str:
-        """Why the result is stale, in words."""
-        where = "is not in the data set any more" if self.scan is None else f"is {self.scan} now"
-        return f"its scan {where}"
+        """Why the result is stale, for messages."""
+        state = "is no longer in the data set" if self.scan is None else f"is {self.scan} now"
+        return f"its scan {state}"
 
 
 def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
-    """Return the stale results in the output directory of a data set, in natural order.
+    """Return the stale results of a data set in an output directory, in natural order.
 
-    A result is not stale if its scan is in the data set but was not asked for, or if it is of
-    another data set: one that has no scan in common with this one.
+    Results of unselected scans are not stale, nor results of other data sets, which have no scan
+    in common with this one.
 
     Args:
         jobs: All scans of the data set.
@@ -87,15 +87,15 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
     inputs = {name: first for scans in data_sets for name, first in scans.items()}
     folders = {str(path.parent) for job in jobs for path in job.scan.files}
     found = {*_find_records(out, folders)}
-    earlier = [name for name in inputs.keys() | found if name not in names]
-    if not earlier:
+    candidates = [name for name in inputs.keys() | found if name not in names]
+    if not candidates:
         return []
     kind = source.describe().get("kind")
     scans = {os.path.realpath(job.scan.files[0]): job.name for job in jobs if job.scan.files}
     renamed: dict[str, str] = {}
     missing = []
-    for name in earlier:
-        folder = file_of_record(out, out, name)
+    for name in candidates:
+        folder = resolve_output(out, out, name)
         if folder in (None, out) or not folder.is_dir():
             continue
         if first := inputs.get(name) or _first_input(folder, kind):
@@ -104,18 +104,18 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
                 renamed[name] = scans[path]
             elif not Path(path).exists():
                 missing.append(name)
-    own = names | renamed.keys()
+    current = names | renamed.keys()
     groups = [*map(set, data_sets), found - inputs.keys()]
-    same = set().union(*(group for group in groups if not group.isdisjoint(own)))
+    same = set().union(*(group for group in groups if not group.isdisjoint(current)))
     stale = sorted([*renamed, *same.intersection(missing)], key=natural_key)
-    return [StaleResult(out, name, renamed.get(name), _files_of(out / name)) for name in stale]
+    return [StaleResult(out, name, renamed.get(name), _result_files(out / name)) for name in stale]
 
 
 def check_stale(results: Sequence[StaleResult], root: Path, *, prune: bool) -> None:
     """Raise FormatError if stale results of the data set in ``root`` cannot be removed.
 
-    Results whose scan is not in the data set any more need ``prune``. A file that was changed since
-    torchrg wrote it, or that it did not write, is never removed.
+    Results of removed scans require ``prune``. Files that were changed since torchrg wrote them, or
+    that it did not write, are never removed.
     """
     missing = [result for result in results if result.scan is None and result.files]
     if missing and not prune:
@@ -123,21 +123,20 @@ def check_stale(results: Sequence[StaleResult], root: Path, *, prune: bool) -> N
         folders = ", ".join(str(result.folder) for result in first)
         more = f" and {num_more:,} more" if num_more > 0 else ""
         raise FormatError(
-            f"{folders}{more}: expected the scan of each result in {root}, got none; remove such "
-            "results with --prune, or keep them with --only '*'."
+            f"{folders}{more}: no scan in {root} belongs to these results; remove them with "
+            "--prune, or keep them with --only '*'."
         )
     for result in results:
         if (path := _changed_file(result)) is not None:
             raise FormatError(
-                f"{path}: expected a file as torchrg wrote it, got another or a changed one, and "
-                f"{result.reason}; move it away."
+                f"{path}: was changed or not written by torchrg, and {result.reason}; move it."
             )
 
 
 def remove_stale(result: StaleResult) -> None:
-    """Remove a result, its record last, and then the folders that are empty.
+    """Remove a result, its record last, and then empty folders.
 
-    A command that was killed meanwhile finds the record, and removes the rest the next time.
+    If the command is killed meanwhile, the next one finds the record and removes the remainder.
     """
     folder = result.folder
     paths = sorted(result.paths, key=lambda path: path.name == PLANES_FILE)
@@ -155,25 +154,25 @@ def remove_stale(result: StaleResult) -> None:
 
 
 def note_data_set(jobs: Sequence[Job], removed: Sequence[StaleResult]) -> None:
-    """Write the scans of a data set into the list of its output directory, if it is not there.
+    """Add the scans of a data set to the list in its output directory.
 
-    Earlier names stay on the list as long as there is a folder of results.
+    Earlier names stay listed while their result folder exists.
     """
-    out, before = jobs[0].out, _read_data_sets(jobs[0].out)
+    out, existing = jobs[0].out, _read_data_sets(jobs[0].out)
     scans = {job.name: job.input_name(job.scan.files[0]) if job.scan.files else "" for job in jobs}
-    own = scans.keys() | {result.name for result in removed}
-    others = [data_set for data_set in before if own.isdisjoint(data_set)]
-    for data_set in before:
-        if not own.isdisjoint(data_set):
+    current = scans.keys() | {result.name for result in removed}
+    unrelated = [data_set for data_set in existing if current.isdisjoint(data_set)]
+    for data_set in existing:
+        if not current.isdisjoint(data_set):
             scans = {n: i for n, i in data_set.items() if (out / n).is_dir()} | scans
-    after = sorted([*others, dict(sorted(scans.items()))], key=min)
-    if after != before:
+    updated = sorted([*unrelated, dict(sorted(scans.items()))], key=min)
+    if updated != existing:
         with marked_parts(mark_of(REPORT)), atomic_path(out / DATA_SETS) as temporary:
-            temporary.write_text(json.dumps(after, indent=0), encoding="utf-8")
+            temporary.write_text(json.dumps(updated, indent=0), encoding="utf-8")
 
 
 def _read_data_sets(out: Path) -> list[DataSet]:
-    """Return the data sets that are noted in an output directory, none where that is damaged."""
+    """Return the data sets listed in an output directory; none if the list is damaged."""
     try:
         content = json.loads((out / DATA_SETS).read_bytes())
         data_sets = [{str(n): str(first) for n, first in scans.items()} for scans in content]
@@ -182,21 +181,21 @@ def _read_data_sets(out: Path) -> list[DataSet]:
     return [scans for scans in data_sets if scans]
 
 
-def _find_records(out: Path, folders_of_inputs: set[str]) -> Iterator[str]:
-    """Yield the names of the results in a directory, as their folders hold a record.
+def _find_records(out: Path, input_folders: set[str]) -> Iterator[str]:
+    """Yield the names of results in a directory, whose folders contain a record.
 
-    Links are not followed, and other output directories and folders of inputs not entered.
+    Links are not followed; other output directories and input folders are not entered.
     """
-    for place, folders, files in os.walk(out):
-        is_top = place == str(out)
+    for folder, folders, files in os.walk(out):
+        is_top = folder == str(out)
         if RECORD in files and not is_top:
-            yield Path(place).relative_to(out).as_posix()
-        if place in folders_of_inputs or (LOCK in files and not is_top):
+            yield Path(folder).relative_to(out).as_posix()
+        if folder in input_folders or (LOCK in files and not is_top):
             folders.clear()
 
 
 def _first_input(folder: Path, kind: object) -> str:
-    """Return the first input that the record of a scan of a kind names, nothing without one."""
+    """Return the first input in the record of a scan of a source type, or ""."""
     record = read_record(folder) or {}
     source, inputs = record.get("source"), record.get("inputs")
     if not isinstance(source, dict) or source.get("kind") != kind:
@@ -205,35 +204,35 @@ def _first_input(folder: Path, kind: object) -> str:
     return str(first.get("name", "")) if isinstance(first, dict) else ""
 
 
-def _files_of(folder: Path) -> dict[str, Record | None]:
-    """Return the files of a result with their fingerprints, None for those without a record."""
+def _result_files(folder: Path) -> dict[str, Record | None]:
+    """Return the files of a result with their fingerprints, None for files without a record."""
     names, record = written_files(folder), read_record(folder)
     if record is None:
         return dict.fromkeys(names)
     parts = (dict.fromkeys(names), record["outputs"], *record["other_layouts"].values())
-    return {name: noted or {} for part in parts for name, noted in part.items()}
+    return {name: stored or {} for part in parts for name, stored in part.items()}
 
 
 def _changed_file(result: StaleResult) -> Path | None:
-    """Return a file or link in the way of removing a result, None if there is none."""
+    """Return a file or link that prevents removing a result, or None."""
     if not result.files:
         return None
     folder, paths = result.folder, result.paths
     if folder.is_symlink():
         return folder
-    for path, noted in paths.items():
-        is_ours = path.is_file() if noted is None else is_unchanged(path, noted)
-        if os.path.lexists(path) and not is_ours:
+    for path, stored in paths.items():
+        is_unmodified = path.is_file() if stored is None else is_unchanged(path, stored)
+        if os.path.lexists(path) and not is_unmodified:
             return path
-    known = {*paths, *find_leftovers(folder, mark_of(result.name))}
-    if read_record(folder) is not None:  # A damaged record does not show what was changed.
-        known.add(folder / RECORD)
+    allowed = {*paths, *find_leftovers(folder, mark_of(result.name))}
+    if read_record(folder) is not None:  # A damaged record does not reveal changes.
+        allowed.add(folder / RECORD)
     entries = sorted(folder.iterdir())
-    return next((path for path in entries if path not in known and not path.is_dir()), None)
+    return next((path for path in entries if path not in allowed and not path.is_dir()), None)
 
 
 def _remove_empty(folder: Path, out: Path) -> None:
-    """Remove a folder and those above it in the output directory, as long as they are empty."""
+    """Remove a folder and its parents in the output directory, as long as they are empty."""
     while folder != out and folder.is_relative_to(out):
         try:
             folder.rmdir()

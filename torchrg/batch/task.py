@@ -1,4 +1,4 @@
-"""The report of a task: what became of a scan, how long each stage took, and why it failed."""
+"""Task reports: status, stage times, memory and errors."""
 
 import os
 import platform
@@ -21,32 +21,32 @@ from torchrg.errors import (
 from torchrg.io.files import is_disk_full
 
 Status = Literal["converted", "kept", "failed", "not started"]
-"""States of a task at the end: done now, or by an earlier run, or not."""
+"""Final states of a task: done now, done by an earlier run, or not done."""
 STATUSES: tuple[Status, ...] = get_args(Status)
 Begin = Callable[[str], None]
-"""Called with the name of each stage of the work when it starts."""
+"""Called with the name of each stage when it starts."""
 
 
 @dataclass(frozen=True)
 class TaskReport:
-    """What became of a task.
+    """Result of a task.
 
     Attributes:
         name: Its name.
         status: ``converted`` now, ``kept`` from an earlier run, ``failed``, or ``not started``.
-        num_points: Number of points, those that are not finite included.
+        num_points: Number of points, including non-finite ones.
         num_regions: Number of planes.
         files: Names of the files written now, in the folder of the scan.
-        repairs: What was put right in the input, a line each.
-        warnings: What a user should know, a line each.
-        measured: What was measured of the cloud, and the settings that it chose.
-        seconds: Time of each stage by its name.
+        repairs: Input repairs, one per line.
+        warnings: Notes for the user, one per line.
+        measured: Measured properties of the cloud, and the settings derived from them.
+        seconds: Time per stage, by name.
         peak_memory: Largest resident memory of the process, in bytes.
-        reason: Why it failed, a line.
-        details: The traceback of a failure that was not foreseen.
-        disk_full: Whether it failed because there is no space left.
-        host: Machine and process that did it.
-        attempts: How often it was tried, as far as the engine tells: Ray does not.
+        reason: One-line reason of a failure.
+        details: Traceback of an unexpected failure.
+        disk_full: Whether it failed because the disk is full.
+        host: Machine and process that ran it.
+        attempts: Number of attempts, if the engine reports it: Ray does not.
     """
 
     name: str
@@ -67,26 +67,26 @@ class TaskReport:
 
 
 Reports = Generator[TaskReport | None, None, None]
-"""Reports that an engine yields: one of each task when it ends, None while there is none."""
+"""Reports yielded by an engine: one per finished task, None while there is none."""
 
 
 def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
-    """Do the work of a task; what goes wrong with it is in the report and never raised."""
+    """Run a task; errors are put into the report and never raised."""
     clock = _StageClock()
     reset_peak_memory()
     try:
         with warnings.catch_warnings():
-            # They are among the warnings of the report, or were printed before the first task.
+            # These warnings are in the report, or were printed before the first task.
             warnings.simplefilter("ignore", PrecisionWarning)
             warnings.simplefilter("ignore", DepthWarning)
             report = work(clock.begin)
-    except Exception as error:  # noqa: BLE001 One task must never end the others.
-        is_foreseen = isinstance(error, TorchrgError | OSError) or is_out_of_memory(error)
+    except Exception as error:  # noqa: BLE001 A failing task must not end the others.
+        is_expected = isinstance(error, TorchrgError | OSError) or is_out_of_memory(error)
         report = TaskReport(
             name,
             "failed",
             reason=_reason(error),
-            details="" if is_foreseen else traceback.format_exc(),
+            details="" if is_expected else traceback.format_exc(),
             disk_full=is_disk_full(error),
         )
     clock.begin("done")
@@ -96,7 +96,7 @@ def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
 
 @contextmanager
 def collecting_notes() -> Iterator[list[str]]:
-    """Collect warnings as notes for a report, a line each.
+    """Collect warnings as notes for a report, one per line.
 
     Example:
         >>> with collecting_notes() as notes:
@@ -112,14 +112,14 @@ def collecting_notes() -> Iterator[list[str]]:
 
 
 class _StageClock:
-    """Seconds of each stage; one that begins ends the one before it."""
+    """Stopwatch for stages; starting a stage ends the previous one."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._stage, self._start = "done", time.perf_counter()
 
     def begin(self, stage: str) -> None:
-        """Begin a stage; ``"done"`` is none."""
+        """Start a stage; ``"done"`` stops the clock."""
         now = time.perf_counter()
         if self._stage != "done":
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._start
@@ -127,7 +127,7 @@ class _StageClock:
 
 
 def _reason(error: Exception) -> str:
-    """Return an error as one line that names the file where it can."""
+    """Format an error as one line, with the file name if possible."""
     if is_out_of_memory(error):
         return OUT_OF_MEMORY
     if isinstance(error, OSError):

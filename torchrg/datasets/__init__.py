@@ -1,17 +1,17 @@
-"""Data sets: S3DIS and ScanNet as released, folders of clouds, Pointcept's layout, RGB-D frames.
+"""Data sets: S3DIS, ScanNet, cloud folders, Pointcept folders, RGB-D frames.
 
-Every data set is a map-style :class:`torch.utils.data.Dataset`: ``len(data)``, ``data[i]`` is a
-sample dict (``coord``, ``color``, ``segment``, ``instance``, ``name``, ...), ``transform=`` is
-called with it, and ``data.scenes`` lists what there is without reading it: :class:`SceneFiles` with
-``name`` (the place below an output folder), ``path``, and ``files`` (every input file).
-``data.read_cloud(i)`` returns a scene as a :class:`torchrg.Cloud`; depth frames do not have it.
-:func:`collate_offset` joins samples into a ragged batch. :func:`read_room` reads one room of S3DIS,
-:func:`read_pointcept_scene` and :func:`write_pointcept_scene` one folder of Pointcept's layout.
+Every data set is a map-style :class:`torch.utils.data.Dataset`: ``len(data)``; ``data[i]`` is a
+sample dict (``coord``, ``color``, ``segment``, ``instance``, ``name``, ...); ``transform=`` is
+applied to it; ``data.scenes`` lists the scenes without reading them, as :class:`SceneFiles` with
+``name`` (the path below an output folder), ``path``, and ``files`` (every input file).
+``data.read_cloud(i)`` returns a scene as a :class:`torchrg.Cloud`, except for depth frames.
+:func:`collate_offset` collates samples into a ragged batch. :func:`read_room` reads an S3DIS room,
+:func:`read_pointcept_scene` and :func:`write_pointcept_scene` a folder in Pointcept's layout.
 
-The guide with recipes for other programs says how their loaders take these results.
+The guide with recipes for other programs shows how their loaders use these results.
 
-To add a data set, derive from :class:`SceneDataset`: it trains in a loader and
-:class:`torchrg.batch.sources.CloudSource` converts it. To add a folder of depth frames, add a row
+To add a data set, derive from :class:`SceneDataset`: it works in a loader, and
+:class:`torchrg.batch.sources.CloudSource` converts it. To add a layout of depth frames, add a row
 to :data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
 """
 

@@ -1,4 +1,4 @@
-"""Ragged batches: clouds one after the other, and where each ends."""
+"""Collation of clouds into ragged batches."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from torch.utils.data import default_collate
 
 from torchrg._checks import as_tensor
 from torchrg.errors import ShapeError
-from torchrg.transforms.rows import LISTED, Entries, SampleDict, listed_keys
+from torchrg.transforms.rows import LIST_KEY, Entries, SampleDict, get_list
 from torchrg.transforms.sample import NeighborSearch
 
 
@@ -21,28 +21,27 @@ def collate_offset(
     inverse: str = "inverse",
     unique: Sequence[str] = (),
 ) -> SampleDict:
-    """Join samples as Pointcept does: arrays end to end, ``offset`` the row each cloud ends before.
+    """Collate samples as Pointcept does: concatenated arrays, and ``offset``, each cloud's end row.
 
     Convention:
-        Labels stay those of their cloud: plane 0 of the first is another plane than plane 0 of the
-        second. Those named in ``unique`` are counted on instead; negative ones, for none, stay.
+        Labels are per cloud: plane 0 of the first cloud and plane 0 of the second are different
+        planes. Labels named in ``unique`` are offset instead; negative ones (none) are unchanged.
 
     Args:
-        samples: Samples with the same keys. Tensors and arrays are joined along their first axis,
-            scalars stacked, everything else becomes a list. Neighbours that transforms search for
-            each other are left out.
-        coord: Key that says how many points a sample has.
-        inverse: Key of the numbers of points, as of :class:`torchrg.transforms.SampleVoxels`, that
-            shall name rows of the batch.
-        unique: Keys of labels that shall be different in each cloud, as ``("plane",
-            "superpoint")``, so that a network pools over them.
+        samples: Samples with the same keys. Tensors and arrays are concatenated along their first
+            axis, scalars stacked, other values collected in a list. Cached neighbors are dropped.
+        coord: Key whose length is the number of points of a sample.
+        inverse: Key of point indices, as from :class:`torchrg.transforms.SampleVoxels`, which are
+            offset to rows of the batch.
+        unique: Keys of labels to make distinct across clouds, as in ``("plane", "superpoint")``,
+            so that a network can pool over them.
 
     Returns:
-        The batch, with ``offset`` ``(B,)`` int64. Samples that are batches themselves, with an
-        ``offset`` of their own, are joined into one. ``index_valid_keys`` is one list.
+        The batch, with ``offset`` ``(B,)`` int64. Samples that have an ``offset`` are batches and
+        are merged into one. ``index_valid_keys`` is one list.
 
     Raises:
-        ShapeError: If there are no samples, their keys differ, or one in ``unique`` is missing.
+        ShapeError: If there are no samples, their keys differ, or a key in ``unique`` is missing.
 
     Example:
         >>> samples = [{"coord": torch.zeros(2, 3)}, {"coord": torch.ones(3, 3)}]
@@ -61,7 +60,7 @@ def collate_offset(
             different = ", ".join(sorted(set(sample) ^ set(keys)))
             raise ShapeError(
                 f"collate_offset: expected samples with the same keys, got {different} in only one "
-                f"of samples 0 and {i}; leave it out, or let a transform add it to all."
+                f"of samples 0 and {i}; remove it, or add it to all samples with a transform."
             )
     for key in (coord, *unique):
         if key not in keys:
@@ -83,14 +82,14 @@ def collate_offset(
         ]
         pairs = zip(numbers, itertools.accumulate(sizes, initial=0), strict=False)
         batch[key] = torch.cat([torch.where(ids >= 0, ids + start, ids) for ids, start in pairs])
-    if LISTED in batch:
-        names = itertools.chain.from_iterable(listed_keys(s) or () for s in samples)
-        batch[LISTED] = list(dict.fromkeys(names))
+    if LIST_KEY in batch:
+        names = itertools.chain.from_iterable(get_list(s) or () for s in samples)
+        batch[LIST_KEY] = list(dict.fromkeys(names))
     return {**batch, "offset": torch.cat(counts).cumsum(0)}
 
 
 def _join(key: str, values: Sequence[object]) -> object:
-    """Join the values of one key."""
+    """Collate the values of one key."""
     first = values[0]
     if isinstance(first, Tensor | np.ndarray) and first.ndim > 0:
         return torch.cat([as_tensor("collate_offset", key, value) for value in values])

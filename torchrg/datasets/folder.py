@@ -1,4 +1,4 @@
-"""Any folder of clouds as a data set, and how the files below a folder are found and ordered."""
+"""Folders of clouds as data sets, and ordered file discovery."""
 
 import os
 import re
@@ -22,25 +22,25 @@ from torchrg.structures import Cloud
 from torchrg.transforms.rows import Sample, SampleDict
 
 Transform = Callable[[SampleDict], Sample]
-"""A function that data sets call with each sample."""
-_NUMBERED = {"instance", "plane", "superpoint"}
-"""Arrays whose numbers begin again in each scene."""
+"""A function that data sets apply to each sample."""
+_ID_ARRAYS = {"instance", "plane", "superpoint"}
+"""Arrays whose IDs start at 0 in each scene."""
 _FIELD_KEYS = {"normals": "normal"}
-"""Fields of a cloud that have another name in a sample."""
+"""Sample keys of cloud fields, if they differ."""
 
 
 class SceneFiles(NamedTuple):
-    """One item of a data set, and what it is made from.
+    """Item of a data set and its files.
 
     Attributes:
-        name: Unique within the data set and fit for a path below an output folder, with forward
-            slashes: ``Area_1/office_1``.
+        name: Unique name, usable as a path below an output folder, with forward slashes:
+            ``Area_1/office_1``.
         path: The file or folder that is read.
-        files: Every input file, in the order they are read; their bytes decide the result.
-        dataset: The data set whose classes it has, empty if unknown; None for a plain cloud.
-        place: Where it is in the release, which some programs keep. Default: its name.
-        num_points: Its number of points by the headers or sizes of its files, for ``convert``.
-        item: What else reads it; plain values that travel between processes.
+        files: All input files in reading order; their bytes determine the result.
+        dataset: The data set that defines the classes, empty if unknown; None for a plain cloud.
+        place: Path in the release, which some programs keep. Default: its name.
+        num_points: Number of points from headers or file sizes, for ``convert``.
+        item: Extra data for reading; plain, picklable values.
     """
 
     name: str
@@ -53,16 +53,16 @@ class SceneFiles(NamedTuple):
 
 
 class SceneDataset(Dataset[Sample]):
-    r"""A map-style data set that lists its scenes before it reads them; base of data sets.
+    r"""Base class of map-style data sets, which list their scenes before reading them.
 
-    A data set of your own sets ``root`` and ``scenes`` and overrides :meth:`read_scene`. It then
-    works in a :class:`torch.utils.data.DataLoader`, and
-    :class:`torchrg.batch.sources.CloudSource` converts it.
+    A subclass sets ``root`` and ``scenes`` and overrides :meth:`read_scene`. It then works in a
+    :class:`torch.utils.data.DataLoader`, and :class:`torchrg.batch.sources.CloudSource` converts
+    it.
 
     Attributes:
         root: The folder of the data set.
         scenes: Name, path and input files of each scene.
-        transform: Called with each sample. Default: none.
+        transform: Applied to each sample. Default: none.
 
     Example:
         >>> import tempfile
@@ -85,18 +85,18 @@ class SceneDataset(Dataset[Sample]):
     scenes: list[SceneFiles]
     transform: Transform | None = None
     kind: ClassVar[str] = "scenes"
-    """Name of the kind of data set in records of :mod:`torchrg.batch`."""
+    """Name of the type of data set in records of :mod:`torchrg.batch`."""
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
-        """Return the cloud of a scene, labels among its fields."""
+        """Return the cloud of a scene, with labels among its fields."""
         raise NotImplementedError
 
     def read_cloud(self, index: int) -> Cloud:
-        """Return the cloud of the scene of an index."""
+        """Return the cloud of the scene at an index."""
         return self.read_scene(self.scenes[index])
 
     def read_sample(self, index: int) -> SampleDict:
-        """Return the sample of a scene: its fields, and coordinates as they are in its files."""
+        """Return the sample of a scene: its fields, and the coordinates stored in its files."""
         cloud = self.read_cloud(index)
         fields: SampleDict = {key: torch.from_numpy(v) for key, v in cloud.fields.items()}
         for key in fields.keys() & {"segment", "segment200", "instance"}:
@@ -104,58 +104,58 @@ class SceneDataset(Dataset[Sample]):
         if cloud.front is not None:
             fields["front"] = torch.from_numpy(cloud.front)
         header = cloud.header.items()
-        whole = {k: torch.from_numpy(v) for k, v in header if isinstance(v, np.ndarray)}
+        arrays = {k: torch.from_numpy(v) for k, v in header if isinstance(v, np.ndarray)}
         name = self.scenes[index].name
-        return {"coord": torch.from_numpy(cloud.coordinates), **fields, **whole, "name": name}
+        return {"coord": torch.from_numpy(cloud.coordinates), **fields, **arrays, "name": name}
 
     def count_points(self, scene: SceneFiles) -> int:
-        """Return about how many points a scene has, without reading it."""
+        """Return the approximate number of points of a scene, without reading it."""
         return estimate_points(scene.path / "coord.npy" if scene.path.is_dir() else scene.path)
 
     def describe(self) -> dict[str, Any]:
-        """Return the settings that change what is read, for JSON."""
+        """Return the JSON-serializable parameters that affect what is read."""
         return {}
 
     def check_output(self, layout: str, out: Path) -> None:
-        """Raise ConfigError if results in a layout would be read as scenes from where they go."""
+        """Raise ConfigError if results written to ``out`` would be read as scenes."""
         check_outside(self.root, out)
 
     def __len__(self) -> int:
         return len(self.scenes)
 
     def __getitem__(self, index: int) -> Sample:
-        """Return a sample, transformed."""
+        """Return a transformed sample."""
         sample = self.read_sample(index)
         return sample if self.transform is None else self.transform(sample)
 
 
 class FolderOfClouds(SceneDataset):
-    """All readable clouds below a folder, in natural order; hidden files are passed over.
+    """All readable clouds below a folder, in natural order; hidden files are skipped.
 
-    Links are followed and each file is read once; see :func:`files_below`.
+    Links are followed and each file is read once; see :func:`find_files`.
 
-    A sample has ``coord`` ``(N, 3)`` float32 about ``origin`` ``(1, 3)`` float64, the fields of the
-    file (``normal``, ``color``, ``labels``, ``intensity``, ...), ``front`` where the file says to
-    which side surfaces look (see :attr:`torchrg.Cloud.front`), and ``name``, the path below
-    ``root`` without the suffix. A folder with ``coord.npy`` is one cloud, as Pointcept keeps them;
-    see :func:`torchrg.datasets.read_pointcept_scene`.
+    A sample has ``coord`` ``(N, 3)`` float32 relative to ``origin`` ``(1, 3)`` float64, and the
+    fields of the file (``normal``, ``color``, ``labels``, ``intensity``, ...). It has ``front`` if
+    the file stores which side of a surface was seen (see :attr:`torchrg.Cloud.front`). ``name`` is
+    the path below ``root`` without suffix. A folder with ``coord.npy`` is one cloud in Pointcept's
+    layout; see :func:`torchrg.datasets.read_pointcept_scene`.
 
     Args:
         root: The folder.
-        suffixes: Which files are clouds. Default: :data:`torchrg.io.FOLDER_SUFFIXES`,
-            all that can be read but ``.csv``.
-        columns: Names for the columns of text and of bare ``.npy`` arrays; see
+        suffixes: Suffixes of cloud files. Default: :data:`torchrg.io.FOLDER_SUFFIXES`, all
+            readable formats except ``.csv``.
+        columns: Column names of text files and plain ``.npy`` arrays; see
             :func:`torchrg.read_cloud`.
-        transform: Called with each sample.
+        transform: Applied to each sample.
 
     Attributes:
         scenes: Name, path and input files of each cloud.
 
     Raises:
-        FormatError: If there is no such folder, no cloud in it, or two of one name.
+        FormatError: If the folder is missing, contains no cloud, or two of the same name.
 
     Warns:
-        UserWarning: If links are passed over.
+        UserWarning: If links are skipped.
     """
 
     kind = "folder"
@@ -174,7 +174,7 @@ class FolderOfClouds(SceneDataset):
         endings = {suffix.lower() for suffix in suffixes}
         paths = [
             path
-            for path in files_below(self.root, is_item=is_scene)
+            for path in find_files(self.root, is_item=is_scene)
             if path.is_dir() or path.suffix.lower() in endings
         ]
         if not paths:
@@ -187,26 +187,26 @@ class FolderOfClouds(SceneDataset):
             if first.setdefault(name, path) != path:
                 one, other = (place.relative_to(self.root) for place in (first[name], path))
                 raise FormatError(
-                    f"{root}: expected one file for each scan, got {one} and {other}; move or "
-                    "rename one, or choose between them by suffixes."
+                    f"{root}: expected one file per scan, got {one} and {other}; move or rename "
+                    "one, or select files by suffix."
                 )
 
     def _scene(self, path: Path) -> SceneFiles:
-        """Return a cloud, named by the path without the suffix, whatever else there is."""
+        """Return a cloud, named by its path without suffix."""
         inside = path.relative_to(self.root)
         if not path.is_dir():
             return SceneFiles(inside.with_suffix("").as_posix(), path, (path,))
         files = tuple(f for name in POINT_ARRAYS if (f := path / f"{name}.npy").is_file())
-        # Without the classes of ScanNet, the data set is unknown.
+        # segment20 indicates ScanNet; segment alone could be of any data set.
         is_known = {"segment", "segment20"} & {file.stem for file in files} != {"segment"}
         return SceneFiles(inside.as_posix(), path, files, "ScanNet" if is_known else "")
 
     def describe(self) -> dict[str, Any]:
-        """Return the settings that change what is read, for JSON."""
+        """Return the JSON-serializable parameters that affect what is read."""
         return {} if self.columns is None else {"columns": list(self.columns)}
 
     def check_output(self, layout: str, out: Path) -> None:
-        """Raise ConfigError if results go to ``root`` but do not complete folders of Pointcept."""
+        """Raise ConfigError if results in ``root`` would not just complete Pointcept folders."""
         files = [scene.path.name for scene in self.scenes if not scene.path.is_dir()]
         if files or layout != "pointcept":
             what = f"the results of {files[0]}" if files else f"layout {layout}"
@@ -240,30 +240,30 @@ class FolderOfClouds(SceneDataset):
 
 
 def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
-    """Read all scenes of a folder in Pointcept's layout as one cloud: an area of S3DIS, a split.
+    """Read all scenes of a Pointcept folder as one cloud: an area of S3DIS, a split.
 
-    Loaders that take whole areas read this; see :mod:`torchrg.datasets`.
+    Loaders of complete areas use this; see :mod:`torchrg.datasets`.
 
     Args:
-        folder: A folder of scenes, as ``OUT/Area_5`` of ``torchrg convert s3dis``.
+        folder: A folder of scenes, such as ``OUT/Area_5`` of ``torchrg convert s3dis``.
 
     Returns:
-        What :func:`torchrg.datasets.read_pointcept_scene` returns of each scene, end to end in
-        natural order: ``(N, ...)``, with ``offset`` ``(B,)``, the row each scene ends before, and
-        ``name``, a list. Numbers of ``instance``, ``plane`` and ``superpoint`` go on from scene to
-        scene, so that each is in one scene only; -1 stays.
+        Results of :func:`torchrg.datasets.read_pointcept_scene`, concatenated in natural order:
+        ``(N, ...)``, with ``offset`` ``(B,)``, the end row of each scene, and ``name``, a list.
+        IDs in ``instance``, ``plane`` and ``superpoint`` are offset to be unique across scenes; -1
+        is unchanged.
 
     Raises:
-        FormatError: If there is no such folder or no scene in it, or a file is damaged.
-        ShapeError: If some scenes have an array that others have not.
+        FormatError: If the folder is missing, contains no scene, or a file is corrupt.
+        ShapeError: If the arrays of the scenes differ.
     """
-    paths = [path for path in files_below(Path(folder), is_item=is_scene) if path.is_dir()]
+    paths = [path for path in find_files(Path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
         raise FormatError(
-            f"{folder}: expected folders with coord.npy, got none; name the folder of an area."
+            f"{folder}: expected folders with coord.npy, got none; pass the folder of an area."
         )
     scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
-    for key in _NUMBERED & set(scenes[0]):
+    for key in _ID_ARRAYS & set(scenes[0]):
         first = 0
         for labels in (scene[key] for scene in scenes if key in scene):
             labels[labels >= 0] += first
@@ -272,84 +272,84 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether a folder is a cloud itself, in Pointcept's layout."""
+    """Whether a folder is itself a cloud in Pointcept's layout."""
     return (folder / "coord.npy").is_file()
 
 
 def check_outside(root: Path, out: Path, why: str = "so that no result is read as a scan") -> None:
-    """Check that results go elsewhere than to the folder of a data set."""
+    """Raise ConfigError if results would be written to the folder of a data set."""
     if out == root:
         raise ConfigError(f"{out}: expected a directory outside {root}, {why}; choose another.")
 
 
 def check_folder(folder: Path) -> None:
-    """Check that a folder is there."""
+    """Raise FormatError if a folder does not exist."""
     if not folder.is_dir():
         raise FormatError(f"{folder}: no such folder; check the spelling.")
 
 
-def files_below(
+def find_files(
     folder: Path, *, is_item: Callable[[Path], bool] = lambda folder: False
 ) -> list[Path]:
-    """Return the files below a folder in natural order, without hidden ones, each file once.
+    """Return each visible file below a folder once, in natural order.
 
-    A folder that ``is_item`` itself stands for what is in it. Links to files and folders are
-    followed, but not those to a folder that they are in, which have no end. What is there under
-    several names has the one without links, or else the one that comes first.
+    A folder for which ``is_item`` is true is returned instead of its files. Links are followed,
+    except to a folder that contains them. For duplicates, the path without links is returned, else
+    the first path.
 
     Warns:
-        UserWarning: If something is passed over because it is there under another name.
+        UserWarning: If a duplicate or a recursive link is skipped.
     """
     check_folder(folder)
     files: list[Path] = []
     seen: set[str] = set()
     links: list[Path] = []
-    passed: list[Path] = []
+    skipped: list[Path] = []
 
-    def take(path: Path, real: str) -> None:
-        if real in seen:
-            passed.append(path)
+    def visit(path: Path, real_path: str) -> None:
+        if real_path in seen:
+            skipped.append(path)
             return
-        seen.add(real)
+        seen.add(real_path)
         if not path.is_dir() or is_item(path):
             files.append(path)
             return
-        for entry in listed(path):
+        for entry in list_dir(path):
             if entry.is_symlink() and not entry.name.startswith("."):
                 links.append(entry)
             elif not entry.name.startswith("."):
-                take(entry, os.path.join(real, entry.name))  # noqa: PTH118 Paths are slow here.
+                visit(entry, os.path.join(real_path, entry.name))  # noqa: PTH118 Paths are slow here.
 
-    take(folder, os.path.realpath(folder))
+    visit(folder, os.path.realpath(folder))
     while links:
         link = links.pop(0)
         place, target = (Path(os.path.realpath(path)) for path in (link.parent, link))
         if place.is_relative_to(target):
-            passed.append(link)
+            skipped.append(link)
         else:
-            take(link, str(target))
-    warn_of_links(folder, passed)
+            visit(link, str(target))
+    warn_skipped(folder, skipped)
     return sorted(files, key=lambda path: [natural_key(p) for p in path.relative_to(folder).parts])
 
 
-def warn_of_links(folder: Path, passed: Sequence[Path]) -> None:
-    """Warn of what is passed over in a folder because it is there under another name, if any is."""
-    if passed:
-        more = f" and {len(passed) - 1:,} more" if len(passed) > 1 else ""
+def warn_skipped(folder: Path, skipped: Sequence[Path]) -> None:
+    """Warn if duplicates or recursive links in a folder were skipped."""
+    if skipped:
+        more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
         warnings.warn(
-            f"{folder}: passed over {passed[0].relative_to(folder)}{more}: a link leads there from "
-            "another name, or to a folder that it is in, and each file counts once.",
+            f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: links to files that were "
+            "already read, or to a parent folder.",
             stacklevel=3,
         )
 
 
-def listed(folder: str | os.PathLike[str]) -> list[Path]:
-    """Return the entries of a folder in natural order, hidden ones included."""
+def list_dir(folder: str | os.PathLike[str]) -> list[Path]:
+    """Return all entries of a folder in natural order, including hidden ones."""
     return sorted(Path(folder).iterdir(), key=lambda path: natural_key(path.name))
 
 
 def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Return a key that sorts names with numbers as people do, without regard to the locale.
+    """Return a locale-independent key for natural sorting of names with numbers.
 
     Example:
         >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=natural_key)
@@ -359,5 +359,5 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     key: list[tuple[int, int | str]] = [
         (0, int(piece)) if piece.isdigit() else (1, piece.lower()) for piece in parts if piece
     ]
-    # Names that differ in case or leading zeros only still have one order.
+    # The name itself breaks ties of case and leading zeros.
     return (*key, (2, name))

@@ -1,9 +1,9 @@
-"""Superpoints and planes of a scan in the files that networks on superpoints load.
+"""File layouts of superpoints and planes for superpoint networks.
 
-:data:`LAYOUTS` has a function for each family of programs and each data set that they read. It
-returns the files of one scan by their paths below the output directory; :func:`write_layout` puts
-them there, and :mod:`torchrg.datasets.lists` lists them where a program has lists. Superpoints are
-int64 everywhere, as programs that read raw bytes take them for such.
+:data:`LAYOUTS` has a function for each program family and data set. It returns the files of one
+scan by path below the output directory; :func:`write_layout` writes them, and
+:mod:`torchrg.datasets.lists` writes index files for programs that need them. Superpoints are int64
+in every layout, because programs that read raw bytes expect that.
 """
 
 import io
@@ -34,91 +34,91 @@ from torchrg.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints
 
 Files = dict[str, NDArray[Any] | bytes]
-"""Contents by paths below the output directory: arrays as ``.npy``, or bytes."""
+"""File contents by path below the output directory: arrays for ``.npy`` files, or bytes."""
 _IGNORED = -100
-"""Label that SPFormer and ISBNet pass over."""
-_STUFF = 2
-"""Classes of ScanNet below this number, wall and floor, are no objects."""
+"""Label that SPFormer and ISBNet ignore."""
+_NUM_STUFF = 2
+"""Number of leading ScanNet classes (wall, floor) that have no instances."""
 _CENTERED = 127.5
-"""Half of the largest colour: what SPFormer and ISBNet divide colours by before they take off 1."""
+"""Half the maximum color: SPFormer and ISBNet divide colors by it and subtract 1."""
 MODES = {"train": "train", "val": "validation", "test": "test"}
-"""Names of splits in Mask3D."""
+"""Mask3D's names of splits."""
 _MAX_OBJECTS = 999
-"""Objects that a scan may have in Mask3D, whose ground truth is the class in thousands and the
-number of the object, counted from one."""
-_EXACT = 2**24
-"""Largest number up to which float32 holds every whole one."""
+"""Maximum number of objects per scan in Mask3D, whose ground truth is 1000 times the class plus the
+object ID, from one."""
+_MAX_EXACT = 2**24
+"""Limit up to which float32 represents every integer."""
 _S3DIS_FOLDER = "Stanford3dDataset_v1.2_Aligned_Version"
-"""Folder in which MMDetection3D looks for the names of the rooms."""
+"""Folder in which MMDetection3D expects the room names."""
 VERSION = 2
-"""To be raised when a layout gets other files, so that scans with the old ones are done again."""
+"""Layout version; increment it when files change, so that existing scans are converted again."""
 
 
 @dataclass(frozen=True)
 class LayoutScan:
-    """One scan as layouts take it.
+    """Input of a layout: one scan.
 
     Attributes:
-        name: What its files are called.
-        listed: ``train``, ``val`` or ``test``, or nothing where the data set does not say.
-        folder: Where it is in its own data set, which some programs keep.
-        dataset: The data set whose classes and objects it has, a key of a row of :data:`LAYOUTS`;
+        name: Stem of its files.
+        listed: ``train``, ``val`` or ``test``, empty if the data set defines no split.
+        folder: Path in its own data set, which some programs keep.
+        dataset: The data set that defines classes and objects, a key of a row of :data:`LAYOUTS`;
             ``"ScanNet"`` without any.
         coord: Coordinates, shape ``(N, 3)``, float32.
         normal: Unit normals, shape ``(N, 3)``.
         superpoint: Superpoint of each point, shape ``(N,)``.
-        plane: Plane of each point, -1 for none, shape ``(N,)``.
-        given: What else is known: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the
-            class of each point, -1 for none, ``category``, its number in NYU40, 0 for none, and
-            ``instance``, its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
-        objects: What :func:`torchrg.datasets.scannet.read_objects` returns; None if unknown.
-        coarser: Coarser levels of superpoints, each shape ``(N,)``.
+        plane: Plane ID of each point, -1 for none, shape ``(N,)``.
+        given: Optional inputs: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the class
+            of each point, -1 for none, ``category``, its NYU40 ID, 0 for none, and ``instance``,
+            its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
+        objects: Result of :func:`torchrg.datasets.scannet.read_objects`; None if unknown.
+        coarser: Coarser levels of superpoints, each of shape ``(N,)``.
     """
 
     name: str
-    listed: str
+    declared_split: str
     folder: str
     dataset: str
     coord: NDArray[np.float32]
     normal: NDArray[np.floating]
     superpoint: NDArray[np.integer]
     plane: NDArray[np.integer]
-    given: Mapping[str, NDArray[Any]]
+    inputs: Mapping[str, NDArray[Any]]
     objects: Sequence[tuple[Mapping[str, Any], NDArray[np.integer]]] | None = None
     coarser: Sequence[NDArray[np.integer]] = ()
 
     @property
     def split(self) -> str:
-        """One of ``train``, ``val`` and ``test``: those without labels are of the test."""
-        return self.listed or ("test" if self.truth is None else "train")
+        """``train``, ``val`` or ``test``; by default ``test`` for a scan without labels."""
+        return self.declared_split or ("test" if self.ground_truth is None else "train")
 
     @property
     def color(self) -> NDArray[np.uint8]:
-        """Colours, black where there are none."""
-        return self.given.get("color", np.zeros(self.coord.shape, np.uint8))
+        """Colors; black if unknown."""
+        return self.inputs.get("color", np.zeros(self.coord.shape, np.uint8))
 
     @property
-    def truth(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-        """Class and object of each point; None where they are not known."""
-        segment = self.given.get("segment20", self.given.get("segment"))
-        if segment is None or "instance" not in self.given:
+    def ground_truth(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+        """Class and object of each point; None if unknown."""
+        segment = self.inputs.get("segment20", self.inputs.get("segment"))
+        if segment is None or "instance" not in self.inputs:
             return None
         segment, instance = (
             labels.reshape(len(labels), -1)[:, 0].astype(np.int64)
-            for labels in (segment, self.given["instance"])
+            for labels in (segment, self.inputs["instance"])
         )
         return segment, instance
 
     @property
     def category(self) -> NDArray[np.int64]:
-        """Number in NYU40 of the class of each point of ScanNet, 0 for none."""
-        if "category" in self.given or self.truth is None:
-            return self.given.get("category", np.zeros(len(self.coord))).astype(np.int64)
-        return np.array([*NYU_IDS, 0])[self.truth[0]]
+        """NYU40 ID of the class of each ScanNet point, 0 for none."""
+        if "category" in self.inputs or self.ground_truth is None:
+            return self.inputs.get("category", np.zeros(len(self.coord))).astype(np.int64)
+        return np.array([*NYU_IDS, 0])[self.ground_truth[0]]
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Return the split that the name of a scan begins with, if any, and the name of its files.
+    """Return the split in the name of a scan, if any, and the stem of its files.
 
     Example:
         >>> split_name("val/scene0011_00"), split_name("Area_1/office_1")
@@ -128,51 +128,51 @@ def split_name(name: str) -> tuple[str, str]:
     return (head, tail) if head in MODES else ("", name.replace("/", "_"))
 
 
-def stem_of(layout: str, name: str, folder: str) -> str:
-    """Return what no two scans may have in common in a layout, as their files would be the same.
+def layout_stem(layout: str, name: str, folder: str) -> str:
+    """Return the file stem that must be unique per scan in a layout.
 
-    ``name`` is that of the scan in its data set, and ``folder`` where it is there.
+    ``name`` and ``folder`` are the scan's name and path in its data set.
     """
     if layout == "scannet":
         return folder
     _, stem = split_name(name)
-    return _short(stem) if layout == "mask3d" else stem
+    return _mask3d_name(stem) if layout == "mask3d" else stem
 
 
 def check_layout(layout: str, dataset: str, what: str) -> None:
-    """Raise if a layout has no form for a data set, called ``what``, or no package to write it."""
+    """Raise if a layout does not support a data set (``what``), or needs a missing package."""
     layouts = [name for name, forms in LAYOUTS.items() if dataset in forms]
     if layout not in ("pointcept", *layouts):
         raise ConfigError(
             f"expected --layout to be one of pointcept, {', '.join(layouts)} for {what}, got "
-            f"{layout}, whose programs do not know its classes; choose another."
+            f"{layout}, whose programs do not support its classes; choose another."
         )
     if layout == "nag":
         require("h5py", extra="nag", purpose="write layout nag")
 
 
 def check_stems(layout: str, places: Mapping[str, str]) -> None:
-    """Raise FormatError if a scan would write into the files of another in a layout.
+    """Raise FormatError if two scans would write the same files in a layout.
 
-    ``places`` says where each scan is in its data set, by its name.
+    ``places`` contains the path of each scan in its data set, by name.
     """
-    taken: dict[str, str] = {}
-    for name, place in places.items() if layout != "pointcept" else ():
-        stem = stem_of(layout, name, place)
-        other = taken.setdefault(folded_name(stem), name)
+    owners: dict[str, str] = {}
+    for name, path in places.items() if layout != "pointcept" else ():
+        stem = layout_stem(layout, name, path)
+        other = owners.setdefault(folded_name(stem), name)
         if other != name:
             raise FormatError(
-                f"expected files of its own for each scan, got {stem} for {other} and {name} in "
-                f"layout {layout}; rename one, or choose layout pointcept."
+                f"file name collision in layout {layout}: {other} and {name} both use {stem}; "
+                "rename one, or choose layout pointcept."
             )
 
 
 def note_on_origin(layout: str, cloud: Cloud) -> tuple[str, ...]:
-    """Return what a user should know of the coordinates of a cloud in a layout."""
+    """Return a note if a layout shifts the coordinates of a cloud."""
     if layout == "pointcept" or not cloud.origin.any():
         return ()
-    place = " ".join(f"{value:.12g}" for value in cloud.origin)
-    return (f"coordinates are written about {place}, as they are far from the origin",)
+    shift = " ".join(f"{value:.12g}" for value in cloud.origin)
+    return (f"coordinates are written relative to {shift}, because they are far from the origin",)
 
 
 def write_scan(
@@ -185,10 +185,10 @@ def write_scan(
     *,
     level: int = 0,
 ) -> list[str]:
-    """Write a scene in a layout, into the folder of its name; return the paths of files from there.
+    """Write a scene in a layout to the folder of its name; return paths relative to that folder.
 
-    Every layout but ``"pointcept"`` needs superpoints, of which it takes one ``level``. Colors of
-    16 bits are rounded to 8, which is what readers of layouts expect.
+    Every layout except ``"pointcept"`` needs superpoints, and uses one ``level`` of them. 16-bit
+    colors are rounded to 8 bits, as readers of layouts expect.
     """
     if "color" in cloud.fields:
         color = narrow_colors(cloud.fields["color"])
@@ -208,7 +208,7 @@ def write_scan(
     objects = None
     if layout == "scannet" and scene.dataset == "ScanNet" and scene.path.is_file():
         objects = read_objects(scene.path, len(cloud))
-    given = {**cloud.fields, **cloud.header} if is_known else cloud.fields
+    inputs = {**cloud.fields, **cloud.header} if is_known else cloud.fields
     scan = LayoutScan(
         stem,
         split,
@@ -218,7 +218,7 @@ def write_scan(
         normal=seg.normals.numpy(),
         superpoint=superpoint,
         plane=seg.labels.numpy(),
-        given={k: np.asarray(v) for k, v in given.items() if is_known or k == "color"},
+        inputs={k: np.asarray(v) for k, v in inputs.items() if is_known or k == "color"},
         objects=objects,
         coarser=levels[1:],
     )
@@ -227,48 +227,48 @@ def write_scan(
 
 
 def write_layout(
-    layout: str, place: Path, out: Path, scan: LayoutScan, planes: Planes, origin: NDArray[Any]
+    layout: str, folder: Path, out: Path, scan: LayoutScan, planes: Planes, origin: NDArray[Any]
 ) -> list[str]:
     """Write the files of a scan in a layout, and ``planes.json`` in a folder of the scan.
 
     Args:
         layout: A key of :data:`LAYOUTS`.
-        place: The folder of the scan, below ``out``.
+        folder: The folder of the scan, below ``out``.
         out: The output directory.
         scan: The scan.
         planes: Its plane table.
-        origin: Where the origin of the table is; see :func:`torchrg.result.describe_planes`.
+        origin: Origin of the table's coordinates; see :func:`torchrg.result.describe_planes`.
 
     Returns:
-        Names of the files written, as paths from ``place``.
+        Paths of the files written, relative to ``folder``.
 
     Raises:
-        FormatError: If some points are not finite, which these programs do not expect, or a file
-            from elsewhere is in the way.
+        FormatError: If some points are not finite, which these programs do not support, or a file
+            of other origin would be overwritten.
     """
     num_bad = int(np.count_nonzero(scan.superpoint < 0))
     if num_bad:
         raise FormatError(
-            f"{place}: expected finite points for layout {layout}, got {num_bad:,} of "
-            f"{len(scan.coord):,} that are not; remove them, or choose layout pointcept."
+            f"{folder}: expected finite points for layout {layout}, got {num_bad:,} non-finite of "
+            f"{len(scan.coord):,}; remove them, or choose layout pointcept."
         )
-    up = "../" * len(place.relative_to(out).parts)
+    up = "../" * len(folder.relative_to(out).parts)
     files = LAYOUTS[layout][scan.dataset](scan)
     contents = {f"{up}{path}": content for path, content in files.items()}
-    return write_files(place, contents, describe_planes(planes, origin=origin.tolist()))
+    return write_files(folder, contents, describe_planes(planes, origin=origin.tolist()))
 
 
 def _scannet(scan: LayoutScan) -> Files:
-    """ScanNet's own: superpoints as its Segmentator writes segments, and its objects by them."""
-    first = f"{scan.folder}/{scan.name}_vh_clean_2"
+    """Return ScanNet files: superpoints as Segmentator segments, and objects in terms of them."""
+    prefix = f"{scan.folder}/{scan.name}_vh_clean_2"
     if scan.dataset == "ScanNet++":
-        first = f"{scan.folder}/mesh_aligned_0.05"
-    files: Files = {f"{first}.planes.segs.json": _segments(scan, scan.plane)}
+        prefix = f"{scan.folder}/mesh_aligned_0.05"
+    files: Files = {f"{prefix}.planes.segs.json": _segments(scan, scan.plane)}
     parts = scan.superpoint
     if scan.objects is not None:
-        # The release numbers segments by vertices. Beyond these, a file of the one beside a file of
-        # the other has no objects, and not wrong ones.
-        parts = len(scan.coord) + _cut(scan.superpoint, [rows for _, rows in scan.objects])
+        # The release numbers segments by vertices. Larger IDs ensure that mixing its files with
+        # these yields no objects instead of wrong ones.
+        parts = len(scan.coord) + _split(scan.superpoint, [rows for _, rows in scan.objects])
         content = {
             "sceneId": f"scannet.{scan.name}",
             "appId": "torchrg",
@@ -279,18 +279,18 @@ def _scannet(scan: LayoutScan) -> Files:
             "segmentsFile": f"scannet.{scan.name}_vh_clean_2.0.010000.segs.json",
         }
         files[f"{scan.folder}/{scan.name}.aggregation.json"] = _json(content)
-    return {f"{first}.0.010000.segs.json": _segments(scan, parts), **files}
+    return {f"{prefix}.0.010000.segs.json": _segments(scan, parts), **files}
 
 
-def _cut(
+def _split(
     superpoint: NDArray[np.integer], objects: Sequence[NDArray[np.integer]]
 ) -> NDArray[np.int64]:
-    """Return superpoints of which each is in an object as a whole, or not at all.
+    """Split superpoints so that each lies entirely inside or outside every object.
 
-    Objects may overlap, as the release has segments that two of them name.
+    Objects may overlap, because some segments of the release belong to two objects.
 
     Example:
-        >>> _cut(np.array([0, 0, 0, 1, 1]), [np.array([0, 1]), np.array([1, 3])]).tolist()
+        >>> _split(np.array([0, 0, 0, 1, 1]), [np.array([0, 1]), np.array([1, 3])]).tolist()
         [2, 4, 0, 3, 1]
     """
     parts = superpoint.astype(np.int64)
@@ -300,40 +300,40 @@ def _cut(
 
 
 def _segments(scan: LayoutScan, labels: NDArray[np.integer]) -> bytes:
-    """Return labels as the JSON of segments."""
+    """Encode labels as a segments JSON."""
     return _json({"params": {}, "sceneId": scan.name, "segIndices": labels.tolist()})
 
 
 def _json(content: Any) -> bytes:  # noqa: ANN401
-    """Return an object as JSON without blanks."""
+    """Encode an object as compact JSON."""
     return json.dumps(content, separators=(",", ":")).encode()
 
 
 def _mmdet3d(scan: LayoutScan) -> Files:
-    """MMDetection3D: what its ``create_data`` reads, and what its loaders read after that."""
+    """Return MMDetection3D files: the input of ``create_data``, and the input of its loaders."""
     vertices = np.hstack([scan.coord, scan.color.astype(np.float32)])
     superpoint = scan.superpoint.astype(np.int64)
-    first = f"scannet_instance_data/{scan.name}"
+    prefix = f"scannet_instance_data/{scan.name}"
     files: Files = {
-        f"{first}_vert.npy": vertices,
-        f"{first}_sp_label.npy": superpoint,
-        f"{first}_plane.npy": scan.plane.astype(np.int64),
+        f"{prefix}_vert.npy": vertices,
+        f"{prefix}_sp_label.npy": superpoint,
+        f"{prefix}_plane.npy": scan.plane.astype(np.int64),
         f"points/{scan.name}.bin": vertices.tobytes(),
         f"super_points/{scan.name}.bin": superpoint.tobytes(),
     }
-    if scan.truth is not None or scan.split == "test":
+    if scan.ground_truth is not None or scan.split == "test":
         files[f"meta_data/scannetv2_{scan.split}/{scan.name}.json"] = _json({"name": scan.name})
-    if scan.truth is None:
+    if scan.ground_truth is None:
         return files
-    # Objects are counted from one there.
-    category, instance = scan.category, scan.truth[1] + 1
-    matrix = scan.given.get("axis_align_matrix", np.eye(4))
+    # MMDetection3D counts objects from one.
+    category, instance = scan.category, scan.ground_truth[1] + 1
+    matrix = scan.inputs.get("axis_align_matrix", np.eye(4))
     files |= {
-        f"{first}_sem_label.npy": category,
-        f"{first}_ins_label.npy": instance,
-        f"{first}_axis_align_matrix.npy": matrix,
-        f"{first}_unaligned_bbox.npy": _boxes(scan.coord, category, instance),
-        f"{first}_aligned_bbox.npy": _boxes(
+        f"{prefix}_sem_label.npy": category,
+        f"{prefix}_ins_label.npy": instance,
+        f"{prefix}_axis_align_matrix.npy": matrix,
+        f"{prefix}_unaligned_bbox.npy": _boxes(scan.coord, category, instance),
+        f"{prefix}_aligned_bbox.npy": _boxes(
             scan.coord @ matrix[:3, :3].T + matrix[:3, 3], category, instance
         ),
         f"semantic_mask/{scan.name}.bin": category.tobytes(),
@@ -343,17 +343,17 @@ def _mmdet3d(scan: LayoutScan) -> Files:
 
 
 def _mmdet3d_s3dis(scan: LayoutScan) -> Files:
-    """MMDetection3D: S3DIS about the corner of its room, classes and objects of all points."""
+    """Return MMDetection3D files for S3DIS, relative to the room's corner, with all objects."""
     low = scan.coord.min(axis=0).astype(np.float64)
     points = np.hstack([scan.coord - low, scan.color]).astype(np.float32)
     superpoint = scan.superpoint.astype(np.int64)
     segment, instance = _labels(scan)
     instance += 1
-    first = f"s3dis_data/{scan.name}"
+    prefix = f"s3dis_data/{scan.name}"
     return {
-        f"{first}_point.npy": points,
-        f"{first}_sem_label.npy": segment,
-        f"{first}_ins_label.npy": instance,
+        f"{prefix}_point.npy": points,
+        f"{prefix}_sem_label.npy": segment,
+        f"{prefix}_ins_label.npy": instance,
         f"{_S3DIS_FOLDER}/{scan.folder}/plane.npy": scan.plane.astype(np.int64),
         f"points/{scan.name}.bin": points.tobytes(),
         f"super_points/{scan.name}.bin": superpoint.tobytes(),
@@ -363,81 +363,81 @@ def _mmdet3d_s3dis(scan: LayoutScan) -> Files:
 
 
 def _labels(scan: LayoutScan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return class and object of each point of S3DIS, in which no point is without."""
-    if scan.truth is None:
+    """Return class and object of each S3DIS point; every point has both."""
+    if scan.ground_truth is None:
         raise FormatError(f"{scan.name}: expected classes and objects of S3DIS, got none.")
-    segment, instance = scan.truth
+    segment, instance = scan.ground_truth
     return segment, np.unique(instance, return_inverse=True)[1].reshape(-1)
 
 
 def _boxes(
     coord: NDArray[np.floating], category: NDArray[np.int64], instance: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return middle, sides and category of each object of the benchmark, shape ``(K, 7)``."""
+    """Return center, size and category of each benchmark object, shape ``(K, 7)``."""
     rows = []
-    for number in np.unique(instance[np.isin(category, NYU_IDS[_STUFF:]) & (instance > 0)]):
+    for number in np.unique(instance[np.isin(category, NYU_IDS[_NUM_STUFF:]) & (instance > 0)]):
         inside = instance == number
         low, high = coord[inside].min(axis=0), coord[inside].max(axis=0)
         kinds, counts = np.unique(category[inside], return_counts=True)
         rows.append([*(low + high) / 2, *(high - low), kinds[counts.argmax()]])
     boxes = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    return boxes[np.isin(boxes[:, 6], NYU_IDS[_STUFF:])]
+    return boxes[np.isin(boxes[:, 6], NYU_IDS[_NUM_STUFF:])]
 
 
 def _spformer(scan: LayoutScan) -> Files:
-    """SPFormer: a tuple with the superpoints in the middle."""
-    coord, color, *truth = _centered(scan)
-    content = (coord, color, scan.superpoint.astype(np.int64), *truth)
+    """Return SPFormer files: a tuple with the superpoints in the middle."""
+    coord, color, *ground_truth = _centered(scan)
+    content = (coord, color, scan.superpoint.astype(np.int64), *ground_truth)
     return {
-        f"{scan.split}/{scan.name}_inst_nostuff.pth": _pickled(content),
-        f"planes/{scan.name}.pth": _pickled(scan.plane.astype(np.int64)),
+        f"{scan.split}/{scan.name}_inst_nostuff.pth": _to_pickle(content),
+        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
     }
 
 
 def _isbnet(scan: LayoutScan) -> Files:
-    """ISBNet and those after it: a tuple, and the superpoints in a file of their own."""
+    """Return files of ISBNet and its successors: a tuple, and a file of superpoints."""
     return {
-        f"{scan.split}/{scan.name}_inst_nostuff.pth": _pickled(_centered(scan)),
-        f"superpoints/{scan.name}.pth": _pickled(scan.superpoint.astype(np.int64)),
-        f"planes/{scan.name}.pth": _pickled(scan.plane.astype(np.int64)),
+        f"{scan.split}/{scan.name}_inst_nostuff.pth": _to_pickle(_centered(scan)),
+        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint.astype(np.int64)),
+        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
     }
 
 
 def _isbnet_s3dis(scan: LayoutScan) -> Files:
-    """ISBNet's S3DIS: coordinates and colours as they are, and objects of all classes."""
+    """Return ISBNet files for S3DIS: unchanged coordinates and colors, objects of all classes."""
     content = (scan.coord, scan.color.astype(np.float32), *_labels(scan))
     return {
-        f"preprocess/{scan.name}_inst_nostuff.pth": _pickled(content),
-        f"superpoints/{scan.name}.pth": _pickled(scan.superpoint.astype(np.int64)),
-        f"planes/{scan.name}.pth": _pickled(scan.plane.astype(np.int64)),
+        f"preprocess/{scan.name}_inst_nostuff.pth": _to_pickle(content),
+        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint.astype(np.int64)),
+        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
     }
 
 
 def _centered(scan: LayoutScan) -> tuple[NDArray[Any], ...]:
-    """Return coordinates about their mean, colours in [-1, 1], and classes and objects if known."""
+    """Return centered coordinates, colors in [-1, 1], and classes and objects if known."""
     mean = scan.coord.mean(axis=0, dtype=np.float64)
     coord = (scan.coord - mean).astype(np.float32)
     color = (scan.color / _CENTERED - 1).astype(np.float32)
-    if scan.truth is None:
+    if scan.ground_truth is None:
         return coord, color
-    segment, instance = scan.truth
-    is_object = (instance >= 0) & ((segment < 0) | (segment >= _STUFF))
+    segment, instance = scan.ground_truth
+    is_object = (instance >= 0) & ((segment < 0) | (segment >= _NUM_STUFF))
     objects = np.full(len(segment), _IGNORED, dtype=np.float64)
     objects[is_object] = np.unique(instance[is_object], return_inverse=True)[1].reshape(-1)
     return coord, color, np.where(segment < 0, _IGNORED, segment).astype(np.float64), objects
 
 
 def _mask3d(scan: LayoutScan) -> Files:
-    """Mask3D: a scan of ScanNet, whose classes are categories of NYU40."""
-    labels = None if scan.truth is None else (scan.category, scan.truth[1])
-    # Mask3D knows a scan by the folder of its mesh.
+    """Return Mask3D files of a ScanNet scan; its classes are NYU40 categories."""
+    labels = None if scan.ground_truth is None else (scan.category, scan.ground_truth[1])
+    # Mask3D identifies a scan by its mesh folder.
     entry = {"scene": scan.name, "raw_filepath": f"{scan.name}/{scan.name}_vh_clean_2.ply"}
-    places = f"{MODES[scan.split]}/{_short(scan.name)}", f"{MODES[scan.split]}/{scan.name}"
+    places = f"{MODES[scan.split]}/{_mask3d_name(scan.name)}", f"{MODES[scan.split]}/{scan.name}"
     return _mask3d_files(scan, *places, labels, entry, first_class=0)
 
 
 def _mask3d_s3dis(scan: LayoutScan) -> Files:
-    """Mask3D: a room of S3DIS, whose classes are counted from one in the ground truth."""
+    """Return Mask3D files of an S3DIS room; its classes start at one in the ground truth."""
     area, room = scan.folder.split("/")
     entry = {"scene": room, "area": area, "raw_filepath": scan.folder}
     return _mask3d_files(scan, scan.folder, scan.folder, _labels(scan), entry, first_class=1)
@@ -445,58 +445,58 @@ def _mask3d_s3dis(scan: LayoutScan) -> Files:
 
 def _mask3d_files(
     scan: LayoutScan,
-    place: str,
-    truth_place: str,
+    stem: str,
+    ground_truth_path: str,
     labels: tuple[NDArray[np.int64], NDArray[np.int64]] | None,
     entry: Mapping[str, Any],
     first_class: int,
 ) -> Files:
-    """One array of all columns, superpoints the tenth; the ground truth; the entry of its list."""
-    mode, _, name = place.partition("/")
+    """Return an array of all columns (superpoints are the tenth), ground truth and list entry."""
+    mode, _, name = stem.partition("/")
     color = scan.color.astype(np.int64)
     num_values = 255 * max(len(color), 1)
     entry = {
-        "filepath": f"{place}.npy",
+        "filepath": f"{stem}.npy",
         "file_len": len(color),
         "color_mean": (color.sum(axis=0) / num_values).tolist(),
         "color_std": ((color**2).sum(axis=0) / (255 * num_values)).tolist(),
         **entry,
     }
     files: Files = {f"planes/{scan.name}.npy": scan.plane.astype(np.int64)}
-    _check_numbers(scan, "superpoints", scan.superpoint, 0, _EXACT)
+    _check_range(scan, "superpoints", scan.superpoint, 0, _MAX_EXACT)
     columns: list[NDArray[Any]] = [scan.coord, scan.color, scan.normal, scan.superpoint[:, None]]
     if labels is not None:
         category, instance = labels
-        _check_numbers(scan, "numbers of classes", category, 0, _EXACT)
-        _check_numbers(scan, "numbers of objects", instance, -1, _MAX_OBJECTS)
+        _check_range(scan, "numbers of classes", category, 0, _MAX_EXACT)
+        _check_range(scan, "numbers of objects", instance, -1, _MAX_OBJECTS)
         columns += [category[:, None], instance[:, None]]
-        truth = (category + first_class) * 1000 + instance + 1
-        entry["instance_gt_filepath"] = path = f"instance_gt/{truth_place}.txt"
-        files[path] = "".join(f"{number}\n" for number in truth).encode()
+        ground_truth = (category + first_class) * 1000 + instance + 1
+        entry["instance_gt_filepath"] = path = f"instance_gt/{ground_truth_path}.txt"
+        files[path] = "".join(f"{number}\n" for number in ground_truth).encode()
     if labels is not None or mode == "test":
         files[f"{mode}_database/{name}.json"] = _json(entry)
-    return {f"{place}.npy": np.hstack([c.astype(np.float32) for c in columns]), **files}
+    return {f"{stem}.npy": np.hstack([c.astype(np.float32) for c in columns]), **files}
 
 
-def _check_numbers(
-    scan: LayoutScan, what: str, numbers: NDArray[np.integer], least: int, end: int
+def _check_range(
+    scan: LayoutScan, what: str, numbers: NDArray[np.integer], low: int, end: int
 ) -> None:
-    """Refuse numbers that Mask3D would read as others."""
-    bad = numbers[(numbers < least) | (numbers >= end)]
+    """Raise FormatError for integers that Mask3D's files cannot represent."""
+    bad = numbers[(numbers < low) | (numbers >= end)]
     if len(bad):
         raise FormatError(
-            f"{scan.name}: expected {what} from {least} to {end - 1:,} for layout mask3d, whose "
-            f"files hold no others, got {bad[0]:,}; choose another layout."
+            f"{scan.name}: expected {what} from {low} to {end - 1:,} for layout mask3d, got "
+            f"{bad[0]:,}; choose another layout."
         )
 
 
-def _short(name: str) -> str:
-    """Return the name of a scan in Mask3D, which leaves out the first word of ScanNet's."""
+def _mask3d_name(name: str) -> str:
+    """Return Mask3D's name of a scan, without ScanNet's prefix ``scene``."""
     return re.sub(r"^scene(?=[0-9]{4}_[0-9]{2}$)", "", name)
 
 
 def _npy(scan: LayoutScan) -> Files:
-    """A folder of bare arrays, as GrowSP and others keep superpoints."""
+    """Return a folder of plain arrays, as used by GrowSP and others."""
     return {
         f"superpoints/{scan.name}.npy": scan.superpoint.astype(np.int64),
         f"planes/{scan.name}.npy": scan.plane.astype(np.int64),
@@ -504,24 +504,26 @@ def _npy(scan: LayoutScan) -> Files:
 
 
 def _nag(scan: LayoutScan) -> Files:
-    """Superpoint Transformer: the points and all levels above them, with counts of its classes."""
+    """Return a Superpoint Transformer file: points and all levels, with class counts."""
     values: dict[str, Any] = {"rgb": scan.color, "normal": scan.normal}
     numbers = _NAG_CLASSES.get(scan.dataset)
-    if scan.truth is not None and numbers is not None:
-        # The last column is of points without a class.
+    if scan.ground_truth is not None and numbers is not None:
+        # The last column counts points without a class.
         one_hot = np.eye(len(numbers), dtype=np.int64)[numbers]
-        values["y"] = one_hot[np.where(scan.truth[0] < 0, len(numbers) - 1, scan.truth[0])]
+        values["y"] = one_hot[
+            np.where(scan.ground_truth[0] < 0, len(numbers) - 1, scan.ground_truth[0])
+        ]
     fine, *coarse = (torch.from_numpy(level).long() for level in (scan.superpoint, *scan.coarser))
     parts = Superpoints(fine, torch.full((int(fine.max()) + 1,), UNLABELED), tuple(coarse))
     levels = make_nag(scan.coord, parts, data=dict, **values)
-    return {f"{scan.listed or 'nag'}/{scan.name}.h5": encode_nag(levels)}
+    return {f"{scan.declared_split or 'nag'}/{scan.name}.h5": encode_nag(levels)}
 
 
 _NAG_CLASSES = {
     "ScanNet": [*range(len(NYU_IDS) + 1)],
     "S3DIS": [*map(CLASS_ORDERS["spt"].index, CLASS_ORDERS["pointcept"]), 13],
 }
-"""Numbers of classes in Superpoint Transformer, and of none, by those of the data set."""
+"""Class IDs in Superpoint Transformer by class of the data set; the last is for none."""
 
 
 LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
@@ -533,26 +535,26 @@ LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
     "nag": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _nag),
     "npy": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _npy),
 }
-"""Functions for the files of a scan, by the layout and the data set. That without a name has
-labels whose classes nobody knows. Clouds without labels are written as those of ScanNet."""
+"""File functions by layout and data set. The empty name stands for labels of unknown classes.
+Clouds without labels are written like ScanNet scans."""
 
 
-def _pickled(content: Any) -> bytes:  # noqa: ANN401
-    """Return what ``torch.save`` writes, as NumPy 1 can read it too."""
+def _to_pickle(content: Any) -> bytes:  # noqa: ANN401
+    """Return the output of ``torch.save`` in a form that NumPy 1 can also load."""
     with io.BytesIO() as stream:
         torch.save(content, stream, pickle_module=_OLD_PICKLE)
         return stream.getvalue()
 
 
 class _OldPickler(pickle.Pickler):
-    """Writes the name that the module of arrays had before NumPy 2, and has there still."""
+    """Pickler that writes NumPy's module names from before version 2, which still exist."""
 
     def __init__(self, file: io.BytesIO, protocol: int) -> None:
         self._file, self._memory = file, io.BytesIO()
         super().__init__(self._memory, protocol)
 
     def dump(self, obj: Any) -> None:  # noqa: ANN401
-        """Write an object."""
+        """Pickle an object."""
         super().dump(obj)
         self._file.write(_with_old_names(self._memory.getvalue()))
 
@@ -562,15 +564,15 @@ _OLD_PICKLE.Pickler = _OldPickler  # type: ignore[attr-defined]
 
 
 def _with_old_names(pickled: bytes) -> bytes:
-    r"""Return a pickle of protocol 2 with the names of NumPy's modules before version 2.
+    r"""Replace NumPy's module names in a protocol 2 pickle by those from before version 2.
 
     Example:
         >>> _with_old_names(b"cnumpy._core.multiarray\n_reconstruct\n.")
         b'cnumpy.core.multiarray\n_reconstruct\n.'
     """
     parts, start, new = [], 0, b"numpy._core."
-    for opcode, argument, place in pickletools.genops(pickled):
-        if opcode.name == "GLOBAL" and str(argument).startswith(new.decode()) and place is not None:
-            parts += [pickled[start : place + 1], b"numpy.core."]
-            start = place + 1 + len(new)
+    for opcode, argument, at in pickletools.genops(pickled):
+        if opcode.name == "GLOBAL" and str(argument).startswith(new.decode()) and at is not None:
+            parts += [pickled[start : at + 1], b"numpy.core."]
+            start = at + 1 + len(new)
     return b"".join([*parts, pickled[start:]])

@@ -1,9 +1,8 @@
-"""The files of a whole data set in which some programs look up its scans.
+"""Index files of converted data sets.
 
-Each scan leaves an entry of its own among its files, and a list is its entries in natural order. So
-it holds whatever scans are there, whichever commands wrote them, and equal scans give equal lists.
-Lists of names that a program brings itself stay, and get only what they lack. A scan is on the list
-of one split.
+Each scan has an entry file among its outputs, and a list contains its entries in natural order.
+Lists thus contain all existing scans, whichever command wrote them, and identical scans give
+identical lists. Lists that a program provides are only completed. A scan is listed in one split.
 """
 
 import json
@@ -22,26 +21,26 @@ from torchrg.io import atomic_path
 from torchrg.io.files import make_folder, marked_parts, refusing, remove_leftovers
 
 Entry = dict[str, Any]
-"""An entry that a scan leaves for a list, by its keys."""
+"""List entry of a scan, by key."""
 Entries = Mapping[str, Sequence[Entry]]
-"""Entries of the scans of a list, by the folder that they are in."""
+"""List entries by the folder that contains them."""
 
 
 def check_lists(layout: str, dataset: str, out: Path) -> None:
-    """Raise FormatError if lists from elsewhere are where :func:`write_lists` would write.
+    """Raise FormatError if :func:`write_lists` would overwrite lists of other origin.
 
     Args:
         layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
         dataset: A key of its row.
-        out: The output directory; it need not exist.
+        out: The output directory; it may not exist.
     """
-    folders, contents = _DATABASES.get((layout, dataset), _NONE)
+    folders, contents = _DATABASES.get((layout, dataset), _NO_LISTS)
     if any((out / folder).is_dir() for folder in folders):
         return
     for name in contents(dict.fromkeys(folders, ())):
         if (out / name).exists():
             raise FormatError(
-                f"{out / name}: is of another data set or program; move it away, or choose another "
+                f"{out / name}: is of another data set or program; move it, or choose another "
                 "directory."
             )
 
@@ -49,17 +48,17 @@ def check_lists(layout: str, dataset: str, out: Path) -> None:
 def write_lists(
     layout: str, dataset: str, out: Path, mark: str, *, without: Collection[Path] = ()
 ) -> None:
-    """Write the lists of a directory from the entries of the scans that are there, if any is.
+    """Write the lists of a directory from the entries of its scans, if there are any.
 
     Args:
         layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
         dataset: A key of its row.
         out: The output directory.
-        mark: See :func:`torchrg.io.files.marked_parts`; what a killed process left is removed.
-        without: Files of entries that the lists leave out, below ``out``.
+        mark: See :func:`torchrg.io.files.marked_parts`; leftovers of a killed process are removed.
+        without: Entry files below ``out`` to omit from the lists.
 
     Raises:
-        FormatError: If an entry is damaged, or a list cannot be written.
+        FormatError: If an entry is corrupt, or a list cannot be written.
     """
     out = out.resolve()
     remove_leftovers(out, mark)
@@ -68,12 +67,12 @@ def write_lists(
 
 
 def _write_all(layout: str, dataset: str, out: Path, without: Collection[Path]) -> None:
-    """Write the lists of a directory."""
+    """Write all lists of a directory."""
     if (layout, dataset) == ("mmdet3d", "ScanNet"):
         _write_names(out, [f"meta_data/scannetv2_{split}" for split in MODES], without)
-    folders, contents = _DATABASES.get((layout, dataset), _NONE)
+    folders, contents = _DATABASES.get((layout, dataset), _NO_LISTS)
     entries = {folder: _read_entries(out, folder, without) for folder in folders}
-    if any(entries.values()) or _entries_in(out, folders, without):
+    if any(entries.values()) or _entry_files(out, folders, without):
         import yaml
 
         for name, content in contents(entries).items():
@@ -82,50 +81,50 @@ def _write_all(layout: str, dataset: str, out: Path, without: Collection[Path]) 
 
 
 def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -> None:
-    """Write lists of names for MMDetection3D, which asks for all of them, also for empty ones.
+    """Write the name lists of MMDetection3D, which requires all of them, even if empty.
 
-    A scan is on one list: a list loses the names that have their entries in another split.
+    Names whose entry belongs to another split are removed from a list.
     """
     listed_in = {
         folder: [e["name"] for e in _read_entries(out, folder, without)] for folder in folders
     }
-    removed = {path.stem for path in _entries_in(out, folders, without)}
+    removed = {path.stem for path in _entry_files(out, folders, without)}
     for folder, scans in listed_in.items() if any(listed_in.values()) or removed else ():
         path = out / f"{folder}.txt"
-        with refusing(f"{path}: expected a name a line, got: ", ValueError):
+        with refusing(f"{path}: expected one name per line, got: ", ValueError):
             text = path.read_text(encoding="utf-8") if path.is_file() else ""
-        before = [line.strip() for line in text.splitlines() if line.strip()]
-        elsewhere = removed.union(*listed_in.values()) - set(scans)
-        listed = [name for name in before if name not in elsewhere]
-        others = set(listed) - set(scans)
+        existing = [line.strip() for line in text.splitlines() if line.strip()]
+        moved = removed.union(*listed_in.values()) - set(scans)
+        listed = [name for name in existing if name not in moved]
+        foreign = set(listed) - set(scans)
         missing = [name for name in scans if name not in listed]
-        if missing or not others or listed != before:
-            # A list of the program itself keeps its order; one of ours has that of the entries.
-            names = [*listed, *missing] if others else scans
+        if missing or not foreign or listed != existing:
+            # A list provided by the program keeps its order; ours has the order of the entries.
+            names = [*listed, *missing] if foreign else scans
             _write(out, path.relative_to(out), "".join(f"{name}\n" for name in names))
 
 
 def _write(out: Path, name: str | Path, text: str) -> None:
-    """Write a list, whole or not at all."""
+    """Write a list atomically."""
     make_folder((out / name).parent)
-    with atomic_path(out / name, within=out) as beside:
-        beside.write_text(text, encoding="utf-8")
+    with atomic_path(out / name, within=out) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
-def _entries_in(out: Path, folders: Sequence[str], files: Collection[Path]) -> list[Path]:
-    """Return the files that are entries of the lists of some folders."""
-    places = {out / folder for folder in folders}
-    return [path for path in files if path.parent in places]
+def _entry_files(out: Path, folders: Sequence[str], files: Collection[Path]) -> list[Path]:
+    """Return the files that are list entries in the given folders."""
+    parents = {out / folder for folder in folders}
+    return [path for path in files if path.parent in parents]
 
 
 def _read_entries(out: Path, folder: str, without: Collection[Path]) -> list[Entry]:
-    """Return the entries of a list, with files by their whole paths."""
+    """Return the entries of a list, with absolute file paths."""
     found = [path for path in (out / folder).glob("[!.]*.json") if path not in without]
     paths = sorted(found, key=lambda path: natural_key(path.stem))
     entries = []
     for path in paths:
         message = f"{path}: expected an entry of a list, got: "
-        with refusing(message, ValueError, repair="; move it away, and convert the scan again"):
+        with refusing(message, ValueError, repair="; move it, and convert the scan again"):
             entry = json.loads(path.read_text(encoding="utf-8"))
         files = {key: str(out / entry[key]) for key in _FILES & entry.keys()}
         entries.append(entry | files)
@@ -133,11 +132,11 @@ def _read_entries(out: Path, folder: str, without: Collection[Path]) -> list[Ent
 
 
 _FILES = {"filepath", "instance_gt_filepath"}
-"""Parts of an entry that are files."""
+"""Keys of an entry that are file paths."""
 
 
 def _mask3d(entries: Entries) -> dict[str, object]:
-    """Databases of the splits of ScanNet, its classes, and the colours that are subtracted."""
+    """Return Mask3D's ScanNet databases, class table, and color statistics."""
     train, validation, test = (entries[f"{mode}_database"] for mode in MODES.values())
     labels = zip(NYU_IDS, CLASSES, strict=True)
     return {
@@ -149,33 +148,33 @@ def _mask3d(entries: Entries) -> dict[str, object]:
 
 
 def _mask3d_s3dis(entries: Entries) -> dict[str, object]:
-    """Databases of the areas of S3DIS and, for each, of all others, which are trained on."""
+    """Return Mask3D's database of each S3DIS area, and of its training areas (all others)."""
     contents: dict[str, object] = {f"{folder}.yaml": [*scans] for folder, scans in entries.items()}
-    for folder, own in entries.items():
-        others = [entry for name, scans in entries.items() if name != folder for entry in scans]
-        contents[f"train_{folder}.yaml"] = others
+    for folder, test in entries.items():
+        train = [entry for name, scans in entries.items() if name != folder for entry in scans]
+        contents[f"train_{folder}.yaml"] = train
         area = folder.removesuffix("_database")
-        contents[f"{area}_color_mean_std.yaml"] = _color_mean_std(others or own)
+        contents[f"{area}_color_mean_std.yaml"] = _color_mean_std(train or test)
     classes = enumerate(CLASS_ORDERS["pointcept"])
     contents["label_database.yaml"] = {n: {"name": name, "validation": True} for n, name in classes}
     return contents
 
 
 def _color_mean_std(entries: Sequence[Entry]) -> dict[str, list[float]]:
-    """Return mean and deviation of the colours of scans; entries have the mean of squares."""
+    """Return mean and deviation of colors from entries, which store the mean of squares."""
     if not entries:
         return {"mean": [0.0] * 3, "std": [1.0] * 3}
     mean, squares = (
         np.mean([entry[key] for entry in entries], axis=0) for key in ("color_mean", "color_std")
     )
     deviation = np.sqrt(np.maximum(squares - mean**2, 0))
-    # What is of one colour everywhere is not divided by the deviation of it.
+    # A constant channel has no deviation to divide by.
     return {"mean": mean.tolist(), "std": np.where(deviation > 0, deviation, 1.0).tolist()}
 
 
-_NONE: tuple[Sequence[str], Callable[[Entries], dict[str, object]]] = ((), lambda entries: {})
+_NO_LISTS: tuple[Sequence[str], Callable[[Entries], dict[str, object]]] = ((), lambda entries: {})
 _DATABASES = {
     ("mask3d", "ScanNet"): ([f"{mode}_database" for mode in MODES.values()], _mask3d),
     ("mask3d", "S3DIS"): ([f"Area_{area}_database" for area in ROOMS_PER_AREA], _mask3d_s3dis),
 }
-"""Folders of entries, and what makes databases of them, by the layout and the data set."""
+"""Entry folders and database writers, by layout and data set."""

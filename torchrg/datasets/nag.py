@@ -1,4 +1,4 @@
-"""Nested levels of superpoints as Superpoint Transformer takes them: a NAG's list of ``Data``."""
+"""Superpoint levels in Superpoint Transformer's nested format (NAG)."""
 
 import importlib
 import io
@@ -17,11 +17,11 @@ from torchrg.structures import Array, Superpoints
 
 
 class Cluster(NamedTuple):
-    """Which nodes of the level below each node is made of: rows ``pointers[i]:pointers[i + 1]``.
+    """Child nodes of each node in compressed rows: ``points[pointers[i]:pointers[i + 1]]``.
 
     Attributes:
-        pointers: Shape ``(M + 1,)``, int64, from 0 to the number of nodes below.
-        points: Nodes of the level below, shape ``(N,)``, int64, each once.
+        pointers: Shape ``(M + 1,)``, int64, from 0 to the number of child nodes.
+        points: Child nodes, shape ``(N,)``, int64, each once.
     """
 
     pointers: Tensor
@@ -36,28 +36,28 @@ def make_nag(
     cluster: Callable[[Tensor, Tensor], object] = Cluster,
     **values: Tensor | Array,
 ) -> list[Any]:
-    """Return the levels of superpoints, the points first, as Superpoint Transformer nests them [1].
+    """Convert superpoints to a list of levels for Superpoint Transformer [1], points first.
 
-    Of each level ``super_index`` is the node above, and ``sub`` holds the nodes below. There
-    ``NAG(make_nag(points, parts, data=Data, cluster=Cluster))`` with its own ``Data`` and
-    ``Cluster`` of ``src.data`` is a hierarchy in place of that of cut pursuit.
+    In each level, ``super_index`` is the parent node, and ``sub`` holds the child nodes.
+    ``NAG(make_nag(points, parts, data=Data, cluster=Cluster))``, with ``Data`` and ``Cluster`` of
+    its ``src.data``, is a hierarchy that replaces cut pursuit's.
 
     Args:
         points: Points, shape ``(N, 3)``.
-        superpoints: What :func:`torchrg.make_superpoints` said about them.
-        data: Makes a level of entries by name. Default: PyG's ``Data``.
-        cluster: Makes ``sub`` of pointers and points.
-        values: Further entries of the points, of N rows: ``rgb``, ``normal``, ``y``.
+        superpoints: Result of :func:`torchrg.make_superpoints` for the points.
+        data: Creates a level from entries by name. Default: PyG's ``Data``.
+        cluster: Creates ``sub`` from pointers and points.
+        values: Further per-point entries of N rows: ``rgb``, ``normal``, ``y``.
 
     Returns:
-        Of level 0 ``pos``, the values, and ``super_index``, ``(N,)``, int64; of each level above,
-        ``pos``, the mean of its points, ``node_size``, their number, ``sub``, and, but for the
-        last, ``super_index``. Where ``y`` counts classes, ``(N, C)``, so it does above.
+        Level 0 has ``pos``, the values, and ``super_index``, ``(N,)``, int64. Each higher level has
+        ``pos`` (mean of its points), ``node_size`` (their number), ``sub``, and, except for the
+        last level, ``super_index``. Class counts ``y``, ``(N, C)``, are summed in higher levels.
 
     Raises:
-        ShapeError: If some points have no superpoint, as those that are not finite, a number of a
-            superpoint is not in use, or a superpoint is in two of the next level.
-        MissingDependencyError: If PyG is not installed and ``data`` is not given.
+        ShapeError: If some points have no superpoint (because they are not finite), superpoint IDs
+            have gaps, or a superpoint is in two of the next level.
+        MissingDependencyError: If PyG is not installed and ``data`` is not passed.
 
     References:
         [1] D. Robert, H. Raguet, L. Landrieu. Efficient 3D semantic segmentation with superpoint
@@ -77,8 +77,8 @@ def make_nag(
     without = int((superpoints.labels < 0).sum())
     if without:
         raise ShapeError(
-            f"make_nag: expected a superpoint of every point, got {without:,} points without one; "
-            "take out points that are not finite first."
+            f"make_nag: expected a superpoint for every point, got {without:,} points without one; "
+            "remove non-finite points first."
         )
     if data is None:
         try:
@@ -94,7 +94,7 @@ def make_nag(
     for level, labels in enumerate((superpoints.labels, *superpoints.levels)):
         check_shapes("make_nag", points=(pos, "N 3"), labels=(labels, "N"))
         labels, count = labels.to(pos.device), int(labels.max()) + 1 if len(labels) else 0
-        # Every point of a node below is in one node here.
+        # All points of a child node belong to the same node here.
         super_index = labels.new_empty(len(entries["pos"])).index_copy(0, below, labels)
         _check_level(level, labels, count, below, super_index)
         levels.append(data(**entries, super_index=super_index))
@@ -115,28 +115,28 @@ def make_nag(
 def _check_level(
     level: int, labels: Tensor, count: int, below: Tensor, super_index: Tensor
 ) -> None:
-    """Refuse a level with a number that no point has, or one that cuts a node of the level below.
+    """Raise ShapeError if node IDs have gaps, or a child node is split.
 
-    ``labels`` and ``below`` are the nodes of the points here and below, ``super_index`` the node
-    here of each node below.
+    ``labels`` and ``below`` are the nodes of the points here and in the level below,
+    ``super_index`` the parent of each node below.
     """
     sizes = torch.bincount(labels.clamp(min=0), minlength=count)
     if len(empty := (sizes == 0).nonzero()) or int((labels < 0).sum()):
         number = int(empty[0]) if len(empty) else int(labels.min())
         raise ShapeError(
-            f"make_nag: expected superpoints of level {level} numbered from 0 without gaps, got "
-            f"{number} {'of no point' if len(empty) else 'for a point'}; number them by "
+            f"make_nag: expected consecutive superpoint IDs from 0 in level {level}, got "
+            f"{number} {'for no point' if len(empty) else 'for a point'}; renumber them with "
             "torch.unique(labels, return_inverse=True)[1]."
         )
     if len(cut := (super_index[below] != labels).nonzero()):
         raise ShapeError(
             f"make_nag: expected each superpoint in one of level {level}, got {int(below[cut[0]])} "
-            "in two; make coarser levels of the finer ones."
+            "in two; merge finer levels to make coarser ones."
         )
 
 
 def encode_nag(levels: Iterable[Mapping[str, Any]]) -> bytes:
-    """Return levels of :func:`make_nag`, as dicts, as the HDF5 file that ``NAG.load`` reads.
+    """Encode levels of :func:`make_nag`, as dicts, as an HDF5 file for ``NAG.load``.
 
     Raises:
         MissingDependencyError: If h5py is not installed.
@@ -152,7 +152,7 @@ def encode_nag(levels: Iterable[Mapping[str, Any]]) -> bytes:
 
 
 def _entries(level: Mapping[str, Any]) -> Iterator[tuple[str, Tensor | Array]]:
-    """Yield the arrays of a level by their paths; clusters and counts are compressed rows."""
+    """Yield the arrays of a level by path; clusters and counts are in compressed rows."""
     for name, values in level.items():
         if isinstance(values, Cluster):
             yield f"_cluster_/{name}/pointers", values.pointers

@@ -1,11 +1,11 @@
-"""Scenes in Pointcept's processed layout: a folder of ``.npy`` files for each scene.
+"""Scene folders in Pointcept's processed layout.
 
 ``coord`` float32, ``color`` uint8 and ``normal`` float32 of shape ``(N, 3)``; ``segment`` and
-``instance`` int16 of shape ``(N, 1)``, of ScanNet++ ``(N, 3)``; of ScanNet ``segment20``,
-``segment200`` and ``instance`` int64 of shape ``(N,)``. Beside them torchrg puts ``plane`` int32 of
-shape ``(N,)``, ``curvature`` float32 of shape ``(N, 1)`` as Pointcept has features,
-``planes.json``, and ``superpoint`` int32 where it is asked for. Pointcept reads the files it knows
-and passes over the others; ``import torchrg.transforms.pointcept`` makes it know these.
+``instance`` int16 of shape ``(N, 1)``, ``(N, 3)`` for ScanNet++; ``segment20``, ``segment200`` and
+``instance`` int64 of shape ``(N,)`` for ScanNet. torchrg adds ``plane`` int32 of shape ``(N,)``,
+``curvature`` float32 of shape ``(N, 1)`` (as Pointcept's features are), ``planes.json``, and
+optionally ``superpoint`` int32. Pointcept ignores unknown files;
+``import torchrg.transforms.pointcept`` makes it load these.
 """
 
 import json
@@ -34,47 +34,47 @@ POINT_ARRAYS = (
     "coord", "color", "normal", "strength", "segment", "segment20", "segment200", "instance",
     "superpoint", "plane", "curvature",
 )  # fmt: skip
-"""Arrays of a scene folder that have a row for each point."""
-GIVEN_ARRAYS = POINT_ARRAYS[:8]
-"""Those that come with the points."""
-SOURCE_ARRAYS = tuple(name for name in GIVEN_ARRAYS if name != "normal")
-"""Those of a scene that go along with results."""
+"""Per-point arrays of a scene folder."""
+INPUT_ARRAYS = POINT_ARRAYS[:8]
+"""Per-point arrays of the input."""
+SOURCE_ARRAYS = tuple(name for name in INPUT_ARRAYS if name != "normal")
+"""Input arrays that are copied to results."""
 _SCANNET = ("segment20", "segment200")
 _LABELS = ("segment", *_SCANNET, "instance", "superpoint", "plane")
 _FEATURES = ("strength", "curvature")
-"""Arrays of numbers that have two axes in files, whatever they have elsewhere."""
+"""Scalar arrays that have two axes in files."""
 
 
-_kept: ContextVar[Collection[str]] = ContextVar("_kept", default=())
+_protected: ContextVar[Collection[str]] = ContextVar("_protected", default=())
 """Names of files that :func:`write_files` does not remove."""
 
 
 @contextmanager
-def keeping_files(names: Collection[str]) -> Iterator[None]:
-    """Keep files of these names where :func:`write_files` would remove them, in this thread.
+def protecting_files(names: Collection[str]) -> Iterator[None]:
+    """Prevent :func:`write_files` from removing files of these names, in this thread.
 
-    A record has fingerprints, and tells so which files a user has changed.
+    Callers identify files that a user has changed by fingerprints in records.
     """
-    token = _kept.set(names)
+    token = _protected.set(names)
     try:
         yield
     finally:
-        _kept.reset(token)
+        _protected.reset(token)
 
 
 def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """Read a scene folder, whoever wrote it.
+    """Read a scene folder of torchrg or Pointcept.
 
     Args:
         folder: A folder with ``coord.npy``.
 
     Returns:
-        Those of :data:`POINT_ARRAYS` that are there; labels as int64 of shape ``(N,)``. The others
-        are mapped from the files copy-on-write; ``curvature`` has shape ``(N,)``. Of points with
-        several labels the first is taken.
+        The existing arrays of :data:`POINT_ARRAYS`; labels as int64 of shape ``(N,)``. The other
+        arrays are memory-mapped copy-on-write; ``curvature`` has shape ``(N,)``. For points with
+        several labels, the first is returned.
 
     Raises:
-        FormatError: If there are no coordinates, a file is damaged, or lengths differ.
+        FormatError: If coordinates are missing, a file is corrupt, or lengths differ.
     """
     arrays = map_folder(Path(folder), POINT_ARRAYS)
     if arrays["coord"].ndim != 2:
@@ -97,21 +97,21 @@ def write_pointcept_scene(
     superpoint: Tensor | NDArray[np.integer] | None = None,
     origin: Sequence[float] | None = None,
 ) -> list[str]:
-    """Write a scene folder, or complete one that Pointcept wrote.
+    """Write a scene folder, or add results to a folder that Pointcept wrote.
 
-    What is there and was not written by this function is never changed: the arrays must have as
-    many rows, and the coordinates must be those of the sample. What it wrote itself, as
-    ``planes.json`` says, is replaced or removed. All files are complete before the first appears.
+    Files not written by this function are never changed: their arrays must have the same number of
+    rows, and coordinates must equal the sample's. Its own files, as listed in ``planes.json``, are
+    replaced or removed. All files are complete before the first one appears.
 
     Args:
-        folder: The scene, ``OUT/Area_i/<room>``; it is made.
+        folder: The scene, ``OUT/Area_i/<room>``; created if missing.
         sample: ``coord`` ``(N, 3)`` and any of ``color``, ``normal``, ``strength``, ``segment``,
-            ``segment20``, ``segment200``, ``instance``, as tensors or arrays. Without ``normal``
-            those of the segmentation are written.
-        segmentation: What :func:`torchrg.segment_planes` said about ``coord``.
-        superpoint: Superpoint of each point, shape ``(N,)``, to be written as ``superpoint`` too,
-            which ScanNet's data sets have. Default: none are.
-        origin: Where the origin of ``coord`` is, for the plane table; see
+            ``segment20``, ``segment200``, ``instance``, as tensors or arrays. Default for
+            ``normal``: the normals of the segmentation.
+        segmentation: Result of :func:`torchrg.segment_planes` for ``coord``.
+        superpoint: Superpoint of each point, shape ``(N,)``, written as ``superpoint``, as for
+            ScanNet. Default: none are written.
+        origin: Origin of ``coord``, for the plane table; see
             :func:`torchrg.result.describe_planes`. Default: ``coord`` is in the coordinates of the
             data set.
 
@@ -119,21 +119,21 @@ def write_pointcept_scene(
         Names of the files written.
 
     Raises:
-        FormatError: If the folder holds another scene, or a ``plane``, ``curvature``,
-            ``superpoint`` or ``planes.json`` from elsewhere, or cannot be written.
+        FormatError: If the folder contains another scene, or a ``plane``, ``curvature``,
+            ``superpoint`` or ``planes.json`` of other origin, or cannot be written.
     """
-    place = Path(folder)
-    arrays = _arrays_of(place, sample, segmentation, superpoint=superpoint)
-    owned = _owned(place)
-    # What only torchrg makes is never kept: one from elsewhere is in the way.
+    target = Path(folder)
+    arrays = _convert_arrays(target, sample, segmentation, superpoint=superpoint)
+    torchrg_files = _torchrg_files(target)
+    # torchrg's own arrays are never kept as inputs: a file of other origin is an error.
     inputs = {
         name
         for name in arrays.keys() - {"plane", "curvature", "superpoint"}
-        if f"{name}.npy" not in owned and (place / f"{name}.npy").exists()
+        if f"{name}.npy" not in torchrg_files and (target / f"{name}.npy").exists()
     }
-    _check_kept(place, arrays, inputs)
+    _check_inputs(target, arrays, inputs)
     new = {name: values for name, values in arrays.items() if name not in inputs}
-    return write_arrays(place, new, describe_planes(segmentation.planes, origin=origin))
+    return write_arrays(target, new, describe_planes(segmentation.planes, origin=origin))
 
 
 def write_results(
@@ -146,10 +146,10 @@ def write_results(
 ) -> list[str]:
     """Write ``coord``, ``normal``, ``curvature``, ``plane`` as ``.npy``, and ``planes.json``.
 
-    Into a folder that exists; ``coord`` ``(*, 3)`` in the dtype to be written, the segmentation of
-    the same leading axes, further ``fields`` by name. ``origin`` is where the origin of the
-    segmentation is, in the coordinates of ``coord``. Returns the names of the files; those of
-    others are never replaced, see :func:`torchrg.datasets.pointcept.write_arrays`.
+    The folder must exist. ``coord`` ``(*, 3)`` is in the dtype to write and has the leading axes of
+    the segmentation; ``fields`` are written by name. ``origin`` is the origin of the segmentation
+    in the coordinates of ``coord``. Returns the names of the files; files of other origin are never
+    replaced, see :func:`torchrg.datasets.pointcept.write_arrays`.
     """
     arrays: dict[str, NDArray[Any]] = {
         "coord": coord,
@@ -163,63 +163,63 @@ def write_results(
 
 
 def write_arrays(
-    place: Path, arrays: Mapping[str, Array], planes: Mapping[str, object]
+    target: Path, arrays: Mapping[str, Array], planes: Mapping[str, object]
 ) -> list[str]:
-    """Write arrays by name as ``.npy`` and the table of planes; see :func:`write_files`."""
-    return write_files(place, {f"{name}.npy": values for name, values in arrays.items()}, planes)
+    """Write arrays by name as ``.npy`` files and the plane table; see :func:`write_files`."""
+    return write_files(target, {f"{name}.npy": values for name, values in arrays.items()}, planes)
 
 
 def write_files(
-    place: Path, contents: Mapping[str, Array | bytes], planes: Mapping[str, object]
+    target: Path, contents: Mapping[str, Array | bytes], planes: Mapping[str, object]
 ) -> list[str]:
-    """Write files and the table of planes of a scene, beside what others have there.
+    """Write files and the plane table of a scene, without changing files of other origin.
 
-    What an earlier call wrote, as ``planes.json`` says, is replaced, and arrays that it wrote and
-    this one does not are removed; nothing else is. All files are complete before the first appears.
+    Files of an earlier call, as listed in ``planes.json``, are replaced, and its arrays that this
+    call does not write are removed. All files are complete before the first one appears.
 
     Args:
-        place: Folder of the scene; it is made.
-        contents: Bytes, or arrays to be written as ``.npy``, by their paths from there.
-        planes: The table.
+        target: Folder of the scene; created if missing.
+        contents: Bytes, or arrays to write as ``.npy``, by path relative to ``target``.
+        planes: The plane table.
 
     Returns:
         Names of the files written.
 
     Raises:
-        FormatError: If a file from elsewhere is in the way, or a folder cannot be written.
+        FormatError: If a file of other origin would be overwritten, or a folder is not writable.
     """
-    paths = {name: Path(os.path.normpath(place / name)) for name in contents}
-    owned = _owned(place, contents)
-    # Those of another layout stay, and are known again when it is asked for.
-    others = [name for name in _written(place) if "/" in name and name not in contents]
+    paths = {name: Path(os.path.normpath(target / name)) for name in contents}
+    torchrg_files = _torchrg_files(target, contents)
+    # Files of another layout are kept and remain listed.
+    other_files = [name for name in _read_written(target) if "/" in name and name not in contents]
     for name, path in paths.items():
-        if name not in owned and os.path.lexists(path):
+        if name not in torchrg_files and os.path.lexists(path):
             raise FormatError(
-                f"{path}: was not written by torchrg for this scan; move it away, or choose "
-                "another directory."
+                f"{path}: was not written by torchrg for this scan; move it, or choose another "
+                "directory."
             )
-    for folder in {place, *(path.parent for path in paths.values())}:
+    for folder in {target, *(path.parent for path in paths.values())}:
         make_folder(folder)
-    for name in owned - set(contents) - set(_kept.get()):
-        (place / name).unlink(missing_ok=True)
+    for name in torchrg_files - set(contents) - set(_protected.get()):
+        (target / name).unlink(missing_ok=True)
     with ExitStack() as stack:
-        # Files take their places in reverse: the claim on them first, the coordinates last.
+        # Files are renamed in reverse order: the claim first, the coordinates last.
         for name, content in contents.items():
-            beside = stack.enter_context(atomic_path(paths[name], within=place))
-            with beside.open("wb") as stream:
+            temporary = stack.enter_context(atomic_path(paths[name], within=target))
+            with temporary.open("wb") as stream:
                 if isinstance(content, bytes):
                     stream.write(content)
                 else:
                     npy_format.write_array(stream, content, allow_pickle=False)
-        claim = stack.enter_context(atomic_path(place / PLANES_FILE))
+        claim = stack.enter_context(atomic_path(target / PLANES_FILE))
         written = [name.removesuffix(".npy") if "/" not in name else name for name in contents]
-        written += others
+        written += other_files
         claim.write_text(json.dumps({"written": written, **planes}, indent=1), encoding="utf-8")
     return [*contents, PLANES_FILE]
 
 
-def _arrays_of(
-    place: Path,
+def _convert_arrays(
+    target: Path,
     sample: Mapping[str, object],
     segmentation: Segmentation,
     *,
@@ -227,7 +227,7 @@ def _arrays_of(
 ) -> dict[str, Array]:
     """Return the arrays of a scene in Pointcept's types."""
     entries: dict[str, object] = {"normal": segmentation.normals}
-    entries |= {name: sample[name] for name in GIVEN_ARRAYS if name in sample}
+    entries |= {name: sample[name] for name in INPUT_ARRAYS if name in sample}
     entries |= {"plane": segmentation.labels, "curvature": segmentation.curvature}
     if superpoint is not None:
         entries["superpoint"] = superpoint
@@ -235,13 +235,13 @@ def _arrays_of(
     arrays: dict[str, Array] = {}
     for name in (name for name in POINT_ARRAYS if name in entries):
         values = as_tensor("write_pointcept_scene", name, entries[name]).detach().cpu().numpy()
-        check_rows(place / f"{name}.npy", values, segmentation.labels.shape)
+        check_rows(target / f"{name}.npy", values, segmentation.labels.shape)
         if name in _SCANNET or (name == "instance" and not entries.keys().isdisjoint(_SCANNET)):
             arrays[name] = values.astype(np.int64)
         elif name in ("segment", "instance"):
-            arrays[name] = _short(values).reshape(len(values), -1)
+            arrays[name] = _to_int16(values).reshape(len(values), -1)
         elif name == "color":
-            arrays[name] = narrow_colors(read_colors(place / "color.npy", values)[0])
+            arrays[name] = narrow_colors(read_colors(target / "color.npy", values)[0])
         elif name in _FEATURES:
             arrays[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), -1)
         else:
@@ -249,47 +249,47 @@ def _arrays_of(
     return arrays
 
 
-def _short(labels: Array) -> Array:
-    """Return labels as int16, or as int32 where they do not fit."""
+def _to_int16(labels: Array) -> Array:
+    """Convert labels to int16, or to int32 if they do not fit."""
     limits = np.iinfo(np.int16)
     fit = labels.size == 0 or (labels.min() >= limits.min and labels.max() <= limits.max)
     return labels.astype(np.int16 if fit else np.int32)
 
 
-def written_files(place: Path) -> list[str]:
-    """Return the files that torchrg wrote for a scene, as paths from its folder.
+def written_files(target: Path) -> list[str]:
+    """Return the files that torchrg wrote for a scene, relative to its folder.
 
     Raises:
-        FormatError: If ``planes.json`` is of another program.
+        FormatError: If ``planes.json`` was written by another program.
     """
-    names = _written(place)
+    names = _read_written(target)
     return [name if "/" in name else f"{name}.npy" for name in names] + [PLANES_FILE] * bool(names)
 
 
-def _owned(place: Path, others: Collection[str] = ()) -> set[str]:
-    """Return the files that torchrg wrote here: arrays, and those of others that it names."""
-    names = {name if name in others else f"{name}.npy" for name in _written(place)}
-    return names & {*(f"{name}.npy" for name in POINT_ARRAYS), *others}
+def _torchrg_files(target: Path, other_files: Collection[str] = ()) -> set[str]:
+    """Return the files that torchrg wrote here: arrays, and the files in ``other_files``."""
+    names = {name if name in other_files else f"{name}.npy" for name in _read_written(target)}
+    return names & {*(f"{name}.npy" for name in POINT_ARRAYS), *other_files}
 
 
-def _written(place: Path) -> list[str]:
-    """Return what ``planes.json`` says that torchrg wrote."""
+def _read_written(target: Path) -> list[str]:
+    """Return the names of written files listed in ``planes.json``."""
     try:
-        written = json.loads((place / PLANES_FILE).read_text(encoding="utf-8"))["written"]
+        written = json.loads((target / PLANES_FILE).read_text(encoding="utf-8"))["written"]
         return sorted(map(str, set(written)))
     except (FileNotFoundError, NotADirectoryError):
         return []
     except (OSError, *DAMAGES) as error:
         raise FormatError(
-            f"{place / PLANES_FILE}: expected a table of planes that torchrg wrote, got another "
-            "file; move it away."
+            f"{target / PLANES_FILE}: expected a plane table written by torchrg, got another file; "
+            "move it."
         ) from error
 
 
-def _check_kept(place: Path, arrays: Mapping[str, Array], inputs: set[str]) -> None:
-    """Check that what stays in a folder belongs to the points that are written."""
+def _check_inputs(target: Path, arrays: Mapping[str, Array], inputs: set[str]) -> None:
+    """Check that existing input files match the points to write."""
     for name in sorted(inputs):
-        path = place / f"{name}.npy"
+        path = target / f"{name}.npy"
         values = map_array(path)
         check_rows(path, values, arrays[name].shape[:1])
         if name == "coord" and not np.array_equal(values.astype(np.float32), arrays[name]):

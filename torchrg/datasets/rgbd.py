@@ -1,4 +1,4 @@
-"""Depth frames with their cameras, poses and colours, as a data set."""
+"""Data set of depth frames with cameras, poses and colors."""
 
 import math
 import os
@@ -29,22 +29,22 @@ from torchrg.transforms.rows import SampleDict
 
 @dataclass(frozen=True, eq=False)
 class RGBDFrame:
-    """A depth frame on disk.
+    """Depth frame on disk.
 
     Args:
-        depth: Depth image: gray PNG or PGM of 16 bits, or ``.npy`` of shape ``(H, W)``.
-        intrinsics: Camera matrix, shape ``(3, 3)``; the middle of the first pixel is at (0, 0).
-        depth_scale: Stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for metres.
-        name: Unique within a data set and fit for a path below an output folder, with forward
+        depth: Depth image: 16-bit gray PNG or PGM, or ``.npy`` of shape ``(H, W)``.
+        intrinsics: Camera matrix, shape ``(3, 3)``; the center of pixel (0, 0) is at (0, 0).
+        depth_scale: Depth units per meter: 1000 for millimeters, 5000 for TUM, 1 for meters.
+        name: Unique name within a data set, usable as a path below an output folder, with forward
             slashes: ``scene0000_00/12``.
-        color: Colour image registered to the depth, if there is one: PNG or JPEG.
-        pose: Matrix from camera to world coordinates, shape ``(4, 4)``, if it is known.
-        no_depth: Stored value that means "no depth" beside 0, if there is one.
+        color: Color image registered to the depth, PNG or JPEG, or None.
+        pose: Camera-to-world matrix, shape ``(4, 4)``, or None.
+        no_depth: Stored value that means "no depth" in addition to 0, or None.
         sources: Further files that intrinsics and pose were read from.
-        origin: Where the intrinsics are from, in words.
+        origin: Description of where the intrinsics come from.
 
     Raises:
-        ShapeError: If a matrix has another shape.
+        ShapeError: If a matrix has a wrong shape.
         ConfigError: If ``depth_scale`` is not positive.
     """
 
@@ -63,41 +63,40 @@ class RGBDFrame:
         check_camera("RGBDFrame", self.intrinsics)
         if not 0 < self.depth_scale < float("inf"):
             raise ConfigError(
-                f"RGBDFrame: expected depth_scale > 0, the stored value of one metre, got "
+                "RGBDFrame: expected depth_scale > 0, the depth units per meter, got "
                 f"{self.depth_scale}."
             )
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Every input file: depth, colour if there is one, and those of intrinsics and pose."""
+        """All input files: depth, color if present, and the files of intrinsics and pose."""
         color = () if self.color is None else (self.color,)
         return (self.depth, *color, *self.sources)
 
 
 class RGBDFrames(SceneDataset):
-    """Depth frames, read when they are asked for.
+    """Depth frames, read on demand.
 
     A sample has
 
-    * ``depth``: float32, shape ``(1, H, W)``, in metres along the optical axis; 0 where there is
-      none;
+    * ``depth``: float32, shape ``(1, H, W)``, in meters along the optical axis; 0 for no depth;
     * ``intrinsics``: float64, shape ``(3, 3)``;
-    * ``pose``: float64, shape ``(4, 4)``, camera to world; absent where it is not known;
-    * ``color``: uint8, shape ``(3, H, W)``, of the colour image's own size; absent without one;
-    * ``name``: the frame's.
+    * ``pose``: float64, shape ``(4, 4)``, camera to world; absent if unknown;
+    * ``color``: uint8, shape ``(3, H, W)``, in the size of the color image; absent without one;
+    * ``name``: name of the frame.
 
-    Frames of one size are batched by torch's own ``default_collate``.
+    torch's ``default_collate`` can batch frames of one size.
 
     Args:
         frames: The frames, in order.
-        transform: Called with each sample, for example :class:`torchrg.transforms.SegmentDepth`.
+        transform: Applied to each sample, for example :class:`torchrg.transforms.SegmentDepth`.
 
     Attributes:
         frames: The frames.
         scenes: Name, depth image and all input files of each frame.
 
     Raises:
-        ConfigError: If two frames have one name.
+        ConfigError: If two frames have the same name.
 
     Example:
         >>> import numpy as np, tempfile
@@ -124,7 +123,7 @@ class RGBDFrames(SceneDataset):
             first.setdefault(name, path)
             if len(first) <= number:
                 raise ConfigError(
-                    f"RGBDFrames: expected frames of different names, got {name!r} twice, for "
+                    f"RGBDFrames: expected distinct frame names, got {name!r} twice, for "
                     f"{first[name]} and {path}; move or rename one."
                 )
 
@@ -141,28 +140,28 @@ class RGBDFrames(SceneDataset):
         """Find the frames of a folder.
 
         Args:
-            root: The folder: of one recording, or of several beside each other.
+            root: The folder of one recording, or of several.
             layout: A key of :data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`: ``tum``, ``icl-nuim``,
                 ``scannet``, ``7-scenes``, ``nerfstudio``, ``arkitscenes``, ``replica``,
                 ``scannetpp``, ``3rscan``, or ``images`` for any folder of depth images. Default:
-                the one that the folder shows.
+                detected from the folder.
             intrinsics: Camera matrix, shape ``(3, 3)``, or a camera of images of another size.
-                Default: that of the frames or of a camera file next to them, else the built-in
-                camera of ``tum``, ``icl-nuim`` and ``7-scenes``.
-            depth_scale: Stored value of one metre. Default: that of the camera file, else the
-                layout's; ``images`` has none.
-            transform: Called with each sample.
+                Default: from the frames or a camera file next to them, else the built-in camera of
+                ``tum``, ``icl-nuim`` and ``7-scenes``.
+            depth_scale: Depth units per meter. Default: from the camera file, else the layout's;
+                ``images`` has no default.
+            transform: Applied to each sample.
 
         Returns:
-            The dataset, its frames in natural order.
+            The data set, with frames in natural order.
 
         Raises:
-            ConfigError: If there is no such layout, it needs intrinsics or a scale, or a camera
-                cannot be that of an image.
-            FormatError: If there are no such frames in the folder, or a file is damaged.
+            ConfigError: If the layout is unknown, needs intrinsics or a scale, or a camera cannot
+                belong to an image.
+            FormatError: If the folder contains no such frames, or a file is corrupt.
 
         Warns:
-            DepthWarning: If a camera is built in, or improbable for an image.
+            DepthWarning: If a camera is built in, or implausible for an image.
         """
         folder = Path(root)
         refuse_recording(folder)
@@ -172,7 +171,7 @@ class RGBDFrames(SceneDataset):
         if name not in LAYOUTS:
             names = ", ".join(sorted(LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = [*_find(folder, name, intrinsics, depth_scale)]
+        frames = [*_find_frames(folder, name, intrinsics, depth_scale)]
         if not frames:
             suffixes = " ".join(DEPTH_SUFFIXES)
             raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
@@ -182,7 +181,7 @@ class RGBDFrames(SceneDataset):
         """Return the sample of a frame.
 
         Raises:
-            FormatError: If a file is missing, damaged, or not a depth image.
+            FormatError: If a file is missing, corrupt, or not a depth image.
         """
         frame = self.frames[index]
         depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
@@ -198,43 +197,43 @@ class RGBDFrames(SceneDataset):
         return sample
 
 
-def _find(
+def _find_frames(
     root: Path, name: str, intrinsics: Tensor | Pinhole | None, depth_scale: float | None
 ) -> Iterator[RGBDFrame]:
-    """Yield the frames of a folder, of one recording or of several beside each other.
+    """Yield the frames of a folder of one or several recordings.
 
     Warns:
-        DepthWarning: If a camera is improbable for an image; once for each recording.
+        DepthWarning: If a camera is implausible for an image; once per recording.
     """
     layout = LAYOUTS[name]
     for prefix, folder in find_recordings(root, layout):
         shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}
-        is_doubted = False
+        has_warned = False
         for frame in layout.frames(folder):
             camera: Tensor | Pinhole | None = intrinsics
             files, origin = tuple[Path, ...](), "given"
             if camera is None and frame.camera is not None:
                 camera, files = frame.camera, frame.sources[:1]
             elif camera is None:
-                place = frame.depth.parent
-                if place not in shared:
-                    shared[place] = _shared_camera(place, folder, root, name)
-                camera, files = shared[place]
+                image_folder = frame.depth.parent
+                if image_folder not in shared:
+                    shared[image_folder] = _shared_camera(image_folder, folder, root, name)
+                camera, files = shared[image_folder]
             if intrinsics is None:
                 origin = files[0].name if files else f"built in, {name}"
-            own = camera.depth_scale if isinstance(camera, Pinhole) else None
-            scales = (depth_scale, own, frame.depth_scale, layout.depth_scale)
+            camera_scale = camera.depth_scale if isinstance(camera, Pinhole) else None
+            scales = (depth_scale, camera_scale, frame.depth_scale, layout.depth_scale)
             scale = next((value for value in scales if value is not None), None)
             if camera is None or scale is None:
                 missing = "intrinsics" if camera is None else "depth_scale"
                 raise ConfigError(
-                    f"{frame.depth}: expected {missing}, which depth images do not hold; pass it"
-                    f"{': 1 for metres, 1000 for millimetres' if camera is not None else ''}."
+                    f"{frame.depth}: expected {missing}, which depth images do not store; pass it"
+                    f"{': 1 for meters, 1000 for millimeters' if camera is not None else ''}."
                 )
-            matrix, doubt = fit_camera(frame.depth, camera, *files[:1])
-            if doubt and not is_doubted:
-                warnings.warn(doubt, DepthWarning, stacklevel=3)
-            is_doubted |= bool(doubt)
+            matrix, warning = fit_camera(frame.depth, camera, *files[:1])
+            if warning and not has_warned:
+                warnings.warn(warning, DepthWarning, stacklevel=3)
+            has_warned |= bool(warning)
             yield RGBDFrame(
                 frame.depth,
                 matrix,
@@ -249,16 +248,16 @@ def _find(
 
 
 def _shared_camera(
-    place: Path, folder: Path, root: Path, name: str
+    image_folder: Path, folder: Path, root: Path, name: str
 ) -> tuple[Pinhole | None, tuple[Path, ...]]:
-    """Return the camera of the images of a recording in one place, and the file it was read from.
+    """Return the camera of the images in a folder of a recording, and its file.
 
-    A camera file wins over the built-in camera of the data set. It is None where there is neither.
+    A camera file takes precedence over the built-in camera. The camera is None without either.
 
     Warns:
         DepthWarning: If the camera is built in.
     """
-    if found := find_camera(place, root):
+    if found := find_camera(image_folder, root):
         return found[0], found[1:]
     layout = LAYOUTS[name]
     if layout.camera is None:
@@ -266,8 +265,8 @@ def _shared_camera(
     camera = layout.camera(folder)
     numbers = ",".join(f"{number:g}" for number in camera[:4])
     warnings.warn(
-        f"{root}: frames without a camera file get the built-in camera of {name}, {numbers}; pass "
-        "--intrinsics if they are of another.",
+        f"{root}: using the built-in camera of {name}, {numbers}, for frames without a camera "
+        "file; pass --intrinsics if they have another.",
         DepthWarning,
         stacklevel=4,
     )
@@ -277,15 +276,15 @@ def _shared_camera(
 def fit_camera(
     image: Path, camera: Tensor | Pinhole, file: Path | None = None
 ) -> tuple[Tensor, str]:
-    """Return the camera matrix for a depth image, and why it is improbable, if it is.
+    """Return the camera matrix for a depth image, and a warning if it is implausible.
 
     Args:
-        image: The depth image. The size of one that is too large to be read does not count.
+        image: The depth image. Its size is ignored if it is too large to be read.
         camera: The camera, or its matrix.
-        file: Where the camera was read from, for messages.
+        file: File of the camera, for messages.
 
     Raises:
-        ConfigError: If the camera cannot be that of the image.
+        ConfigError: If the camera cannot belong to the image.
     """
     caller = f"{image}" if file is None else f"{image}: {file.name}"
     size = image_size(image)

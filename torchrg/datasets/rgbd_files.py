@@ -1,4 +1,4 @@
-"""Depth, colour and poses from files."""
+"""Readers of depth images, color images, poses and trajectories."""
 
 import math
 import os
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io.colors import narrow_colors
-from torchrg.io.files import DAMAGES, check_file, check_promise, read_text, refusing
+from torchrg.io.files import DAMAGES, check_available, check_file, read_text, refusing
 from torchrg.structures import FARTHEST, Array
 
 Value = TypeVar("Value")
@@ -29,36 +29,36 @@ _CONVERTERS = {
     ".r3d": "unzip it, and save what pyliblzfse reads of its .depth files as .npy, in metres",
     ".exr": "save what OpenEXR reads of it as .npy, usually in metres",
 }
-"""Ways to frames from recordings and images that are not read, by suffix."""
+"""How to convert unsupported recordings and images to frames, by suffix."""
 _PNG = b"\x89PNG"
 _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
-"""Width and height in the header of a PNG, and the byte at which they begin."""
+"""Width and height in a PNG header, and their offset."""
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
-"""Beginning of a binary PGM: width, height and the largest value."""
-_LONGEST_HEAD = 512
-_MOST_OF_8_BITS, _MOST_OF_16_BITS = 255, 65535
+"""Header of a binary PGM: width, height and maximum value."""
+_MAX_HEADER_BYTES = 512
+_MAX_8_BIT, _MAX_16_BIT = 255, 65535
 MAX_PIXELS = 1 << 26
-"""Pixels of the largest image that is read, 8192 x 8192. No depth camera has as many, and what is
-made of them on the way to metres takes 1.5 GB. A library that has less ends the process."""
+"""Maximum pixels of an image, 8192 x 8192. No depth camera has more, and converting them to
+meters takes 1.5 GB. A library that runs out of memory ends the process."""
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
-"""Median depths in meters beyond which the depth scale is doubted. Depth cameras see 0.1 to 20."""
+"""Plausible range of the median depth, in meters. Depth cameras measure 0.1 to 20."""
 _SAMPLED = 20_000
-"""Pixels that the median is taken of."""
+"""Pixels sampled for the median."""
 _MAX_SECONDS = 0.02
-"""Most seconds between an image and a pose that belong together."""
+"""Maximum time difference, in seconds, between an image and its pose."""
 
 
 def read_depth(
     path: str | os.PathLike[str], *, depth_scale: float, no_depth: int | None = None
 ) -> Tensor:
-    """Read depth in metres, ``(H, W)``, float32, from gray PNG or PGM of 16 bits, or ``.npy``.
+    """Read depth in meters, ``(H, W)``, float32, from 16-bit gray PNG or PGM, or ``.npy``.
 
-    It is 0 where there is none (0, negative, not finite, or ``no_depth``, as 65535 in 7-Scenes).
-    ``depth_scale`` is the stored value of one metre: 1000 for millimetres, 5000 for TUM, 1 for
-    metres. It is not in the files, and never guessed.
+    Pixels without depth (0, negative, non-finite, or ``no_depth``, like 65535 in 7-Scenes) are 0.
+    ``depth_scale`` is the number of depth units per meter: 1000 for millimeters, 5000 for TUM, 1
+    for meters. It is not stored in the files, and never guessed.
 
     Warns:
-        DepthWarning: If the median depth is below 5 cm or beyond 100 m.
+        DepthWarning: If the median depth is below 5 cm or above 100 m.
 
     Example:
         >>> import tempfile
@@ -82,13 +82,13 @@ def read_depth(
     stored = reader(source)
     depth = stored.astype(np.float64)
     with np.errstate(invalid="ignore"):
-        bad = ~(np.isfinite(depth) & (depth > 0))
+        missing = ~(np.isfinite(depth) & (depth > 0))
     if no_depth is not None:
-        bad |= stored == no_depth
-    seen = depth[~bad]
-    # A sample tells the scale, and takes no time.
-    seen = seen[:: len(seen) // _SAMPLED + 1] / depth_scale
-    median = float(np.median(seen)) if len(seen) else _MIN_MEDIAN_DEPTH
+        missing |= stored == no_depth
+    valid = depth[~missing]
+    # A sample is enough to check the scale, and fast.
+    valid = valid[:: len(valid) // _SAMPLED + 1] / depth_scale
+    median = float(np.median(valid)) if len(valid) else _MIN_MEDIAN_DEPTH
     if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:
         warnings.warn(
             f"{source}: expected a median depth of {_MIN_MEDIAN_DEPTH} to {_MAX_MEDIAN_DEPTH:g} m, "
@@ -97,14 +97,14 @@ def read_depth(
             DepthWarning,
             stacklevel=2,
         )
-    return torch.from_numpy((np.where(bad, 0, depth) / depth_scale).astype(np.float32))
+    return torch.from_numpy((np.where(missing, 0, depth) / depth_scale).astype(np.float32))
 
 
 def refuse_recording(path: Path) -> None:
-    """Raise FormatError with what converts it, of a file that holds depth and is not read."""
+    """Raise FormatError with conversion instructions if a file is an unsupported recording."""
     if (tool := _CONVERTERS.get(path.suffix.lower())) and not path.is_dir():
         raise FormatError(
-            f"{path}: expected depth images, got {path.suffix}; {tool}, and give the folder to "
+            f"{path}: expected depth images, got {path.suffix}; {tool}, and pass the folder to "
             "torchrg convert rgbd."
         )
 
@@ -112,14 +112,14 @@ def refuse_recording(path: Path) -> None:
 def read_color(source: Path) -> Tensor:
     """Read red, green and blue, shape ``(3, H, W)``, uint8, from a PNG or JPEG.
 
-    A gray image has three equal channels, and channels of 16 bits are rounded to 8.
+    Gray images become three equal channels, and 16-bit channels are rounded to 8 bits.
     """
     image = _read_image(source, "PNG or JPEG")
     is_known = image.dtype in (np.uint8, np.uint16) and image.ndim == 3
     if not is_known or image.shape[2] not in (1, 3, 4):
         raise FormatError(
-            f"{source}: expected a color image of 8 or 16 bits a channel, got shape {image.shape} "
-            f"and {image.dtype}."
+            f"{source}: expected a color image of 8 or 16 bits per channel, got shape "
+            f"{image.shape} and {image.dtype}."
         )
     image = narrow_colors(image)
     channels = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
@@ -127,19 +127,19 @@ def read_color(source: Path) -> Tensor:
 
 
 def _read_png16(source: Path) -> NDArray[np.uint16]:
-    """Return the values of a gray PNG of 16 bits, shape ``(H, W)``."""
+    """Return the values of a 16-bit gray PNG, shape ``(H, W)``."""
     image = _read_image(source, "PNG")
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 1:
         raise FormatError(
-            f"{source}: expected a gray PNG of 16 bits, got shape {image.shape} and {image.dtype}; "
-            "depth does not fit into 8 bits or colours."
+            f"{source}: expected a 16-bit gray PNG, got shape {image.shape} and {image.dtype}; "
+            "8 bits or colors cannot represent depth."
         )
     values: NDArray[np.uint16] = image[..., 0]
     return values
 
 
 def _read_image(source: Path, kinds: str) -> Array:
-    """Return what an image holds, shape ``(H, W, C)``."""
+    """Return the pixels of an image, shape ``(H, W, C)``."""
     from kornia_rs import io
 
     check_file(source)
@@ -149,23 +149,23 @@ def _read_image(source: Path, kinds: str) -> Array:
             "header; the file may be corrupt, or make it smaller."
         )
     with refusing(f"{source}: expected a {kinds} image, got: ", Exception):
-        # Without a mode, the library says how many bits and channels there are.
+        # Without a mode argument, the library detects bit depth and channels.
         return np.asarray(io.read_image(str(source)))
 
 
 def _read_pgm16(source: Path) -> NDArray[np.uint16]:
-    """Return the values of a binary PGM of 16 bits, shape ``(H, W)``."""
+    """Return the values of a 16-bit binary PGM, shape ``(H, W)``."""
     check_file(source)
     content = source.read_bytes()
     header = _PGM.match(content)
-    if header is None or not _MOST_OF_8_BITS < int(header[3]) <= _MOST_OF_16_BITS:
+    if header is None or not _MAX_8_BIT < int(header[3]) <= _MAX_16_BIT:
         raise FormatError(
-            f"{source}: expected a binary PGM of 16 bits, P5, got {content[:16]!r}; depth does not "
-            "fit into 8 bits."
+            f"{source}: expected a 16-bit binary PGM, P5, got {content[:16]!r}; 8 bits cannot "
+            "represent depth."
         )
     width, height, start = int(header[1]), int(header[2]), header.end()
     available = len(content) - start
-    check_promise(source, start, 2 * width * height, "its pixels", available=available)
+    check_available(source, start, 2 * width * height, "its pixels", available=available)
     if available > 2 * width * height:
         raise FormatError(
             f"{source}: expected {2 * width * height:,} bytes for {width} x {height} pixels, got "
@@ -176,13 +176,13 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Return width and height by the beginning of a depth image; None if damaged or not there."""
+    """Return width and height from a depth image header; None if corrupt or missing."""
     try:
         if path.suffix.lower() == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape
             return width, height
         with path.open("rb") as stream:
-            head = stream.read(_LONGEST_HEAD)
+            head = stream.read(_MAX_HEADER_BYTES)
         if head.startswith(_PNG):
             width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
             return width, height
@@ -193,12 +193,12 @@ def image_size(path: Path) -> tuple[int, int] | None:
 
 
 def num_pixels(path: Path) -> int:
-    """Return the number of pixels of a depth image, 0 where :func:`image_size` does not know it."""
+    """Return the number of pixels of a depth image, 0 if :func:`image_size` returns None."""
     return math.prod(image_size(path) or (0,))
 
 
 def _read_npy(source: Path) -> NDArray[np.number]:
-    """Return the values of a ``.npy`` file, shape ``(H, W)``."""
+    """Return the array of a ``.npy`` file, shape ``(H, W)``."""
     check_file(source)
     with refusing(f"{source}: expected an array of numbers, got: ", OSError, *DAMAGES):
         values: NDArray[np.number] = np.load(source, allow_pickle=False)
@@ -210,7 +210,7 @@ def _read_npy(source: Path) -> NDArray[np.number]:
 
 
 def read_matrix(path: Path) -> Tensor:
-    """Read a matrix of four rows of four numbers, shape ``(4, 4)``, float64."""
+    """Read a 4 x 4 matrix, shape ``(4, 4)``, float64."""
     rows = _words(path)
     if [len(row) for row in rows] != [4] * 4:
         raise FormatError(f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows.")
@@ -218,26 +218,26 @@ def read_matrix(path: Path) -> Tensor:
 
 
 def read_numbers(path: Path, count: int, what: str) -> list[list[float]]:
-    """Read rows of so many numbers; ``what`` says which they are."""
+    """Read rows of ``count`` numbers, described by ``what`` in messages."""
     return _numbers(path, _rows(path, count, what))
 
 
-def known_pose(matrix: Tensor) -> Tensor | None:
-    """Return a pose, or None for one that is not finite or leads nowhere: tracking was lost."""
+def valid_pose(matrix: Tensor) -> Tensor | None:
+    """Return a pose, or None if tracking was lost: non-finite, or too far away."""
     return matrix if bool((matrix.abs() <= FARTHEST).all()) else None
 
 
 def read_timed(path: Path) -> tuple[list[float], list[str]]:
-    """Read rows of a time and a file name; return times, ascending, and names."""
+    """Read rows of a time and a file name; return times (ascending) and names."""
     rows = _rows_by_time(path, 2, "a time and a file name")
     return [float(time) for time, _ in rows], [name for _, name in rows]
 
 
 def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
-    """Read rows of ``time tx ty tz qx qy qz qw``; return times, ascending, and poses.
+    """Read rows of ``time tx ty tz qx qy qz qw``; return times (ascending) and poses.
 
-    Poses are matrices from camera to world, shape ``(4, 4)``, float64, or None; see
-    :func:`known_pose`.
+    Poses are camera-to-world matrices, shape ``(4, 4)``, float64, or None; see
+    :func:`valid_pose`.
     """
     rows = _rows_by_time(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
@@ -245,7 +245,7 @@ def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
 
 
 def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor | None]]:
-    """Do as :func:`read_trajectory` with ``time rx ry rz tx ty tz``, from world to camera."""
+    """Like :func:`read_trajectory`, for ``time rx ry rz tx ty tz`` from world to camera."""
     from scipy.spatial.transform import Rotation
 
     rows = _rows_by_time(path, 7, "time rx ry rz tx ty tz")
@@ -255,37 +255,37 @@ def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor | None]]:
 
 
 def _poses_by_time(
-    values: Tensor, turns: Tensor, places: Tensor
+    values: Tensor, rotations: Tensor, translations: Tensor
 ) -> tuple[list[float], list[Tensor | None]]:
-    """Return the times of rows, and matrices of turns ``(n, 3, 3)`` and places ``(n, 3)``."""
+    """Return the times of rows, and poses from rotations and translations ``(n, 3)``."""
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
-    poses[:, :3, :3], poses[:, :3, 3] = turns, places
-    return values[:, 0].tolist(), [known_pose(pose) for pose in poses]
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, translations
+    return values[:, 0].tolist(), [valid_pose(pose) for pose in poses]
 
 
 def read_nearest(
     times: list[float], path: Path, read: Callable[[Path], tuple[list[float], Sequence[Value]]]
 ) -> list[Value | None]:
-    """Return what a list by time has nearest to each of some times, None where that is too far.
+    """Return the value nearest to each time in a timed list, None if it is too far away.
 
-    It is None everywhere if there is no such file.
+    All are None if the file does not exist.
     """
-    others, values = read(path) if path.is_file() else ([], [])
+    other_times, values = read(path) if path.is_file() else ([], [])
     nearest: list[Value | None] = []
     for time in times:
-        place = bisect_left(others, time)
-        around = range(max(place - 1, 0), min(place + 1, len(others)))
-        best = min(around, key=lambda i: abs(others[i] - time), default=None)
-        if best is not None and abs(others[best] - time) > _MAX_SECONDS:
+        index = bisect_left(other_times, time)
+        candidates = range(max(index - 1, 0), min(index + 1, len(other_times)))
+        best = min(candidates, key=lambda i: abs(other_times[i] - time), default=None)
+        if best is not None and abs(other_times[best] - time) > _MAX_SECONDS:
             best = None
         nearest.append(None if best is None else values[best])
     return nearest
 
 
 def _rotations(quaternions: Tensor) -> Tensor:
-    """Return rotation matrices of quaternions x y z w of any length, shape ``(n, 3, 3)``.
+    """Convert quaternions x y z w of any norm to rotation matrices, shape ``(n, 3, 3)``.
 
-    They are not numbers where the quaternion is zero or not finite.
+    Zero and non-finite quaternions give NaN.
     """
     from scipy.spatial.transform import Rotation
 
@@ -299,17 +299,17 @@ def _rotations(quaternions: Tensor) -> Tensor:
 
 
 def _rows_by_time(path: Path, num_words: int, what: str) -> list[list[str]]:
-    """Return the words of each row, which are so many, by the time that the first of them is."""
+    """Return rows of ``num_words`` words, sorted by time, which is the first word."""
     rows = _rows(path, num_words, what)
     times = [time for (time,) in _numbers(path, [row[:1] for row in rows])]
     wrong = next((time for time in times if not math.isfinite(time)), None)
     if wrong is not None:
-        raise FormatError(f"{path}: expected finite times, got {wrong}; repair or delete its row.")
+        raise FormatError(f"{path}: expected finite times, got {wrong}; correct or delete its row.")
     return [rows[i] for i in sorted(range(len(rows)), key=times.__getitem__)]
 
 
 def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
-    """Return the words of each row, which are so many."""
+    """Return rows of ``num_words`` words."""
     rows = _words(path)
     wrong = next((row for row in rows if len(row) != num_words), [])
     if wrong or not rows:
@@ -321,14 +321,14 @@ def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
 
 
 def _words(path: Path) -> list[list[str]]:
-    """Return the words of each row; ``#`` begins a comment."""
+    """Return the words of each non-empty row; ``#`` begins a comment."""
     lines = read_text(path).splitlines()
     words = (line.split("#")[0].replace(",", " ").split() for line in lines)
     return [row for row in words if row]
 
 
 def _numbers(path: Path, rows: list[list[str]]) -> list[list[float]]:
-    """Return words as numbers."""
+    """Convert words to numbers."""
     try:
         return [[float(word) for word in row] for row in rows]
     except ValueError as error:

@@ -1,7 +1,7 @@
-"""Folder shapes of depth frames: benchmarks, data sets, and captures of phones.
+"""Folder layouts of depth frames.
 
-A new shape is a function here that lists the frames of a recording, a row of :data:`LAYOUTS`, its
-name among the choices of ``torchrg convert rgbd``, and a test.
+A new layout needs a function that lists the frames of a recording, a row of :data:`LAYOUTS`, a
+choice of ``torchrg convert rgbd``, and a test.
 """
 
 import re
@@ -14,22 +14,22 @@ import torch
 from torch import Tensor
 
 from torchrg.datasets.camera_files import (
-    camera_of,
-    matrix_of,
-    number_of,
+    parse_camera,
+    parse_matrix,
+    parse_number,
     read_info,
     read_record,
 )
-from torchrg.datasets.folder import check_folder, files_below, listed, natural_key, warn_of_links
+from torchrg.datasets.folder import check_folder, find_files, list_dir, natural_key, warn_skipped
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
-    known_pose,
     read_axis_angles,
     read_matrix,
     read_nearest,
     read_numbers,
     read_timed,
     read_trajectory,
+    valid_pose,
 )
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, DepthWarning, FormatError
@@ -41,13 +41,13 @@ _TUM_INTRINSICS = {
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
-"""fx, fy, cx, cy of the three cameras, as the data set gives them."""
+"""fx, fy, cx, cy of the three cameras, from the data set's documentation."""
 _ICL_NUIM_INTRINSICS = (481.2, -480.0, 319.5, 239.5)
-"""The scenes were rendered with y upwards: rows count against it."""
+"""The scenes were rendered with y up, so the vertical focal length is negative."""
 _SEVEN_SCENES_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)
-"""Width and height of the images of these cameras."""
-_NO_DEPTH = frozenset(
+"""Width and height of the images of these cameras, in pixels."""
+_NON_DEPTH_WORDS = frozenset(
     re.findall(
         "[a-z]+",
         "albedo annotation annotations color colors confidence curvature extrinsics instance "
@@ -55,18 +55,18 @@ _NO_DEPTH = frozenset(
         "poses rendered rgb seg segmentation segmentations semantic semantics semseg",
     )
 )
-"""Words in the names of files and folders whose images are not depth."""
+"""Words in the names of files and folders of images that are not depth."""
 _IPHONES = ("", "iphone/", "*/iphone/", "data/*/iphone/")
 _SCANNETPP_COLOR = {"width": 1920, "height": 1440}
-"""Sides of the colour images, which the intrinsics of ScanNet++ are of."""
+"""Size of the color images, to which ScanNet++ intrinsics refer."""
 _NERFSTUDIO_UNIT = 0.001
-"""Metres that one stored value is worth for nerfstudio where no file says another."""
+"""nerfstudio's default depth unit, in meters."""
 _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
-"""From the axes of our cameras to those of OpenGL: x right, y up, z backwards."""
+"""Conversion from our camera axes to OpenGL's: x right, y up, z backwards."""
 
 
 class ListedFrame(NamedTuple):
-    """A frame as a folder lists it, with its own camera and scale where a recording has none."""
+    """Frame listed in a folder, with its own camera and scale if the recording has none."""
 
     name: str
     depth: Path
@@ -78,22 +78,21 @@ class ListedFrame(NamedTuple):
 
 
 Camera = Callable[[Path], Pinhole]
-"""Returns the camera of a recording that has no camera file."""
+"""Returns the camera of a recording without a camera file."""
 
 
 class FrameLayout(NamedTuple):
-    """The shape of a folder of frames.
+    """Layout of a folder of frames.
 
     Attributes:
         frames: Yields the frames of a recording in natural order.
-        mark: Pattern of the name of an entry of every recording; nothing where a folder is one.
-        camera: The camera of a recording without a camera file, None where none is known or frames
-            have their own.
-        depth_scale: Stored value of one metre, None where frames have their own or none is known.
-        no_depth: As of :class:`torchrg.datasets.RGBDFrame`.
-        places: Where recordings are below a folder of several, as patterns.
-        signs: Patterns of further entries, one of which tells the layout from others with the same
-            mark; nothing where the mark is enough, no pattern where a folder does not show it.
+        mark: Name pattern of an entry in every recording; empty if any folder is a recording.
+        camera: Camera of a recording without a camera file; None if unknown or per frame.
+        depth_scale: Depth units per meter; None if unknown or per frame.
+        no_depth: See :class:`torchrg.datasets.RGBDFrame`.
+        places: Path patterns of recordings below a folder of several.
+        signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
+            ``("",)`` if the mark is enough, empty if the layout cannot be detected.
     """
 
     frames: Callable[[Path], Iterable[ListedFrame]]
@@ -101,15 +100,15 @@ class FrameLayout(NamedTuple):
     camera: Camera | None = None
     depth_scale: float | None = None
     no_depth: int | None = None
-    places: tuple[str, ...] = ("", "*/")
+    locations: tuple[str, ...] = ("", "*/")
     signs: tuple[str, ...] = ("",)
 
 
 def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of TUM RGB-D, which are listed in ``depth.txt``.
+    """Yield the frames of TUM RGB-D listed in ``depth.txt``.
 
-    Colour (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are those nearest in time;
-    without one, the frame has none.
+    Color (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are the nearest in time, or
+    None.
     """
     lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
     times, images = read_timed(lists[0])
@@ -117,27 +116,26 @@ def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
     poses = read_nearest(times, lists[2], read_trajectory)
     sources = tuple(path for path in lists if path.is_file())
     for image, color, pose in zip(images, colors, poses, strict=True):
-        beside = None if color is None else folder / color
-        yield ListedFrame(Path(image).stem, folder / image, beside, pose, sources)
+        color_path = None if color is None else folder / color
+        yield ListedFrame(Path(image).stem, folder / image, color_path, pose, sources)
 
 
 def _tum_camera(folder: Path) -> Pinhole:
-    """Return the camera of a recording by its name."""
+    """Return the camera of a recording from its name."""
     name = folder.resolve().name.lower()
     for camera, values in _TUM_INTRINSICS.items():
         if camera in name:
             return Pinhole(*values, _KINECT_SIZE)
     raise ConfigError(
-        f"{folder}: expected intrinsics, as the name says none of {', '.join(_TUM_INTRINSICS)}; "
-        "pass them."
+        f"{folder}: expected intrinsics, because the folder name contains none of "
+        f"{', '.join(_TUM_INTRINSICS)}; pass them."
     )
 
 
 def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of ICL-NUIM in its TUM-compatible form: ``depth/0.png``, ``rgb/0.png``.
 
-    There is perhaps one trajectory ``*.gt.freiburg``, whose first column is the number of the
-    image.
+    An optional trajectory ``*.gt.freiburg`` has the image number in its first column.
     """
     tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
     numbers, matrices = read_trajectory(tracks[0]) if tracks else ([], [])
@@ -147,14 +145,14 @@ def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
 
 
 def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterator[ListedFrame]]:
-    """Return what yields frames by the names of their files, where ``*`` is that of the frame."""
+    """Return a function that yields frames by file name patterns; ``*`` is the frame name."""
 
     def frames(folder: Path) -> Iterator[ListedFrame]:
         for name, image in _depth_images(folder, depth):
             if name.endswith(".rendered"):
                 continue
             path = folder / pose.replace("*", name)
-            posed = (known_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
+            posed = (valid_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
             yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *posed)
 
     return frames
@@ -162,28 +160,28 @@ def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterato
 
 def _depth_images(folder: Path, pattern: str) -> Iterator[tuple[str, Path]]:
     """Yield names and depth images of a folder, in natural order; the pattern has no suffix."""
-    place, _, name = pattern.rpartition("/")
+    subfolder, _, name = pattern.rpartition("/")
     before, after = name.split("*")
-    check_folder(folder / place)
-    for path in listed(folder / place):
+    check_folder(folder / subfolder)
+    for path in list_dir(folder / subfolder):
         fits = path.stem.startswith(before) and path.stem.endswith(after)
         if path.suffix.lower() in DEPTH_SUFFIXES and fits:
             yield path.stem.removeprefix(before).removesuffix(after), path
 
 
 def _color_image(path: Path) -> Path | None:
-    """Return the colour image of a path without its suffix, None if there is none."""
+    """Return the color image for a path without suffix, or None."""
     paths = (path.with_name(f"{path.name}{suffix}") for suffix in _COLOR_SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
 
-def _same_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return what gives every recording the same camera."""
+def _fixed_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
+    """Return a function that returns the same camera for every recording."""
     return lambda folder: Pinhole(fx, fy, cx, cy, _KINECT_SIZE)
 
 
 def _scannet_camera(folder: Path) -> Pinhole:
-    """Refuse a scan without a camera file."""
+    """Raise FormatError for a scan without a camera file."""
     raise FormatError(
         f"{folder}: expected intrinsic/intrinsic_depth.txt or intrinsics_depth.txt, got none; add "
         "it, or pass --intrinsics."
@@ -191,26 +189,26 @@ def _scannet_camera(folder: Path) -> Pinhole:
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
-    """Yield all depth images below a folder, by one camera, without colours and poses.
+    """Yield all depth images below a folder, with one camera, without colors and poses.
 
-    Where names speak of depth, the images without that word are left out, and everywhere those
-    whose names speak of something else.
+    Images whose names contain words for other content are skipped. If some names contain "depth",
+    all images without it are skipped too.
 
     Warns:
-        DepthWarning: If images are left out.
+        DepthWarning: If images are skipped.
     """
-    images = [path for path in files_below(folder) if path.suffix.lower() in DEPTH_SUFFIXES]
+    images = [path for path in find_files(folder) if path.suffix.lower() in DEPTH_SUFFIXES]
     words = {
         path: {*re.findall("[a-z]+", path.relative_to(folder).as_posix().lower())}
         for path in images
     }
-    chosen = [path for path in images if words[path].isdisjoint(_NO_DEPTH)]
+    chosen = [path for path in images if words[path].isdisjoint(_NON_DEPTH_WORDS)]
     if any("depth" in words[path] for path in chosen):
         chosen = [path for path in chosen if "depth" in words[path]]
-    if others := [path for path in images if path not in {*chosen}]:
+    if skipped := [path for path in images if path not in {*chosen}]:
         warnings.warn(
-            f"{folder}: left out {len(others):,} of {len(images):,} images, which are not depth by "
-            f"their names, {others[0].relative_to(folder)} first; rename them if they are.",
+            f"{folder}: skipped {len(skipped):,} of {len(images):,} images that are not depth "
+            f"by their names, {skipped[0].relative_to(folder)} first; rename them if they are.",
             DepthWarning,
             stacklevel=2,
         )
@@ -219,9 +217,9 @@ def _all_images(folder: Path) -> Iterator[ListedFrame]:
 
 
 def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of ``transforms.json``, which nerfstudio and its importers write.
+    """Yield the frames in ``transforms.json`` of nerfstudio and its importers.
 
-    Its cameras have the axes of OpenGL, and what stands in a frame goes before what all share.
+    Its cameras have OpenGL's axes, and values of a frame override shared values.
     """
     path = folder / "transforms.json"
     shared = read_record(path)
@@ -229,27 +227,27 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
     is_list = isinstance(frames, list) and all(isinstance(frame, dict) for frame in frames)
     if not is_list or not all(frame.get("depth_file_path") for frame in frames):
         raise FormatError(
-            f"{path}: expected a list of frames, each with depth_file_path; name the depth images "
-            "there, as ns-process-data polycam --use-depth does, and leave out frames without."
+            f"{path}: expected a list of frames, each with depth_file_path; add the depth images "
+            "there, as ns-process-data polycam --use-depth does, and remove frames without."
         )
     for frame in sorted(frames, key=lambda frame: natural_key(str(frame["depth_file_path"]))):
         record = {**shared, **frame}
         image = Path(str(record["depth_file_path"]))
         name = Path(image.as_posix().removesuffix(image.suffix))
-        steps = [step for step in name.parts if step not in ("..", name.anchor)]
+        parts = [step for step in name.parts if step not in ("..", name.anchor)]
         color = folder / str(record.get("file_path"))
         unit = None if image.suffix.lower() == ".npy" else _NERFSTUDIO_UNIT
         if "depth_unit_scale_factor" in record:
-            unit = number_of(path, record, "depth_unit_scale_factor")
+            unit = parse_number(path, record, "depth_unit_scale_factor")
         pose = torch.eye(4, dtype=torch.float64)
-        pose[:3] = matrix_of(path, record, "transform_matrix", columns=4)[:3]
+        pose[:3] = parse_matrix(path, record, "transform_matrix", columns=4)[:3]
         yield ListedFrame(
-            "/".join(steps),
+            "/".join(parts),
             folder / image,
             color if color.suffix.lower() in _COLOR_SUFFIXES and color.is_file() else None,
-            known_pose(pose @ _OPENGL_AXES),
+            valid_pose(pose @ _OPENGL_AXES),
             (path,),
-            camera_of(path, record),
+            parse_camera(path, record),
             unit and 1 / unit,
         )
 
@@ -257,8 +255,8 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
 def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of ARKitScenes: ``lowres_depth/<video>_<seconds>.png``.
 
-    Cameras are files of the same name, whose times are a millisecond off in some, and poses stand
-    in ``lowres_wide.traj``.
+    Cameras are files of the same name, with times that may differ by a millisecond; poses are in
+    ``lowres_wide.traj``.
     """
     images = [*_depth_images(folder, "lowres_depth/*")]
     with refusing(
@@ -269,56 +267,56 @@ def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     tracks = (track,) if track.is_file() else ()
     poses = read_nearest(times, track, read_axis_angles)
     for (name, image), time, pose in zip(images, times, poses, strict=True):
-        beside = folder / "lowres_wide_intrinsics" / f"{name}.pincam"
+        exact = folder / "lowres_wide_intrinsics" / f"{name}.pincam"
         video = name.rpartition("_")[0]
-        near = [beside.with_name(f"{video}_{time + off:.3f}.pincam") for off in (-0.001, 0.001)]
-        path = next((path for path in (beside, *near) if path.is_file()), beside)
+        near = [exact.with_name(f"{video}_{time + off:.3f}.pincam") for off in (-0.001, 0.001)]
+        path = next((path for path in (exact, *near) if path.is_file()), exact)
         names = ("width", "height", "fx", "fy", "cx", "cy")
         record = dict(zip(names, read_numbers(path, 6, " ".join(names))[0], strict=True))
-        camera = camera_of(path, record)
+        camera = parse_camera(path, record)
         color = _color_image(folder / "lowres_wide" / name)
         yield ListedFrame(name, image, color, pose, (path, *tracks), camera)
 
 
 def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of Replica as NICE-SLAM gives them: ``results/depth000000.png``.
+    """Yield the frames of NICE-SLAM's Replica: ``results/depth000000.png``.
 
-    The number of an image is that of its row in ``traj.txt``; the rooms share a camera.
+    The number of an image is its row in ``traj.txt``; the rooms share a camera.
     """
-    places = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
-    calibration = next((path for path in places if path.is_file()), places[0])
+    locations = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
+    calibration = next((path for path in locations if path.is_file()), locations[0])
     record = read_record(calibration, "camera")
-    camera = camera_of(calibration, record)
-    scale = number_of(calibration, record, "scale")
+    camera = parse_camera(calibration, record)
+    scale = parse_number(calibration, record, "scale")
     track = folder / "traj.txt"
     rows = read_numbers(track, 16, "16 numbers, those of a matrix,")
     poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
     for name, image in _depth_images(folder, "results/depth*"):
         color = _color_image(folder / "results" / f"frame{name}")
         has_row = name.isdecimal() and int(name) < len(poses)
-        pose = known_pose(poses[int(name)]) if has_row else None
+        pose = valid_pose(poses[int(name)]) if has_row else None
         yield ListedFrame(name, image, color, pose, (calibration, track), camera, scale)
 
 
 def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of an iPhone of ScanNet++, ``depth/frame_000000.png``, in the aligned world.
+    """Yield the iPhone frames of ScanNet++, ``depth/frame_000000.png``, in the aligned world.
 
-    A frame without an aligned pose has none.
+    Frames without an aligned pose have none.
     """
     path = folder / "pose_intrinsic_imu.json"
     if not (folder / "depth").is_dir():
         raise FormatError(
-            f"{folder}: expected images in depth, got none; take them out of depth.bin by "
+            f"{folder}: expected images in depth, got none; extract them from depth.bin with "
             "iphone/prepare_iphone_data.py of the data set's toolbox."
         )
     records = read_record(path)
     for name, image in _depth_images(folder, "depth/*"):
         record = records.get(name)
         if not isinstance(record, dict):
-            raise FormatError(f"{path}: expected {name}, of which there is depth, got no such.")
-        camera = camera_of(path, _SCANNETPP_COLOR | record)
+            raise FormatError(f"{path}: expected an entry for {name}, which has depth, got none.")
+        camera = parse_camera(path, _SCANNETPP_COLOR | record)
         has_pose = record.get("aligned_pose") is not None
-        pose = known_pose(matrix_of(path, record, "aligned_pose", 4)) if has_pose else None
+        pose = valid_pose(parse_matrix(path, record, "aligned_pose", 4)) if has_pose else None
         color = _color_image(folder / "rgb" / name)
         yield ListedFrame(name, image, color, pose, (path,), camera)
 
@@ -327,8 +325,8 @@ def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of 3RScan, ``frame-000000.depth.pgm``, and of others with ``_info.txt``."""
     path = folder / "_info.txt"
     record = read_info(path)
-    camera = camera_of(path, record)
-    scale = number_of(path, record, "m_depthShift")
+    camera = parse_camera(path, record)
+    scale = parse_number(path, record, "m_depthShift")
     for frame in _named_frames("*.depth", "*.color", "*.pose.txt")(folder):
         yield frame._replace(sources=(path, *frame.sources), camera=camera, depth_scale=scale)
 
@@ -338,83 +336,82 @@ LAYOUTS = {
         _scannetpp_frames,
         "pose_intrinsic_imu.json",
         depth_scale=1000.0,
-        places=_IPHONES,
+        locations=_IPHONES,
     ),
     "arkitscenes": FrameLayout(
         _arkitscenes_frames,
         "lowres_depth",
         depth_scale=1000.0,
-        places=("", "*/", "*/*/", "*/*/*/"),
+        locations=("", "*/", "*/*/", "*/*/*/"),
     ),
-    "3rscan": FrameLayout(_3rscan_frames, "_info.txt", places=("", "*/", "*/sequence/")),
+    "3rscan": FrameLayout(_3rscan_frames, "_info.txt", locations=("", "*/", "*/sequence/")),
     "replica": FrameLayout(_replica_frames, "traj.txt"),
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
     "icl-nuim": FrameLayout(
-        _icl_nuim_frames, "depth", _same_camera(*_ICL_NUIM_INTRINSICS), 5000.0, signs=()
+        _icl_nuim_frames, "depth", _fixed_camera(*_ICL_NUIM_INTRINSICS), 5000.0, signs=()
     ),
     "scannet": FrameLayout(
         _named_frames("depth/*", "color/*", "pose/*.txt"),
         "depth",
         _scannet_camera,
         1000.0,
-        places=("", "*/", "*/*/"),
+        locations=("", "*/", "*/*/"),
         signs=("intrinsic*_depth.txt", "intrinsic*/intrinsic*_depth.txt"),
     ),
     "7-scenes": FrameLayout(
         _named_frames("*.depth", "*.color", "*.pose.txt"),
         "frame-*.depth.png",
-        _same_camera(*_SEVEN_SCENES_INTRINSICS),
+        _fixed_camera(*_SEVEN_SCENES_INTRINSICS),
         1000.0,
         no_depth=65535,
-        places=("", "*/", "*/*/"),
+        locations=("", "*/", "*/*/"),
     ),
     "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json"),
     "images": FrameLayout(_all_images),
 }
-"""Shapes of folders of frames by their names, as :func:`find_layout` tries them: ScanNet++ (ICCV,
-2023); ARKitScenes (NeurIPS, 2021); 3RScan (RIO, ICCV, 2019); Replica as in NICE-SLAM (CVPR, 2022);
+"""Layouts by name, in the order that :func:`find_layout` tries them: ScanNet++ (ICCV, 2023);
+ARKitScenes (NeurIPS, 2021); 3RScan (RIO, ICCV, 2019); Replica as in NICE-SLAM (CVPR, 2022);
 J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS, 2012; A. Handa et al.,
 A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM, ICRA, 2014; ScanNet (CVPR, 2017)
 as its reader exports it; J. Shotton et al., Scene coordinate regression forests, CVPR, 2013;
-Nerfstudio (SIGGRAPH, 2023); and any other."""
+Nerfstudio (SIGGRAPH, 2023); and any other folder."""
 
 
 def find_layout(root: Path) -> str:
-    """Return the layout whose mark a folder has, and its sign where the mark is not enough.
+    """Detect the layout of a folder by its mark, and its sign if the mark is ambiguous.
 
-    It is ``images`` where there is no mark.
+    Default: ``images``.
     """
     for name, layout in LAYOUTS.items():
-        for folder in _marked(root, layout) if layout.mark and layout.signs else ():
+        for folder in _marked_folders(root, layout) if layout.mark and layout.signs else ():
             if any(not sign or any(folder.glob(sign)) for sign in layout.signs):
                 return name
     return "images"
 
 
 def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path]]:
-    """Yield the recordings in a folder, which may be one itself, with the folder of their names.
+    """Yield the recordings in a folder (or the folder itself), with their name prefixes.
 
-    One that is there under several names has the one without links, or else the one that comes
-    first.
+    For duplicates, the path without links is used, else the first path.
     """
     check_folder(root)
     if not layout.mark:
         yield "", root
         return
-    marked = sorted({*_marked(root, layout)}, key=lambda path: natural_key(str(path)))
+    marked = sorted({*_marked_folders(root, layout)}, key=lambda path: natural_key(str(path)))
     first_names: dict[Path, Path] = {}
     for path in sorted(marked, key=lambda path: path != root and path.is_symlink()):
         first_names.setdefault(path.resolve(), path)
     folders = [path for path in marked if first_names[path.resolve()] == path]
-    passed = [path for path in marked if path not in folders]
-    warn_of_links(root, [path for path in passed if not {*path.parents} & {*passed}])
+    skipped = [path for path in marked if path not in folders]
+    warn_skipped(root, [path for path in skipped if not {*path.parents} & {*skipped}])
     if not folders:
-        raise FormatError(f"{root}: expected recordings with {layout.mark} in them, got none.")
+        raise FormatError(f"{root}: expected recordings that contain {layout.mark}, got none.")
     for folder in folders:
         inside = folder.resolve().name if folder == root else folder.relative_to(root).as_posix()
         yield f"{inside}/", folder
 
 
-def _marked(root: Path, layout: FrameLayout) -> Iterator[Path]:
-    """Return the folders with the mark of a layout, each perhaps several times."""
-    return (path.parent for place in layout.places for path in root.glob(place + layout.mark))
+def _marked_folders(root: Path, layout: FrameLayout) -> Iterator[Path]:
+    """Return the folders with the mark of a layout, possibly with duplicates."""
+    return (path.parent for prefix in layout.locations for path in root.glob(prefix + layout.mark))

@@ -1,9 +1,9 @@
-r"""The Stanford rooms, S3DIS, as they are released: a text file for each annotated object.
+r"""S3DIS rooms as released, with a text file per object.
 
-A file has ``x y z r g b`` on each line. The two releases hold six known broken bytes. In all of
-them a character lost its bit 0x20 (``\x10`` for ``0``, ``\x00`` for a space), so setting that bit
-again repairs them exactly; a space in their place, as is often done, would make two numbers of one.
-Each repair is reported, and every other line that is not six numbers is an error.
+A file has ``x y z r g b`` on each line. The two releases contain six known corrupt bytes. Each of
+them lost its bit 0x20 (``\x10`` for ``0``, ``\x00`` for a space), so setting that bit repairs it
+exactly; the common fix of inserting a space would split a number in two. Each repair is reported,
+and any other line that is not six numbers is an error.
 """
 
 import filecmp
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
-from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, listed
+from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
@@ -39,51 +39,50 @@ CLASS_ORDERS = {
         "chair", "table", "bookcase", "sofa", "board", "clutter",
     ),
 }  # fmt: skip
-"""Names of the classes by number: the order of Pointcept, MMDetection3D and PointNet, and that of
+"""Class names by index, in the order of Pointcept, MMDetection3D and PointNet, and in the order of
 Superpoint Transformer and KPConv."""
 _OTHER_CLASS = "clutter"
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
-"""Number of rooms of each area in the release, 272 in all."""
+"""Number of rooms per area in the release, 272 in all."""
 ANNOTATIONS = "Annotations"
 _OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
-"""Names of the files of objects, and of their copies."""
+"""Names of object files and their copies."""
 _NUM_COLUMNS = 6
 _CONTROL_BYTES = bytes(sorted(set(range(32)) - set(b"\t\n\r")))
-"""Bytes that no text of numbers has."""
+"""Bytes that never occur in a text of numbers."""
 _LOST_BIT = 0x20
-"""Bit that the broken bytes of the releases have lost."""
-_LARGEST = float(np.finfo(np.float32).max)
-"""Largest coordinate, in metres, that the arrays of a room hold."""
+"""Bit that the corrupt bytes of the releases have lost."""
+_MAX_COORDINATE = float(np.finfo(np.float32).max)
+"""Largest coordinate, in meters, that float32 arrays can store."""
 _NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 class S3DIS(SceneDataset):
-    """The rooms of S3DIS, read from ``ROOT/Area_i/<room>/Annotations/*.txt``, aligned or not.
+    """Rooms of S3DIS, read from ``ROOT/Area_i/<room>/Annotations/*.txt``, aligned or not.
 
     A sample has ``coord``, ``color``, ``segment`` and ``instance`` of :func:`read_room`, the last
     two as int64, and ``name``, as in ``Area_1/office_1``. Points are in the order of the objects,
-    not in that of the room's own text file.
+    not in the order of the room's text file.
 
-    The text is read each time, and nothing is written; ``torchrg convert s3dis`` writes arrays,
-    which :class:`torchrg.datasets.FolderOfClouds` reads at once.
+    The text is parsed on every access; ``torchrg convert s3dis`` writes arrays, which
+    :class:`torchrg.datasets.FolderOfClouds` reads much faster.
 
     Args:
-        root: The folder that holds ``Area_1`` to ``Area_6``.
+        root: The folder that contains ``Area_1`` to ``Area_6``.
         areas: Numbers of the areas to use.
-        class_order: What the numbers in ``segment`` mean: a key of
-            :data:`torchrg.datasets.CLASS_ORDERS`.
-        transform: Called with each sample.
+        class_order: Class order of ``segment``: a key of :data:`torchrg.datasets.CLASS_ORDERS`.
+        transform: Applied to each sample.
 
     Attributes:
         scenes: Name, folder and input files of each room, in natural order.
-        classes: Names of the classes by number.
+        classes: Class names by index.
 
     Raises:
         FormatError: If an area is missing.
         ConfigError: If an area or the class order is unknown.
 
     Warns:
-        UserWarning: If an area has not as many rooms as the release.
+        UserWarning: If the number of rooms in an area differs from the release.
 
     References:
         [1] I. Armeni et al. 3D semantic parsing of large-scale indoor spaces. CVPR, 2016.
@@ -103,34 +102,34 @@ class S3DIS(SceneDataset):
         self.class_order = class_order
         self.classes = class_names(class_order)
         self.transform = transform
-        self.scenes = [scene for area in areas for scene in _scenes_of_area(self.root, area)]
+        self.scenes = [scene for area in areas for scene in _list_area(self.root, area)]
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
         """Return the cloud of a room; see :func:`read_room`."""
         return read_room(scene.path, class_order=self.class_order)
 
     def count_points(self, scene: SceneFiles) -> int:
-        """Return the number of points by the size of the files and the lines of the largest."""
+        """Estimate the number of points from the file sizes and the lines of the largest file."""
         sizes = {file: file.stat().st_size for file in scene.files}
         largest = max(sizes, key=lambda file: sizes[file])
         return round(sum(sizes.values()) * estimate_points(largest) / max(sizes[largest], 1))
 
     def describe(self) -> dict[str, Any]:
-        """Return what beside its files decides what is read, for JSON."""
+        """Return the JSON-serializable parameters that affect what is read."""
         return {"class_order": self.class_order}
 
     def check_output(self, layout: str, out: Path) -> None:
-        """Raise ConfigError if a layout has classes in another order, or results go to ``root``."""
+        """Raise ConfigError if a layout needs another class order, or results go to ``root``."""
         super().check_output(layout, out)
         if layout != "pointcept" and self.class_order != "pointcept":
             raise ConfigError(
-                f"expected --class-order with --layout pointcept, got layout {layout}, which "
-                "has the order pointcept; leave it out."
+                f"--class-order requires --layout pointcept, got layout {layout}, which uses the "
+                "order pointcept; remove --class-order."
             )
 
 
-def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
-    """Return the rooms of an area, and warn if there are not as many as in the release."""
+def _list_area(root: Path, area: int) -> list[SceneFiles]:
+    """Return the rooms of an area, and warn if their number differs from the release."""
     if area not in ROOMS_PER_AREA:
         choices = ", ".join(map(str, ROOMS_PER_AREA))
         raise ConfigError(f"S3DIS: expected areas among {choices}, got {area!r}.")
@@ -138,18 +137,16 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
     check_folder(root)
     if not folder.is_dir():
         inside = [path.parent for path in root.glob("*/Area_[1-6]")]
-        repair = (
-            f"pass {inside[0]}" if inside else "choose areas that are there, or download it again"
-        )
+        repair = f"pass {inside[0]}" if inside else "select existing areas, or download it again"
         raise FormatError(f"{root}: expected a folder {folder.name}, got none; {repair}.")
-    entries = [path for path in listed(folder) if path.is_dir() and not path.name.startswith(".")]
+    entries = [path for path in list_dir(folder) if path.is_dir() and not path.name.startswith(".")]
     rooms = [path for path in entries if (path / ANNOTATIONS).is_dir()]
     if len(rooms) != ROOMS_PER_AREA[area]:
         bare = [path.name for path in entries if path not in rooms]
-        without = f" ({', '.join(bare)}: no {ANNOTATIONS})" if bare else ""
+        missing = f" ({', '.join(bare)}: no {ANNOTATIONS})" if bare else ""
         warnings.warn(
-            f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{without}; "
-            "fetch the others unless you mean to go without.",
+            f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{missing}; "
+            "download the missing rooms unless this is intended.",
             stacklevel=3,
         )
     return [
@@ -159,27 +156,27 @@ def _scenes_of_area(root: Path, area: int) -> list[SceneFiles]:
 
 
 def find_areas(root: Path) -> tuple[int, ...]:
-    """Return the numbers of the areas that are there; all six if none is, to be told so."""
+    """Return the existing areas; all six if there are none, so that the error names them."""
     return tuple(n for n in ROOMS_PER_AREA if (root / f"Area_{n}").is_dir()) or (*ROOMS_PER_AREA,)
 
 
 def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
-    """Read a room from the raw release; nothing is written. The points of an object are in a row.
+    """Read a room from the raw release. Points of an object are contiguous.
 
     Args:
-        path: Folder of the room, the one above ``Annotations``.
-        class_order: What the numbers in ``segment`` mean: a key of :data:`CLASS_ORDERS`.
+        path: Folder of the room, the parent of ``Annotations``.
+        class_order: Class order of ``segment``: a key of :data:`CLASS_ORDERS`.
 
     Returns:
         The cloud, in float32, with ``color`` ``(N, 3)`` uint8, ``segment`` ``(N,)`` int16, and
-        ``instance`` ``(N,)``, the object, counted in natural order of the file names, int16, or
-        int32 with more than that holds. ``repairs`` has a line for each byte that was read as
-        another one: file, line and column, counted from one, and the line before and after; the
-        file itself is not changed. ``notes`` has one for each entry of the folder that is no
-        object, and for each file whose class is not among the 13, ``stairs`` for example.
+        ``instance`` ``(N,)``. The latter is the object index in natural order of the file names,
+        int16, or int32 if it does not fit. ``repairs`` has a line for each repaired byte: file,
+        line and column (from one), and the line before and after; the file itself is unchanged.
+        ``notes`` has a line for each folder entry that is not an object, and for each file of an
+        unknown class, for example ``stairs``.
 
     Raises:
-        FormatError: If there is no object, or a line of one is not a point.
+        FormatError: If there is no object, or a line is not a point.
         ConfigError: If the class order is unknown.
         MissingDependencyError: If pyarrow is not installed.
     """
@@ -187,11 +184,11 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
     objects, notes = _list_room(path)
     coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
     numbers = [classes.index(name if name in classes else _OTHER_CLASS) for name, _ in objects]
-    notes += [f"{file.name} taken as clutter" for name, file in objects if name not in classes]
+    notes += [f"{file.name} read as clutter" for name, file in objects if name not in classes]
     first: dict[bytes, str] = {}
     for (_, file), coord in zip(objects, coords, strict=True):
         other = first.setdefault(hashlib.sha256(coord.tobytes()).digest(), file.name)
-        notes += [] if other == file.name else [f"{file.name} has the points of {other}, too"]
+        notes += [] if other == file.name else [f"{file.name} has the same points as {other}"]
     color, more = read_colors(path, np.concatenate(colors))
     counts = [len(coord) for coord in coords]
     dtype = np.int16 if len(objects) <= np.iinfo(np.int16).max else np.int32
@@ -210,7 +207,7 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
 
 
 def class_names(class_order: str) -> tuple[str, ...]:
-    """Return the names of the 13 classes in an order, a key of :data:`CLASS_ORDERS`."""
+    """Return the names of the 13 classes in the order of a key of :data:`CLASS_ORDERS`."""
     if class_order not in CLASS_ORDERS:
         raise ConfigError(
             f"S3DIS: expected class_order to be one of {', '.join(CLASS_ORDERS)}, got "
@@ -220,17 +217,17 @@ def class_names(class_order: str) -> tuple[str, ...]:
 
 
 def object_files(room: Path) -> tuple[Path, ...]:
-    """Return the files of a room's objects; none of a broken room, which fails when it is read."""
+    """Return the object files of a room; none for a corrupt room, which fails when it is read."""
     with suppress(FormatError):
         return tuple(file for _, file in _list_room(room)[0])
     return ()
 
 
 def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
-    """Return class and file of each object of a room in natural order, and notes on the others.
+    """Return class and file of each object in natural order, and notes on skipped files.
 
-    These are hidden files, files that are not named ``CLASS_NUMBER.txt``, and copies named
-    ``CLASS_NUMBER (2).txt`` of a file that is there.
+    Skipped are hidden files, files not named ``CLASS_NUMBER.txt``, and copies named
+    ``CLASS_NUMBER (2).txt`` of an existing file.
     """
     folder = path / ANNOTATIONS
     if not folder.is_dir():
@@ -238,7 +235,7 @@ def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
             f"{path}: expected a folder {ANNOTATIONS}, got none; the file may be corrupt."
         )
     objects, notes = [], []
-    for file in listed(folder):
+    for file in list_dir(folder):
         match = _OBJECT.fullmatch(file.stem)
         if file.name.startswith(".") or file.suffix != ".txt" or not match or file.is_dir():
             notes.append(f"{file.name} not read: not named CLASS_NUMBER.txt")
@@ -258,15 +255,15 @@ def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
 def read_annotation(
     path: Path,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8] | NDArray[np.float64], list[str]]:
-    """Read coordinates and colors of one object in the order of the file, and list the repairs.
+    """Read coordinates and colors of one object in file order, and list the repairs.
 
-    Numbers stand between spaces or tabs, lines end in LF or CR LF, blank lines do not count.
-    Colors are 0 to 255, may be written as ``106.000000``, and are rounded to uint8. Colors in 0..1,
-    of which most are fractions, stay float64, as one range is that of the whole room.
+    Numbers are separated by spaces or tabs, lines end in LF or CR LF, blank lines are skipped.
+    Colors are 0 to 255, possibly written as ``106.000000``, and are rounded to uint8. Colors in
+    0..1, most of them fractions, stay float64, because the range must be the same in the room.
     """
     check_file(path)
     original = path.read_bytes()
-    content, repairs = _repair(path, original)
+    content, repairs = _restore_bits(path, original)
     table = _parse_fast(content)
     if table is None or not _are_points(table):
         table = _parse_lines(path, content, original)
@@ -276,20 +273,20 @@ def read_annotation(
     return coord, color if is_fraction else np.rint(color).astype(np.uint8), repairs
 
 
-def _repair(path: Path, original: bytes) -> tuple[bytes, list[str]]:
-    """Set the lost bit of control bytes, and list where."""
+def _restore_bits(path: Path, original: bytes) -> tuple[bytes, list[str]]:
+    """Restore the lost bit of control bytes, and list the repairs."""
     if len(original.translate(None, _CONTROL_BYTES)) == len(original):
         return original, []
     table = bytes(byte | _LOST_BIT if byte in _CONTROL_BYTES else byte for byte in range(256))
     content = original.translate(table)
-    places = np.flatnonzero(np.frombuffer(original, np.uint8) != np.frombuffer(content, np.uint8))
+    bad = np.flatnonzero(np.frombuffer(original, np.uint8) != np.frombuffer(content, np.uint8))
     ends = np.flatnonzero(np.frombuffer(original, np.uint8) == ord("\n"))
     repairs = []
-    for place, line in zip(places.tolist(), np.searchsorted(ends, places).tolist(), strict=True):
+    for byte, line in zip(bad.tolist(), np.searchsorted(ends, bad).tolist(), strict=True):
         begin = int(ends[line - 1]) + 1 if line else 0
         end = int(ends[line]) if line < len(ends) else len(original)
         before, after = (text[begin:end].rstrip(b"\r") for text in (original, content))
-        column = place - begin + 1
+        column = byte - begin + 1
         repairs.append(
             f"{path.name}: line {line + 1}, column {column}: {before!r} read as {after!r}"
         )
@@ -297,8 +294,8 @@ def _repair(path: Path, original: bytes) -> tuple[bytes, list[str]]:
 
 
 def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
-    """Parse lines of six numbers; None if they are not."""
-    # A lone CR would end a line here, and a minus that lost its bit is one.
+    """Parse lines of six numbers; None if any line differs."""
+    # Arrow treats a lone CR as a line end, but it is a minus sign that lost its bit.
     if content.count(b"\r") != content.count(b"\r\n"):
         return None
     require("pyarrow", extra="text", purpose="read S3DIS")
@@ -307,8 +304,8 @@ def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
 
 
 def _are_points(table: list[NDArray[np.float64]]) -> bool:
-    """Whether columns hold coordinates that float32 holds, and colours that fit a byte."""
-    lows, highs = [-_LARGEST] * 3 + [0.0] * 3, [_LARGEST] * 3 + [255.0] * 3
+    """Whether columns contain float32 coordinates and byte-sized colors."""
+    lows, highs = [-_MAX_COORDINATE] * 3 + [0.0] * 3, [_MAX_COORDINATE] * 3 + [255.0] * 3
     return all(
         bool(low <= np.rint(column.min()) and np.rint(column.max()) <= high)
         for column, low, high in zip(table, lows, highs, strict=True)
@@ -316,7 +313,7 @@ def _are_points(table: list[NDArray[np.float64]]) -> bool:
 
 
 def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np.float64]]:
-    """Parse line by line, and name the first line that is not a point."""
+    """Parse line by line; an error names the first line that is not a point."""
     rows: list[list[float]] = []
     for number, line in enumerate(content.split(b"\n"), start=1):
         text = line.removesuffix(b"\r")
@@ -333,8 +330,8 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np
             shown = original.split(b"\n")[number - 1].removesuffix(b"\r")
             shown = shown if len(shown) <= 80 else shown[:77] + b"..."
             raise FormatError(
-                f"{path}: line {number}: expected x y z and colours in 0 to 255, six numbers, "
-                f"got {shown!r}; repair or delete this line in a copy."
+                f"{path}: line {number}: expected x y z and colors in 0 to 255, six numbers, "
+                f"got {shown!r}; correct or delete this line in a copy."
             )
         rows.append(row)
     if not rows:

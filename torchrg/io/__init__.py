@@ -1,4 +1,4 @@
-"""Clouds in and out of files: :func:`read_cloud` and :func:`write_cloud` choose by the suffix."""
+"""Point cloud files; the file suffix selects the format."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -14,8 +14,8 @@ from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import FormatError
 from torchrg.io.columns import check_length
 from torchrg.io.e57 import count_e57, read_e57
-from torchrg.io.fields import checked_coordinates, put_results
-from torchrg.io.files import ARCHIVE_DAMAGES, atomic_path, check_file, check_place
+from torchrg.io.fields import convert_coordinates, put_results
+from torchrg.io.files import ARCHIVE_ERRORS, atomic_path, check_file, check_place
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
@@ -39,15 +39,15 @@ __all__ = [
 
 
 class Format(NamedTuple):
-    """How a kind of file is read and written; a new kind is a file, a row of FORMATS, and a test.
+    """Functions of a file format. A new format needs a module, a row of FORMATS, and a test.
 
     Attributes:
-        read: Reads a file of so many bytes, not 0; names of columns come third.
-        count: Returns the number of points by the header of a file of so many bytes, or about their
-            number by its size, in no time. May raise anything of a damaged file.
-        write: Writes a cloud; None for a kind that is read only.
-        check: Raises if a cloud, or any cloud for None, cannot be written; None if all can.
-        takes_columns: Whether columns can be without names.
+        read: Reads a non-empty file of the given size; the third argument holds column names.
+        count: Returns the number of points from the header, or an estimate from the file size,
+            without reading points. May raise any error on a corrupt file.
+        write: Writes a cloud; None for read-only formats.
+        check: Raises if a cloud (None: any cloud) cannot be written; None if every cloud can.
+        takes_columns: Whether the columns may be unnamed.
     """
 
     read: Callable[..., Cloud]
@@ -58,7 +58,7 @@ class Format(NamedTuple):
 
 
 RESULT_FIELDS = ("labels", "normals", "curvature")
-"""Fields that a segmentation adds to those of a cloud."""
+"""Fields that a segmentation adds to a cloud."""
 FORMATS: dict[str, Format] = {
     ".npz": Format(read_npz, count_npz, write_npz),
     ".npy": Format(read_npy, count_npy, write_npy, takes_columns=True),
@@ -73,43 +73,42 @@ FORMATS: dict[str, Format] = {
     ".pts": Format(read_text, count_text, None, takes_columns=True),
     ".csv": Format(read_text, count_text, None, takes_columns=True),
 }
-"""Formats that are read, by suffix. Those that are written hold any field."""
+"""Readable formats, by suffix. Writable formats store any field."""
 FOLDER_SUFFIXES = tuple(kind for kind in FORMATS if kind != ".csv")
-"""Suffixes of what is taken for a cloud in folders, where ``.csv`` is mostly a table of others."""
+"""Suffixes read as clouds in folders. A ``.csv`` file is usually another table."""
 _CONVERTERS = {
     ".obj": "a mesh; sample points on it with CloudCompare or pcl_mesh_sampling",
     ".glb": "a mesh; sample points on it with CloudCompare or Open3D",
     ".ptx": "a scan that CloudCompare opens; save it there as .e57",
 }
-"""Kinds of files that are not read, by suffix, and the programs that make clouds of them."""
+"""Unsupported suffixes, with the programs that convert them to point clouds."""
 _PLANES_SUFFIX = ".vg"
-"""Suffix of vertex groups, which are written only, and hold coordinates, colours and planes."""
+"""Suffix of vertex groups, which are write-only and store coordinates, colors and planes."""
 
 
 def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Cloud:
-    r"""Read a point cloud; the suffix says how.
+    r"""Read a point cloud; the file suffix selects the format.
 
     Convention:
-        Coordinates and fields stay as they are in the file, points that are not finite included.
-        Fields have one name whatever the format calls them, see :mod:`torchrg.io.fields`:
-        ``labels`` int64, ``normals``, ``curvature``, ``intensity``, ``color`` uint8 or uint16, see
-        :mod:`torchrg.io.colors`. What had to be taken for granted, as the names of columns without
-        any, and what was left out, as pictures, is in :attr:`torchrg.Cloud.notes`. Of the faces of
-        a mesh and the poses of scans it is kept from which side points were seen,
-        :attr:`torchrg.Cloud.front`.
+        Coordinates and fields are returned unchanged, including non-finite points. Field names do
+        not depend on the format (see :mod:`torchrg.io.fields`): ``labels`` int64, ``normals``,
+        ``curvature``, ``intensity``, ``color`` uint8 or uint16 (see :mod:`torchrg.io.colors`).
+        :attr:`torchrg.Cloud.notes` lists assumptions, such as guessed column names, and skipped
+        data, such as images. Mesh faces and scan poses give the side from which each point was
+        seen, :attr:`torchrg.Cloud.front`.
 
     Args:
         path: A file with a suffix of :data:`FORMATS`, in any case.
-        columns: Names of the columns of text and of a bare ``.npy`` array, in their order: ``x``,
-            ``y``, ``z`` and any others, ``_`` for one to leave out. Default: those that the file
-            says, else those of :data:`torchrg.io.fields.COLUMNS_RULE`.
+        columns: Column names of a text file or a plain ``.npy`` array, in order: ``x``, ``y``,
+            ``z`` and any others, ``_`` to skip a column. Default: the names in the file, else
+            :data:`torchrg.io.fields.COLUMNS_RULE`.
 
     Returns:
         The cloud, with at least one point.
 
     Raises:
-        FormatError: If the file is missing, damaged, or not of a known format, or if ``columns``
-            are not its. The message begins with the path and names the place and the repair.
+        FormatError: If the file is missing, corrupt, or of an unknown format, or if ``columns`` do
+            not fit it. The message begins with the path and names the position and the fix.
         MissingDependencyError: If the format needs an optional package.
 
     Example:
@@ -122,35 +121,35 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
         ((2, 3), [[255, 0, 0], [0, 255, 0]])
     """
     source = Path(path)
-    size, form = check_file(source), _format_of(source)
-    if columns is not None and not form.takes_columns:
+    size, fmt = check_file(source), _get_format(source)
+    if columns is not None and not fmt.takes_columns:
         raise FormatError(
-            f"{source}: expected text or .npy for names of columns, got a file that has its own; "
-            "leave them out."
+            f"{source}: column names apply to text and .npy files only; this format stores its "
+            "own. Omit them."
         )
     names = () if columns is None else (columns,)
     try:
-        # Files may hold any bits as numbers: those that overflow or signal are kept, not reported.
+        # Arbitrary bit patterns may overflow or signal; keep them without a warning.
         with np.errstate(over="ignore", invalid="ignore"):
-            return form.read(source, size, *names)
+            return fmt.read(source, size, *names)
     except OSError as error:
         raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
     except MemoryError as error:
         raise FormatError(
-            f"{source}: its points do not fit into memory; use a machine with more, or cut the "
-            "cloud into parts."
+            f"{source}: not enough memory for its points. Use a machine with more memory, or split "
+            "the cloud."
         ) from error
 
 
 def takes_columns(path: str | os.PathLike[str]) -> bool:
-    """Whether names can be given for the columns of a file, which its format does not ask for.
+    """Whether the format of a file allows column names to be passed.
 
     Example:
         >>> takes_columns("scan.txt"), takes_columns("scan.ply")
         (True, False)
     """
-    form = FORMATS.get(Path(path).suffix.lower())
-    return form is not None and form.takes_columns
+    fmt = FORMATS.get(Path(path).suffix.lower())
+    return fmt is not None and fmt.takes_columns
 
 
 def write_cloud(
@@ -161,31 +160,31 @@ def write_cloud(
     superpoints: Superpoints | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a point cloud, or the result of segmenting it; the suffix says how.
+    """Write a point cloud or a segmentation result; the file suffix selects the format.
 
-    The file appears whole or not at all. What is written reads back with :func:`read_cloud`, in the
-    same order and, but for the grid of ``.las``, to the last bit of the coordinates.
+    The file is written atomically. :func:`read_cloud` returns the points in the same order with
+    bit-identical coordinates, except for the ``.las`` grid.
 
     Convention:
-        A segmentation is written as ``label``, normals and ``curvature`` of each point, beside the
-        cloud's own fields, under the names that Open3D, CloudCompare, PCL and PDAL know. A field of
-        the cloud whose name a result takes is kept under another: ``label_input``,
-        ``normals_input`` and so on; where there is such a field already, it is that which stays.
-        ``.npz`` holds ``points``, ``color`` of the cloud, ``labels``, ``normals``, ``curvature``,
-        ``sharp``, ``valid``, the table of planes as
-        :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's coordinates, and
-        ``provenance``. Equal input gives equal bytes. Superpoints are
-        ``superpoint``, and ``superpoint_1`` and so on for the coarser levels; in ``.npz`` also
-        ``plane_of_superpoint``. ``.vg`` holds coordinates, colours, normals and the planes as
-        vertex groups, see :mod:`torchrg.io.vg`; it is not read.
+        A segmentation is written as ``label``, normals and ``curvature`` of each point, next to the
+        cloud's fields. The names are those of Open3D, CloudCompare, PCL and PDAL. A cloud field
+        with the name of a result is renamed to ``label_input``, ``normals_input`` and so on; if
+        the cloud already has such a field, that field is kept instead.
+        ``.npz`` contains ``points``, the cloud's ``color``, ``labels``, ``normals``, ``curvature``,
+        ``sharp``, ``valid``, the plane table in input coordinates (see
+        :func:`torchrg.plane_table.planes_to_arrays`), and ``provenance``. Identical input gives
+        byte-identical files. Superpoints are ``superpoint``, and ``superpoint_1`` and so on for
+        the coarser levels; ``.npz`` also contains ``plane_of_superpoint``. ``.vg`` contains
+        coordinates, colors, normals and the planes as vertex groups (see :mod:`torchrg.io.vg`); it
+        cannot be read back.
 
     Args:
-        path: The file; an older one is replaced. Its suffix is ``.vg`` or one of :data:`FORMATS`
-            but ``.e57``, ``.pts`` and ``.csv``.
+        path: The file; an existing one is replaced. Its suffix is ``.vg`` or one of :data:`FORMATS`
+            except ``.e57``, ``.pts`` and ``.csv``.
         cloud: The cloud, or its points, shape ``(N, 3)``.
-        segmentation: What :func:`torchrg.segment_planes` said about ``cloud.points``.
-        superpoints: What :func:`torchrg.make_superpoints` said about them.
-        provenance: How the result was made, anything that JSON can hold; kept by ``.npz`` only.
+        segmentation: Result of :func:`torchrg.segment_planes` for ``cloud.points``.
+        superpoints: Result of :func:`torchrg.make_superpoints` for ``cloud.points``.
+        provenance: How the result was made; any JSON-serializable mapping. Stored in ``.npz`` only.
 
     Raises:
         FormatError: If the format cannot hold the values, or the file cannot be written.
@@ -207,7 +206,7 @@ def write_cloud(
     check_output(target, cloud)
     for name, values in cloud.fields.items():
         check_length(target, name, values, len(cloud))
-    cloud = replace(cloud, coordinates=checked_coordinates(target, cloud.coordinates))
+    cloud = replace(cloud, coordinates=convert_coordinates(target, cloud.coordinates))
     for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):
         if result is not None and len(result.labels) != len(cloud):
             raise FormatError(
@@ -224,23 +223,22 @@ def write_cloud(
     if segmentation is not None:
         results = {name: getattr(segmentation, name).numpy(force=True) for name in RESULT_FIELDS}
         fields = put_results(fields, results)
-    labelled = replace(cloud, fields=fields)
+    labeled = replace(cloud, fields=fields)
     if suffix == _PLANES_SUFFIX and segmentation is not None:
         table = planes_to_arrays(segmentation.planes, cloud.origin)
         equations = np.column_stack([table["plane_normal"], -table["plane_offset"]])
-        write_vg(target, labelled, equations)
+        write_vg(target, labeled, equations)
         return
-    _writer_of(target)(target, labelled)
+    _get_writer(target)(target, labeled)
 
 
 def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:
-    """Check before long work that its result has a place: known suffix, folder there.
+    """Check an output path before long work: known suffix, existing writable folder.
 
-    ``cloud`` is the one that shall be written, if it is known yet: LAS holds no points that are not
-    finite.
+    ``cloud`` is the cloud to write, if already known: LAS cannot store non-finite points.
 
     Raises:
-        FormatError: If :func:`write_cloud` would refuse the path, or the cloud.
+        FormatError: If :func:`write_cloud` would reject the path or the cloud.
         MissingDependencyError: If the format needs an optional package.
 
     Example:
@@ -250,18 +248,18 @@ def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> No
         torchrg.errors.FormatError: planes.stl: expected a file that ends in one of .npz ...'.stl'.
     """
     target = Path(path)
-    _writer_of(target)
+    _get_writer(target)
     check_place(path)
-    form = FORMATS.get(target.suffix.lower())
-    if form is not None and form.check is not None:
-        form.check(target, cloud)
+    fmt = FORMATS.get(target.suffix.lower())
+    if fmt is not None and fmt.check is not None:
+        fmt.check(target, cloud)
 
 
 def estimate_points(path: Path) -> int:
-    r"""Return the number of points that a file says it holds, without reading them.
+    r"""Return the number of points of a file from its header, without reading the points.
 
-    For text, which has no header, and for E57 it is an estimate from the size; 0 for a file that is
-    damaged or of no known format, which reading will tell.
+    Text files have no header; for them and for E57 the number is estimated from the file size.
+    Returns 0 for a corrupt file or an unknown format, which reading reports.
 
     Example:
         >>> import tempfile
@@ -272,18 +270,18 @@ def estimate_points(path: Path) -> int:
         3
     """
     try:
-        return _format_of(path).count(path, path.stat().st_size)
-    except (OSError, FormatError, *ARCHIVE_DAMAGES):
+        return _get_format(path).count(path, path.stat().st_size)
+    except (OSError, FormatError, *ARCHIVE_ERRORS):
         return 0
 
 
-def _format_of(path: Path, *, is_written: bool = False) -> Format:
-    """Return how a file is read, or written, by its suffix."""
+def _get_format(path: Path, *, for_writing: bool = False) -> Format:
+    """Return the format of a file to read or write, by its suffix."""
     suffix = path.suffix.lower()
-    if suffix in _CONVERTERS and not is_written:
+    if suffix in _CONVERTERS and not for_writing:
         raise FormatError(f"{path}: expected points, got {_CONVERTERS[suffix]}.")
     if suffix not in FORMATS:
-        suffixes = [kind for kind, format_ in FORMATS.items() if format_.write or not is_written]
+        suffixes = [kind for kind, format_ in FORMATS.items() if format_.write or not for_writing]
         raise FormatError(
             f"{path}: expected a file that ends in one of {' '.join(suffixes)}, got "
             f"{path.suffix!r}."
@@ -291,14 +289,11 @@ def _format_of(path: Path, *, is_written: bool = False) -> Format:
     return FORMATS[suffix]
 
 
-def _writer_of(path: Path) -> Callable[[Path, Cloud], None]:
-    """Return the function that writes a file, by its suffix."""
+def _get_writer(path: Path) -> Callable[[Path, Cloud], None]:
+    """Return the writer of a file, by its suffix."""
     if path.suffix.lower() == _PLANES_SUFFIX:
         return write_vg
-    write = _format_of(path, is_written=True).write
+    write = _get_format(path, for_writing=True).write
     if write is None:
-        raise FormatError(
-            f"{path}: expected a format that is written, got {path.suffix}, which is only read; "
-            "write .laz or .ply."
-        )
+        raise FormatError(f"{path}: {path.suffix} can be read but not written. Use .laz or .ply.")
     return write

@@ -1,4 +1,4 @@
-"""Lines of plain numbers through pyarrow, which is faster than NumPy the more digits they have."""
+"""Fast parsing of plain numbers with pyarrow."""
 
 import importlib
 from contextlib import suppress
@@ -8,23 +8,25 @@ import torch
 from numpy.typing import NDArray
 
 _PLAIN = b"0123456789+-.eE \t\r\nnaifNAIF"
-"""Characters of numbers, ``nan`` and ``inf``; all that pyarrow makes of these, Python does, too."""
+"""Characters of numbers, ``nan`` and ``inf``. pyarrow accepts only what Python accepts of them."""
 
 
 def parse_numbers(
     content: bytes, num_columns: int, delimiter: str | None = None, decimal: str = "."
 ) -> NDArray[np.float64] | None:
-    r"""Parse lines of so many plain numbers, to the bits that Python's ``float`` gives.
+    r"""Parse rows of plain numbers, bit-identical to Python's ``float``.
+
+    pyarrow is faster than NumPy, and more so the more digits the numbers have.
 
     Args:
-        content: Lines, which end in LF or CR; blank ones do not count.
-        num_columns: How many numbers a line has.
-        delimiter: What is between them; None for spaces and tabs.
-        decimal: What their decimals begin with.
+        content: Lines that end in LF or CR; blank lines are skipped.
+        num_columns: Numbers per line.
+        delimiter: Delimiter; None for spaces and tabs.
+        decimal: Decimal separator.
 
     Returns:
-        The numbers, shape ``(N, num_columns)``. None if a line holds anything else, which may be
-        right or not, or if pyarrow is not installed.
+        The numbers, shape ``(N, num_columns)``. None if a line contains anything else, valid or
+        not, or if pyarrow is not installed.
 
     Example:
         >>> table = parse_numbers(b"0 1.5 -2\n3 4 1e3\n", 3)
@@ -47,20 +49,20 @@ def parse_numbers(
             column_types=dict.fromkeys(names, arrow.float64()), null_values=[], check_utf8=False
         ),
     )
-    for prepare in (bytes, _single_spaced) if delimiter is None else (bytes,):
+    for transform in (bytes, _collapse_blanks) if delimiter is None else (bytes,):
         with suppress(arrow.ArrowInvalid):
-            table = csv.read_csv(arrow.BufferReader(prepare(content)), *options)
+            table = csv.read_csv(arrow.BufferReader(transform(content)), *options)
             numbers = np.empty((table.num_rows, num_columns))
             for i, column in enumerate(table.columns):
-                # Its own way to NumPy imports pandas.
+                # pyarrow's to_numpy imports pandas.
                 parts = [np.empty(0), *map(np.from_dlpack, column.chunks)]
                 np.concatenate(parts, out=numbers[:, i])
             return numbers
     return None
 
 
-def _single_spaced(content: bytes) -> bytes:
-    """Return lines with one space between words, and none around them."""
+def _collapse_blanks(content: bytes) -> bytes:
+    """Collapse runs of blanks to one space, and strip blanks at line ends."""
     content = content.replace(b"\t", b" ")
     while b"  " in content:
         content = content.replace(b"  ", b" ")

@@ -1,4 +1,4 @@
-"""From a cloud to the columns of a file, by the format's own names and types."""
+"""Conversion of clouds to file columns."""
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -8,25 +8,25 @@ import numpy as np
 
 from torchrg.errors import FormatError
 from torchrg.io.colors import narrow_colors
-from torchrg.io.fields import LARGEST_WHOLE, LEFT_OUT, Columns, Values, name_aside
+from torchrg.io.fields import MAX_EXACT_INTEGER, SKIPPED, Columns, Values, backup_name
 from torchrg.io.files import atomic_path
 from torchrg.structures import Cloud
 
-_RECORDS_AT_ONCE = 1 << 20
-"""Records that are made and written together, which bounds the memory beside the cloud."""
-_LABELS = ("labels", name_aside("labels"))
+_RECORDS_PER_CHUNK = 1 << 20
+"""Records converted and written together, which bounds the memory."""
+_LABELS = ("labels", backup_name("labels"))
 
 
-class Spelling(NamedTuple):
-    """How a format spells torchrg's names.
+class FieldNames(NamedTuple):
+    """Names that a format uses for torchrg's fields.
 
     Attributes:
         normals: Names of the three components.
         color: Names of the three channels.
         curvature: Name of the curvature.
-        color_bits: Width of a channel, 8 or 16; colours of 16 bits are rounded to 8, not widened.
-        vectors: Whether other fields of several columns stay one, shape ``(N, C)``.
-        blanks: Whether names keep their blanks, which become ``_`` elsewhere.
+        color_bits: Bits per channel, 8 or 16; 16-bit colors are rounded to 8, never widened.
+        vectors: Whether other multi-column fields stay one column of shape ``(N, C)``.
+        blanks: Whether names may contain blanks; otherwise they become ``_``.
     """
 
     normals: tuple[str, str, str] = ("nx", "ny", "nz")
@@ -37,50 +37,49 @@ class Spelling(NamedTuple):
     blanks: bool = False
 
 
-def flatten_cloud(path: Path, cloud: Cloud, spelling: Spelling) -> dict[str, Values]:
-    """Spread a cloud over columns by the format's names: ``x y z`` first, then its fields.
+def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str, Values]:
+    """Convert a cloud to named columns: ``x y z`` first, then its fields.
 
-    Labels are int32 where that holds them, colours uint8 (or uint16 if the format holds it), truth
-    values uint8, half precision float32. A field of several columns is ``name_0``, ``name_1`` and
-    so on, unless the format has ``vectors``.
+    Labels become int32 if that holds them, colors uint8 (or uint16 if the format stores it),
+    booleans uint8, half precision float32. A multi-column field is split into ``name_0``,
+    ``name_1`` and so on, unless the format has ``vectors``.
     """
     columns: dict[str, Values] = {axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")}
     for name, values in cloud.fields.items():
-        if name == LEFT_OUT:
-            raise FormatError(f"{path}: expected names of fields, got {name!r}; rename it.")
-        values = _storable(path, name, values, spelling)
+        if name == SKIPPED:
+            raise FormatError(f"{path}: a field cannot be named {name!r}; rename it.")
+        values = _to_storable(path, name, values, field_names)
         if name in _LABELS:
             values = narrow_integers(values, ("i4",))
-        for column_name, column in _spread(name, values, spelling).items():
+        for column_name, column in _split_field(name, values, field_names).items():
             if column_name in columns:
                 raise FormatError(
-                    f"{path}: expected fields of different names, got {column_name!r} twice; "
-                    "rename one."
+                    f"{path}: duplicate field name {column_name!r}; rename one of the fields."
                 )
             columns[column_name] = column
     return columns
 
 
 def check_length(path: Path, name: str, values: Values, num_points: int) -> None:
-    """Check that a field has a value for each point."""
+    """Check that a field has one row per point."""
     if values.shape[:1] != (num_points,):
         raise FormatError(
             f"{path}: expected field {name} of shape ({num_points}, ...), got {values.shape}; "
-            "give one row a point."
+            "pass one row per point."
         )
 
 
-def _storable(path: Path, name: str, values: Values, spelling: Spelling) -> Values:
-    """Return a field as real numbers that files hold."""
+def _to_storable(path: Path, name: str, values: Values, field_names: FieldNames) -> Values:
+    """Return a field as real numbers of a type that files store."""
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
         raise FormatError(
             f"{path}: expected field {name} to be real numbers of at most 64 bits, got "
-            f"{values.dtype}; leave it out or write .npz."
+            f"{values.dtype}; remove it or write .npz."
         )
     if values.ndim > 2 or 0 in values.shape[1:]:
         raise FormatError(
             f"{path}: expected field {name} of shape (N,) or (N, C), got {values.shape}; "
-            "leave it out or write .npz."
+            "remove it or write .npz."
         )
     if values.dtype.kind == "b":
         return values.astype(np.uint8)
@@ -92,59 +91,59 @@ def _storable(path: Path, name: str, values: Values, spelling: Spelling) -> Valu
         raise FormatError(
             f"{path}: expected field color of uint8 or uint16, got {values.dtype}; convert it."
         )
-    return values if spelling.color_bits == 16 else narrow_colors(values)
+    return values if field_names.color_bits == 16 else narrow_colors(values)
 
 
-def _spread(name: str, values: Values, spelling: Spelling) -> dict[str, Values]:
-    """Cut a field into named columns."""
-    word = (name if spelling.blanks else "_".join(name.split())) or "field"
+def _split_field(name: str, values: Values, field_names: FieldNames) -> dict[str, Values]:
+    """Split a field into named columns."""
+    word = (name if field_names.blanks else "_".join(name.split())) or "field"
     if values.shape[1:] in ((), (1,)):
-        word = {"labels": "label", "curvature": spelling.curvature}.get(name, word)
+        word = {"labels": "label", "curvature": field_names.curvature}.get(name, word)
         return {word: values.reshape(-1)}
-    triples = {"normals": spelling.normals, "color": spelling.color}
+    triples = {"normals": field_names.normals, "color": field_names.color}
     if name in triples and values.shape[1] == 3:
         return dict(zip(triples[name], values.T, strict=True))
-    if spelling.vectors:
+    if field_names.vectors:
         return {word: values}
     return {f"{word}_{i}": column for i, column in enumerate(values.T)}
 
 
 def check_exact(path: Path, columns: Columns) -> None:
-    """Check that float64, and so text, holds all 64-bit integers exactly."""
+    """Check that float64, and thus text, represents all 64-bit integers exactly."""
     for name, column in columns.items():
-        if _is_wide(column) and max(-int(column.min()), int(column.max())) >= LARGEST_WHOLE:
+        if _is_64_bit(column) and max(-int(column.min()), int(column.max())) >= MAX_EXACT_INTEGER:
             raise FormatError(
-                f"{path}: expected field {name} within 2^53, got 64-bit integers beyond; "
-                "leave it out or write .npz."
+                f"{path}: field {name} contains integers beyond 2^53, which this format rounds; "
+                "remove the field or write .npz."
             )
 
 
-def _is_wide(values: Values) -> bool:
-    """Whether values are integers of 64 bits, one of them at least."""
+def _is_64_bit(values: Values) -> bool:
+    """Whether values are 64-bit integers, and not empty."""
     return values.dtype.kind in "iu" and values.dtype.itemsize == 8 and values.size > 0
 
 
 def narrow_integers(values: Values, codes: Collection[str]) -> Values:
-    """Return 64-bit integers in the first of the types, as ``("i4", "u4")``, that holds them all.
+    """Convert 64-bit integers to the first type of ``codes`` that holds them all.
 
-    Values that none of them holds, and values that are no 64-bit integers, stay as they are.
+    Values that fit none of the types, and values of other types, are returned unchanged.
 
     Example:
         >>> narrow_integers(np.array([0, 2**31]), ("i4", "u4")).dtype
         dtype('uint32')
     """
-    if not _is_wide(values):
+    if not _is_64_bit(values):
         return values
     low, high = int(values.min()), int(values.max())
     for code in codes:
-        held = np.iinfo(code)
-        if held.min <= low and high <= held.max:
+        limits = np.iinfo(code)
+        if limits.min <= low and high <= limits.max:
             return values.astype(code)
     return values
 
 
 def to_records(columns: Columns, rows: slice = slice(None)) -> Values:
-    """Return rows of columns as one structured array, little-endian, shape ``(n,)``."""
+    """Return rows of columns as one little-endian structured array, shape ``(n,)``."""
     parts = {name: column[rows] for name, column in columns.items()}
     types = [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in parts.items()]
     records = np.empty(len(next(iter(parts.values()))), types)
@@ -154,15 +153,15 @@ def to_records(columns: Columns, rows: slice = slice(None)) -> Values:
 
 
 def write_records(path: Path, header: Sequence[str], columns: Columns) -> None:
-    """Write the lines of a header, and columns as binary records."""
+    """Write header lines and columns as binary records."""
     num_rows = len(next(iter(columns.values())))
-    with atomic_path(path) as beside, beside.open("wb") as stream:
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
         stream.write("".join(f"{line}\n" for line in header).encode())
-        for rows in slices(num_rows, _RECORDS_AT_ONCE):
+        for rows in row_slices(num_rows, _RECORDS_PER_CHUNK):
             to_records(columns, rows).tofile(stream)
 
 
-def slices(num_rows: int, at_once: int) -> Iterator[slice]:
-    """Cut so many rows into pieces of at most so many."""
-    for start in range(0, num_rows, at_once):
-        yield slice(start, min(start + at_once, num_rows))
+def row_slices(num_rows: int, chunk_size: int) -> Iterator[slice]:
+    """Yield consecutive slices of at most ``chunk_size`` rows."""
+    for start in range(0, num_rows, chunk_size):
+        yield slice(start, min(start + chunk_size, num_rows))

@@ -1,11 +1,10 @@
-"""From the columns of a file to a cloud and back: one name for what every format calls otherwise.
+"""Mapping between file columns and cloud fields, with format-independent names.
 
 Read as ``labels``: ``label``; as ``normals``: ``nx ny nz``, ``normal_x ...``, ``NormalX ...``,
 ``normal``; as ``color``: ``red green blue``, ``diffuse_red ...``, ``r g b``, ``rgb``, ``colors``,
-``rf gf bf``; as ``intensity``: ``intensities``. Case does not matter, nor CloudCompare's prefix
-``scalar_``.
-``name_0``, ``name_1``, ... of one type become one field ``name`` of as many columns. Everything
-else keeps its name.
+``rf gf bf``; as ``intensity``: ``intensities``. Case and CloudCompare's prefix ``scalar_`` are
+ignored. ``name_0``, ``name_1``, ... of one type become one multi-column field ``name``. All other
+names are unchanged.
 """
 
 import re
@@ -21,9 +20,9 @@ from torchrg.io.colors import BYTE, WORD, read_colors
 from torchrg.structures import UNLABELED, Cloud
 
 Values = NDArray[Any]
-"""An array of any type, as files hold them."""
+"""An array of any type."""
 Columns = Mapping[str, Values]
-"""Values of each point by name, each of shape ``(N, ...)``."""
+"""Per-point values by name, each of shape ``(N, ...)``."""
 
 _ALIASES = {
     "label": "labels",
@@ -37,7 +36,7 @@ _ALIASES = {
     "intensities": "intensity",
     "curvature": "curvature",
 }
-"""torchrg's names by those of files in lower case."""
+"""Field names by lower-case column name."""
 _TRIPLES = {
     ("nx", "ny", "nz"): "normals",
     ("normal_x", "normal_y", "normal_z"): "normals",
@@ -47,32 +46,33 @@ _TRIPLES = {
     ("r", "g", "b"): "color",
     ("rf", "gf", "bf"): "color",
 }
-"""torchrg's names by those of three columns, in lower case."""
+"""Field names by three lower-case column names."""
 _COLOR = ("red", "green", "blue")
 _GUESSED_WIDTHS = (6, 7)
-"""Columns of a table without names whose meaning the values tell."""
-LEFT_OUT = "_"
-"""Name of a column that is not read, as in PCD."""
+"""Numbers of unnamed columns whose meaning is guessed from the values."""
+SKIPPED = "_"
+"""Name of a skipped column, as in PCD."""
 _MAX_COLUMNS = 32
-"""Columns of a few rows without names. More are taken for points in columns; programs write up to a
-dozen values of a point without names."""
+"""Maximum number of unnamed columns of a table with few rows. Programs write up to a dozen unnamed
+values per point; more columns mean a transposed table."""
 _SHOWN_NAMES = 8
-"""Names of columns in a note; more are not shown one by one."""
+"""Maximum number of column names listed in a note."""
 _GUESSED_ROWS = 1000
-"""Rows from which the meaning of such columns is guessed."""
+"""Rows from which the meaning of unnamed columns is guessed."""
 COLUMNS_RULE = (
-    "Without names, columns are x y z, and a fourth alone is intensity. Of six, the last three are "
-    "a unit normal, or a color of integers from 0 to 255, where the first 1,000 rows fit; else a "
-    "color of integers from 0 to 65535, where all rows fit. Of seven, the same is asked of the "
-    "last three and of the three before the last; if one of both fits, it is taken, with intensity "
-    "before a color; in .pts, where colors come last, the last three alone are asked. Any other "
-    "column is column_4, column_5 and so on."
+    "Without names, columns are x y z; a fourth column alone is intensity. With six columns, the "
+    "last three are a unit normal, or a color of integers from 0 to 255, if the first 1,000 rows "
+    "fit; else a color of integers from 0 to 65535, if all rows fit. With seven columns, the last "
+    "three and the three before the last are tested in this way; if exactly one of them fits, it "
+    "is used, with intensity before a color. In .pts files, in which colors come last, only the "
+    "last three are tested. All other columns are named column_4, column_5 and so on."
 )
-"""How the columns of text and of bare arrays are named where nothing names them, for people."""
+"""Naming rule for unnamed columns of text files and plain arrays, for help texts."""
 _UNIT_TOLERANCE = 2e-3
-"""Most that the square of a unit vector's length differs from 1: 1e-3 of the length."""
-LARGEST_WHOLE = 2**53
-"""float64, and so text, tells whole numbers below from all others; this may have been another."""
+"""Maximum deviation of a unit vector's squared norm from 1; 1e-3 of the norm."""
+MAX_EXACT_INTEGER = 2**53
+"""Limit below which float64, and thus text, represents integers exactly. The limit itself may be a
+rounded integer."""
 
 
 def assemble_cloud(
@@ -85,15 +85,15 @@ def assemble_cloud(
     notes: tuple[str, ...] = (),
     integers: Collection[str] = (),
 ) -> Cloud:
-    """Build a cloud from columns by the file's own names.
+    """Build a cloud from columns named as in the file.
 
-    ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, where these are no columns.
-    ``integers`` are the columns that the file writes as integers, whatever their type is here.
+    ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, if these are not columns.
+    ``integers`` are the columns stored as integers in the file, whatever their type here.
     """
     remaining = dict(columns)
     if coordinates is None:
-        exact = all(axis in remaining for axis in "xyz")
-        names = [axis if exact else axis.upper() for axis in "xyz"]
+        is_lower = all(axis in remaining for axis in "xyz")
+        names = [axis if is_lower else axis.upper() for axis in "xyz"]
         if not all(name in remaining for name in names):
             present = ", ".join(map(ascii, remaining)) or "none"
             raise FormatError(
@@ -103,19 +103,19 @@ def assemble_cloud(
         if any(axis.ndim != 1 for axis in axes):
             shapes = ", ".join(map(_row_shape, axes))
             raise FormatError(
-                f"{path}: expected one number a point in each of x, y, z, got {shapes}; flatten "
+                f"{path}: expected x, y, z of one number per point, got {shapes}; flatten "
                 "or rename them."
             )
-        places = _stacked(path, axes)
+        values = _stack(path, axes)
     else:
-        places = remaining.pop(coordinates)
-    points = checked_coordinates(path, places)
-    sources = _sources_of(remaining)
+        values = remaining.pop(coordinates)
+    points = convert_coordinates(path, values)
+    sources = _field_columns(remaining)
     fields = {
-        name: _stacked(path, [remaining[column] for column in parts])
+        name: _stack(path, [remaining[column] for column in parts])
         for name, parts in sources.items()
     }
-    for name, check in (("labels", _labels), ("normals", _normals)):
+    for name, check in (("labels", _convert_labels), ("normals", _convert_normals)):
         if name in fields:
             fields[name] = check(path, fields[name])
     if "color" in fields:
@@ -135,30 +135,30 @@ def assemble_table(
     notes: tuple[str, ...] = (),
     integers: Collection[int] = (),
 ) -> Cloud:
-    """Build a cloud from a table, shape ``(N, C)``, with names of its columns or by the rule.
+    """Build a cloud from a table, shape ``(N, C)``, with column names or by the naming rule.
 
-    ``integers`` are the columns that the file writes without a decimal point or an exponent.
+    ``integers`` are the indices of columns written without decimal point or exponent.
     """
     if names is None:
         _check_table(path, table)
         is_pts = path.suffix.lower() == ".pts"
-        names = names_by_rule(table, color_last=is_pts)
+        names = guess_column_names(table, color_last=is_pts)
         if len(names) > 3:
-            many = len(names) > _SHOWN_NAMES
-            shown = [*names[: _SHOWN_NAMES - 1], "...", names[-1]] if many else names
+            is_long = len(names) > _SHOWN_NAMES
+            shown = [*names[: _SHOWN_NAMES - 1], "...", names[-1]] if is_long else names
             notes += (
                 f"its columns have no names and are taken as {' '.join(shown)}; if they are "
                 "others, name them with --columns",
             )
-    columns = {name: table[:, i] for i, name in enumerate(names) if name != LEFT_OUT}
+    columns = {name: table[:, i] for i, name in enumerate(names) if name != SKIPPED}
     return assemble_cloud(path, columns, notes=notes, integers=[names[i] for i in integers])
 
 
-def checked_coordinates(path: Path, coordinates: Values) -> NDArray[np.floating]:
+def convert_coordinates(path: Path, coordinates: Values) -> NDArray[np.floating]:
     """Return coordinates as float32 or float64 in native byte order.
 
-    Whole numbers of at most 16 bits and half precision become float32, which holds them exactly;
-    other numbers become float64.
+    Integers of at most 16 bits and half precision become float32, which is exact; other numbers
+    become float64.
     """
     check_coordinates(path, coordinates.shape, coordinates.dtype)
     dtype = coordinates.dtype
@@ -167,7 +167,7 @@ def checked_coordinates(path: Path, coordinates: Values) -> NDArray[np.floating]
 
 
 def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    """Check that an array of this shape and type can be coordinates."""
+    """Check that an array of this shape and type can hold coordinates."""
     if len(shape) != 2 or shape[1] != 3:
         repair = "transpose" if len(shape) == 2 and shape[0] == 3 else "reshape"
         raise FormatError(
@@ -179,25 +179,25 @@ def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) 
         )
     if shape[0] == 0:
         raise FormatError(
-            f"{path}: expected at least one point, got none; check where it comes from."
+            f"{path}: expected at least one point, got none; check the source of the file."
         )
 
 
-def name_aside(name: str) -> str:
-    """Return the name under which a cloud's own field is kept when a result takes its name.
+def backup_name(name: str) -> str:
+    """Return the backup name of a cloud field that a result replaces.
 
     Example:
-        >>> name_aside("labels"), name_aside("normals")
+        >>> backup_name("labels"), backup_name("normals")
         ('label_input', 'normals_input')
     """
     return f"{'label' if name == 'labels' else name}_input"
 
 
 def put_results(fields: Mapping[str, Values], results: Mapping[str, Values]) -> dict[str, Values]:
-    """Return the fields of a cloud with those of a result beside them.
+    """Return the fields of a cloud together with the fields of a result.
 
-    What a result has the name of is kept as :func:`name_aside` says, unless there is such a field
-    already: then the cloud is a result itself, and its input's own field stays.
+    A field with the name of a result is renamed as :func:`backup_name` returns. If that name is
+    taken, the cloud is itself a result; then the input field is kept and the result is replaced.
 
     Example:
         >>> first = put_results({"labels": np.array([7])}, {"labels": np.array([0])})
@@ -205,34 +205,35 @@ def put_results(fields: Mapping[str, Values], results: Mapping[str, Values]) -> 
         >>> {name: values.tolist() for name, values in again.items()}
         {'label_input': [7], 'labels': [1]}
     """
-    others = {name: values for name, values in fields.items() if name not in results}
-    aside = {name_aside(name): fields[name] for name in results if name in fields}
-    return {**aside, **others, **results}
+    unchanged = {name: values for name, values in fields.items() if name not in results}
+    backups = {backup_name(name): fields[name] for name in results if name in fields}
+    return {**backups, **unchanged, **results}
 
 
 def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[str]:
-    """Return what to tell people of fields that :func:`put_results` renames or leaves out."""
+    """Return notes on fields that :func:`put_results` renames or drops."""
     shown = {name: "label" if name == "labels" else name for name in results if name in fields}
-    moved = [name for name in shown if name_aside(name) not in fields]
-    lost = [name for name in shown if name not in moved]
+    renamed = [name for name in shown if backup_name(name) not in fields]
+    dropped = [name for name in shown if name not in renamed]
     notes = []
-    if moved:
-        names = ", ".join(f"{shown[name]} as {name_aside(name)}" for name in moved)
+    if renamed:
+        names = ", ".join(f"{shown[name]} as {backup_name(name)}" for name in renamed)
         notes.append(f"its own fields are kept beside the result's: {names}")
-    if lost:
-        names, stay = ", ".join(shown[name] for name in lost), ", ".join(map(name_aside, lost))
-        notes.append(f"its own {names} left out for the result's; {stay} stay")
+    if dropped:
+        names = ", ".join(shown[name] for name in dropped)
+        kept = ", ".join(map(backup_name, dropped))
+        notes.append(f"its own {names} left out for the result's; {kept} stay")
     return notes
 
 
-def names_by_rule(table: Values, *, color_last: bool = False) -> list[str]:
+def guess_column_names(table: Values, *, color_last: bool = False) -> list[str]:
     """Name the columns of a table by :data:`COLUMNS_RULE`, shape ``(N, C)``.
 
-    Of seven columns of small whole numbers, programs mean ``intensity red green blue`` or ``red
-    green blue label``; which of these is not told by values, so both keep their numbers.
+    Seven columns of small integers mean ``intensity red green blue`` or ``red green blue label``.
+    The values cannot distinguish the two, so both stay numbered.
 
     Example:
-        >>> names_by_rule(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
+        >>> guess_column_names(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
         ['x', 'y', 'z', 'intensity', 'red', 'green', 'blue']
     """
     num_columns = table.shape[1]
@@ -243,7 +244,7 @@ def names_by_rule(table: Values, *, color_last: bool = False) -> list[str]:
         return names
     starts = range(num_columns - 3 if color_last else 3, num_columns - 2)
     threes = {i: table[:, i : i + 3] for i in starts}
-    first = {i: _triple_by_values(three[:_GUESSED_ROWS]) for i, three in threes.items()}
+    first = {i: _guess_triple(three[:_GUESSED_ROWS]) for i, three in threes.items()}
     triples = {i: triple for i, triple in first.items() if triple}
     if not triples:
         triples = {i: _COLOR for i, three in threes.items() if _is_wide_color(three)}
@@ -255,10 +256,10 @@ def names_by_rule(table: Values, *, color_last: bool = False) -> list[str]:
     return names
 
 
-def _triple_by_values(three: Values) -> tuple[str, str, str] | None:
-    """Return the names of three columns, shape ``(n, 3)``, that can be a normal or a color."""
+def _guess_triple(three: Values) -> tuple[str, str, str] | None:
+    """Return names for three columns, shape ``(n, 3)``, if they can be a normal or a color."""
     squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
-    # Unit vectors may be zero or not numbers where there is none.
+    # Missing normals may be zero or NaN.
     lengths = squares[np.isfinite(squares) & (squares != 0)]
     if len(lengths) and (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
         return ("nx", "ny", "nz")
@@ -267,84 +268,84 @@ def _triple_by_values(three: Values) -> tuple[str, str, str] | None:
 
 
 def _is_wide_color(three: Values) -> bool:
-    """Whether three columns can be a color of 16 bits, each of which is more than 8 hold."""
+    """Whether three columns can be a 16-bit color with every channel above the 8-bit maximum."""
     in_range = three.min() >= 0 and three.max() <= WORD and three.max(axis=0).min() > BYTE
     return bool(in_range) and are_whole(three)
 
 
 def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
-    """Check names that are given for columns: one for each, and each once but for ``_``."""
-    read, shown = [name for name in names if name != LEFT_OUT], ",".join(names)
+    """Check column names: one per column, and no duplicates except ``_``."""
+    read, shown = [name for name in names if name != SKIPPED], ",".join(names)
     if not {"x", "y", "z"} <= {name.lower() for name in read} or len(set(read)) != len(read):
-        wrong = f"names of columns that differ, x, y and z among them, got {shown}"
+        wrong = f"distinct column names that include x, y and z, got {shown}"
     elif len(names) != num_columns:
         wrong = f"names for {num_columns} columns, got {len(names)} ({shown})"
     else:
         return
-    raise FormatError(f"{path}: expected {wrong}; {LEFT_OUT} leaves a column out.")
+    raise FormatError(f"{path}: expected {wrong}; use {SKIPPED} to skip a column.")
 
 
 def _check_table(path: Path, table: Values) -> None:
-    """Refuse tables without names that are no points: a pose, or points across."""
+    """Reject unnamed tables that are no point clouds: a pose matrix, or a transposed table."""
     num_rows, num_columns = table.shape
     if table.shape == (4, 4) and table[3].tolist() == [0, 0, 0, 1]:
         raise FormatError(
-            f"{path}: expected points, got a matrix of 4 x 4, a pose; name the file of the cloud."
+            f"{path}: expected points, got a 4 x 4 pose matrix; pass the point cloud file."
         )
     if 3 <= num_rows <= max(_GUESSED_WIDTHS) and num_columns > _MAX_COLUMNS:
         raise FormatError(
-            f"{path}: expected a row for each point, got {num_rows} rows of {num_columns:,} "
+            f"{path}: expected one row per point, got {num_rows} rows of {num_columns:,} "
             "numbers; transpose them, or name the columns with --columns."
         )
 
 
 def are_whole(values: Values) -> bool:
-    """Whether all values are finite whole numbers."""
+    """Whether all values are finite integers."""
     if values.dtype.kind in "iub":
         return True
     return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
-def _sources_of(columns: Columns) -> dict[str, list[str]]:
-    """Return the columns that each field is made of; the first of two equal names wins it.
+def _field_columns(columns: Columns) -> dict[str, list[str]]:
+    """Return the columns of each field; the first of two equal names wins.
 
-    Triples and numbered columns are joined, the others renamed. Shapes and types decide, no values.
+    Triples and numbered columns are joined, the others renamed, by shape and type only.
     """
-    plain = {_plain(name): name for name in columns if columns[name].ndim == 1}
+    by_plain_name = {_normalize_name(name): name for name in columns if columns[name].ndim == 1}
     remaining, fields = dict(columns), dict[str, list[str]]()
     for parts, target in _TRIPLES.items():
-        if target not in fields and all(column in plain for column in parts):
-            fields[target] = [plain[column] for column in parts]
+        if target not in fields and all(column in by_plain_name for column in parts):
+            fields[target] = [by_plain_name[column] for column in parts]
             for column in fields[target]:
                 del remaining[column]
-    for name, members in _numbered(remaining).items():
+    for name, members in _find_numbered(remaining).items():
         if name not in fields and name not in remaining:
             fields[name] = members
             for member in members:
                 del remaining[member]
     for name, values in remaining.items():
-        fields[_free_name(name, values, fields)] = [name]
+        fields[_unique_field_name(name, values, fields)] = [name]
     return fields
 
 
-def _free_name(name: str, values: Values, taken: Collection[str]) -> str:
-    """Return torchrg's name for a column if its shape fits and no other has it yet."""
-    target = _ALIASES.get(_plain(name), name.removeprefix("scalar_") or name)
+def _unique_field_name(name: str, values: Values, existing: Collection[str]) -> str:
+    """Return the field name of a column if its shape fits, changed if the name is taken."""
+    target = _ALIASES.get(_normalize_name(name), name.removeprefix("scalar_") or name)
     shapes = {"normals": (3,), "color": (3,), "labels": ()}
     if target in shapes and values.shape[1:] != shapes[target]:
         target = name
-    while target in taken:
+    while target in existing:
         target = name = f"_{name}" if target == name else name
     return target
 
 
-def _plain(name: str) -> str:
-    """Return a name in lower case without CloudCompare's prefix."""
+def _normalize_name(name: str) -> str:
+    """Return a lower-case name without CloudCompare's prefix."""
     return name.lower().removeprefix("scalar_")
 
 
-def _numbered(columns: Columns) -> dict[str, list[str]]:
-    """Find ``name_0``, ``name_1``, ... without a gap, single columns of one type."""
+def _find_numbered(columns: Columns) -> dict[str, list[str]]:
+    """Find consecutive ``name_0``, ``name_1``, ... of single columns of one type."""
     numbers: dict[str, dict[int, str]] = {}
     for name, values in columns.items():
         match = re.fullmatch(r"(.+)_(0|[1-9][0-9]{0,5})", name)
@@ -359,8 +360,8 @@ def _numbered(columns: Columns) -> dict[str, list[str]]:
     }
 
 
-def _stacked(path: Path, columns: list[Values]) -> Values:
-    """Put single columns side by side, or return one as it is, in native byte order."""
+def _stack(path: Path, columns: list[Values]) -> Values:
+    """Stack single columns, or return one column as it is, in native byte order."""
     if len(columns) == 1:
         return np.ascontiguousarray(columns[0], dtype=columns[0].dtype.newbyteorder("="))
     try:
@@ -368,7 +369,7 @@ def _stacked(path: Path, columns: list[Values]) -> Values:
     except TypeError as error:
         kinds = ", ".join(str(column.dtype) for column in columns)
         raise FormatError(
-            f"{path}: expected columns of one kind side by side, got {kinds}; convert them to "
+            f"{path}: expected columns of one type to combine, got {kinds}; convert them to "
             "numbers."
         ) from error
     stacked = np.empty((len(columns[0]), len(columns)), dtype)
@@ -377,12 +378,12 @@ def _stacked(path: Path, columns: list[Values]) -> Values:
     return stacked
 
 
-def _labels(path: Path, labels: Values) -> NDArray[np.int64]:
-    """Return labels as int64, shape ``(N,)``; not-a-number means no label, as in CloudCompare."""
+def _convert_labels(path: Path, labels: Values) -> NDArray[np.int64]:
+    """Convert labels to int64, shape ``(N,)``; NaN means unlabeled, as in CloudCompare."""
     flat = labels.reshape(-1) if labels.shape[1:] == (1,) else labels
     if flat.ndim != 1 or flat.dtype.kind not in "biuf":
         raise FormatError(
-            f"{path}: expected one whole number a point as labels, got shape "
+            f"{path}: expected labels to be one integer per point, got shape "
             f"{_row_shape(labels)} of {labels.dtype}; rename or remove that field."
         )
     if flat.dtype.kind == "f":
@@ -390,32 +391,32 @@ def _labels(path: Path, labels: Values) -> NDArray[np.int64]:
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
     if not are_whole(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
         raise FormatError(
-            f"{path}: expected labels to be whole numbers of 64 bits, got others; rename or remove "
-            "that field."
+            f"{path}: expected labels to be 64-bit integers, got fractions or larger values; "
+            "rename or remove that field."
         )
-    if flat.dtype.kind == "f" and largest >= LARGEST_WHOLE:
+    if flat.dtype.kind == "f" and largest >= MAX_EXACT_INTEGER:
         raise FormatError(
-            f"{path}: expected labels within 2^53, as text and floating-point numbers do not tell "
-            f"others apart, got {largest:.0f}; write them as integers, as in .npz."
+            f"{path}: expected labels within 2^53, because text and floating-point numbers round "
+            f"larger ones, got {largest:.0f}; write them as integers, as in .npz."
         )
     return flat.astype(np.int64)
 
 
-def _normals(path: Path, normals: Values) -> NDArray[np.floating]:
-    """Return normals as float32 or float64, shape ``(N, 3)``."""
+def _convert_normals(path: Path, normals: Values) -> NDArray[np.floating]:
+    """Convert normals to float32 or float64, shape ``(N, 3)``."""
     _check_triples(path, "normals", normals)
     return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
 
 
 def _check_triples(path: Path, name: str, values: Values) -> None:
-    """Check that a field is three real numbers a point."""
+    """Check that a field has three real numbers per point."""
     if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
         raise FormatError(
-            f"{path}: expected {name} to be three numbers a point, got shape {_row_shape(values)} "
+            f"{path}: expected {name} of shape (N, 3), got shape {_row_shape(values)} "
             f"of {values.dtype}; rename or remove that field."
         )
 
 
 def _row_shape(values: Values) -> str:
-    """Return the shape of a field for a message, without the number of points."""
+    """Format the shape of a field for a message, with N for the number of points."""
     return f"({', '.join(['N', *map(str, values.shape[1:])])})"

@@ -1,4 +1,4 @@
-"""Files: checked before they are read, and written whole or not at all."""
+"""File checks, atomic writing and error conversion."""
 
 import errno
 import hashlib
@@ -34,34 +34,34 @@ DAMAGES = (
     tokenize.TokenError,
     struct.error,
 )
-"""Errors that libraries raise of damaged files beside their own, as where bytes are flipped."""
-ARCHIVE_DAMAGES = (zipfile.BadZipFile, zlib.error, *DAMAGES)
-"""Errors that reading a damaged archive raises."""
+"""Exceptions that third-party readers raise on corrupt files, in addition to their own classes."""
+ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, *DAMAGES)
+"""Exceptions raised on corrupt archives."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a full disk, and of a user who may not fill it further."""
-_MORE_BYTES = 1 << 20
-"""Bytes that are tried on a disk that may be full. They are more than a library writes at a time,
-and do not fit where its last ones did not."""
+"""Error numbers of a full disk or an exceeded quota."""
+_PROBE_BYTES = 1 << 20
+"""Bytes written to test whether a disk is full. They exceed the buffer of a library, so they do not
+fit if its last write failed."""
 _CHECKED_END = 1 << 16
-"""Bytes after the last record that are looked at. Padding up to a page is shorter."""
+"""Bytes checked after the last record. Padding to a page is shorter."""
 _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
-"""Mark in the names that :func:`atomic_path` writes under here."""
+"""Mark in the temporary file names of :func:`atomic_path` in this context."""
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> Iterator[Path]:
-    """Give a path to write to that takes the place of ``path`` once the block has ended well.
+    """Yield a temporary path that replaces ``path`` atomically if the block succeeds.
 
-    The file is written beside its final place, flushed to the disk, and moved there in one step;
-    then its name is flushed too. If the block raises, nothing is left behind and an older file
-    stays as it was. The suffix is kept.
+    The file is written next to its destination, flushed to disk, and renamed in one step; then the
+    folder entry is flushed. If the block raises, no file remains and an existing file is unchanged.
+    The suffix is kept.
 
     Args:
-        path: Where the file shall be. A symbolic link is followed.
-        within: Folder on the same disk in which it is written before. Default: that of ``path``.
+        path: Destination. A symbolic link is followed.
+        within: Folder on the same file system for the temporary file. Default: that of ``path``.
 
     Yields:
-        The path to write to.
+        The temporary path to write to.
 
     Raises:
         FormatError: If the folder does not exist, or the file cannot be written.
@@ -70,43 +70,42 @@ def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> 
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = Path(folder) / "a.txt"
-        ...     with atomic_path(path) as beside:
-        ...         _ = beside.write_text("whole")
+        ...     with atomic_path(path) as temporary:
+        ...         _ = temporary.write_text("complete")
         ...         print(path.exists())
         ...     print(path.read_text())
         False
-        whole
+        complete
     """
     target = Path(os.path.realpath(path))
     name = f".{target.stem}.{_mark.get() or make_mark()}{secrets.token_hex(4)}{target.suffix}"
-    beside = (target.parent if within is None else within) / name
+    temporary = (target.parent if within is None else within) / name
     check_place(path)
     try:
-        yield beside
-        with beside.open("rb+") as stream:
+        yield temporary
+        with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
-        beside.replace(target)
+        temporary.replace(target)
         sync_folder(target.parent)
     except OSError as error:
-        # NumPy's error of a short write comes without its number; it is a full disk's.
+        # NumPy's error for a short write has no number; the cause is a full disk.
         if error.errno is None and "requested and" in str(error):
             error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         raise FormatError(f"{path}: cannot be written: {error.strerror or error}.") from error
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def make_mark() -> str:
-    """Return a mark for the names of one run, which no other file bears."""
+    """Return a unique mark for the temporary file names of one run."""
     return secrets.token_hex(8)
 
 
 @contextmanager
 def marked_parts(mark: str) -> Iterator[None]:
-    """Let :func:`atomic_path` write under names that bear a mark in this block, in this thread.
+    """Make :func:`atomic_path` put a mark into temporary names in this block and thread.
 
-    Whoever knows the mark can then remove what a process left that was killed; without one, nobody
-    can tell whose such a file is.
+    The mark identifies the files that a killed process leaves, so that they can be removed.
     """
     token = _mark.set(mark)
     try:
@@ -116,9 +115,9 @@ def marked_parts(mark: str) -> Iterator[None]:
 
 
 def remove_leftovers(folder: Path, mark: str) -> None:
-    """Remove what :func:`atomic_path` left in a folder under a mark when its process was killed.
+    """Remove the marked temporary files that a killed process left in a folder.
 
-    Nothing may be writing there under the same mark.
+    No process may be writing there under the same mark.
 
     Example:
         >>> import tempfile
@@ -134,7 +133,7 @@ def remove_leftovers(folder: Path, mark: str) -> None:
 
 
 def find_leftovers(folder: Path, mark: str) -> list[Path]:
-    """Return the files that :func:`remove_leftovers` removes."""
+    """Return the files that :func:`remove_leftovers` would remove."""
     name = re.compile(rf"\..*\.{mark}[0-9a-f]{{8}}(\.[^.]*)?")
     with os.scandir(folder) as entries:
         return [
@@ -145,7 +144,7 @@ def find_leftovers(folder: Path, mark: str) -> list[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush the names in a folder to the disk, where its file system has a way to do so."""
+    """Flush the entries of a folder to disk, if the file system supports it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -155,28 +154,28 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_place(path: str | os.PathLike[str]) -> None:
-    """Check that a file can be put at a path, so that this is not found out after long work.
+    """Check that a path can be written, before long work.
 
-    Its folder exists and takes files, and what is there already is a file that may be replaced: not
-    a directory or device, and not read-only.
+    The folder exists and is writable. An existing target is a writable file, not a directory or
+    device.
     """
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise FormatError(f"{path}: expected a file to write, got a directory; name a file in it.")
     if not target.parent.is_dir():
-        raise FormatError(f"{path}: there is no folder {target.parent}; make it first.")
+        raise FormatError(f"{path}: there is no folder {target.parent}; create it first.")
     if target.exists() and not target.is_file():
-        raise FormatError(f"{path}: expected a file to write, got a device; name another.")
-    for place in (target.parent, target):
-        if place.exists() and not os.access(place, os.W_OK):
+        raise FormatError(f"{path}: expected a file to write, got a device; use another path.")
+    for item in (target.parent, target):
+        if item.exists() and not os.access(item, os.W_OK):
             raise FormatError(
-                f"{path}: cannot be written: {place} is read-only; write to another place, or make "
+                f"{path}: cannot be written: {item} is read-only; write to another place, or make "
                 "it writable."
             )
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, and those above it, if it is not there; raise FormatError if it cannot be."""
+    """Create a folder and its parents if missing; raise FormatError on failure."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -184,7 +183,7 @@ def make_folder(path: Path) -> None:
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error, or what caused it, is a full disk."""
+    """Return whether an error or one of its causes is a full disk."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _DISK_FULL:
             return True
@@ -193,19 +192,19 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 
 def free_space(folder: Path) -> int:
-    """Return the free bytes of the disk on which a folder is, or would be made."""
-    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    """Return the free bytes on the disk of a folder, which may not exist yet."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     return shutil.disk_usage(existing).free
 
 
 def check_space(folder: Path, needed: int, what: str, *, repair: str = "") -> None:
-    """Raise FormatError if the disk of a folder, which need not exist, has not so many bytes free.
+    """Raise FormatError if the disk of a folder (which may not exist) has too few free bytes.
 
-    ``what`` takes the bytes; ``repair`` is a way out beside more room and another directory.
+    ``what`` names the data to be written; ``repair`` is a further fix to suggest.
     """
     free = free_space(folder)
     if needed > free:
-        ways = ["make room", "choose another directory", *([repair] if repair else [])]
+        ways = ["free some space", "choose another directory", *([repair] if repair else [])]
         raise FormatError(
             f"{folder}: expected {needed / 1e6:,.1f} MB of free disk for {what}, got "
             f"{free / 1e6:,.1f} MB; {', '.join(ways[:-1])}, or {ways[-1]}."
@@ -213,12 +212,12 @@ def check_space(folder: Path, needed: int, what: str, *, repair: str = "") -> No
 
 
 def check_file(path: Path) -> int:
-    """Return the size of a file in bytes; it is there, no directory, and not empty."""
+    """Check that a path is a non-empty file, and return its size in bytes."""
     try:
         status = path.stat()
     except FileNotFoundError as error:
         raise FormatError(f"{path}: no such file; check the spelling.") from error
-    except (OSError, ValueError) as error:  # A name that no file can have.
+    except (OSError, ValueError) as error:  # ValueError: not a valid file name.
         raise FormatError(
             f"{path}: cannot be read: {getattr(error, 'strerror', error)}."
         ) from error
@@ -230,46 +229,45 @@ def check_file(path: Path) -> int:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-8, without the mark that some programs begin it with."""
+    """Return the UTF-8 text of a file, without a byte order mark."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}.") from error
     try:
-        place = content.find(b"\0")  # No text has it in UTF-8, and all have it in UTF-16.
+        byte = content.find(b"\0")  # Never in UTF-8 text, always in UTF-16 text.
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        place = error.start
-    if place >= 0:
+        byte = error.start
+    if byte >= 0:
         raise FormatError(
-            f"{path}: byte {place}: expected text in UTF-8, got {content[place : place + 1]!r}; "
+            f"{path}: byte {byte}: expected text in UTF-8, got {content[byte : byte + 1]!r}; "
             "save it as UTF-8."
         )
     return text
 
 
-def check_promise(
-    path: Path, byte: int, promised: int, content: str, *, available: int, at_least: bool = False
+def check_available(
+    path: Path, byte: int, needed: int, content: str, *, available: int, at_least: bool = False
 ) -> None:
-    """Compare the bytes that a header promises from a place on with those that can be there.
+    """Check that the bytes which a header announces at a position can be in the file.
 
-    This comes before memory is taken, so that a damaged header cannot ask for all of it. With
-    ``at_least``, ``promised`` is a lower bound of what is needed.
+    Call it before allocating, so that a corrupt header cannot exhaust the memory. With
+    ``at_least``, ``needed`` is a lower bound.
     """
-    if promised > available:
-        least = "at least " if at_least else ""
+    if needed > available:
+        prefix = "at least " if at_least else ""
         raise FormatError(
-            f"{path}: byte {byte}: expected {least}{promised:,} bytes for {content}, got "
-            f"{available:,}; the file is cut off or its header is wrong, write or copy it again."
+            f"{path}: byte {byte}: expected {prefix}{needed:,} bytes for {content}, got "
+            f"{available:,}; the file is truncated or its header is wrong, write or copy it again."
         )
 
 
 def check_end(path: Path, stream: BinaryIO, record_bytes: int = 0) -> tuple[str, ...]:
-    """Check that the last record of a file has been read, and return notes.
+    """Check that no records follow the last one of a file, and return notes.
 
-    Text after it is left out with a note. Further bytes of a binary file, as many as a record or
-    more, are an error: the header may give other types than the points have. Zeros may follow, as
-    PCL fills files up to a page.
+    Trailing text is skipped with a note. In a binary file, trailing bytes of at least a record are
+    an error, because the types in the header may be wrong. Zeros are allowed: PCL pads files.
     """
     start = stream.tell()
     is_padding = not stream.read(_CHECKED_END).strip(b"\0 \t\r\n")
@@ -277,26 +275,24 @@ def check_end(path: Path, stream: BinaryIO, record_bytes: int = 0) -> tuple[str,
     if is_padding or num_bytes < record_bytes:
         return ()
     if not record_bytes:
-        return (f"{num_bytes:,} bytes after its last point left out, as its header counts no more",)
+        return (f"{num_bytes:,} bytes after its last point are ignored, beyond its header's count",)
     raise FormatError(
-        f"{path}: byte {start}: expected the end of the file, as its header says, got "
-        f"{num_bytes:,} more bytes; correct the number or the types in the header, or write the "
-        "file again."
+        f"{path}: byte {start}: expected the end of the file by its header, got {num_bytes:,} more "
+        "bytes; correct the count or the types in the header, or write the file again."
     )
 
 
 @contextmanager
-def asking_system(path: Path, *errors: type[BaseException]) -> Iterator[None]:
-    """Raise the operating system's error where that of a library, met while it wrote, hides it.
+def raise_os_error(path: Path, *errors: type[BaseException]) -> Iterator[None]:
+    """Raise the system's OSError if a library hides it while writing.
 
-    What is in the way of a library, a full disk, is in the way of a few more bytes, too. The file
-    is spoilt by them; nobody wants it any more.
+    If the disk is full, writing a few extra bytes raises it. The partial file is discarded anyway.
     """
     try:
         yield
     except errors:
         with path.open("ab") as stream:
-            stream.write(bytes(_MORE_BYTES))
+            stream.write(bytes(_PROBE_BYTES))
             stream.flush()
             os.fsync(stream.fileno())
         raise
@@ -304,9 +300,9 @@ def asking_system(path: Path, *errors: type[BaseException]) -> Iterator[None]:
 
 @contextmanager
 def refusing(message: str, *errors: type[BaseException], repair: str = "") -> Iterator[None]:
-    """Raise errors of a library as a FormatError: the message, the error's first line, the repair.
+    """Convert library errors to FormatError: the message, the error's first line, the repair.
 
-    A FormatError passes as it is, though it is a ValueError.
+    A FormatError, which is a ValueError, is raised unchanged.
     """
     try:
         yield
@@ -319,14 +315,14 @@ def refusing(message: str, *errors: type[BaseException], repair: str = "") -> It
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its name if it has none; no full stop."""
+    """Return the first line of an error's message without a full stop, or its class name."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
 def mark_of(name: str) -> str:
-    """Return the mark of the files that are being written for a scan in an output directory.
+    """Return the mark of the temporary files of a scan in an output directory.
 
-    It is the same in every run, so that each removes what one that was killed has left; see
+    It is the same in every run, so that a run removes what a killed one left; see
     :func:`torchrg.io.files.marked_parts`.
 
     Example:
@@ -337,10 +333,10 @@ def mark_of(name: str) -> str:
 
 
 def folded_name(name: str) -> str:
-    """Return what names have in common that some file systems take for the same.
+    """Normalize a name so that names which collide on some file systems become equal.
 
-    Those of macOS and Windows do not tell case apart, nor how letters with accents are put
-    together, and what is written on others is carried there.
+    The file systems of macOS and Windows ignore case and the composition of accented letters, and
+    results are copied there.
 
     Example:
         >>> folded_name("B\u00fcro") == folded_name("bu\u0308RO")
@@ -349,13 +345,13 @@ def folded_name(name: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())
 
 
-def words_of(raw: bytes) -> list[str]:
-    r"""Return the words of a line of a header: UTF-8, or Latin-1, which some programs write.
+def split_words(raw: bytes) -> list[str]:
+    r"""Split a header line into words, decoded as UTF-8, or as Latin-1 from some programs.
 
     Example:
-        >>> words_of("property float höhe".encode())
+        >>> split_words("property float höhe".encode())
         ['property', 'float', 'höhe']
-        >>> words_of(b"property float h\xf6he")
+        >>> split_words(b"property float h\xf6he")
         ['property', 'float', 'höhe']
     """
     try:

@@ -1,10 +1,9 @@
-"""NumPy's own files: ``.npy``, one array, and ``.npz``, several by name. No pickle is ever loaded.
+"""NumPy files: single arrays (``.npy``) and archives (``.npz``), never pickles.
 
 ``.npz``: ``points`` (or ``coord``, or Open3D's ``positions``), shape (N, 3) or records, or ``x``,
-``y`` and ``z``, and any arrays of N rows, which become fields. Arrays of another length are left
-out, and so is what a result says about its planes. See :func:`torchrg.io.write_cloud` for all names
-of a result.
-``.npy``: an array (N, 3) or wider, the columns of which are named when it is read or by
+``y`` and ``z``, and any arrays of N rows, which become fields. Arrays of other lengths and the
+plane table of a result are skipped. See :func:`torchrg.io.write_cloud` for the names in a result.
+``.npy``: an array (N, 3) or wider, with column names from the caller or by
 :data:`torchrg.io.fields.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
 """
 
@@ -22,21 +21,21 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import Spelling, flatten_cloud, to_records
+from torchrg.io.columns import FieldNames, flatten_cloud, to_records
 from torchrg.io.fields import (
     Values,
     assemble_cloud,
     assemble_table,
+    backup_name,
     check_coordinates,
     check_names,
-    name_aside,
 )
 from torchrg.io.files import (
-    ARCHIVE_DAMAGES,
+    ARCHIVE_ERRORS,
     DAMAGES,
     atomic_path,
+    check_available,
     check_file,
-    check_promise,
     refusing,
 )
 from torchrg.plane_table import planes_to_arrays
@@ -46,40 +45,40 @@ _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
 _COORDINATES = ("points", "coord", "positions")
 POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
-"""Arrays of a segmentation that have a row for each point."""
+"""Per-point arrays of a segmentation."""
 KEPT_FIELDS = ("color",)
-"""Fields of a cloud that are kept beside its result, as pages and pictures show them."""
+"""Cloud fields stored with a result, for viewers and images."""
 _NOT_PER_POINT = {
     *(f"plane_{name}" for name in (*(part.name for part in fields(Planes)), "of_superpoint")),
     *(f"adjacency_{name}" for name in PlaneAdjacency._fields),
     *(f"outline_{name}" for name in ("points", "ring_sizes", "ring_planes")),
     "provenance",
 }
-"""Arrays of a result that are not about its points, of however many rows."""
-_LARGEST_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
-"""Most bytes that one byte of an archive becomes, by the methods of compression that are read."""
+"""Arrays of a result that are not per point, whatever their number of rows."""
+_MAX_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
+"""Maximum decompressed bytes per archive byte, by supported compression method."""
 _MAX_ARRAYS = 10_000
-"""Most arrays of an archive: to look at each takes a fifth of a millisecond."""
+"""Maximum number of arrays of an archive: to check an array takes a fifth of a millisecond."""
 _MAX_CHECKED = 1 << 30
-"""Most bytes of arrays that are left out and yet read, so that damage in them is told: seconds."""
-_BYTES_AT_ONCE = 1 << 20
-"""Bytes that are unpacked together, which bounds the memory."""
-_LONGEST_HEADER = 1 << 16
-"""Bytes that are read of an array to find its header, which NumPy takes up to 10,000 of."""
+"""Maximum total size of skipped arrays that are read to verify their checksums (seconds)."""
+_BYTES_PER_READ = 1 << 20
+"""Bytes decompressed together, which bounds the memory."""
+_MAX_HEADER_BYTES = 1 << 16
+"""Bytes read to parse an array header, of which NumPy accepts up to 10,000."""
 _EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-"""Time of every array in an archive, the earliest that there is, so that equal results give equal
-bytes."""
+"""Constant time of every archive member, the earliest possible, so that identical results are
+byte-identical."""
 
 
 def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
-    """Read a ``.npy`` file; ``columns`` are names for those of an array that has none."""
+    """Read a ``.npy`` file; ``columns`` names the columns of an unstructured array."""
     shape, dtype = _check_npy(path, size)
     names = dtype.names
     if names is not None:
         if columns is not None:
             raise FormatError(
-                f"{path}: expected no names for columns, as its fields have some: "
-                f"{', '.join(names)}; leave them out."
+                f"{path}: column names apply to unstructured arrays only; this array has fields "
+                f"{', '.join(names)}. Omit the names."
             )
         records = np.load(path, allow_pickle=False).reshape(-1)
         return assemble_cloud(path, {name: records[name] for name in records.dtype.names})
@@ -94,15 +93,15 @@ def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Clo
 
 
 def count_npy(path: Path, size: int) -> int:
-    """Return the number of points: of rows, or of all records."""
+    """Return the number of points: rows, or all records of a structured array."""
     shape, dtype = _check_npy(path, size)
     return math.prod(shape if dtype.names is not None else shape[:1])
 
 
 def write_npy(path: Path, cloud: Cloud) -> None:
-    """Write coordinates of shape (N, 3), or with fields a structured array named as in PLY."""
-    columns = flatten_cloud(path, cloud, Spelling())
-    with atomic_path(path) as beside, beside.open("wb") as file:
+    """Write coordinates of shape (N, 3); with fields, write a structured array with PLY names."""
+    columns = flatten_cloud(path, cloud, FieldNames())
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
         _write_array(file, to_records(columns) if cloud.fields else cloud.coordinates)
 
 
@@ -111,17 +110,19 @@ def read_npz(path: Path, size: int) -> Cloud:
     with _open_archive(path) as archive:
         layouts = _check_members(path, archive, size)
         coordinates, num_points = _find_coordinates(path, layouts)
-        own = [name for name in layouts if name not in _NOT_PER_POINT]
-        others = [name for name in own if layouts[name][0][:1] != (num_points,)]
-        columns = {name: _read_member(path, archive, name) for name in own if name not in others}
-        left = [archive.getinfo(f"{name}.npy") for name in layouts if name not in columns]
-        if sum(member.file_size for member in left) <= _MAX_CHECKED:
-            for member in left:
+        per_point = [name for name in layouts if name not in _NOT_PER_POINT]
+        mismatched = [name for name in per_point if layouts[name][0][:1] != (num_points,)]
+        columns = {
+            name: _read_member(path, archive, name) for name in per_point if name not in mismatched
+        }
+        skipped = [archive.getinfo(f"{name}.npy") for name in layouts if name not in columns]
+        if sum(member.file_size for member in skipped) <= _MAX_CHECKED:
+            for member in skipped:
                 with _open_member(path, archive, member) as stream:
-                    _read_on(stream)
-    notes = (f"{', '.join(others)} left out: not of {num_points:,} rows",) if others else ()
+                    _drain(stream)
+    notes = (f"{', '.join(mismatched)} left out: not of {num_points:,} rows",) if mismatched else ()
     if coordinates is not None and (names := layouts[coordinates][1].names) is not None:
-        # pyntcloud writes records, whose fields are columns.
+        # pyntcloud writes a structured array, whose fields become columns.
         records = columns.pop(coordinates)
         columns = {**{name: records[name] for name in names}, **columns}
         coordinates = None
@@ -135,9 +136,9 @@ def count_npz(path: Path, size: int) -> int:
 
 
 def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str | None, int]:
-    """Return the name of the array of an archive that holds coordinates, and its number of rows.
+    """Return the name of the coordinate array in an archive, and its number of rows.
 
-    There is none where each axis has an array of its own.
+    The name is None if each axis is an array of its own.
     """
     for name in _COORDINATES:
         if name in layouts:
@@ -154,7 +155,7 @@ def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str |
 
 
 def read_beside(path: Path) -> dict[str, Values]:
-    """Return what a ``.npz`` file says beside its points: table of planes, provenance."""
+    """Read the arrays of a ``.npz`` file that are not per point: plane table, provenance."""
     size = check_file(path)
     with _open_archive(path) as archive:
         names = _check_members(path, archive, size).keys() & _NOT_PER_POINT
@@ -168,21 +169,19 @@ def write_npz(
     provenance: Mapping[str, Any] | None = None,
     superpoints: Superpoints | None = None,
 ) -> None:
-    """Write ``points`` and every field under its name, or the arrays of a result, and provenance.
+    """Write ``points`` and all fields, or the arrays of a result, and provenance.
 
-    Equal arrays give equal bytes, whenever and wherever.
+    Identical arrays give byte-identical files.
     """
     arrays: dict[str, Values] = {"points": cloud.coordinates}
     if segmentation is None:
         for name, values in cloud.fields.items():
             if name in _COORDINATES or name in _NOT_PER_POINT:
                 raise FormatError(
-                    f"{path}: expected fields beside points, got {name!r}; rename it."
+                    f"{path}: a field cannot be named {name!r}, a reserved array name; rename it."
                 )
             if values.dtype.hasobject:
-                raise FormatError(
-                    f"{path}: expected numbers or text in {name}, got Python objects; leave it out."
-                )
+                raise FormatError(f"{path}: field {name} contains Python objects; remove it.")
             arrays[name] = values
     else:
         arrays |= {name: cloud.fields[name] for name in KEPT_FIELDS if name in cloud.fields}
@@ -191,12 +190,15 @@ def write_npz(
     if superpoints is not None:
         for name, level in superpoints.by_level().items():
             if name in arrays:
-                arrays.setdefault(name_aside(name), arrays[name])
+                arrays.setdefault(backup_name(name), arrays[name])
             arrays[name] = level
         arrays["plane_of_superpoint"] = superpoints.plane.numpy(force=True)
     if provenance is not None:
         arrays["provenance"] = np.array(json.dumps(provenance, sort_keys=True))
-    with atomic_path(path) as beside, zipfile.ZipFile(beside, "w", allowZip64=True) as archive:
+    with (
+        atomic_path(path) as temporary,
+        zipfile.ZipFile(temporary, "w", allowZip64=True) as archive,
+    ):
         for name, values in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy", _EARLIEST_ZIP_TIME)
             with archive.open(member, "w", force_zip64=True) as file:
@@ -204,19 +206,19 @@ def write_npz(
 
 
 def _write_array(file: IO[bytes], values: Values) -> None:
-    """Write an array in NumPy's format, its rows one after the other."""
+    """Write an array in NumPy's format, in C order."""
     npy_format.write_array(file, np.asarray(values, order="C"), allow_pickle=False)
 
 
 def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Values]:
-    """Map those arrays of a folder that are there, one of which, ``coord``, has to be.
+    """Memory-map the arrays of a folder that exist; ``coord`` is required.
 
-    It has shape ``(N, 3)``, or that of an image; the others have a row for each of its points.
+    Its shape is ``(N, 3)`` or that of an image; the others have one row per point.
     """
     paths = {name: folder / f"{name}.npy" for name in names}
     if not paths["coord"].is_file():
         raise FormatError(
-            f"{folder}: expected coord.npy in this folder, got none; name the folder of a scene."
+            f"{folder}: expected coord.npy in this folder, got none; pass the folder of a scene."
         )
     arrays = {name: map_array(path) for name, path in paths.items() if path.is_file()}
     shape = arrays["coord"].shape
@@ -228,28 +230,28 @@ def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Values]:
 
 
 def check_rows(path: Path, values: Values, shape: tuple[int, ...]) -> None:
-    """Check that an array has a row for each point, or for each pixel of an image."""
+    """Check that an array has one row per point, or per pixel of an image."""
     if values.shape[: len(shape)] != shape:
         rows = " x ".join(map(str, shape))
         raise FormatError(
-            f"{path}: expected {rows} rows, got shape {values.shape}; write it of the same points."
+            f"{path}: expected {rows} rows, got shape {values.shape}; write one row per point."
         )
 
 
 def map_array(path: Path) -> Values:
-    """Map the array of a ``.npy`` file into memory, copy-on-write: no change reaches the file."""
+    """Map a ``.npy`` file into memory, copy-on-write: changes never reach the file."""
     shape, _ = _check_npy(path, check_file(path))
-    # There is nothing to map in an empty array, and trying fails.
+    # Mapping an empty array fails.
     values = np.load(path, mmap_mode=None if 0 in shape else "c", allow_pickle=False)
     return np.asarray(values)
 
 
 @contextmanager
 def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; errors name it."""
+    """Open an archive, and convert errors to errors that name it."""
     message = f"{path}: expected an archive of NumPy arrays, got: "
     with (
-        refusing(message, *ARCHIVE_DAMAGES, repair="; copy or write it again"),
+        refusing(message, *ARCHIVE_ERRORS, repair="; copy or write it again"),
         zipfile.ZipFile(path) as archive,
     ):
         yield archive
@@ -259,37 +261,37 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 def _open_member(
     path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo
 ) -> Iterator[IO[bytes]]:
-    """Open an array of an archive; errors name both."""
+    """Open an archive member, and convert errors to errors that name both."""
     message = f"{path}: {member.filename!r}: "
     with (
-        refusing(message, *ARCHIVE_DAMAGES, repair="; copy or write the file again"),
+        refusing(message, *ARCHIVE_ERRORS, repair="; copy or write the file again"),
         archive.open(member) as stream,
     ):
         yield stream
 
 
 def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, _Layout]:
-    """Return shape and type of the arrays of an archive, of which all bytes can be there."""
+    """Check that all members fit into an archive, and return their shapes and types."""
     layouts, members = {}, archive.infolist()
     if len(members) > _MAX_ARRAYS:
         raise FormatError(
-            f"{path}: expected at most {_MAX_ARRAYS:,} arrays, got {len(members):,}; leave out "
-            "what is not about points."
+            f"{path}: expected at most {_MAX_ARRAYS:,} arrays, got {len(members):,}; remove the "
+            "arrays that are not per point."
         )
-    # Arrays that share bytes of a small file expand to any size.
+    # Overlapping members of a small file could expand to any size.
     packed = sum(member.compress_size for member in members)
-    check_promise(path, 0, packed, f"{len(members):,} arrays", available=size)
+    check_available(path, 0, packed, f"{len(members):,} arrays", available=size)
     for member in members:
         if not member.filename.endswith(".npy"):
             continue
-        if member.compress_type not in _LARGEST_RATIO:
+        if member.compress_type not in _MAX_RATIO:
             raise FormatError(
                 f"{path}: expected {member.filename!r} stored or deflated, got compression "
                 f"{member.compress_type}; write it with numpy.savez."
             )
         content = repr(member.filename)
-        most = min(member.compress_size, size) * _LARGEST_RATIO[member.compress_type]
-        check_promise(path, member.header_offset, member.file_size, content, available=most)
+        max_bytes = min(member.compress_size, size) * _MAX_RATIO[member.compress_type]
+        check_available(path, member.header_offset, member.file_size, content, available=max_bytes)
         with _open_member(path, archive, member) as stream:
             name = member.filename.removesuffix(".npy")
             layouts[name] = _check_array(path, stream, member.file_size, content)
@@ -297,49 +299,49 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
-    """Read one array of an archive, and all of its bytes."""
+    """Read an archive member to its end."""
     with _open_member(path, archive, archive.getinfo(f"{name}.npy")) as stream:
         values: Values = npy_format.read_array(stream, allow_pickle=False)
-        _read_on(stream)
+        _drain(stream)
         return values
 
 
-def _read_on(stream: IO[bytes]) -> None:
-    """Read to the end of an array, where its checksum is compared, without keeping it."""
-    while stream.read(_BYTES_AT_ONCE):
+def _drain(stream: IO[bytes]) -> None:
+    """Read a member to its end, which verifies its checksum, and discard the data."""
+    while stream.read(_BYTES_PER_READ):
         pass
 
 
 def _check_npy(path: Path, size: int) -> _Layout:
-    """Return shape and type of the array of a ``.npy`` file, all of whose bytes are there."""
+    """Check a complete ``.npy`` file, and return shape and type of its array."""
     with path.open("rb") as stream:
         return _check_array(path, stream, size, "the array")
 
 
 def _check_array(path: Path, stream: IO[bytes], size: int, content: str) -> _Layout:
-    """Return shape and type of an array, checked against the ``size`` bytes that are there."""
+    """Check an array header against the available ``size``, and return shape and type."""
     message = f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
     repair = "; write it again with numpy.save or numpy.savez"
     with refusing(message, *DAMAGES, repair=repair):
-        head = io.BytesIO(stream.read(_LONGEST_HEADER))
+        head = io.BytesIO(stream.read(_MAX_HEADER_BYTES))
         is_old = npy_format.read_magic(head) == (1, 0)
         read = npy_format.read_array_header_1_0 if is_old else npy_format.read_array_header_2_0
         shape, _, dtype = read(head)
     if dtype.hasobject:
         raise FormatError(
-            f"{path}: expected numbers or text in {content}, got pickled Python objects, which are "
-            "never loaded; convert them with numpy.asarray(..., dtype=float) and save again."
+            f"{path}: {content} contains pickled Python objects, which are not loaded for security "
+            "reasons; convert them with numpy.asarray(..., dtype=float) and save again."
         )
     if min(shape, default=0) < 0 or dtype.itemsize == 0:
         raise FormatError(
-            f"{path}: byte 0: expected a shape and a type in {content}, got {shape} of {dtype}; "
+            f"{path}: byte 0: invalid shape or type in {content}: {shape} of {dtype}; "
             "write it again."
         )
-    promised, start = math.prod(shape) * dtype.itemsize, head.tell()
-    check_promise(path, start, promised, f"{content} of shape {shape}", available=size - start)
-    if size - start > promised:
+    num_bytes, start = math.prod(shape) * dtype.itemsize, head.tell()
+    check_available(path, start, num_bytes, f"{content} of shape {shape}", available=size - start)
+    if size - start > num_bytes:
         raise FormatError(
-            f"{path}: byte {start}: expected {promised:,} bytes for {content} of shape {shape}, "
+            f"{path}: byte {start}: expected {num_bytes:,} bytes for {content} of shape {shape}, "
             f"got {size - start:,}; correct the shape or the type, or write it again."
         )
     return shape, dtype

@@ -1,12 +1,12 @@
-"""Points as text, ``.xyz .txt .asc .pts .csv``: one point a line, numbers between spaces or marks.
+"""Text files (``.xyz .txt .asc .pts .csv``), one point per line.
 
-Marks are commas, semicolons or tabs; decimals may begin with a comma where that is not the mark. A
-first line of names (``x y z red green blue``, with or without ``#`` or ``//``) names the columns,
-unless names are given; without either :data:`torchrg.io.fields.COLUMNS_RULE` does. A line of one
-number before the first point is the count of points, as Leica's ``.pts`` begins; its further scans
-begin with theirs. Plain numbers are parsed by pyarrow where it is installed; what it does not take
-is parsed here, which gives the same bits and says what is wrong. The rows of numbers in ASCII files
-of other formats are read here, too.
+The delimiter is a comma, semicolon, tab or blanks; the decimal separator may be a comma if that is
+not the delimiter. A first line of names (``x y z red green blue``, with or without ``#`` or ``//``)
+names the columns unless the caller does; otherwise :data:`torchrg.io.fields.COLUMNS_RULE` applies.
+A line of one number before the first point is the point count, as in Leica's ``.pts``. Further
+scans begin with their count. pyarrow, if installed, parses plain numbers. The slower
+parser here handles the remaining cases with bit-identical results and reports errors. It also
+reads the rows of other ASCII formats.
 """
 
 import csv
@@ -21,88 +21,87 @@ import numpy as np
 
 from torchrg.errors import FormatError
 from torchrg.io.arrow import parse_numbers
-from torchrg.io.columns import Spelling, check_exact, flatten_cloud, slices
-from torchrg.io.fields import LEFT_OUT, Values, assemble_table, check_names
-from torchrg.io.files import atomic_path, check_promise
+from torchrg.io.columns import FieldNames, check_exact, flatten_cloud, row_slices
+from torchrg.io.fields import SKIPPED, Values, assemble_table, check_names
+from torchrg.io.files import atomic_path, check_available
 from torchrg.structures import Cloud
 
-LINES_AT_ONCE = 65_536
-"""Lines that are parsed or formatted together; bounds memory."""
-CHARACTERS_AT_ONCE = 1 << 22
-"""Characters of a file that are read together; bounds memory, and gives each core some lines."""
-_COUNTED_BYTES = 1 << 16
-"""How much of a file is read to tell how long its lines are."""
+LINES_PER_CHUNK = 65_536
+"""Lines parsed or formatted together, which bounds the memory."""
+CHARACTERS_PER_READ = 1 << 22
+"""Characters read together, which bounds the memory and still occupies all cores."""
+_SAMPLE_BYTES = 1 << 16
+"""Bytes read to estimate the line length."""
 _COMMENTS = ("#", "//")
 _COLMAP = "POINT3D_ID, X, Y, Z"
-"""Comment of COLMAP above its points, which are followed by the images that see them, in
-``points3D.txt``."""
+"""Comment above the points in COLMAP's ``points3D.txt``, whose rows list the images that see a
+point."""
 _MAX_DIGITS = 18
-"""Most digits of a number of points; no file has room for more points."""
+"""Maximum digits of a point count; no file stores more points."""
 
 
-class _Form(NamedTuple):
-    """How the numbers of a line are written.
+class _Dialect(NamedTuple):
+    """Number format of a line.
 
     Attributes:
-        delimiter: What is between them; None for white space.
-        decimal: What their decimals begin with.
+        delimiter: Delimiter; None for white space.
+        decimal: Decimal separator.
     """
 
     delimiter: str | None = None
     decimal: str = "."
 
     def split(self, text: str) -> list[str]:
-        """Return the words of a line, decimals after a point."""
+        """Split a line into words, with decimal points."""
         words = [word.strip().strip("\"'") for word in text.split(self.delimiter)]
         return [word.replace(self.decimal, ".") for word in words]
 
 
-_FORMS = (_Form(";"), _Form(";", ","), _Form(","), _Form(), _Form(None, ","))
-"""The first that makes numbers of all words of a line is its form."""
-_MARKS = {None: "blanks", ",": "commas", ";": "semicolons"}
-"""Names of what is between numbers, for people."""
+_DIALECTS = (_Dialect(";"), _Dialect(";", ","), _Dialect(","), _Dialect(), _Dialect(None, ","))
+"""Candidates; the first one that parses all words of a line as numbers is used."""
+_DELIMITER_NAMES = {None: "blanks", ",": "commas", ";": "semicolons"}
+"""Names of delimiters in messages."""
 
 
 def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
-    """Read points as text, always in float64; ``columns`` are names in place of the file's own."""
-    # Letters matter only in the names of columns.
+    """Read a text file in float64; ``columns`` overrides the file's column names."""
+    # Decoding errors matter only in column names.
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        opening = _read_opening(path, stream, columns)
-        table = np.concatenate(list(_parse_blocks(path, stream, opening)))
-    promised = sum(opening.counts)
-    if len(table) < promised:
+        preamble = _read_preamble(path, stream, columns)
+        table = np.concatenate(list(_parse_blocks(path, stream, preamble)))
+    num_points = sum(preamble.counts)
+    if len(table) < num_points:
         raise FormatError(
-            f"{path}: expected {promised:,} points, as the line before them says, got "
-            f"{len(table):,}; the file is cut off or the line is wrong, copy it again, or delete "
-            "that line."
+            f"{path}: expected {num_points:,} points by the count before them, got {len(table):,}; "
+            "the file is truncated or the count is wrong, copy it again, or delete that line."
         )
     notes: tuple[str, ...] = ()
-    if opening.form.decimal == ",":
-        notes += ("its commas are taken as decimal points",)
-    if opening.counts and len(table) > promised:
-        notes += (f"the line before its points says {promised:,}, but {len(table):,} follow",)
-    return assemble_table(path, table, opening.names, notes, opening.integers)
+    if preamble.dialect.decimal == ",":
+        notes += ("its commas are read as decimal points",)
+    if preamble.counts and len(table) > num_points:
+        notes += (f"the count before its points is {num_points:,}, but {len(table):,} follow",)
+    return assemble_table(path, table, preamble.names, notes, preamble.integers)
 
 
 def write_text(path: Path, cloud: Cloud) -> None:
-    """Write points as text that reads back to the same values, names of fields in a comment."""
-    columns = flatten_cloud(path, cloud, Spelling())
+    """Write text that reads back to identical values, with the field names in a comment."""
+    columns = flatten_cloud(path, cloud, FieldNames())
     check_exact(path, columns)
-    with atomic_path(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
         if cloud.fields:
-            file.write(f"# {' '.join(columns)}\n")
-        # Nine digits identify a float32; the shortest text of a Python float identifies a float64.
-        marks = {"f4": "%.9g", "f8": "%r"}
-        row = " ".join(marks.get(c.dtype.str[1:], "%d") for c in columns.values()) + "\n"
-        for rows in slices(len(cloud), LINES_AT_ONCE):
+            out.write(f"# {' '.join(columns)}\n")
+        # Nine digits identify a float32; Python's shortest repr identifies a float64.
+        formats = {"f4": "%.9g", "f8": "%r"}
+        row = " ".join(formats.get(c.dtype.str[1:], "%d") for c in columns.values()) + "\n"
+        for rows in row_slices(len(cloud), LINES_PER_CHUNK):
             block = [column[rows].tolist() for column in columns.values()]
-            file.write(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
+            out.write(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
 
 
 def count_text(path: Path, size: int) -> int:
-    """Return about the number of lines, by the length of the first."""
+    """Estimate the number of lines from the mean line length at the beginning."""
     with path.open("rb") as stream:
-        sample = stream.read(_COUNTED_BYTES)
+        sample = stream.read(_SAMPLE_BYTES)
     return round(sample.count(b"\n") * size / max(len(sample), 1))
 
 
@@ -115,21 +114,21 @@ def read_rows(
     *,
     line_number: int,
 ) -> Values:
-    """Read rows of a structured type from an ASCII file, the next line of which has this number.
+    """Read rows of a structured type from an ASCII file, starting at ``line_number``.
 
-    ``content`` is what rows are, for messages.
+    ``content`` names the rows in messages.
     """
-    # A digit and what separates it from the next; the last may end with the file.
-    least, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
+    # A digit and a separator per number; the last separator may be missing.
+    min_bytes, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
     available = os.fstat(stream.fileno()).st_size - start
     content = f"{num_rows:,} {content}"
-    check_promise(path, start, least, content, available=available, at_least=True)
+    check_available(path, start, min_bytes, content, available=available, at_least=True)
     lines = (raw.decode("latin-1") for raw in stream)
     return _read_table(path, lines, dtype, line_number, num_rows)
 
 
 def skip_lines(stream: BinaryIO, count: int) -> int:
-    """Pass so many lines of an ASCII file that are not blank, and return how many that took."""
+    """Skip ``count`` non-blank lines, and return the number of lines read."""
     passed = 0
     while count > 0 and (line := stream.readline()):
         passed += 1
@@ -140,17 +139,17 @@ def skip_lines(stream: BinaryIO, count: int) -> int:
 def _read_table(
     path: Path, lines: Iterator[str], dtype: np.dtype[Any], line_number: int, num_rows: int
 ) -> Values:
-    """Read rows of numbers; blank lines do not count.
+    """Read rows of numbers, ignoring blank lines.
 
-    Lines are read only as far as needed, the first of them has this number in the file.
+    No more lines are read than needed; ``line_number`` is the number of the first one.
     """
     parts, count = [np.empty(0, dtype)], 0
     while count < num_rows:
-        block = list(islice(lines, min(LINES_AT_ONCE, num_rows - count)))
+        block = list(islice(lines, min(LINES_PER_CHUNK, num_rows - count)))
         if not block:
             raise FormatError(
                 f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got "
-                f"{count:,}; the file is cut off or its header is wrong, write or copy it again."
+                f"{count:,}; the file is truncated or its header is wrong, write or copy it again."
             )
         parts.append(_parse(path, block, dtype, line_number))
         count += len(parts[-1])
@@ -158,34 +157,34 @@ def _read_table(
     return np.concatenate(parts)
 
 
-def _parse_blocks(path: Path, stream: TextIO, opening: "_Opening") -> Iterator[Values]:
-    """Parse the first point, and the lines that follow it in a stream, into tables."""
-    dtype = np.dtype([("row", "f8", (opening.num_columns,))])
-    line, number = opening.line, opening.line_number
-    while block := line + stream.read(CHARACTERS_AT_ONCE) + stream.readline():
-        table = parse_numbers(block.encode(), opening.num_columns, *opening.form)
+def _parse_blocks(path: Path, stream: TextIO, preamble: "_Preamble") -> Iterator[Values]:
+    """Yield tables of the first point and of the lines that follow it in a stream."""
+    dtype = np.dtype([("row", "f8", (preamble.num_columns,))])
+    line, number = preamble.line, preamble.line_number
+    while block := line + stream.read(CHARACTERS_PER_READ) + stream.readline():
+        table = parse_numbers(block.encode(), preamble.num_columns, *preamble.dialect)
         if table is None:
-            lines = _without_counts(block.split("\n"), opening.counts)
-            table = _parse(path, lines, dtype, number, opening.form, opening.left_out)["row"]
+            lines = _extract_counts(block.split("\n"), preamble.counts)
+            table = _parse(path, lines, dtype, number, preamble.dialect, preamble.skipped)["row"]
         yield table
         line, number = "", number + block.count("\n")
 
 
-def _without_counts(lines: list[str], counts: list[int]) -> list[str]:
-    """Return lines with blank ones in place of counts of points, which are added to those before.
+def _extract_counts(lines: list[str], counts: list[int]) -> list[str]:
+    """Blank the lines that are point counts, and append these counts to ``counts``.
 
-    Each scan in a file of Cyclone begins with its count. Without one before the first, lines stay.
+    Each scan in a Cyclone file begins with its count. Without a first count, lines are unchanged.
     """
     if counts:
-        for place, line in enumerate(lines):
-            if (count := _count_of(line.strip())) is not None:
+        for index, line in enumerate(lines):
+            if (count := _parse_count(line.strip())) is not None:
                 counts.append(count)
-                lines[place] = ""
+                lines[index] = ""
     return lines
 
 
-def _count_of(text: str) -> int | None:
-    """Return the count of points that a line is, or None."""
+def _parse_count(text: str) -> int | None:
+    """Parse a line as a point count, or return None."""
     return int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else None
 
 
@@ -194,22 +193,22 @@ def _parse(
     block: Sequence[str],
     dtype: np.dtype[Any],
     line_number: int,
-    form: _Form | None = None,
-    left_out: Collection[int] = (),
+    dialect: _Dialect | None = None,
+    skipped: Collection[int] = (),
 ) -> Values:
-    """Parse a block of lines, and name the first one that is wrong.
+    """Parse a block of lines; an error names the first wrong line.
 
-    Without a form numbers stand between white space, and there are no comments. Columns that are
-    left out may hold words.
+    Without a dialect, white space separates numbers and there are no comments. Skipped columns may
+    contain words.
     """
-    delimiter, decimal, comments = (None, ".", None) if form is None else (*form, _COMMENTS[0])
+    delimiter, decimal, comments = (*dialect, _COMMENTS[0]) if dialect else (None, ".", None)
     converters: dict[int | str, Callable[[str], float]] | None
-    converters = dict.fromkeys(left_out, lambda word: np.nan) or None
+    converters = dict.fromkeys(skipped, lambda word: np.nan) or None
 
     def parse(lines: list[str]) -> Values:
         if decimal != ".":
             lines = [line.replace(decimal, ".") for line in lines]
-        # Before version 2.3 NumPy cuts numbers to fit an integer, and warns that it will not.
+        # NumPy before 2.3 truncates numbers to integers, with a deprecation warning.
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)
             try:
@@ -236,42 +235,40 @@ def _parse(
             shown = text if len(text) <= 60 else f"{text[:57]}..."
             raise FormatError(
                 f"{path}: line {number}: expected {_num_columns(dtype)} numbers, got {shown!r}; "
-                f"{_repair_of(text, _num_columns(dtype), form)}."
+                f"{_suggest_fix(text, _num_columns(dtype), dialect)}."
             ) from error
     raise FormatError(f"{path}: line {line_number}: expected rows of numbers; write it again.")
 
 
-def _repair_of(text: str, num_columns: int, form: _Form | None) -> str:
-    """Return what to do about a line that is not numbers of this form."""
-    expected = form or _Form()
-    for other in _FORMS:
-        words = other.split(text)
-        if other == expected or len(words) != num_columns or not all(map(_is_number, words)):
+def _suggest_fix(text: str, num_columns: int, dialect: _Dialect | None) -> str:
+    """Return the fix for a line that does not match a number format."""
+    expected = dialect or _Dialect()
+    for candidate in _DIALECTS:
+        words = candidate.split(text)
+        if candidate == expected or len(words) != num_columns or not all(map(_is_number, words)):
             continue
-        if other.decimal == expected.decimal:
-            return f"separate all numbers with {_MARKS[expected.delimiter]}"
-        return "write all decimals with points" + (", or all with commas" if form else "")
+        if candidate.decimal == expected.decimal:
+            return f"separate all numbers with {_DELIMITER_NAMES[expected.delimiter]}"
+        return "write all decimals with points" + (", or all with commas" if dialect else "")
     words = expected.split(text)
-    if form is not None and len(words) == num_columns and not all(map(_is_number, words)):
-        return (
-            f"repair or delete this line, or leave a column of words out, {LEFT_OUT} in --columns"
-        )
-    return "repair or delete this line"
+    if dialect is not None and len(words) == num_columns and not all(map(_is_number, words)):
+        return f"correct or delete this line, or skip a column of words with {SKIPPED} in --columns"
+    return "correct or delete this line"
 
 
 def _num_columns(dtype: np.dtype[Any]) -> int:
-    """Return the number of columns of a row."""
+    """Return the number of columns per row."""
     return sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
 
 
-class _Opening(NamedTuple):
-    """What the lines up to the first point say, that point's line, and its number, from one.
+class _Preamble(NamedTuple):
+    """Header of a text file, the line of its first point, and the line number, from 1.
 
-    Names are None without a header. Counts are numbers of points that follow, one at most so far.
+    ``names`` is None without a header. ``counts`` are point counts, at most one so far.
     """
 
     names: list[str] | None
-    form: _Form
+    dialect: _Dialect
     num_columns: int
     counts: list[int]
     line: str
@@ -279,111 +276,113 @@ class _Opening(NamedTuple):
 
     @property
     def integers(self) -> list[int]:
-        """Columns that the first point has as integers."""
-        words = self.form.split(self.line.split(_COMMENTS[0])[0])
+        """Indices of columns that are integers in the first point."""
+        words = self.dialect.split(self.line.split(_COMMENTS[0])[0])
         return [i for i, word in enumerate(words) if word.removeprefix("-").isdecimal()]
 
     @property
-    def left_out(self) -> list[int]:
-        """Places of the columns that nobody wants."""
-        return [i for i, name in enumerate(self.names or ()) if name == LEFT_OUT]
+    def skipped(self) -> list[int]:
+        """Indices of skipped columns."""
+        return [i for i, name in enumerate(self.names or ()) if name == SKIPPED]
 
 
-def _read_opening(path: Path, lines: Iterable[str], columns: Sequence[str] | None) -> _Opening:
+def _read_preamble(path: Path, lines: Iterable[str], columns: Sequence[str] | None) -> _Preamble:
     """Read up to the first line of numbers."""
     header, counts = "", list[int]()
     for number, line in enumerate(lines, start=1):
         text = line.strip()
         is_comment = text.startswith(_COMMENTS)
         bare = text.lstrip("#/") if is_comment else text.split(_COMMENTS[0])[0]
-        form = _form_of(bare)
-        words = form.split(bare)
+        dialect = _detect_dialect(bare)
+        words = dialect.split(bare)
         are_numbers = [_is_number(word) for word in words]
         if is_comment and _COLMAP in text:
             raise FormatError(
-                f"{path}: line {number}: expected points, got those of COLMAP with their images; "
+                f"{path}: line {number}: expected points, got COLMAP's points3D.txt; convert it: "
                 f"colmap model_converter --input_path {path.parent} --output_path points.ply "
-                "--output_type PLY writes a file that is read."
+                "--output_type PLY."
             )
         if is_comment:
-            header = bare if _name_lists(bare) else header
+            header = bare if _parse_names(bare) else header
         elif not bare.strip():
             continue
         elif len(words) == 1 and are_numbers[0]:
-            count = _count_of(words[0])
+            count = _parse_count(words[0])
             if count is None:
                 raise FormatError(
-                    f"{path}: line {number}: expected a count of points or a point, got "
+                    f"{path}: line {number}: expected a point count or a point, got "
                     f"{text[:60]!r}; correct or delete this line."
                 )
             counts.append(count)
             if len(counts) > 1:
                 raise FormatError(
-                    f"{path}: line {number}: expected a point after the count of points, got a "
-                    "second count, as in PTX files; export PTS, E57 or PLY."
+                    f"{path}: line {number}: expected a point after the point count, got a second "
+                    "count, as in PTX files; export PTS, E57 or PLY."
                 )
         elif not any(are_numbers) and not header:
-            if not _name_lists(bare) and columns is None:
+            if not _parse_names(bare) and columns is None:
                 raise FormatError(
-                    f"{path}: line {number}: expected numbers or names of columns with x, y and z, "
-                    f"got {text[:60]!r}; name the columns there or with --columns, or mark the "
-                    "line as a comment with #."
+                    f"{path}: line {number}: expected numbers or column names with x, y and z, got "
+                    f"{text[:60]!r}; name the columns there or with --columns, or mark the line as "
+                    "a comment with #."
                 )
             header = bare
         elif len(words) < 3:
             raise FormatError(
                 f"{path}: line {number}: expected at least 3 numbers, got {text[:60]!r}; "
-                "repair or delete this line."
+                "correct or delete this line."
             )
         else:
             if columns is not None:
                 check_names(path, columns, len(words))
                 names: list[str] | None = list(columns)
             else:
-                names = _names_of(path, header, words, number) if header else None
-            return _Opening(names, form, len(words), counts, line, number)
-    raise FormatError(f"{path}: expected at least one point, got none; check where it comes from.")
+                names = _match_names(path, header, words, number) if header else None
+            return _Preamble(names, dialect, len(words), counts, line, number)
+    raise FormatError(f"{path}: expected at least one point, got none; check the file's source.")
 
 
-def _form_of(text: str) -> _Form:
-    """Return how the numbers of a line are written, or would be if its words were numbers."""
-    for form in _FORMS:
-        if all(map(_is_number, form.split(text))):
-            return form
-    return _Form(next((mark for mark in ";," if mark in text), None))
+def _detect_dialect(text: str) -> _Dialect:
+    """Detect the number format of a line; for words, guess the delimiter."""
+    for dialect in _DIALECTS:
+        if all(map(_is_number, dialect.split(text))):
+            return dialect
+    return _Dialect(next((delimiter for delimiter in ";," if delimiter in text), None))
 
 
-def _name_lists(text: str) -> list[list[str]]:
-    """Return the ways to read a line as names of the columns of points, each name once.
+def _parse_names(text: str) -> list[list[str]]:
+    """Return all readings of a line as distinct column names, one per delimiter.
 
-    Names may be in quotes and then hold what is between the others.
+    Quoted names may contain the delimiter.
     """
     rows = []
-    for mark in ";,\t ":
+    for delimiter in ";,\t ":
         try:
-            (row,) = csv.reader([text.replace("\t", " ") if mark == " " else text], delimiter=mark)
+            (row,) = csv.reader(
+                [text.replace("\t", " ") if delimiter == " " else text], delimiter=delimiter
+            )
         except csv.Error:
             return []
-        words = [word.strip().strip("\"'") for word in row if mark != " " or word]
+        words = [word.strip().strip("\"'") for word in row if delimiter != " " or word]
         if {"x", "y", "z"} <= {word.lower() for word in words} and len(set(words)) == len(words):
             rows.append(words)
     return rows
 
 
-def _names_of(path: Path, header: str, words: Sequence[str], number: int) -> list[str]:
-    """Return the names of the columns by the header, as many as the first point has numbers."""
-    lists = _name_lists(header)
-    names = next((names for names in lists if len(names) == len(words)), None)
+def _match_names(path: Path, header: str, words: Sequence[str], number: int) -> list[str]:
+    """Return the column names in the header if they match the first point."""
+    readings = _parse_names(header)
+    names = next((names for names in readings if len(names) == len(words)), None)
     if names is not None:
         return names
-    most, shown = max(map(len, lists), default=0), " ".join(words)[:60]
-    message = f"{path}: line {number}: expected {most} numbers, got {shown!r}"
-    if most > len(words):
+    max_names, shown = max(map(len, readings), default=0), " ".join(words)[:60]
+    message = f"{path}: line {number}: expected {max_names} numbers, got {shown!r}"
+    if max_names > len(words):
         raise FormatError(
-            f"{message}, under names that may hold blanks: {header.strip()[:60]!r}; name the "
-            f"{len(words)} columns with --columns, or put _ in place of the blanks."
+            f"{message}, for names that may contain blanks: {header.strip()[:60]!r}; name the "
+            f"{len(words)} columns with --columns, or replace the blanks with _."
         )
-    raise FormatError(f"{message}; repair or delete this line.")
+    raise FormatError(f"{message}; correct or delete this line.")
 
 
 def _is_number(word: str) -> bool:

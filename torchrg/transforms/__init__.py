@@ -1,16 +1,16 @@
-"""Modules for data pipelines: a dict of tensors (or a PyG ``Data``, ``Batch``) in, a new one out.
+"""Transforms of samples: dicts of tensors, PyG ``Data`` or ``Batch``.
 
-:mod:`torchrg.transforms.pointcept` makes them known to Pointcept; for other loaders see
+:mod:`torchrg.transforms.pointcept` registers them with Pointcept; for other loaders see
 :mod:`torchrg.datasets`.
 
-All take ``keys``, other names for the entries of a sample, as in ``{"coord": "pos"}``. Those that
-search neighbours, or hold them anyway, take ``keep_neighbors``: the sample then carries these to
-the next, see :class:`torchrg.transforms.sample.NeighborSearch`.
+All transforms accept ``keys``, which renames the entries of a sample, as in ``{"coord": "pos"}``.
+Transforms that use neighbors accept ``keep_neighbors``, which stores them in the sample for the
+next transform, see :class:`torchrg.transforms.sample.NeighborSearch`.
 
-As in kornia, ``depth`` is channels-first, ``(B, 1, H, W)``, and ``intrinsics`` may be 4 x 4 or a
-``PinholeCamera``. What :class:`SegmentDepth` adds is not: ``plane`` and ``curvature`` are
+``depth`` is channels-first, ``(B, 1, H, W)``, as in kornia, and ``intrinsics`` may be 4 x 4 or a
+``PinholeCamera``. The results of :class:`SegmentDepth` differ: ``plane`` and ``curvature`` are
 ``(B, H, W)`` and ``normal`` is ``(B, H, W, 3)``, with vectors last as in clouds. The guide on depth
-cameras takes them through kornia's augmentations.
+cameras applies kornia's augmentations to them.
 """
 
 from torchrg.neighbors import restore_points, sample_voxels

@@ -1,4 +1,4 @@
-"""Depth images: as modules to clouds and to planes, and several of them as one cloud."""
+"""Transforms of depth images: conversion to clouds, segmentation, and fusion."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,9 +21,9 @@ from torchrg.transforms.sample import SampleTransform
 
 
 class DepthTransform(SampleTransform):
-    """Base of the transforms of depth images.
+    """Base class of depth image transforms.
 
-    Results are in world coordinates where a sample has a pose, else in camera coordinates.
+    Results are in world coordinates if a sample has a pose, else in camera coordinates.
     """
 
     names = (
@@ -53,16 +53,16 @@ class DepthTransform(SampleTransform):
         poses = self.read(sample, "pose") if has_pose else None
         return (
             depth,
-            self._one_each("intrinsics", intrinsics, (len(depth), 3, 3)),
-            None if poses is None else self._one_each("pose", poses, (len(depth), 4, 4)),
+            self._expand("intrinsics", intrinsics, (len(depth), 3, 3)),
+            None if poses is None else self._expand("pose", poses, (len(depth), 4, 4)),
         )
 
     def is_batch(self, sample: Entries) -> bool:
         """Return whether the depth of a sample is a batch, ``(B, 1, H, W)``."""
         return self.read(sample, "depth").ndim == 4
 
-    def _one_each(self, name: str, values: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        """Return a matrix for each image; one of shape ``(n, n)`` serves all."""
+    def _expand(self, name: str, values: Tensor, shape: tuple[int, int, int]) -> Tensor:
+        """Return one matrix per image; a single matrix applies to all images."""
         expanded = (
             values.expand(shape) if values.ndim == 2 and values.shape == shape[1:] else values
         )
@@ -75,17 +75,17 @@ class DepthTransform(SampleTransform):
 
 
 class DepthToCloud(DepthTransform):
-    """Turn depth images into the cloud of their pixels; see :func:`depth_to_points`.
+    """Convert depth images to the cloud of their pixels; see :func:`depth_to_points`.
 
-    Reads ``depth`` and ``intrinsics``, and ``pose`` and ``color`` if there; the shapes are those of
-    :class:`SegmentDepth`, colours ``(3, H, W)`` or ``(B, 3, H, W)`` of any size. Adds
+    Reads ``depth`` and ``intrinsics``, and ``pose`` and ``color`` if present, with the shapes of
+    :class:`SegmentDepth`; colors are ``(3, H, W)`` or ``(B, 3, H, W)`` of any size. Adds
 
-    * ``coord`` ``(N, 3)``: the pixels with depth, in the dtype of the depth or that of the pose;
-    * ``pixel`` ``(N,)``, int64: row-major place of each in its image, so that
-      ``image.flatten()[pixel] = labels`` takes labels back;
-    * ``offset`` ``(B,)``, int64, for a batch: where the points of each image end;
+    * ``coord`` ``(N, 3)``: the pixels with depth, in the dtype of the depth or of the pose;
+    * ``pixel`` ``(N,)``, int64: row-major pixel index in the image, so that
+      ``image.flatten()[pixel] = labels`` maps labels back;
+    * ``offset`` ``(B,)``, int64, for a batch: end row of each image's points;
 
-    and replaces ``color`` by that of the points, ``(N, 3)``, of the nearest pixel.
+    and replaces ``color`` by the color of the nearest pixel of each point, ``(N, 3)``.
 
     Example:
         >>> depth = torch.tensor([[[2.0, 0.0], [2.0, 2.0]]])
@@ -115,7 +115,7 @@ class DepthToCloud(DepthTransform):
 
 
 def _colors(color: Tensor, seen: Tensor) -> Tensor:
-    """Return the colours of some pixels, shape ``(N, 3)``, from images of any size."""
+    """Return the colors of the ``seen`` pixels, shape ``(N, 3)``, from images of any size."""
     images = color.reshape(math.prod(color.shape[:-3]), *color.shape[-3:])
     if images.shape[:2] != (len(seen), 3) or (seen.numel() and not images.numel()):
         raise ShapeError(
@@ -131,23 +131,23 @@ def _colors(color: Tensor, seen: Tensor) -> Tensor:
 class SegmentDepth(DepthTransform):
     """Add plane labels, normals and curvature to depth images; see :func:`segment_depth`.
 
-    Reads ``depth``, of shape ``(H, W)``, ``(1, H, W)`` or ``(B, 1, H, W)``, ``intrinsics``
-    ``(3, 3)`` or ``(B, 3, 3)``, 4 x 4 or a kornia ``PinholeCamera``, and ``pose`` ``(4, 4)`` or
-    ``(B, 4, 4)`` if there: normals and planes are then in world coordinates, else in camera
-    coordinates. Adds images, with ``B`` in front for a batch:
+    Reads ``depth``, of shape ``(H, W)``, ``(1, H, W)`` or ``(B, 1, H, W)``; ``intrinsics``
+    ``(3, 3)`` or ``(B, 3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; and, if present, ``pose``
+    ``(4, 4)`` or ``(B, 4, 4)``. With a pose, normals and planes are in world coordinates, else in
+    camera coordinates. Adds images, preceded by ``B`` for a batch:
 
     * ``plane`` ``(H, W)``, int64: 0 to M-1 by descending size in each image, -1 for none;
-    * ``normal`` ``(H, W, 3)``: unit normals, 0 where there is no depth;
+    * ``normal`` ``(H, W, 3)``: unit normals, 0 for pixels without depth;
     * ``curvature`` ``(H, W)``;
 
-    and with ``planes=True`` also ``planes``, the table of planes
-    (:class:`torchrg.structures.Planes`; a list of them for a batch).
+    and with ``planes=True`` also ``planes``, the plane table (:class:`torchrg.structures.Planes`;
+    a list of tables for a batch).
 
     Args:
-        config: Settings, or a dictionary of them.
-        orient: Side to which normals point, by default the camera.
-        planes: Whether to add the table.
-        **changes: Single settings, as in ``max_depth=4.0``.
+        config: Configuration, as an object or a dictionary.
+        orient: Orientation of normals. Default: towards the camera.
+        planes: Whether to add the plane table.
+        **changes: Single parameters, as in ``max_depth=4.0``.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -172,7 +172,7 @@ class SegmentDepth(DepthTransform):
         self.orient, self.planes = orient, planes
 
     def extra_repr(self) -> str:
-        """Return the settings."""
+        """Return the configuration."""
         return f"{super().extra_repr()}, orient={self.orient!r}"
 
     @of_clouds
@@ -195,17 +195,17 @@ class SegmentDepth(DepthTransform):
 
 
 class FusedFrames(NamedTuple):
-    """A cloud of several depth frames.
+    """Cloud fused from several depth frames.
 
     Attributes:
         coord: Points in world coordinates, shape ``(N, 3)``, float64: the pixels with depth, or one
-            of each voxel.
-        color: Their colours, shape ``(N, 3)``, uint8; None where a frame has none.
-        frame: Number of the frame that each point is from, shape ``(N,)``, int64.
-        pixel: Row-major place of each point in its frame, shape ``(N,)``, int64.
-        inverse: The point that stands for each pixel with depth, frame after frame, row-major,
-            shape ``(P,)``, int64.
-        seen: Pixels with depth of each frame, of shape ``(H, W)``, bool.
+            per voxel.
+        color: Colors, shape ``(N, 3)``, uint8; None if any frame has no color.
+        frame: Frame index of each point, shape ``(N,)``, int64.
+        pixel: Row-major pixel index of each point in its frame, shape ``(N,)``, int64.
+        inverse: Index of the point that represents each pixel with depth, frame by frame,
+            row-major, shape ``(P,)``, int64.
+        seen: Mask of the pixels with depth, per frame, shape ``(H, W)``, bool.
     """
 
     coord: Tensor
@@ -216,17 +216,17 @@ class FusedFrames(NamedTuple):
     seen: tuple[Tensor, ...]
 
     def to_frames(self, values: Tensor, *, fill: int = UNLABELED) -> list[Tensor]:
-        """Return values of the points, labels for example, as images of the frames.
+        """Map per-point values, such as labels, to images of the frames.
 
         Args:
-            values: A row for each point, shape ``(N, ...)``.
-            fill: Value of the pixels without depth; for normals 0.
+            values: One row per point, shape ``(N, ...)``.
+            fill: Value of pixels without depth; use 0 for normals.
 
         Returns:
-            An image of shape ``(H, W, ...)`` for each frame.
+            An image of shape ``(H, W, ...)`` per frame.
 
         Raises:
-            ShapeError: If there is not a row for each point.
+            ShapeError: If ``values`` does not have one row per point.
         """
         if len(values) != len(self.coord):
             raise ShapeError(
@@ -244,14 +244,14 @@ def fuse_depth(samples: Sequence[Entries], *, voxel_size: float | None = None) -
     """Fuse depth frames with poses into one cloud.
 
     Args:
-        samples: Samples as :class:`torchrg.datasets.RGBDFrames` gives them: ``depth``
-            ``(1, H, W)`` or ``(H, W)``, ``intrinsics`` ``(3, 3)``, ``pose`` ``(4, 4)``, perhaps
-            ``color``. Frames may differ in size.
-        voxel_size: Keep one point of each cell of a grid of this size, the one nearest to its
-            middle, see :func:`torchrg.transforms.sample_voxels`. Default: all points are kept.
+        samples: Samples as returned by :class:`torchrg.datasets.RGBDFrames`: ``depth``
+            ``(1, H, W)`` or ``(H, W)``, ``intrinsics`` ``(3, 3)``, ``pose`` ``(4, 4)``, and
+            optionally ``color``. Frames may differ in size.
+        voxel_size: Keep only the point nearest to the center of each voxel of this size; see
+            :func:`torchrg.transforms.sample_voxels`. Default: keep all points.
 
     Returns:
-        The cloud; :meth:`FusedFrames.to_frames` takes its labels back into every frame.
+        The cloud; :meth:`FusedFrames.to_frames` maps its labels back to every frame.
 
     Raises:
         ConfigError: If there is no sample, one lacks a pose, or ``voxel_size`` is not positive.

@@ -1,9 +1,9 @@
-"""Normals, plane labels and superpoints as modules.
+"""Transforms that add normals, plane labels and superpoints.
 
-``config`` is settings, a dictionary of them, a whole configuration, or the name of a preset; where
-none is passed it is that of :func:`torchrg.load_config`. ``changes`` are single settings, as in
-``k=30``, of a whole configuration as in ``**{"normals.k": 30}``. Points with equal coordinates
-count once and get one result, as in :func:`torchrg.segment_planes`.
+``config`` is a configuration object, a dictionary, a complete configuration, or the name of a
+preset. Default: that of :func:`torchrg.load_config`. ``changes`` override single parameters, as in
+``k=30``, or ``**{"normals.k": 30}`` for a complete configuration. Points with equal coordinates are
+treated as one and get the same result, as in :func:`torchrg.segment_planes`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,27 +38,26 @@ from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.regions.growth import number_by_count
 from torchrg.structures import UNLABELED
-from torchrg.transforms.rows import Sample, rows_of_clouds
+from torchrg.transforms.rows import Sample, cloud_rows
 from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
 
 
 class OrientedTransform(CloudTransform):
-    """Base of the transforms that choose the sign of normals.
+    """Base class of transforms that orient normals.
 
-    Reads ``coord`` and, where a sample has it, ``front`` ``(N, 3)``, the direction from each point
-    to where its surface was seen from. ``orient="viewpoint"`` reads ``viewpoint`` unless one is
-    given: where the scanner stood, of shape ``(3,)``, ``(B, 3)`` for the clouds of a batch, or
-    ``(N, 3)``.
+    Reads ``coord`` and, if present, ``front`` ``(N, 3)``, the direction from each point to the
+    sensor. ``orient="viewpoint"`` reads ``viewpoint`` unless it is passed here: the scanner
+    position, of shape ``(3,)``, ``(B, 3)`` for the clouds of a batch, or ``(N, 3)``.
 
     Args:
-        orient: Side to which normals point; see :func:`torchrg.normals.orient_normals`.
-        viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
+        orient: Orientation of normals; see :func:`torchrg.normals.orient_normals`.
+        viewpoint: Scanner position of all samples. Default: read from the sample.
 
     Raises:
-        ConfigError: If ``orient`` is unknown, or does not go with ``viewpoint``.
+        ConfigError: If ``orient`` is unknown, or does not match ``viewpoint``.
     """
 
-    reads_if_there: tuple[str, ...] = ("front",)
+    optional_reads: tuple[str, ...] = ("front",)
 
     def __init__(
         self,
@@ -73,38 +72,38 @@ class OrientedTransform(CloudTransform):
         check_choices(caller, orient=(orient, Orientation))
         if viewpoint is not None and (orient != "viewpoint" or len(viewpoint) != 3):
             raise ConfigError(
-                f"{caller}: expected three numbers as viewpoint, with orient='viewpoint', got "
+                f"{caller}: viewpoint must be three numbers and needs orient='viewpoint', got "
                 f"{viewpoint!r} with {orient!r}."
             )
         self.orient: Orientation = orient
         self.viewpoint = None if viewpoint is None else tuple(map(float, viewpoint))
         if orient == "viewpoint":
-            self.reads_if_there = ()
+            self.optional_reads = ()
             if viewpoint is None:
                 self.reads = (*self.reads, "viewpoint")
 
     def read(self, sample: Sample, name: str) -> Tensor:
-        """Return an entry of a sample; of a viewpoint a row for each point."""
+        """Return an entry of a sample; a viewpoint is expanded to one row per point."""
         values = super().read(sample, name)
         if name != "viewpoint":
             return values
-        parts = rows_of_clouds(sample, len(super().read(sample, "coord")))
-        places = values[None] if values.ndim == 1 else values
-        if len(places) not in (1, len(parts)):
-            return places
-        of_clouds = places.expand(len(parts), -1)
+        parts = cloud_rows(sample, len(super().read(sample, "coord")))
+        positions = values[None] if values.ndim == 1 else values
+        if len(positions) not in (1, len(parts)):
+            return positions
+        per_cloud = positions.expand(len(parts), -1)
         counts = [rows.stop - rows.start for rows in parts]
-        return of_clouds.repeat_interleave(torch.tensor(counts, device=places.device), dim=0)
+        return per_cloud.repeat_interleave(torch.tensor(counts, device=positions.device), dim=0)
 
     def side(self, cloud: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Return the arguments of a function that says to which side normals point."""
+        """Return the keyword arguments for orienting the normals of a cloud."""
         viewpoint = self.viewpoint if self.viewpoint is not None else cloud.get("viewpoint")
         return {"orient": self.orient, "viewpoint": viewpoint, "front": cloud.get("front")}
 
     def extra_repr(self) -> str:
-        """Return the settings."""
-        own = {"orient": self.orient, "viewpoint": self.viewpoint}
-        shown = [f"{name}={value!r}" for name, value in own.items() if value is not None]
+        """Return the configuration."""
+        options = {"orient": self.orient, "viewpoint": self.viewpoint}
+        shown = [f"{name}={value!r}" for name, value in options.items() if value is not None]
         return ", ".join([*filter(None, [super().extra_repr()]), *shown])
 
 
@@ -114,13 +113,13 @@ class EstimateNormals(OrientedTransform):
     Reads ``coord`` ``(N, 3)``; adds ``normal`` ``(N, 3)``, ``curvature`` and ``residual`` ``(N,)``.
 
     Args:
-        config: Settings of the estimator.
-        orient: Side to which normals point, as in :class:`SegmentPlanes`.
-        viewpoint: Where the scanner stood, for ``orient="viewpoint"``.
-        residual: Whether to add ``residual`` ``(N,)``, the root mean square distance of the
-            neighbours to the plane, which ``GrowRegions`` reads where ``plane_reach`` is on.
-        chunk_size: Points handled at a time; bounds memory, changes no result.
-        **changes: Single settings, as in ``method="pca", k=30``.
+        config: Configuration of the estimator.
+        orient: Orientation of normals, as in :class:`SegmentPlanes`.
+        viewpoint: Scanner position, for ``orient="viewpoint"``.
+        residual: Whether to add ``residual`` ``(N,)``, the RMS distance of the neighbors to the
+            plane, which ``GrowRegions`` reads if ``plane_reach`` is set.
+        chunk_size: Points processed at a time; bounds the memory, does not change results.
+        **changes: Single parameters, as in ``method="pca", k=30``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -163,18 +162,18 @@ class EstimateNormals(OrientedTransform):
 
 
 class OrientNormals(OrientedTransform):
-    """Choose the sign of the normals that a sample has; see :func:`torchrg.normals.orient_normals`.
+    """Orient the normals of a sample; see :func:`torchrg.normals.orient_normals`.
 
-    Reads ``coord``, ``normal`` ``(N, 3)`` and what :class:`OrientedTransform` reads; changes
-    ``normal``. Each cloud of a batch is oriented on its own. :class:`SegmentPlanes` and
-    :class:`EstimateNormals` orient the normals that they add.
+    Reads ``coord``, ``normal`` ``(N, 3)`` and the entries of :class:`OrientedTransform`; changes
+    ``normal``. Each cloud of a batch is oriented separately. :class:`SegmentPlanes` and
+    :class:`EstimateNormals` already orient the normals that they add.
 
     Args:
-        orient: Side to which normals point.
-        viewpoint: Where the scanner stood, for all samples. Default: as the sample says.
+        orient: Orientation of normals.
+        viewpoint: Scanner position of all samples. Default: read from the sample.
 
     Raises:
-        ConfigError: If ``orient`` is unknown, or does not go with ``viewpoint``.
+        ConfigError: If ``orient`` is unknown, or does not match ``viewpoint``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -186,7 +185,7 @@ class OrientNormals(OrientedTransform):
     reads = ("coord", "normal")
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
-        """Return the normals of a cloud, turned."""
+        """Return the oriented normals of a cloud."""
         points, normals = cloud["coord"], cloud["normal"]
         is_all = bool((normals != 0).any(dim=1).all() & points.isfinite().all())
         side = self.side(cloud)
@@ -202,16 +201,16 @@ class OrientNormals(OrientedTransform):
 
 
 class GrowRegions(CloudTransform):
-    """Add plane labels grown on the normals that a sample has; see :func:`torchrg.grow_regions`.
+    """Add plane labels grown from the normals of a sample; see :func:`torchrg.grow_regions`.
 
-    Reads ``coord``, ``normal`` ``(N, 3)``, ``curvature`` ``(N,)`` and, where ``plane_reach`` is on
+    Reads ``coord``, ``normal`` ``(N, 3)``, ``curvature`` ``(N,)`` and, if ``plane_reach`` is set
     (as in the preset ``consensus``), ``residual`` ``(N,)``; adds ``plane`` ``(N,)``, int64, -1 for
     none. A point with a zero normal joins no region.
 
     Args:
-        config: Settings of the growth.
-        k: Number of neighbours, the point itself included.
-        **changes: Single settings, as in ``max_angle_deg=7``.
+        config: Configuration of region growing.
+        k: Number of neighbors, including the point itself.
+        **changes: Single parameters, as in ``max_angle_deg=7``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -256,22 +255,22 @@ class GrowRegions(CloudTransform):
         return {"plane": number_by_count(plane)[plane]}
 
     def extra_repr(self) -> str:
-        """Return the settings."""
+        """Return the configuration."""
         return f"{super().extra_repr()}, k={self.k}"
 
 
 class SegmentPlanes(OrientedTransform):
     """Add plane labels, normals and curvature; see :func:`torchrg.segment_planes`.
 
-    Reads ``coord`` ``(N, 3)`` and what :class:`OrientedTransform` reads; adds ``plane`` ``(N,)``,
-    int64, -1 for none, ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
+    Reads ``coord`` ``(N, 3)`` and the entries of :class:`OrientedTransform`; adds ``plane``
+    ``(N,)``, int64, -1 for none, ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
 
     Args:
-        config: Settings. Default: those of the preset ``consensus``.
-        orient: Side to which normals point. Default: to the front of the surface where the sample
-            has ``front``, else into the free space of rooms.
-        viewpoint: Where the scanner stood, for ``orient="viewpoint"``. Default: as the sample says.
-        **changes: Single settings, as in ``**{"normals.k": 30}``.
+        config: Configuration. Default: the preset ``consensus``.
+        orient: Orientation of normals. Default: towards ``front`` if the sample has it, else into
+            the free space of rooms.
+        viewpoint: Scanner position, for ``orient="viewpoint"``. Default: read from the sample.
+        **changes: Single parameters, as in ``**{"normals.k": 30}``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -306,13 +305,13 @@ class MakeSuperpoints(CloudTransform):
     """Add superpoints, a partition of all points; see :func:`torchrg.make_superpoints`.
 
     Reads ``coord``, ``normal`` ``(N, 3)`` and ``plane`` ``(N,)``, as :class:`SegmentPlanes` adds
-    them; adds ``superpoint`` ``(N,)``, int64, of the first strength.
+    them; adds ``superpoint`` ``(N,)``, int64, for the first strength.
 
     Args:
-        config: Settings. Default: :class:`torchrg.config.SuperpointsConfig`.
-        white: Value of a full channel of colors, 255 or 1, to read ``color`` ``(N, 3)`` too.
-            Default: colors play no part.
-        **changes: Single settings, as in ``strengths=2.0``.
+        config: Configuration. Default: :class:`torchrg.config.SuperpointsConfig`.
+        white: Maximum channel value of colors, 255 or 1; enables reading ``color`` ``(N, 3)``.
+            Default: colors are not used.
+        **changes: Single parameters, as in ``strengths=2.0``.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -331,7 +330,7 @@ class MakeSuperpoints(CloudTransform):
     ) -> None:
         super().__init__(keys=keys)
         if white is not None and not white > 0:
-            raise ConfigError(f"MakeSuperpoints: expected white > 0 or none, got {white!r}.")
+            raise ConfigError(f"MakeSuperpoints: expected white > 0 or None, got {white!r}.")
         self.config = settings_of("MakeSuperpoints", SuperpointsConfig, config, changes)
         self.white = white
         self.reads = ("coord", "normal", "plane", *["color"] * (white is not None))
@@ -341,11 +340,11 @@ class MakeSuperpoints(CloudTransform):
         colors = None
         if self.white is not None:
             colors = cloud["color"].double().nan_to_num(0, 0, 0)
-            largest = find_white(colors.numpy(force=True))
-            if largest > self.white:
+            maximum = find_white(colors.numpy(force=True))
+            if maximum > self.white:
                 raise ConfigError(
-                    f"MakeSuperpoints: expected color in 0..{self.white:g}, got 0..{largest}; pass "
-                    f"white={largest}."
+                    f"MakeSuperpoints: expected color in 0..{self.white:g}, got 0..{maximum}; pass "
+                    f"white={maximum}."
                 )
             colors = colors / self.white
         points, plane = cloud["coord"], cloud["plane"].reshape(-1)
@@ -357,17 +356,17 @@ class MakeSuperpoints(CloudTransform):
 
 
 class AlignAxes(SampleTransform):
-    """Set each cloud upright, its walls along x and y; see :func:`torchrg.align_axes`.
+    """Align each cloud, with up along z and walls along x and y; see :func:`torchrg.align_axes`.
 
-    Reads ``coord`` ``(N, 3)``; changes it and ``normal`` and ``front``, if they are there, and adds
-    ``axis_align_matrix`` ``(B, 4, 4)``, float64, the motion of each cloud.
+    Reads ``coord`` ``(N, 3)``; changes it, and ``normal`` and ``front`` if present; adds
+    ``axis_align_matrix`` ``(B, 4, 4)``, float64, the rigid transform of each cloud.
 
     Args:
-        config: How the planes are found that say where floor and walls are.
-        up: Where up is, to within 30 degrees.
+        config: Configuration for detecting the planes of floor and walls.
+        up: Up direction, accurate to 30 degrees.
 
     Raises:
-        ConfigError: If a cloud has neither floor nor walls, when it is called.
+        ConfigError: On a call, if a cloud has neither floor nor walls.
 
     Example:
         >>> from torchrg.scenes import make_room
@@ -391,31 +390,31 @@ class AlignAxes(SampleTransform):
         self.up = tuple(up)
 
     def transform(self, sample: Sample) -> Sample:
-        """Return a new sample with moved coordinates and normals."""
+        """Return a new sample with transformed coordinates and normals."""
         coord = self.read(sample, "coord")
-        parts = rows_of_clouds(sample, len(coord))
-        motions = [
+        parts = cloud_rows(sample, len(coord))
+        transforms = [
             align_axes(segment_planes(coord[rows], self.config, orient="none"), up=self.up).to(
                 coord.device
             )
             for rows in parts
         ]
-        moved = {"coord": _moved(coord, parts, motions, shifted=True)}
+        moved = {"coord": _transform(coord, parts, transforms, shifted=True)}
         for name in ("normal", "front"):
             if self.key(sample, name) in sample:
-                moved[name] = _moved(self.read(sample, name), parts, motions, shifted=False)
+                moved[name] = _transform(self.read(sample, name), parts, transforms, shifted=False)
         changes = {self.key(sample, name): values for name, values in moved.items()}
-        return self.changed(
-            sample, changes | {self.key(sample, "axis_align_matrix"): torch.stack(motions)}
+        return self.replace(
+            sample, changes | {self.key(sample, "axis_align_matrix"): torch.stack(transforms)}
         )
 
 
-def _moved(
-    vectors: Tensor, parts: Sequence[slice], motions: list[Tensor], *, shifted: bool
+def _transform(
+    vectors: Tensor, parts: Sequence[slice], transforms: list[Tensor], *, shifted: bool
 ) -> Tensor:
-    """Return rows of vectors after the motion of their cloud, or after its turn only."""
+    """Apply the transform of their cloud to vectors, without translation unless ``shifted``."""
     moved = [
-        vectors[rows].double() @ motion[:3, :3].T + motion[:3, 3] * shifted
-        for rows, motion in zip(parts, motions, strict=True)
+        vectors[rows].double() @ transform[:3, :3].T + transform[:3, 3] * shifted
+        for rows, transform in zip(parts, transforms, strict=True)
     ]
     return torch.cat(moved).to(vectors.dtype)

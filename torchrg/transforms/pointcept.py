@@ -1,18 +1,18 @@
-"""Importing this module makes torchrg known to Pointcept.
+"""Registration of torchrg with Pointcept, on import.
 
-Put ``import torchrg.transforms.pointcept`` at the end of ``pointcept/datasets/__init__.py``, where
-every process meets it. From then on
+Put ``import torchrg.transforms.pointcept`` at the end of ``pointcept/datasets/__init__.py``, which
+every process imports. Then
 
 * a config can name the transforms: ``dict(type="SegmentPlanes", config="classic")``, before or
-  after points are taken out. They read and return NumPy arrays there, and have two axes for one
-  number a point, as ``strength`` has, so that ``Collect`` can join ``curvature`` to the features;
-* the data sets load ``plane.npy``, ``curvature.npy`` and ``superpoint.npy``, which ``torchrg
-  convert`` wrote;
-* what takes points out takes them out of these entries too;
-* ``point_collate_fn`` with ``mix_prob`` numbers the planes of two mixed rooms anew, so that they
-  stay apart.
+  after points are removed. They read and return NumPy arrays, with two axes for scalars per point,
+  like ``strength``, so that ``Collect`` can concatenate ``curvature`` with the features;
+* the data sets load ``plane.npy``, ``curvature.npy`` and ``superpoint.npy``, as written by
+  ``torchrg convert``;
+* operations that remove points remove them from these entries too;
+* ``point_collate_fn`` with ``mix_prob`` offsets the plane IDs of two mixed rooms, so that they
+  stay distinct.
 
-Where Pointcept is not installed, nothing happens.
+Without Pointcept, the import has no effect.
 """
 
 import importlib.util
@@ -24,56 +24,56 @@ from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
 from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints, OrientNormals
 from torchrg.transforms.rows import (
-    OUR_KEYS,
+    TORCHRG_KEYS,
     Entries,
     Sample,
     SampleDict,
-    recognized_keys,
-    with_listed,
+    extend_list,
+    per_point_keys,
 )
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
 _FEATURES = ("curvature", "residual")
-"""Entries of one number a point that may become features."""
+"""Scalar per-point entries that can be features."""
 _LABELS = ("plane", "superpoint")
-"""Entries whose numbers begin again in each room."""
+"""Entries whose IDs start at 0 in each room."""
 _FILES = ("plane", "curvature", "superpoint")
-"""Arrays of a scene folder that the data sets of Pointcept pass over by themselves."""
+"""Arrays of a scene folder that Pointcept's data sets would ignore."""
 
 
-class _WithColumns(SampleTransform):
-    """Gives features two axes, as Pointcept's ``Collect`` joins them."""
+class _ColumnFeatures(SampleTransform):
+    """Mixin that adds a second axis to features, as Pointcept's ``Collect`` requires."""
 
-    def changed(
+    def replace(
         self,
         sample: Sample,
         values: Entries,
         *,
         per_point: Sequence[str] = (),
     ) -> Sample:
-        """Return a new sample of the same kind with other values by key."""
+        """Return a new sample of the same type with other values by key."""
         columns = {self.key(sample, name) for name in _FEATURES}
-        wide = {
+        expanded = {
             key: value[:, None] if key in columns and value.ndim == 1 else value
             for key, value in values.items()
         }
-        return super().changed(sample, wide, per_point=per_point)
+        return super().replace(sample, expanded, per_point=per_point)
 
 
-class EstimateNormals(_WithColumns, planes.EstimateNormals):
+class EstimateNormals(_ColumnFeatures, planes.EstimateNormals):
     """:class:`torchrg.transforms.EstimateNormals`; ``curvature``, ``residual`` are ``(N, 1)``."""
 
 
-class SegmentPlanes(_WithColumns, planes.SegmentPlanes):
+class SegmentPlanes(_ColumnFeatures, planes.SegmentPlanes):
     """:class:`torchrg.transforms.SegmentPlanes`; ``curvature`` is ``(N, 1)``."""
 
 
 def point_collate_fn(batch: Sequence[Entries], mix_prob: float = 0) -> SampleDict:
-    """Join samples as Pointcept does; where two rooms become one, their planes stay apart.
+    """Collate samples as Pointcept does, and keep the planes of mixed rooms distinct.
 
-    Of each pair the planes of the second are numbered after those of the first.
+    Of each pair of rooms, the plane IDs of the second are offset.
     """
-    joined: SampleDict = _OWN["point_collate_fn"](batch, mix_prob=mix_prob)
+    joined: SampleDict = _ORIGINALS["point_collate_fn"](batch, mix_prob=mix_prob)
     labels = [joined[name] for name in _LABELS if name in joined]
     if not labels or "offset" not in joined:
         return joined
@@ -99,26 +99,26 @@ _TRANSFORMS = (
     MakeSuperpoints,
     OrientNormals,
 )
-"""Transforms that configs can name."""
-_OWN: dict[str, Callable[..., SampleDict]] = {}
-"""Pointcept's own functions, behind those that take their places."""
+"""Transforms available in configs."""
+_ORIGINALS: dict[str, Callable[..., SampleDict]] = {}
+"""Pointcept's original functions by name."""
 
 
 def index_operator(data_dict: SampleDict, index: object, duplicate: bool = False) -> SampleDict:
-    """Take points out as Pointcept does, and out of all entries with a row for each point."""
-    others = recognized_keys(data_dict, len(data_dict["coord"]))
-    data_dict.update(with_listed(data_dict, [*OUR_KEYS, *_LABELS, *others]))
-    return _OWN["index_operator"](data_dict, index, duplicate)
+    """Select points as Pointcept does, from all per-point entries."""
+    keys = per_point_keys(data_dict, len(data_dict["coord"]))
+    data_dict.update(extend_list(data_dict, [*TORCHRG_KEYS, *_LABELS, *keys]))
+    return _ORIGINALS["index_operator"](data_dict, index, duplicate)
 
 
-def _make_known() -> None:
-    """Name the transforms and files, and take the places of two functions, once a process."""
+def _register() -> None:
+    """Register transforms and files, and wrap two functions, once per process."""
     from pointcept import datasets
     from pointcept.datasets import transform, utils
     from pointcept.datasets.builder import DATASETS
 
-    for replaced in _TRANSFORMS:
-        transform.TRANSFORMS.register_module(module=replaced, force=True)
+    for transform_class in _TRANSFORMS:
+        transform.TRANSFORMS.register_module(module=transform_class, force=True)
     for data_set in DATASETS.module_dict.values():
         for assets in ("VALID_ASSETS", "PC_VALID_ASSETS"):
             files = getattr(data_set, assets, None)
@@ -126,16 +126,16 @@ def _make_known() -> None:
                 setattr(data_set, assets, list(dict.fromkeys([*files, *_FILES])))
     if not hasattr(transform, "index_operator"):
         raise MissingDependencyError(
-            "torchrg.transforms.pointcept: expected a Pointcept whose transforms take points out "
-            "by index_operator, got an older one; update it."
+            "torchrg.transforms.pointcept: expected a Pointcept version with "
+            "transform.index_operator, got an older one; update it."
         )
-    for module, ours in ((transform, index_operator), (utils, point_collate_fn)):
-        # Kept there, so that another import of this module finds them and not our own.
-        name = ours.__name__
-        _OWN[name] = vars(module).setdefault(f"_{name}_of_pointcept", getattr(module, name))
-        setattr(module, name, ours)
+    for module, wrapper in ((transform, index_operator), (utils, point_collate_fn)):
+        # Stored in the module, so that a repeated import finds the original, not the wrapper.
+        name = wrapper.__name__
+        _ORIGINALS[name] = vars(module).setdefault(f"_{name}_of_pointcept", getattr(module, name))
+        setattr(module, name, wrapper)
     datasets.point_collate_fn = point_collate_fn
 
 
 if importlib.util.find_spec("pointcept") is not None:
-    _make_known()
+    _register()

@@ -1,8 +1,8 @@
-"""Which entries of a sample have a row for each point, and how points leave all of them at once.
+"""Detection and consistent selection of per-point entries of a sample.
 
-``index_valid_keys`` names them, as Pointcept has it. Where nobody made such a list, what is as long
-as the cloud counts too. What is as long as the cloud but not on a list that somebody made, or is in
-a cloud of few points under an unknown name, is in doubt, and said to be so.
+``index_valid_keys`` lists the per-point entries, as in Pointcept. Without a user-defined list,
+known names and arrays as long as the cloud count too. An entry as long as the cloud is ambiguous
+if it is missing from a user-defined list, or unknown in a cloud of few points.
 """
 
 import itertools
@@ -17,49 +17,49 @@ from torchrg.errors import ConfigError
 from torchrg.structures import Array
 
 Sample = Any
-"""A sample: a dict of tensors, NumPy arrays and others, or a PyG ``Data`` or ``Batch``."""
+"""A sample: a dict of tensors, NumPy arrays and other values, or a PyG ``Data`` or ``Batch``."""
 Entries = Mapping[str, Any]
-"""Contents of a sample by key."""
+"""Sample entries by key."""
 SampleDict = dict[str, Any]
-"""A sample as data sets give it."""
-LISTED = "index_valid_keys"
-"""The entry that names those with a row for each point."""
+"""A sample as returned by data sets."""
+LIST_KEY = "index_valid_keys"
+"""Key of the list of per-point entries."""
 POINTCEPT_KEYS = ("coord", "color", "normal", "superpoint", "strength", "segment", "instance")
-"""Entries on the list that Pointcept makes for a sample without one when it takes points out."""
-OUR_KEYS = ("plane", "curvature", "residual")
-"""Entries that torchrg adds."""
-_USUAL_KEYS = {
+"""Entries that Pointcept lists by default when it removes points from a sample."""
+TORCHRG_KEYS = ("plane", "curvature", "residual")
+"""Per-point entries that torchrg adds."""
+_PER_POINT_KEYS = {
     *POINTCEPT_KEYS,
-    *OUR_KEYS,
+    *TORCHRG_KEYS,
     *("grid_coord", "displacement", "index", "intensity", "labels", "front"),
     *("pos", "x", "y", "rgb", "norm", "batch", "plane_index", "superpoint_index"),
 }
-"""Entries that have a row for each point where they are as long as the cloud; PyG's come last."""
-_WHOLE_KEYS = ("offset", "ptr", "origin", "pose", "inverse", "inverse_index", LISTED)
-"""Entries that have none, however long they are."""
-_EARLIER = "origin_"
-"""Begins the names of what Pointcept keeps of the points as they were before any left."""
-_HOLDING_ROWS = {
+"""Entries that are per point if they are as long as the cloud; PyG's come last."""
+_NEVER_PER_POINT = ("offset", "ptr", "origin", "pose", "inverse", "inverse_index", LIST_KEY)
+"""Entries that are never per point, whatever their length."""
+_COPY_PREFIX = "origin_"
+"""Prefix of Pointcept's copies of entries from before points were removed."""
+_INDEX_KEYS = {
     "edge_index": "before edges are made",
     "face": "to clouds without faces",
     "adj_t": "before edges are made",
-    "sampled_index": "to samples whose labelled points are not listed",
+    "sampled_index": "to samples whose labeled points are not listed",
     "frame_pcd_offset": "before frames are joined",
 }
-"""Entries that hold numbers of points: who takes points out would have to renumber them."""
-_FEW = 16
-"""Most points of a cloud in which names alone tell what has a row for each point: a pose or a box
-may have as many rows."""
+"""Entries that contain point indices, which removing points would invalidate, and the fix."""
+_MAX_AMBIGUOUS_POINTS = 16
+"""Maximum number of points of a cloud in which only names identify per-point entries: a pose or a
+box may have the same number of rows."""
 
 
-def entries_of(sample: Sample) -> Entries:
-    """Return what a sample holds by key."""
+def get_entries(sample: Sample) -> Entries:
+    """Return the entries of a sample by key."""
     entries: Entries = sample if isinstance(sample, Mapping) else sample.to_dict()
     return entries
 
 
 def check_sample(caller: str, sample: Sample, example: str) -> None:
-    """Raise if something is no sample, and say by an example what is one."""
+    """Raise ConfigError unless the argument is a sample; the message shows an example."""
     is_data = callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__")
     if not (isinstance(sample, Mapping) or is_data):
         raise ConfigError(
@@ -68,71 +68,70 @@ def check_sample(caller: str, sample: Sample, example: str) -> None:
         )
 
 
-def listed_keys(entries: Entries) -> list[str] | None:
-    """Return the list of a sample, None if it has none; whatever kind of collection it is."""
-    names = entries.get(LISTED)
+def get_list(entries: Entries) -> list[str] | None:
+    """Return the list of per-point entries of any collection type, or None if there is none."""
+    names = entries.get(LIST_KEY)
     if names is None:
         return None
     return [names] if isinstance(names, str) else list(names)
 
 
-def recognized_keys(entries: Entries, num_points: int, *, whole: Collection[str] = ()) -> list[str]:
-    """Return what belongs on a list besides ours: nothing where somebody made the list."""
-    return [] if _has_chosen_list(entries) else _sort_keys(entries, num_points, whole)[0]
+def per_point_keys(entries: Entries, num_points: int, *, skip: Collection[str] = ()) -> list[str]:
+    """Return further per-point keys to list; none if the list is user-defined."""
+    return [] if _has_user_list(entries) else _classify_keys(entries, num_points, skip)[0]
 
 
-def with_listed(entries: Entries, keys: Iterable[str]) -> dict[str, list[str]]:
-    """Return the list of a sample with some entries on it, those that are there; never the old one.
+def extend_list(entries: Entries, keys: Iterable[str]) -> dict[str, list[str]]:
+    """Return a new list of per-point entries, extended by the ``keys`` that exist.
 
-    Where there is none, it is what Pointcept would begin, and they.
+    Without a list, it starts with Pointcept's default.
     """
-    listed = listed_keys(entries)
+    listed = get_list(entries)
     present = [key for key in keys if isinstance(entries.get(key), Tensor | np.ndarray)]
     if listed is None and not present:
         return {}
-    begun = POINTCEPT_KEYS if listed is None else listed
-    return {LISTED: list(dict.fromkeys([*begun, *present]))}
+    start = POINTCEPT_KEYS if listed is None else listed
+    return {LIST_KEY: list(dict.fromkeys([*start, *present]))}
 
 
-def _has_chosen_list(entries: Entries) -> bool:
-    """Return whether somebody made the list; of usual names alone, nobody did."""
-    return not _USUAL_KEYS.issuperset(listed_keys(entries) or ())
+def _has_user_list(entries: Entries) -> bool:
+    """Return whether the list is user-defined, i.e. contains other than known names."""
+    return not _PER_POINT_KEYS.issuperset(get_list(entries) or ())
 
 
-def _sort_keys(
-    entries: Entries, num_points: int, whole: Collection[str]
+def _classify_keys(
+    entries: Entries, num_points: int, skip: Collection[str]
 ) -> tuple[list[str], list[str]]:
-    """Return the entries with a row for each point, and those that may have one."""
-    by_name = _USUAL_KEYS.union(listed_keys(entries) or ())
-    by_length = num_points > _FEW and not _has_chosen_list(entries)
+    """Return the per-point keys, and the keys that may be per point."""
+    by_name = _PER_POINT_KEYS.union(get_list(entries) or ())
+    by_length = num_points > _MAX_AMBIGUOUS_POINTS and not _has_user_list(entries)
     in_rows: list[str] = []
     ambiguous: list[str] = []
     for key, value in entries.items():
-        is_whole = key in _WHOLE_KEYS or key in whole or str(key).startswith(_EARLIER)
-        if is_whole or num_points == 0 or not _is_as_long(value, num_points):
+        skipped = key in _NEVER_PER_POINT or key in skip or str(key).startswith(_COPY_PREFIX)
+        if skipped or num_points == 0 or not _has_length(value, num_points):
             continue
         is_array = isinstance(value, Tensor | np.ndarray)
         (in_rows if is_array and (by_length or key in by_name) else ambiguous).append(key)
     return in_rows, ambiguous
 
 
-def check_in_step(caller: str, entries: Entries, num_points: int) -> None:
-    """Raise if an entry that must have a row for each point has another number of rows.
+def check_lengths(caller: str, entries: Entries, num_points: int) -> None:
+    """Raise ConfigError if a per-point entry has a wrong number of rows.
 
-    Which must, the list says; besides, the names that Pointcept and torchrg use, unless the entry
-    has the shape of an image.
+    Checked are listed entries, and names that Pointcept and torchrg use, unless the entry has the
+    shape of an image.
     """
-    listed = listed_keys(entries) or []
-    for key in {**dict.fromkeys(listed), **dict.fromkeys((*POINTCEPT_KEYS, *OUR_KEYS))}:
+    listed = get_list(entries) or []
+    for key in {**dict.fromkeys(listed), **dict.fromkeys((*POINTCEPT_KEYS, *TORCHRG_KEYS))}:
         value = entries.get(key)
         if not isinstance(value, Tensor | np.ndarray) or value.ndim == 0:
             continue
         is_table = value.ndim == 1 or (value.ndim == 2 and value.shape[1] in (1, 3))
         if len(value) != num_points and (key in listed or is_table):
             raise ConfigError(
-                f"{caller}: expected {key} with a row for each of {num_points} points, got "
-                f"{len(value)} rows; name it in {LISTED!r} before points are taken out, or leave "
-                "it out."
+                f"{caller}: expected {key} with {num_points} rows, one per point, got "
+                f"{len(value)}; name it in {LIST_KEY!r} before points are removed, or remove it."
             )
 
 
@@ -142,66 +141,65 @@ def select_points(
     rows: Tensor,
     num_points: int,
     *,
-    whole: Collection[str] = (),
+    skip: Collection[str] = (),
 ) -> SampleDict:
-    """Return the entries of a sample that change when only some rows are kept, given ascending.
+    """Return the entries of a sample that change when only ``rows`` (ascending) are kept.
 
-    Entries in ``whole`` have no row for each point.
+    Entries in ``skip`` are not per point.
 
     Raises:
-        ConfigError: If it cannot be told what changes, or an entry holds numbers of points.
+        ConfigError: If an entry is ambiguous or contains point indices.
     """
-    entries = entries_of(sample)
-    for key, repair in _HOLDING_ROWS.items():
+    entries = get_entries(sample)
+    for key, repair in _INDEX_KEYS.items():
         if entries.get(key) is not None:
             raise ConfigError(
-                f"{caller}: expected a sample without {key} to take points out of, got one; apply "
-                f"the transform {repair}."
+                f"{caller}: cannot remove points from a sample with {key}; apply the transform "
+                f"{repair}."
             )
-    in_rows, ambiguous = _sort_keys(entries, num_points, whole)
+    in_rows, ambiguous = _classify_keys(entries, num_points, skip)
     if ambiguous:
         raise ConfigError(
-            f"{caller}: cannot tell whether {', '.join(map(str, ambiguous))} of the sample has a "
-            f"row for each of {num_points} points; make it an array and name it in "
-            f"{LISTED!r}, or leave it out."
+            f"{caller}: cannot tell whether {', '.join(map(str, ambiguous))} of the sample has one "
+            f"row per point ({num_points}); make it an array named in {LIST_KEY!r}, or remove it."
         )
-    chosen: SampleDict = {key: _take(entries[key], rows) for key in in_rows}
+    selected: SampleDict = {key: _select(entries[key], rows) for key in in_rows}
     ends = torch.tensor(_cloud_ends(sample, num_points), device=rows.device)
     ends = torch.searchsorted(rows, ends)
     if entries.get("offset") is not None:
-        chosen["offset"] = _alike(ends, entries["offset"])
+        selected["offset"] = _convert_like(ends, entries["offset"])
     if entries.get("ptr") is not None:
-        chosen["ptr"] = _alike(torch.cat([ends.new_zeros(1), ends]), entries["ptr"])
+        selected["ptr"] = _convert_like(torch.cat([ends.new_zeros(1), ends]), entries["ptr"])
     if entries.get("num_nodes") is not None:
-        chosen["num_nodes"] = len(rows)
-    return chosen
+        selected["num_nodes"] = len(rows)
+    return selected
 
 
-def follow_points(caller: str, inverse: Tensor, place: Tensor) -> Tensor:
-    """Return where the points of ``inverse`` are after rows moved to ``place``, negative for none.
+def remap_rows(caller: str, inverse: Tensor, new_rows: Tensor) -> Tensor:
+    """Return the indices ``inverse`` after rows moved to ``new_rows``, negative for removed points.
 
     Raises:
-        ConfigError: If ``inverse`` names rows that are not there.
+        ConfigError: If ``inverse`` contains rows that do not exist.
     """
-    if len(inverse) and int(inverse.max()) >= len(place):
+    if len(inverse) and int(inverse.max()) >= len(new_rows):
         raise ConfigError(
-            f"{caller}: expected inverse to name rows of {len(place)} points, got row "
-            f"{int(inverse.max())}; points were taken out after it was made, so leave it out."
+            f"{caller}: expected inverse to contain rows of {len(new_rows)} points, got row "
+            f"{int(inverse.max())}; points were removed after it was made, so remove it too."
         )
-    is_there = inverse >= 0
-    moved = inverse.long().clone()
-    moved[is_there] = place.to(inverse.device)[moved[is_there]]
-    return moved
+    exists = inverse >= 0
+    remapped = inverse.long().clone()
+    remapped[exists] = new_rows.to(inverse.device)[remapped[exists]]
+    return remapped
 
 
-def rows_of_clouds(sample: Sample, num_points: int) -> list[slice]:
-    """Return the rows of each cloud of a sample, by its ``offset`` or ``batch`` if it has one."""
+def cloud_rows(sample: Sample, num_points: int) -> list[slice]:
+    """Return the rows of each cloud of a sample, from its ``offset`` or ``batch`` if present."""
     return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]
 
 
 def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
-    """Return the row that each cloud of a sample ends before; one cloud ends at the last."""
-    entries = entries_of(sample)
+    """Return the end row of each cloud of a sample."""
+    entries = get_entries(sample)
     if entries.get("offset") is not None:
         ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
         if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:
@@ -213,38 +211,38 @@ def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
         batch = torch.as_tensor(entries["batch"])
         if len(batch) != num_points or bool((batch.diff() < 0).any()):
             raise ConfigError(
-                f"expected batch to ascend over {num_points} points, got {len(batch)} numbers; "
+                f"expected batch to ascend over {num_points} points, got {len(batch)} entries; "
                 "sort the points by cloud."
             )
-        least = 0 if entries.get("ptr") is None else len(entries["ptr"]) - 1
-        counts: list[int] = torch.bincount(batch, minlength=least).cumsum(0).tolist()
+        min_clouds = 0 if entries.get("ptr") is None else len(entries["ptr"]) - 1
+        counts: list[int] = torch.bincount(batch, minlength=min_clouds).cumsum(0).tolist()
         return counts or [0]
     return [num_points]
 
 
-def _is_as_long(value: object, num_points: int) -> bool:
-    """Return whether a value is, or holds, as many rows as there are points.
+def _has_length(value: object, num_points: int) -> bool:
+    """Return whether a value is, or contains, an array with one row per point.
 
-    Lists count if they hold numbers, and what is nested counts: neither is left behind unseen.
+    Lists of numbers and nested containers count, so that no per-point value is overlooked.
     """
     if isinstance(value, Tensor | np.ndarray):
         return value.ndim > 0 and len(value) == num_points
-    if num_points <= _FEW:
+    if num_points <= _MAX_AMBIGUOUS_POINTS:
         return False
     if isinstance(value, Mapping):
-        return any(_is_as_long(inner, num_points) for inner in value.values())
+        return any(_has_length(inner, num_points) for inner in value.values())
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return len(value) == num_points and isinstance(value[0], int | float | Iterable)
     return False
 
 
-def _take(values: Tensor | Array, rows: Tensor) -> Tensor | Array:
-    """Return rows of a tensor or an array, in its own kind and dtype."""
+def _select(values: Tensor | Array, rows: Tensor) -> Tensor | Array:
+    """Return rows of a tensor or an array, with its type and dtype."""
     return values[rows.to(values.device) if isinstance(values, Tensor) else rows.numpy(force=True)]
 
 
-def _alike(values: Tensor, like: object) -> Tensor | Array:
-    """Return whole numbers in the kind, dtype and device of others."""
+def _convert_like(values: Tensor, like: object) -> Tensor | Array:
+    """Convert integers to the type, dtype and device of ``like``."""
     if isinstance(like, Tensor):
         return values.to(like)
     return values.numpy(force=True).astype(like.dtype) if isinstance(like, np.ndarray) else values

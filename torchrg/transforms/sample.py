@@ -1,8 +1,8 @@
-"""Samples: a dict of tensors or NumPy arrays, or a PyG ``Data`` or ``Batch``, never imported here.
+"""Base classes and basic transforms of samples.
 
-A sample holds one cloud, or a ragged batch: ``offset`` ``(B,)``, the row each cloud ends before
-(Pointcept), or ``batch`` ``(N,)``, the cloud of each point in ascending order (PyG). Transforms
-treat each cloud by itself.
+A sample is a dict of arrays, or a PyG ``Data`` or ``Batch``, with one cloud or a ragged batch:
+``offset`` ``(B,)``, the row after each cloud (Pointcept), or ``batch`` ``(N,)``, the ascending
+cloud index of each point (PyG). Transforms treat each cloud separately. PyG is never imported here.
 """
 
 import copy
@@ -19,50 +19,50 @@ from torchrg.errors import ConfigError
 from torchrg.neighbors import sample_voxels, search_knn
 from torchrg.structures import UNLABELED, Neighbors
 from torchrg.transforms.rows import (
-    LISTED,
-    OUR_KEYS,
+    LIST_KEY,
+    TORCHRG_KEYS,
     Entries,
     Sample,
     SampleDict,
-    check_in_step,
+    check_lengths,
     check_sample,
-    entries_of,
-    follow_points,
-    recognized_keys,
-    rows_of_clouds,
+    cloud_rows,
+    extend_list,
+    get_entries,
+    per_point_keys,
+    remap_rows,
     select_points,
-    with_listed,
 )
 
 KEYS = (
     "coord", "normal", "curvature", "residual", "plane", "inverse", "origin", "color", "superpoint",
     "viewpoint", "front", "neighbors",
 )  # fmt: skip
-"""Names of the entries of a sample (Pointcept's, and ours)."""
+"""Default names of sample entries (Pointcept's, and torchrg's)."""
 PYG_KEYS = {"coord": "pos", "inverse": "inverse_index"}
-"""Names that a PyG ``Data`` has instead of ours, unless others are given. Of entries with ``index``
-in their name PyG counts on when it batches, as it does ``edge_index``: ``inverse_index`` names rows
-of the batch, and planes and superpoints of several clouds stay apart with ``keys={"plane":
-"plane_index", "superpoint": "superpoint_index"}``."""
-_MADE_BY_BATCHING = ("batch", "ptr", "num_nodes")
-"""Entries that PyG makes when it joins clouds."""
-_NEVER_A_ROW = torch.iinfo(torch.int64).min
-"""Stands for none in entries that PyG counts on, where -1 would not: it is still negative when PyG
-has added the rows of the clouds before."""
+"""Default names in a PyG ``Data``, if they differ. When batching, PyG adds offsets to entries with
+``index`` in their name, like ``edge_index``: ``inverse_index`` then holds rows of the batch. Use
+``keys={"plane": "plane_index", "superpoint": "superpoint_index"}`` to keep planes and superpoints
+of different clouds apart."""
+_BATCH_KEYS = ("batch", "ptr", "num_nodes")
+"""Entries that PyG creates when it batches clouds."""
+_MISSING_ROW = torch.iinfo(torch.int64).min
+"""Missing index in entries to which PyG adds offsets. Unlike -1, it remains negative after PyG has
+added the row counts of earlier clouds."""
 
 
 class SampleTransform(nn.Module):
-    """Base of the transforms: reads and writes samples of every kind, never changes one.
+    """Base class of transforms, which return a new sample of the input's type.
 
-    Results are NumPy arrays where the coordinates are. New entries join the list of those that have
-    a row for each point, Pointcept's ``index_valid_keys``, where there is one. A PyG ``Batch``
-    leaves as one that can be taken apart again.
+    Results are NumPy arrays if the coordinates are. New entries are appended to the list of
+    per-point entries, Pointcept's ``index_valid_keys``, if present. A PyG ``Batch`` is returned as
+    a ``Batch`` that can be split again.
 
     Args:
         keys: Other names for some of :data:`KEYS`, as in ``{"coord": "pos"}``.
 
     Raises:
-        ConfigError: On a call, if an entry that must have a row for each point has not.
+        ConfigError: On a call, if a per-point entry has a wrong number of rows.
     """
 
     names: Sequence[str] = KEYS
@@ -79,32 +79,32 @@ class SampleTransform(nn.Module):
             )
 
     def extra_repr(self) -> str:
-        """Return the settings."""
+        """Return the configuration."""
         return "" if self.config is None else repr(self.config)
 
     @of_clouds
     def forward(self, sample: Sample) -> Sample:
-        """Return a new sample; the given one is not changed."""
+        """Return a new sample; the input is not changed."""
         check_sample(type(self).__name__, sample, "{'coord': points}")
-        if is_separable(sample):
-            return with_each(sample, self.forward)
+        if can_split(sample):
+            return map_clouds(sample, self.forward)
         num_points = len(self.read(sample, "coord"))
-        check_in_step(type(self).__name__, entries_of(sample), num_points)
+        check_lengths(type(self).__name__, get_entries(sample), num_points)
         return self.transform(sample)
 
     def transform(self, sample: Sample) -> Sample:
-        """Return a new sample, of one whose entries are in step."""
+        """Return a new sample from one whose per-point entries have been checked."""
         raise NotImplementedError
 
     def key(self, sample: Sample, name: str) -> str:
-        """Return what an entry is called in a sample."""
-        usual = name if isinstance(sample, Mapping) else PYG_KEYS.get(name, name)
-        return self.renamed.get(name, usual)
+        """Return the key of an entry in a sample."""
+        default = name if isinstance(sample, Mapping) else PYG_KEYS.get(name, name)
+        return self.renamed.get(name, default)
 
     def read(self, sample: Sample, name: str) -> Tensor:
-        """Return an entry of a sample as a tensor, or say what is wrong with it."""
+        """Return an entry of a sample as a tensor, or raise ConfigError."""
         key, caller = self.key(sample, name), type(self).__name__
-        entries = entries_of(sample)
+        entries = get_entries(sample)
         if key not in entries:
             raise ConfigError(
                 f"{caller}: expected a sample with {key!r}, got {', '.join(map(str, entries))}; "
@@ -115,25 +115,25 @@ class SampleTransform(nn.Module):
             check_shapes(caller, **{key: (tensor, "N 3")})
         if "index" in key and not isinstance(sample, Mapping):
             tensor = tensor.clamp(min=UNLABELED)
-        # Pointcept keeps one number a point with two axes.
-        return tensor.squeeze(-1) if name in OUR_KEYS and tensor.ndim == 2 else tensor
+        # Pointcept stores scalars per point with two axes.
+        return tensor.squeeze(-1) if name in TORCHRG_KEYS and tensor.ndim == 2 else tensor
 
-    def changed(
+    def replace(
         self,
         sample: Sample,
         values: Entries,
         *,
         per_point: Sequence[str] = (),
     ) -> Sample:
-        """Return a new sample of the same kind with other values by key.
+        """Return a new sample of the same type with other values by key.
 
-        Those in ``per_point`` have a row for each point.
+        The keys in ``per_point`` are added to the list of per-point entries.
         """
         if not isinstance(sample, Mapping):
             other = copy.copy(sample)
             for key, value in values.items():
-                is_counted_on = "index" in key and isinstance(value, Tensor)
-                other[key] = value.where(value >= 0, _NEVER_A_ROW) if is_counted_on else value
+                is_offset = "index" in key and isinstance(value, Tensor)
+                other[key] = value.where(value >= 0, _MISSING_ROW) if is_offset else value
             return other
         is_numpy = isinstance(sample.get(self.key(sample, "coord")), np.ndarray)
         new = {
@@ -142,40 +142,40 @@ class SampleTransform(nn.Module):
         }
         changed = {**sample, **new}
         coord = self.key(sample, "coord")
-        if LISTED in sample:
-            num_points, whole = len(changed[coord]), self._whole_keys(sample)
-            others = recognized_keys(changed, num_points, whole=whole)
-            changed |= with_listed(changed, [*OUR_KEYS, *per_point, *others])
+        if LIST_KEY in sample:
+            num_points, skip = len(changed[coord]), self._skipped_keys(sample)
+            further = per_point_keys(changed, num_points, skip=skip)
+            changed |= extend_list(changed, [*TORCHRG_KEYS, *per_point, *further])
         return changed
 
-    def selected(self, sample: Sample, rows: Tensor, num_points: int) -> SampleDict:
-        """Return the entries that change when only some rows are kept, given ascending."""
-        whole = self._whole_keys(sample)
-        return select_points(type(self).__name__, sample, rows, num_points, whole=whole)
+    def select_rows(self, sample: Sample, rows: Tensor, num_points: int) -> SampleDict:
+        """Return the entries that change when only ``rows`` (ascending) are kept."""
+        skip = self._skipped_keys(sample)
+        return select_points(type(self).__name__, sample, rows, num_points, skip=skip)
 
-    def moved_inverse(self, sample: Sample, place: Tensor) -> dict[str, Tensor]:
-        """Return the ``inverse`` of a sample after rows moved to ``place``, if it has one."""
+    def update_inverse(self, sample: Sample, new_rows: Tensor) -> dict[str, Tensor]:
+        """Return ``inverse`` updated for rows moved to ``new_rows``, if the sample has one."""
         key = self.key(sample, "inverse")
-        if entries_of(sample).get(key) is None:
+        if get_entries(sample).get(key) is None:
             return {}
         inverse = self.read(sample, "inverse")
-        return {key: follow_points(type(self).__name__, inverse, place)}
+        return {key: remap_rows(type(self).__name__, inverse, new_rows)}
 
-    def _whole_keys(self, sample: Sample) -> list[str]:
-        """Return what the entries are called that have no row for each point."""
+    def _skipped_keys(self, sample: Sample) -> list[str]:
+        """Return the keys of entries that are never per point."""
         return [self.key(sample, name) for name in ("inverse", "origin")]
 
 
 class NeighborSearch:
-    """Searches the neighbours of clouds, and remembers them for the transforms that follow.
+    """Neighbor search with a cache for subsequent transforms.
 
-    A sample carries it where a transform was asked to by ``keep_neighbors``. It holds the points
-    that were searched: where some were moved, taken out or put in since, neighbours are searched
-    again. The next transform may use fewer neighbours, not more. No collate function joins it:
-    :func:`torchrg.datasets.collate_offset` leaves it out, torch's refuses it.
+    A sample contains it after a transform with ``keep_neighbors``. The searched points are stored:
+    if points were moved, removed or added since, neighbors are searched again. The next transform
+    may use fewer neighbors, not more. It cannot be collated:
+    :func:`torchrg.datasets.collate_offset` drops it, torch's collate function raises.
 
     Args:
-        known: Distinct finite points of clouds in canonical order, and their neighbours.
+        known: Distinct finite points of clouds in canonical order, and their neighbors.
     """
 
     def __init__(self, known: Sequence[tuple[Tensor, Neighbors]] = ()) -> None:
@@ -183,7 +183,7 @@ class NeighborSearch:
         self.used: list[tuple[Tensor, Neighbors]] = []
 
     def __call__(self, points: Tensor, k: int) -> Neighbors:
-        """Return the ``k`` nearest neighbours of distinct points in canonical order."""
+        """Return the ``k`` nearest neighbors of distinct points in canonical order."""
         k = min(k, len(points))
         neighbors = self.recall(points, k)
         if neighbors is None:
@@ -193,30 +193,30 @@ class NeighborSearch:
         return Neighbors(neighbors.indices[:, : max(k, 1)])
 
     def recall(self, points: Tensor, k: int = 1) -> Neighbors | None:
-        """Return what is known of distinct points in canonical order; None of fewer than ``k``."""
-        for others, neighbors in self.known:
-            is_same = others.dtype == points.dtype and others.device == points.device
-            if is_same and neighbors.indices.shape[1] >= k and torch.equal(others, points):
+        """Return cached neighbors of distinct points in canonical order; None if fewer than k."""
+        for cached, neighbors in self.known:
+            is_same = cached.dtype == points.dtype and cached.device == points.device
+            if is_same and neighbors.indices.shape[1] >= k and torch.equal(cached, points):
                 self.remember(points, neighbors)
                 return neighbors
         return None
 
     def remember(self, points: Tensor, neighbors: Neighbors) -> None:
-        """Keep the neighbours of distinct points in canonical order."""
+        """Cache the neighbors of distinct points in canonical order."""
         self.used.append((points.detach(), neighbors))
 
 
 class CloudTransform(SampleTransform):
-    """Base of the transforms that add a row for each point, cloud by cloud.
+    """Base class of transforms that add per-point entries, cloud by cloud.
 
     Args:
-        keep_neighbors: Whether the sample carries the neighbours on, as ``neighbors``, so that the
-            next transform need not search them; see :class:`NeighborSearch`. They take 4 bytes for
-            each neighbour of a point.
+        keep_neighbors: Whether to store the neighbors in the sample as ``neighbors``, so that the
+            next transform can reuse them; see :class:`NeighborSearch`. They take 4 bytes per point
+            and neighbor.
     """
 
     reads: tuple[str, ...] = ("coord",)
-    reads_if_there: tuple[str, ...] = ()
+    optional_reads: tuple[str, ...] = ()
 
     def __init__(
         self, *, keep_neighbors: bool = False, keys: Mapping[str, str] | None = None
@@ -225,25 +225,25 @@ class CloudTransform(SampleTransform):
         self.keep_neighbors = keep_neighbors
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
-        """Return new entries of one cloud, from those that are read."""
+        """Return the new entries of one cloud from the entries that are read."""
         raise NotImplementedError
 
     def transform(self, sample: Sample) -> Sample:
         """Return a new sample with the new entries."""
-        entries = entries_of(sample)
-        there = [name for name in self.reads_if_there if self.key(sample, name) in entries]
-        values = {name: self.read(sample, name) for name in (*self.reads, *there)}
+        entries = get_entries(sample)
+        present = [name for name in self.optional_reads if self.key(sample, name) in entries]
+        values = {name: self.read(sample, name) for name in (*self.reads, *present)}
         key = self.key(sample, "neighbors")
         carried = entries.get(key)
         search = NeighborSearch(carried.known if isinstance(carried, NeighborSearch) else ())
         parts = [
             self.add({name: value[rows] for name, value in values.items()}, search)
-            for rows in rows_of_clouds(sample, len(values["coord"]))
+            for rows in cloud_rows(sample, len(values["coord"]))
         ]
         added = {
             self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
         }
-        changed = self.changed(sample, added, per_point=list(added))
+        changed = self.replace(sample, added, per_point=list(added))
         if self.keep_neighbors:
             changed[key] = NeighborSearch(search.used or search.known)
         elif isinstance(carried, NeighborSearch):
@@ -252,11 +252,11 @@ class CloudTransform(SampleTransform):
 
 
 class CenterCloud(SampleTransform):
-    """Move each cloud so that the middle of its bounding box is the origin.
+    """Shift each cloud so that the center of its bounding box is the origin.
 
-    Reads ``coord`` ``(N, 3)``; changes it, and adds ``origin`` ``(B, 3)``, float64, where the
-    origin of the new coordinates is in the old ones (an ``origin`` that is there is added up), so
-    that ``coord + origin`` is what it was. Points that are not finite do not count.
+    Reads ``coord`` ``(N, 3)``; changes it, and adds ``origin`` ``(B, 3)``, float64, the new origin
+    in the old coordinates, so that ``coord + origin`` restores them. An existing ``origin`` is
+    added to it. Non-finite points are ignored.
 
     Example:
         >>> corner = torch.tensor([[5.0, 5.0, 5.0], [7.0, 5.0, 5.0]])
@@ -266,25 +266,24 @@ class CenterCloud(SampleTransform):
     """
 
     def transform(self, sample: Sample) -> Sample:
-        """Return a new sample with moved coordinates."""
+        """Return a new sample with shifted coordinates."""
         coord = self.read(sample, "coord")
-        clouds = [coord[rows] for rows in rows_of_clouds(sample, len(coord))]
-        middles = torch.stack([_middle(cloud) for cloud in clouds])
-        moved = [
-            (cloud.double() - middle).to(cloud.dtype)
-            for cloud, middle in zip(clouds, middles, strict=True)
+        clouds = [coord[rows] for rows in cloud_rows(sample, len(coord))]
+        centers = torch.stack([_center(cloud) for cloud in clouds])
+        shifted = [
+            (cloud.double() - center).to(cloud.dtype)
+            for cloud, center in zip(clouds, centers, strict=True)
         ]
         key = self.key(sample, "origin")
         if key in sample:
-            middles = middles + self.read(sample, "origin").reshape(-1, 3)
-        return self.changed(sample, {self.key(sample, "coord"): torch.cat(moved), key: middles})
+            centers = centers + self.read(sample, "origin").reshape(-1, 3)
+        return self.replace(sample, {self.key(sample, "coord"): torch.cat(shifted), key: centers})
 
 
 class KeepFinite(SampleTransform):
-    """Leave out points whose coordinates are not finite, from every entry with a row a point.
+    """Remove points with non-finite coordinates from every per-point entry.
 
-    Changes ``inverse``, if it is there, so that it still names the same points, -1 for those left
-    out.
+    An existing ``inverse`` is updated to index the same points; removed points become -1.
 
     Example:
         >>> sample = {"coord": torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0]]), "name": "a"}
@@ -297,13 +296,13 @@ class KeepFinite(SampleTransform):
         coord = self.read(sample, "coord")
         is_finite = coord.isfinite().all(dim=-1)
         rows = is_finite.nonzero().squeeze(-1)
-        place = torch.where(is_finite, is_finite.cumsum(dim=0) - 1, UNLABELED)
-        selected = self.selected(sample, rows, len(coord))
-        return self.changed(sample, selected | self.moved_inverse(sample, place))
+        new_rows = torch.where(is_finite, is_finite.cumsum(dim=0) - 1, UNLABELED)
+        selected = self.select_rows(sample, rows, len(coord))
+        return self.replace(sample, selected | self.update_inverse(sample, new_rows))
 
 
-def _middle(cloud: Tensor) -> Tensor:
-    """Return the middle of the box around the finite points, float64; zero if there is none."""
+def _center(cloud: Tensor) -> Tensor:
+    """Return the center of the bounding box of finite points, float64; zero without points."""
     finite = cloud[cloud.isfinite().all(dim=-1)].double()
     if len(finite) == 0:
         return torch.zeros(3, dtype=torch.float64, device=cloud.device)
@@ -312,16 +311,16 @@ def _middle(cloud: Tensor) -> Tensor:
 
 
 class SampleVoxels(SampleTransform):
-    """Keep one point of each voxel, and remember the voxel of every point.
+    """Keep one point per voxel, and store the voxel of every point.
 
-    Reads ``coord`` ``(N, 3)``; reduces every entry with a row for each point to ``(V, ...)``, and
-    adds ``inverse`` ``(N,)``, int64, negative for none: ``restore_points`` takes labels of the
-    voxels back to all points. It names rows of the whole sample, in a batch too; in a PyG ``Data``
-    it is ``inverse_index``, which PyG keeps so when it batches. Where ``inverse`` is there already,
-    it goes on from its points. No voxel crosses the clouds of a batch. See ``sample_voxels``.
+    Reads ``coord`` ``(N, 3)``; reduces every per-point entry to ``(V, ...)``, and adds ``inverse``
+    ``(N,)``, int64, negative for none: ``restore_points`` copies voxel labels to all points. It
+    contains rows of the complete sample, also in a batch; in a PyG ``Data`` it is
+    ``inverse_index``, which PyG offsets when batching. An existing ``inverse`` is composed with
+    it. Voxels never contain points of several clouds of a batch. See ``sample_voxels``.
 
     Args:
-        size: Side of a voxel, in the unit of the cloud.
+        size: Side length of a voxel, in coordinate units.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [0.04, 0, 0], [0.11, 0, 0]])
@@ -340,25 +339,27 @@ class SampleVoxels(SampleTransform):
         """Return a new sample of voxels."""
         coord = self.read(sample, "coord")
         rows, inverse, num_voxels = [], [], 0
-        for cloud in rows_of_clouds(sample, len(coord)):
+        for cloud in cloud_rows(sample, len(coord)):
             voxels = sample_voxels(coord[cloud], self.size)
             rows.append(voxels.rows + cloud.start)
             inverse.append(torch.where(voxels.inverse >= 0, voxels.inverse + num_voxels, UNLABELED))
             num_voxels += len(voxels.rows)
-        voxel_of = torch.cat(inverse)
-        selected = self.selected(sample, torch.cat(rows), len(coord))
-        found = {self.key(sample, "inverse"): voxel_of} | self.moved_inverse(sample, voxel_of)
-        return self.changed(sample, selected | found)
+        voxel_index = torch.cat(inverse)
+        selected = self.select_rows(sample, torch.cat(rows), len(coord))
+        added = {self.key(sample, "inverse"): voxel_index} | self.update_inverse(
+            sample, voxel_index
+        )
+        return self.replace(sample, selected | added)
 
     def extra_repr(self) -> str:
-        """Return the settings."""
+        """Return the configuration."""
         return f"size={self.size}"
 
 
-def is_separable(sample: Sample) -> bool:
-    """Return whether a sample is a PyG ``Batch`` that can be taken apart into its clouds.
+def can_split(sample: Sample) -> bool:
+    """Return whether a sample is a PyG ``Batch`` that can be split into its clouds.
 
-    One whose points were taken out by hand cannot; it counts as one sample with ``batch``.
+    A batch from which points were removed cannot; it is treated as one sample with ``batch``.
     """
     slices = getattr(sample, "_slice_dict", None)
     if not slices or not callable(getattr(sample, "to_data_list", None)):
@@ -366,30 +367,30 @@ def is_separable(sample: Sample) -> bool:
     return all(
         int(ends[-1]) == sample[key].shape[sample.__cat_dim__(key, sample[key]) or 0]
         for key, ends in slices.items()
-        # Matrices stacked along a diagonal have two axes of ends, and no row for a point.
+        # Matrices stacked along a diagonal have two-axis slices, and are not per point.
         if key in sample and isinstance(sample[key], Tensor) and ends.ndim == 1
     )
 
 
-def with_each(batch: Sample, change: Callable[[Sample], Sample]) -> Sample:
-    """Return a batch of the changed clouds of a batch; the given one is not changed.
+def map_clouds(batch: Sample, change: Callable[[Sample], Sample]) -> Sample:
+    """Apply ``change`` to each cloud of a batch, and return a new batch.
 
-    What was added to the batch after it was made stays: rows of points with their clouds, the rest
-    as it is. ``follow_batch`` is kept.
+    Entries added after batching are kept: per-point rows with their clouds, other entries
+    unchanged. ``follow_batch`` is kept.
     """
-    clouds, whole = batch.to_data_list(), {}
+    clouds, unsplit = batch.to_data_list(), {}
     followed = [key for key in batch._slice_dict if f"{key}_ptr" in batch]  # noqa: SLF001
-    made = {*_MADE_BY_BATCHING, *(f"{key}_{end}" for key in followed for end in ("batch", "ptr"))}
-    for key in set(batch.keys()) - set(batch._slice_dict) - made:  # noqa: SLF001
+    created = {*_BATCH_KEYS, *(f"{key}_{end}" for key in followed for end in ("batch", "ptr"))}
+    for key in set(batch.keys()) - set(batch._slice_dict) - created:  # noqa: SLF001
         value = batch[key]
         if isinstance(value, Tensor) and value.ndim and len(value) == batch.num_nodes:
             counts = torch.bincount(batch.batch, minlength=batch.num_graphs).tolist()
             for cloud, rows in zip(clouds, torch.split(value, counts), strict=True):
                 cloud[key] = rows
         else:
-            whole[key] = value
+            unsplit[key] = value
     join = importlib.import_module("torch_geometric.data").Batch.from_data_list
     changed = join([change(cloud) for cloud in clouds], follow_batch=followed)
-    for key, value in whole.items():
+    for key, value in unsplit.items():
         changed[key] = value
     return changed
