@@ -117,7 +117,7 @@ def test_fields_become_what_is_written(line, changes):
         ("a --out", "expected a value for --out. See"),
         ("a --out b --part.size wide", "expected a number for --part.size, got 'wide'. See"),
         ("a --out b --place 1 2", "expected 3 values for --place, got 2. See"),
-        ("a --out b --part.counts 1 x", "expected a whole number for --part.counts, got 'x'. See"),
+        ("a --out b --part.counts 1 x", "expected an integer for --part.counts, got 'x'. See"),
         ("a --out b --kind none", "expected --kind to be one of one, other, got 'none'. See"),
         ("a --out b --part.is-on=yes", "expected no value for --part.is-on. See"),
         ("a b --out b", "unrecognized argument b. See"),

@@ -1,4 +1,4 @@
-"""``torchrg align``: scans set upright, with their walls along x and y."""
+"""``torchrg align``: make scans upright, with walls along x and y."""
 
 import dataclasses
 import time
@@ -26,10 +26,10 @@ from torchrg.structures import Segmentation
 
 @dataclass(frozen=True)
 class Arguments:
-    """Set scans upright, with walls along x and y, the lowest floor at z = 0, the middle at 0, 0.
+    """Make scans upright, with walls along x and y.
 
-    The planes of the scan say where floors and walls are; settings are those of torchrg segment.
-    The axis of --up points up to within 30 degrees.
+    The lowest floor is moved to z = 0 and the center to x = y = 0. Floors and walls are detected
+    with the settings of torchrg segment. The axis --up may be off by up to 30 degrees.
 
     Examples:
         torchrg align scan.ply --out upright.ply
@@ -40,10 +40,10 @@ class Arguments:
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     matrix: Path | None = None
-    """File for the motion of the scan, of one input: .npy holds it as 4 x 4 numbers, .txt as the
-    line axisAlignment of ScanNet."""
+    """File for the rigid transform of a single input: .npy (4 x 4 array) or .txt (axisAlignment
+    line of ScanNet)."""
     segment: bool = False
-    """Write labels, normals, curvature and the table of planes too, as torchrg segment does."""
+    """Also write labels, normals, curvature and the plane table, as torchrg segment does."""
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
     settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
@@ -63,7 +63,7 @@ def run(argv: list[str]) -> int:
 
 
 def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None:
-    """Refuse a file for the motion that cannot be written, or stands for several."""
+    """Raise if the transform cannot be written, or there are several inputs."""
     if len(arguments.inputs) > 1:
         raise ConfigError(
             f"expected one input with --matrix, got {len(arguments.inputs)}; align them one by one."
@@ -90,7 +90,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
             motion = align_axes(seg, up=settings.planes.up or "z")
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
-    # The motion of the coordinates in the file; points are about their origin.
+    # The transform in file coordinates; points are relative to the cloud's origin.
     whole = motion.clone()
     whole[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
     moved = move_cloud(cloud, whole)
@@ -109,7 +109,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
 
 
 def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Segmentation:
-    """Return a segmentation after a rigid motion, about the origin of the moved cloud."""
+    """Transform a segmentation rigidly, relative to the origin of the moved cloud."""
     about = motion.clone()
     about[:3, 3] -= torch.from_numpy(origin)
     normals = (seg.normals.double() @ motion[:3, :3].T).to(seg.normals.dtype)
@@ -117,7 +117,7 @@ def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Seg
 
 
 def _write_matrix(path: Path, matrix: NDArray[np.float64]) -> None:
-    """Write a motion as an array, or as the line that ScanNet has in the text of a scan."""
+    """Write a transform as an array, or as the axisAlignment line of ScanNet."""
     with atomic_path(path) as beside:
         if path.suffix.lower() == ".npy":
             np.save(beside, matrix)

@@ -1,4 +1,4 @@
-"""``torchrg info``: what a file holds."""
+"""``torchrg info``: summary of a point cloud file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +17,19 @@ from torchrg.neighbors import distinct_points, measure_sampling, search_knn
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
-"""Digits of a coordinate that are shown, by its bytes. float32 holds no more than six, and ten are
-millimetres at a thousand kilometres."""
+"""Significant digits printed for a coordinate, by its size in bytes. float32 has at most six; ten
+resolve a millimeter at a thousand kilometers."""
 
 
 _NUM_NEIGHBORS = 50
-"""Neighbours that the surfaces are measured by, as by the default."""
+"""Number of neighbors for measuring the surfaces, as in the default preset."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Say what a file holds: points, extent, spacing, duplicates, fields; and what kernels run.
+    """Print a summary of a point cloud file and the compiled kernels.
+
+    Points, extent, spacing, duplicates and fields.
 
     Examples:
         torchrg info scan.ply
@@ -35,12 +37,12 @@ class Arguments:
     """
 
     file: Annotated[Path, Argument("FILE", is_positional=True)]
-    """Cloud to read."""
+    """Input point cloud."""
     columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
-    """Parse the arguments and print what the file holds."""
+    """Parse the arguments and print the summary."""
     arguments = parse(Arguments, argv, prog="torchrg info")
     check_columns(arguments.columns, [arguments.file])
     cloud = read_cloud(arguments.file, columns=columns_of(arguments.file, arguments.columns))
@@ -48,12 +50,12 @@ def run(argv: list[str]) -> int:
         say(f"{name:<12}{value}")
     for note in filter(None, (*cloud.notes, cloud.precision_note)):
         say(f"{'note':<12}{note}")
-    say(f"{'kernels':<12}{kernels.name_of_library() or 'none: torchrg runs without, slower'}")
+    say(f"{'kernels':<12}{kernels.name_of_library() or 'none (several times slower)'}")
     return 0
 
 
 def describe_cloud(cloud: Cloud) -> dict[str, str]:
-    """Return the facts about a cloud, by name."""
+    """Return the properties of a cloud by name."""
     facts = {"points": f"{len(cloud):,} of {cloud.coordinates.dtype}"}
     if cloud.grid_shape:
         facts["grid"] = f"{cloud.grid_shape[0]} rows x {cloud.grid_shape[1]} columns"

@@ -31,12 +31,12 @@ from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import find_directions
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
-"""Fields of each point that are written."""
+"""Per-point output fields."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Estimate normals and curvature of scans, and tell sharp feature points.
+    """Estimate normals, curvature and sharp points of scans.
 
     Examples:
         torchrg normals scan.pcd --out normals.ply
@@ -49,14 +49,13 @@ class Arguments:
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     method: NormalMethod | None = None
-    """Estimator of the normals, a short form of --normals.method."""
+    """Normal estimator; short form of --normals.method."""
     orient: flags.OrientFlag = "auto"
     viewpoint: flags.ViewpointFlag = None
     normals: NormalsConfig = dataclasses.field(default_factory=lambda: load_config().normals)
-    """How normals and curvature are estimated."""
+    """Normals and curvature."""
     chunk_size: int = PipelineConfig.chunk_size
-    """Number of points that are handled at a time. It bounds the memory and never changes a
-    result."""
+    """Points processed at a time; bounds memory use."""
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
 
@@ -84,7 +83,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     check_finite(cloud)
     if cloud.precision_note:
         warn(f"{source}: {cloud.precision_note}.")
-    # Before the work.
+    # Fail before the computation.
     find_directions("normals", cloud, arguments.orient, viewpoint=arguments.viewpoint)
     check_output(target, cloud)
     with stage_bar(source.name, ("normals", "orientation")) as advance:
