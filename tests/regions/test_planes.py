@@ -313,9 +313,9 @@ def test_a_table_is_gone_through_plane_by_plane():
             assert torch.equal(torch.as_tensor(one, dtype=column.dtype), column)
     assert planes[-1].id == len(planes) - 1
     assert planes[torch.tensor(2)].id == 2
-    with pytest.raises(IndexError, match=f"expected one of {len(planes)} planes, got 99"):
+    with pytest.raises(IndexError, match=f"expected a row below {len(planes)}, got 99"):
         planes[99]
-    with pytest.raises(TypeError, match="got slice; columns take slices and masks"):
+    with pytest.raises(TypeError, match="got slice; index columns with slices and masks"):
         planes[:3]
 
 
