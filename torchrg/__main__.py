@@ -1,10 +1,11 @@
-"""The process of a command: ``torchrg`` and ``python -m torchrg``."""
+"""Process of a command: ``torchrg`` and ``python -m torchrg``."""
 
 import os
 import sys
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):
-    # Python has put the folder of the command first; what lies there is data, but for this package.
+    # Python puts the working directory first; modules there must not be imported, except torchrg
+    # itself.
     sys.path[:1] = sys.path[:1] if __file__ == f"{sys.path[0]}/torchrg/__main__.py" else []
 
 try:
@@ -19,14 +20,14 @@ except KeyboardInterrupt:
 
 
 def main() -> int:
-    """Run the command that the arguments of the process name, and return its exit code.
+    """Run the command of the process arguments and return its exit code.
 
-    Ctrl-C and SIGTERM end it with one line at any moment. While modules load nothing is being
-    written, and libraries lose or show exceptions, so the process ends on the spot. When all is
-    done they come too late: what is left is Python's own end.
+    Ctrl-C and SIGTERM end the process with one line. While modules load, nothing is being written
+    and libraries may swallow exceptions, so the process exits immediately. After the command,
+    interrupts are ignored.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
-        # One that is closed would be the next file that is opened, with all that is printed in it.
+        # Otherwise the next opened file would take the descriptor and receive all output.
         if getattr(sys, name) is None:
             place = os.open(os.devnull, os.O_RDWR)
             os.dup2(place, number)
