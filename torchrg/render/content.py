@@ -1,4 +1,4 @@
-"""What a page says about a cloud: its axes, the points it shows, its planes, what closes it."""
+"""Content of a viewer: axes, displayed points, planes and outer sides."""
 
 from dataclasses import replace
 from importlib.util import find_spec
@@ -23,29 +23,29 @@ from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
 NUM_STRATA = 8
-"""Random parts of the points, each along a Morton curve. While the page moves on a slow machine it
-draws the first ones; along a curve, positions compress to two thirds."""
+"""Number of random strata of the points, each sorted along a Morton curve. While the camera moves,
+slow machines draw only the first strata; sorting compresses positions to two thirds."""
 PAGE_EXTENT = 10.0
-"""The longest side of a cloud on a page: pages do not depend on the unit."""
+"""Longest side of a cloud in a viewer; independent of the unit."""
 _OUTLINE_POINTS = 200_000
-"""Points through which outlines are traced: enough for a picture."""
+"""Number of points from which polygons are traced; enough for display."""
 _NOT_SHOWN = ("id", "centroid", "axes", "center", "outline")
-"""Columns of the plane table that a page draws or does not need."""
+"""Columns of the plane table that a viewer draws or omits."""
 _USUAL_RADIUS = 128
-"""Byte of a point with the usual radius, in the middle of what a byte holds."""
+"""Encoded median radius, in the middle of the byte range."""
 _STEPS_OF_OCTAVE = 16
-"""Steps of the byte in which the radius of a point doubles: one step is 4 percent."""
+"""Steps of the encoded radius per factor of two: one step is 4 percent."""
 _LARGEST_SPACING = 3.0
-"""Largest ratio of a point's radius to the usual one, and of the usual one to it."""
+"""Maximum ratio of a point's radius to the median, in either direction."""
 
 
 class Frame(NamedTuple):
-    """Where a page's axes are: z up, the middle of the first cloud in the origin.
+    """Axes of a viewer: z up, the center of the first cloud at the origin.
 
     Attributes:
-        origin: In the coordinates of the files, shape ``(3,)``, float64.
-        rotation: Rows are the axes of the page, shape ``(3, 3)``, float64.
-        scale: Length of a unit of the page, in the unit of the cloud.
+        origin: Origin in file coordinates, shape ``(3,)``, float64.
+        rotation: Axes of the viewer as rows, shape ``(3, 3)``, float64.
+        scale: Length of a viewer unit, in units of the cloud.
     """
 
     origin: Tensor
@@ -53,22 +53,21 @@ class Frame(NamedTuple):
     scale: float
 
     def place(self, points: Tensor, origin: NDArray[np.float64]) -> Tensor:
-        """Return points about an origin in the axes of the page, float32."""
+        """Transform points relative to an origin to viewer axes, float32."""
         moved = points.double() + (torch.from_numpy(origin) - self.origin)
         return (moved @ self.rotation.T / self.scale).float()
 
 
 class Shown(NamedTuple):
-    """The points of a cloud that a page shows.
+    """Points of a cloud displayed in a viewer.
 
     Attributes:
-        rows: Those that are shown, by strata, shape ``(n,)``.
-        levels: Number of points in the first stratum, in the first two, and so on.
-        points: In the axes of the page, shape ``(n, 3)``, float32.
-        fields: Fields of those points; normals are in the axes of the page, and labels numbered
-            without gaps.
-        surface: The surface through those points, in the axes of the page.
-        sides: Its outer sides.
+        rows: Displayed rows, by strata, shape ``(n,)``.
+        levels: Cumulative number of points of the strata.
+        points: Points in viewer axes, shape ``(n, 3)``, float32.
+        fields: Fields of those points; normals are in viewer axes, labels are consecutive.
+        surface: Surface of those points, in viewer axes.
+        sides: Outer sides of the surface.
     """
 
     rows: Tensor
@@ -80,9 +79,9 @@ class Shown(NamedTuple):
 
 
 def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
-    """Return the axes of a page for its first cloud."""
+    """Return the axes of a viewer for its first cloud."""
     third = unit_direction("make_page", up)
-    # With z up, x stays x; else the axis least along the upward one, so that x is never up.
+    # With z up, x stays x; otherwise use the axis most perpendicular to the up direction.
     start = torch.zeros(3, dtype=torch.float64)
     start[int(third.abs().argmin())] = 1
     first = functional.normalize(start - (start @ third) * third, dim=0)
@@ -98,7 +97,7 @@ def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
 
 
 def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
-    """Choose the points to show: the same whatever their order, and in random strata."""
+    """Sample the points to display, in random strata, independent of their order."""
     cloud = result.cloud
     finite = finite_rows(cloud.points)
     mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
@@ -126,7 +125,7 @@ def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
 
 
 def radii_of(shown: Shown) -> Tensor:
-    """Return the radius of each point as a byte, 16 steps to an octave, 128 the usual one."""
+    """Return the encoded radius of each point: 16 steps per factor of two, 128 is the median."""
     surface, labels = shown.surface, shown.fields.get("labels")
     usual = float(surface.spacing.median()) if len(surface.spacing) else 0.0
     if usual == 0:
@@ -138,12 +137,11 @@ def radii_of(shown: Shown) -> Tensor:
 
 
 def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, object]]:
-    """Return what a page says about each plane, by the number that its points have there.
+    """Return the plane entries of a viewer, by viewer label.
 
-    It is the table of the result: the columns of :func:`torchrg.result.describe_planes` but for
-    those that are drawn, ``rings`` in the axes of the page, and which planes it ``meets``, at which
-    angle and along which length. Kinds go by the upward direction of the page where the result has
-    none.
+    Entries have the columns of :func:`torchrg.result.describe_planes` that are not drawn, ``rings``
+    in viewer axes, and ``meets``: adjacent planes with angle and boundary length. Planes without
+    classes are classified by the up axis of the viewer.
     """
     planes, origin, table = result.planes, result.cloud.origin, describe_shown(result, frame)
     if not planes:
@@ -169,7 +167,7 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
 
 
 def describe_shown(result: Result, frame: Frame) -> Json:
-    """Return the table of a result as a page has it, its ids the labels of the file."""
+    """Return the plane table of a viewer, with the labels of the file as IDs."""
     planes = result.planes
     if not planes:
         return {"planes": []}
@@ -183,7 +181,7 @@ def describe_shown(result: Result, frame: Frame) -> Json:
 
 
 def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:
-    """Trace the outlines of planes through a sample of their points; none without shapely."""
+    """Trace polygons of planes from a sample of their points; empty without shapely."""
     outlines: list[tuple[Tensor, ...]] = [() for _ in planes.count]
     if find_spec("shapely") is None:
         return outlines
@@ -198,13 +196,13 @@ def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, .
 
 
 def _rectangles(planes: Planes) -> Tensor:
-    """Return the corners of the rectangle around each plane, shape ``(M, 4, 3)``."""
+    """Return the corners of the bounding rectangle of each plane, shape ``(M, 4, 3)``."""
     half = (planes.axes * planes.extent[:, :, None] / 2).double()
     signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
     return planes.center.double()[:, None] + signs @ half
 
 
 def rounded(values: Tensor) -> object:
-    """Return numbers of a page as JSON needs them: a step is a hundred-thousandth of the cloud."""
+    """Round numbers for JSON, to a hundred-thousandth of the cloud."""
     numbers: object = np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
     return numbers
