@@ -12,11 +12,11 @@ try:
     import signal
 
     from torchrg import cli
-    from torchrg.cli.ending import end_at_once, on_interrupts
+    from torchrg.cli.ending import exit_interrupted, handle_interrupts
 except KeyboardInterrupt:
-    from torchrg.cli.ending import end_at_once
+    from torchrg.cli.ending import exit_interrupted
 
-    end_at_once()
+    exit_interrupted()
 
 
 def main() -> int:
@@ -29,17 +29,17 @@ def main() -> int:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         # Otherwise the next opened file would take the descriptor and receive all output.
         if getattr(sys, name) is None:
-            place = os.open(os.devnull, os.O_RDWR)
-            os.dup2(place, number)
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            os.dup2(descriptor, number)
             os.set_inheritable(number, True)
             setattr(sys, name, os.fdopen(number, "w" if number else "r"))
     try:
-        on_interrupts(end_at_once)
+        handle_interrupts(exit_interrupted)
         return cli.main()
     except KeyboardInterrupt:
-        end_at_once()
+        exit_interrupted()
     finally:
-        on_interrupts(signal.SIG_IGN)
+        handle_interrupts(signal.SIG_IGN)
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ def test_examples_are_understood(prog, capsys):
     for line in examples:
         assert line.startswith(f"{prog} ")
         arguments = shlex.split(line)[len(prog.split()) :]
-        parse(kind, flags.spell_counts(arguments), prog=prog)
+        parse(kind, flags.expand_counts(arguments), prog=prog)
 
 
 @pytest.mark.parametrize("prog", KINDS)
@@ -152,7 +152,7 @@ def test_short_help_fits_a_screen_and_names_the_rest(prog, capsys, monkeypatch):
     text, flags = help_of(prog, capsys, "--help"), list(list_flags(KINDS[prog]))
     assert len(text.splitlines()) <= 60
     shown = [flag for flag in flags if f"\n  {flag.spelling}" in text]
-    assert all(flag in shown for flag in flags if flag.is_needed)
+    assert all(flag in shown for flag in flags if flag.is_required)
     more = f"{prog} --help-all explains these and {len(flags) - len(shown)} more."
     assert (more in text) == (len(shown) < len(flags))
     assert text.rstrip().endswith(example_lines(KINDS[prog])[-1])

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrg.batch.records import describe_run
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.ending import say, warn, warnings_as_lines
-from torchrg.cli.loop import STAGES, check_apart, note_input, output_paths, run_each, stage_bar
+from torchrg.cli.ending import print_lines, print_warnings, warn
+from torchrg.cli.loop import STAGES, check_distinct, note_input, output_paths, run_each, stage_bar
 from torchrg.clouds import check_finite
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
@@ -56,7 +56,7 @@ def run(argv: list[str]) -> int:
     flags.use_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
-    check_apart(outputs, arguments.inputs)
+    check_distinct(outputs, arguments.inputs)
     if arguments.matrix is not None:
         _check_matrix(arguments, arguments.matrix, outputs)
     return run_each(_align_file, arguments, arguments.inputs, outputs)
@@ -70,14 +70,14 @@ def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None
         )
     if path.suffix.lower() not in (".npy", ".txt"):
         raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
-    check_apart([path], [*arguments.inputs, *outputs])
+    check_distinct([path], [*arguments.inputs, *outputs])
     check_place(path)
 
 
 def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Align one file."""
     begin = time.perf_counter()
-    cloud = read_cloud(source, columns=flags.columns_of(source, arguments.columns))
+    cloud = read_cloud(source, columns=flags.file_columns(source, arguments.columns))
     note_input(f"{source}", cloud, target, RESULT_FIELDS if arguments.segment else ())
     for note in check_finite(cloud):
         warn(f"{source}: {note}.")
@@ -86,7 +86,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     with stage_bar(source.name, STAGES) as advance:
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     try:
-        with warnings_as_lines():
+        with print_warnings():
             motion = align_axes(seg, up=settings.planes.up or "z")
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
@@ -102,7 +102,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     tilt = torch.rad2deg(whole[2, 2].clamp(-1, 1).acos())
     turn = torch.rad2deg(torch.atan2(whole[1, 0], whole[0, 0]))
     seconds = time.perf_counter() - begin
-    say(
+    print_lines(
         f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "
         f"{seconds:.1f} s -> {target}"
     )
@@ -118,9 +118,9 @@ def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Seg
 
 def _write_matrix(path: Path, matrix: NDArray[np.float64]) -> None:
     """Write a transform as an array, or as the axisAlignment line of ScanNet."""
-    with atomic_path(path) as beside:
+    with atomic_path(path) as temporary:
         if path.suffix.lower() == ".npy":
-            np.save(beside, matrix)
+            np.save(temporary, matrix)
         else:
             numbers = " ".join(f"{value:.9f}" for value in matrix.reshape(-1))
-            beside.write_text(f"axisAlignment = {numbers}\n", encoding="utf-8")
+            temporary.write_text(f"axisAlignment = {numbers}\n", encoding="utf-8")

@@ -28,7 +28,7 @@ from torchrg.errors import ConfigError
 
 Command = TypeVar("Command")
 
-OFTEN = (
+COMMON = (
     *("--normals.method", "--normals.k"),
     *("--growing.max-angle-deg", "--growing.min-size", "--growing.max-distance", "--up"),
     *("--depth.noise", "--depth.max-depth", "--depth.min-size"),
@@ -44,18 +44,18 @@ RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
 """Flags that set where and how fast a command runs, and do not change its result."""
-ALSO = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
+ALIASES = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
 """Alternative spellings of flags, accepted but not listed."""
 NEEDED = "required"
 """Title of the required arguments."""
-_RUNNING = "performance (does not change the result)"
+_PERFORMANCE = "performance (does not change the result)"
 _EXAMPLES = "\n\nExamples:\n"
-_WIDEST = 100
+_MAX_WIDTH = 100
 _COLUMN = 28
 """Terminal column at which the texts of the short help start."""
-_SHORT = 40
+_MAX_LENGTH = 40
 """Maximum length of a default listed in the short help, in characters."""
-_WORDS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 _NUMBERS = {int: "an integer", float: "a number"}
 _NONE = "None"
 """Spelling of a None value."""
@@ -92,7 +92,7 @@ class Flag(NamedTuple):
     part: str
     """Title of its part, empty for flags of the command itself."""
     hint: object
-    is_needed: bool
+    is_required: bool
 
     @property
     def is_positional(self) -> bool:
@@ -121,18 +121,18 @@ def parse(
     """
     flags = list(list_flags(kind, default))
     if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
-        print(format_help(kind, flags, prog=prog, whole="--help-all" in arguments))
+        print(format_help(kind, flags, prog=prog, complete="--help-all" in arguments))
         raise SystemExit(0)
     try:
         example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
         values = _read(flags, arguments, prog, example)
         return typing.cast(Command, _build(kind, default, values))
     except ConfigError as error:
-        text = _named_as_flags(str(error), flags)
+        text = _use_flag_name(str(error), flags)
         raise ConfigError(f"{text} See {prog} --help.") from None
 
 
-def _named_as_flags(message: str, flags: Sequence[Flag]) -> str:
+def _use_flag_name(message: str, flags: Sequence[Flag]) -> str:
     """Replace the setting in a message by its flag, if the flag has no part."""
     named = re.fullmatch(r"\w+Config: expected (\w+) (.*)", message, re.DOTALL)
     name = f"--{named[1].replace('_', '-')}" if named else ""
@@ -167,24 +167,24 @@ def _read(
         for name, const in switches if flag.hint is bool else [(flag.name, None)]:
             # Underscores are accepted too.
             underscored = f"--{name[2:].replace('-', '_')}"
-            spellings = dict.fromkeys((name, underscored, *ALSO.get(name, ())))
+            spellings = dict.fromkeys((name, underscored, *ALIASES.get(name, ())))
             takes: dict[str, Any] = {"nargs": nargs}
             if const is not None:
                 takes = {"action": "store_const", "const": const}
             parser.add_argument(*spellings, dest=flag.path, **takes)
-    namespace, left = parser.parse_known_args(_joined(flags, arguments))
+    namespace, left = parser.parse_known_args(_join_dashed_values(flags, arguments))
     if left:
         raise ConfigError(_describe_unknown(left[0], flags, arguments))
     values = vars(namespace)
     missing = [
-        flag.name for flag in flags if flag.is_needed and values.get(flag.path) in (None, [])
+        flag.name for flag in flags if flag.is_required and values.get(flag.path) in (None, [])
     ]
     if missing:
         inputs = [values[flag.path] for flag in flags if flag.is_positional and flag.path in values]
         words = " ".join(" ".join(words) if isinstance(words, list) else words for words in inputs)
         given = f" for {words}" if words else ""
         raise ConfigError(f"missing required {' and '.join(missing)}{given}.{example}")
-    return {flag.path: _value_of(flag, values[flag.path]) for flag in flags if flag.path in values}
+    return {flag.path: _to_value(flag, values[flag.path]) for flag in flags if flag.path in values}
 
 
 def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]) -> str:
@@ -215,7 +215,7 @@ def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]
     return f"unrecognized option {asked}.{f' Did you mean {name}?' if name else ''}"
 
 
-def _joined(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:
+def _join_dashed_values(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:
     """Join each flag with a value that starts with a dash.
 
     Example:
@@ -265,7 +265,7 @@ def _choices(kind: object) -> tuple[str, ...]:
     return typing.get_args(items[0]) if items and typing.get_origin(items[0]) is Literal else ()
 
 
-def _value_of(flag: Flag, typed: bool | str | list[str]) -> object:
+def _to_value(flag: Flag, typed: bool | str | list[str]) -> object:
     """Convert the text of a flag to its value."""
     if isinstance(typed, bool):
         return typed
@@ -309,20 +309,20 @@ def _build(kind: Any, default: Any, typed: Mapping[str, object], prefix: str = "
     return kind(**values)
 
 
-def format_help(kind: type, flags: Sequence[Flag], *, prog: str, whole: bool = True) -> str:
+def format_help(kind: type, flags: Sequence[Flag], *, prog: str, complete: bool = True) -> str:
     """Format the help of a command, complete or on one screen.
 
     The class docstring is the description; its "Examples" section comes last. The short help shows
     only the first sentence of each common option.
     """
-    common = [flag for flag in flags if whole or _is_common(flag)]
+    common = [flag for flag in flags if complete or _is_common(flag)]
     groups = group_flags(common)
     needed = (flag.spelling for flag in groups.get(NEEDED, ()))
     usage = " ".join(["usage:", prog, *needed, "[options]"])
     paragraphs = describe(kind).split("\n\n")
-    blocks = [usage, *map(_wrap, paragraphs if whole else paragraphs[:1])]
+    blocks = [usage, *map(_wrap, paragraphs if complete else paragraphs[:1])]
     for title, members in groups.items():
-        entries = [_whole_entry(flag) if whole else _short_entry(flag) for flag in members]
+        entries = [_long_entry(flag) if complete else _short_entry(flag) for flag in members]
         blocks.append("\n".join([f"{title}:", *entries]))
     if len(common) < len(flags):
         blocks.append(f"{prog} --help-all explains these and {len(flags) - len(common)} more.")
@@ -333,10 +333,12 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str, whole: bool = T
 
 def _is_common(flag: Flag) -> bool:
     """Return whether the short help lists a flag."""
-    return flag.is_needed or (flag.name not in ADVANCED and (not flag.part or flag.name in OFTEN))
+    return flag.is_required or (
+        flag.name not in ADVANCED and (not flag.part or flag.name in COMMON)
+    )
 
 
-def _whole_entry(flag: Flag) -> str:
+def _long_entry(flag: Flag) -> str:
     """Format a flag with its complete help text."""
     return f"  {flag.spelling}\n{_wrap(flag.text, indent=6)}"
 
@@ -344,7 +346,7 @@ def _whole_entry(flag: Flag) -> str:
 def _short_entry(flag: Flag) -> str:
     """Format a flag with its first sentence and its default."""
     sentences = re.split(r"(?<=[.]) (?=[A-Z])", flag.text)
-    default = [s for s in sentences[1:] if s.startswith("Default:") and len(s) < _SHORT]
+    default = [s for s in sentences[1:] if s.startswith("Default:") and len(s) < _MAX_LENGTH]
     text = _wrap(" ".join([sentences[0], *default]), indent=_COLUMN)
     head = f"  {flag.spelling}"
     return f"{head:<{_COLUMN}}{text.lstrip()}" if len(head) < _COLUMN - 1 else f"{head}\n{text}"
@@ -352,20 +354,20 @@ def _short_entry(flag: Flag) -> str:
 
 def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
     """Group arguments by title: required, options, performance, then each part."""
-    groups: dict[str, list[Flag]] = {title: [] for title in (NEEDED, "options", _RUNNING)}
+    groups: dict[str, list[Flag]] = {title: [] for title in (NEEDED, "options", _PERFORMANCE)}
     for flag in flags:
-        if flag.is_needed:
+        if flag.is_required:
             group = NEEDED
         elif flag.name in RESOURCES:
-            group = _RUNNING
-        elif not flag.part or flag.name in OFTEN:
+            group = _PERFORMANCE
+        elif not flag.part or flag.name in COMMON:
             group = "options"
         else:
             group = f"advanced: {flag.part}"
         groups.setdefault(group, []).append(flag)
     # Positional arguments come first, in their order.
     groups[NEEDED].sort(key=lambda flag: not flag.is_positional)
-    groups[_RUNNING].sort(key=lambda flag: RESOURCES.index(flag.name))
+    groups[_PERFORMANCE].sort(key=lambda flag: RESOURCES.index(flag.name))
     return {title: members for title, members in groups.items() if members}
 
 
@@ -393,26 +395,26 @@ def list_flags(
     defaults. Nested dataclasses are parts: ``path`` is the path of the part, ``prefix`` the start
     of its flags, and ``part`` its title.
     """
-    texts, hints = _texts(kind), typing.get_type_hints(kind, include_extras=True)
+    texts, hints = _field_docstrings(kind), typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         if not field.metadata.get("is_flag", True):
             continue
         hint, argument = hints[field.name], Argument()
         if typing.get_origin(hint) is typing.Annotated:
             hint, argument = typing.get_args(hint)
-        value, own = _default_of(field, default), f"{path}{field.name}"
+        value, field_path = _default_of(field, default), f"{path}{field.name}"
         front, subject = prefix, part
         if not field.metadata.get("has_part", True):
             front, subject = "--", ""
         if dataclasses.is_dataclass(hint):
             inner = (prefix, part)
             if not argument.is_inline:
-                inner = (f"{prefix}{field.name}.", _first_line(hint))
-            yield from list_flags(hint, value, f"{own}.", *inner)
+                inner = (f"{prefix}{field.name}.", _summary(hint))
+            yield from list_flags(hint, value, f"{field_path}.", *inner)
             continue
         text = plain(argument.text or texts.get(field.name, ""))
         if "Default:" not in text:
-            text = f"{text} {_said(value, is_setting=front != '--')}".strip()
+            text = f"{text} {_default_sentence(value, is_setting=front != '--')}".strip()
         name = f"{front}{field.name}".replace("_", "-")
         if argument.is_positional:
             name = argument.metavar or field.name.upper()
@@ -421,9 +423,9 @@ def list_flags(
             # Only settings can be on by default, and need a flag to turn them off.
             spelling = ", ".join(_switches(name)) if value or subject else name
         else:
-            spelling = f"{name} {argument.metavar or _words(hint)}"
+            spelling = f"{name} {argument.metavar or _metavar(hint)}"
         needed = argument.is_positional or value is dataclasses.MISSING
-        yield Flag(own, name, spelling, text, subject, hint, needed)
+        yield Flag(field_path, name, spelling, text, subject, hint, needed)
 
 
 def plain(text: str) -> str:
@@ -437,7 +439,7 @@ def plain(text: str) -> str:
 
 
 @functools.cache
-def _texts(kind: type) -> dict[str, str]:
+def _field_docstrings(kind: type) -> dict[str, str]:
     """Return the docstrings of the fields of a dataclass and its bases."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
@@ -456,11 +458,11 @@ def _default_of(field: "dataclasses.Field[Any]", default: object) -> object:
         return default[field.name]
     if default is not None and not isinstance(default, Mapping):
         return getattr(default, field.name)
-    made = field.default_factory
-    return field.default if made is dataclasses.MISSING else made()
+    factory = field.default_factory
+    return field.default if factory is dataclasses.MISSING else factory()
 
 
-def _said(value: object, *, is_setting: bool) -> str:
+def _default_sentence(value: object, *, is_setting: bool) -> str:
     """Return the sentence about a default; empty for command flags that are off."""
     is_off = value is None or value is False or value == ()
     if value is dataclasses.MISSING or (is_off and not is_setting):
@@ -471,7 +473,7 @@ def _said(value: object, *, is_setting: bool) -> str:
     return f"Default: {' '.join(words)}."
 
 
-def _words(hint: object) -> str:
+def _metavar(hint: object) -> str:
     """Return the placeholder for a value of a type; None is left to the text."""
     choices = [choice for choice in typing.get_args(hint) if choice not in (NoneType, None)]
     if typing.get_origin(hint) is Literal:
@@ -479,11 +481,11 @@ def _words(hint: object) -> str:
     if typing.get_origin(hint) is tuple:
         if words := _choices(hint):
             return f"{{{','.join(words)}}},..."
-        return f"{_words(choices[0])}..." if ... in choices else " ".join(map(_words, choices))
-    return " or ".join(map(_words, choices)) if choices else _WORDS[typing.cast(type, hint)]
+        return f"{_metavar(choices[0])}..." if ... in choices else " ".join(map(_metavar, choices))
+    return " or ".join(map(_metavar, choices)) if choices else _METAVARS[typing.cast(type, hint)]
 
 
-def _first_line(kind: object) -> str:
+def _summary(kind: object) -> str:
     """Return the first sentence of a docstring, in lower case."""
     first = re.split(r"[.;] |\.$", plain(inspect.getdoc(kind) or ""))[0].replace("\n", " ")
     return first[:1].lower() + first[1:]
@@ -491,7 +493,7 @@ def _first_line(kind: object) -> str:
 
 def _wrap(text: str, *, indent: int = 0) -> str:
     """Wrap a paragraph to the width of the terminal."""
-    width = min(shutil.get_terminal_size().columns, _WIDEST)
+    width = min(shutil.get_terminal_size().columns, _MAX_WIDTH)
     return textwrap.fill(
         " ".join(text.split()),
         width,

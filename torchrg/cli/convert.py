@@ -40,11 +40,11 @@ from torchrg.cli.ending import (
     SOME_FAILED,
     USAGE_ERROR,
     fail,
-    say,
+    print_lines,
+    print_warnings,
     warn,
-    warnings_as_lines,
 )
-from torchrg.cli.loop import Progress, tell_failure
+from torchrg.cli.loop import Progress, print_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig
 from torchrg.datasets import S3DIS, FolderOfClouds, ScanNet
@@ -55,7 +55,7 @@ from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
 from torchrg.io.files import check_place, free_space, make_folder, mark_of, remove_leftovers
 from torchrg.plane_table import TABLE_SUFFIXES
-from torchrg.render.gallery import check_gallery, draw_entry, write_index
+from torchrg.render.gallery import check_gallery, write_entry, write_index
 from torchrg.render.page import check_library
 from torchrg.result import PLANES_FILE, RECORD, read_result
 
@@ -269,7 +269,7 @@ def run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
         raise SystemExit(0 if argv else USAGE_ERROR)
-    kind, *rest = flags.spell_counts(argv)
+    kind, *rest = flags.expand_counts(argv)
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     chosen, start = KINDS[kind], {}
@@ -278,23 +278,23 @@ def run(argv: list[str]) -> int:
     arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
-    with warnings_as_lines():
+    with print_warnings():
         scans = list_jobs(arguments.source(root), out)
     jobs = match_jobs(scans, arguments.only)
     if arguments.dry_run:
-        plan, stale = _look_at(jobs, arguments), _find_stale(scans, arguments)
+        plan, stale = _plan_with_bar(jobs, arguments), _find_stale(scans, arguments)
         resources = (arguments.workers or num_cores(), _memory_limit(arguments), free_space(out))
         print(format_plan(plan))
         for result in stale:
             if result.files and (result.scan is not None or arguments.prune):
-                say(f"remove {result.name}: {result.reason}")
+                print_lines(f"remove {result.name}: {result.reason}")
         print(format_costs(plan, *resources, arguments.seconds_per_million))
         check_stale(stale, root, prune=arguments.prune)
         check_room(plan)
         return 0
     make_folder(out)
     check_place(out / REPORT)
-    pages = _pages_of(arguments)
+    pages = _page_folder(arguments)
     if pages is not None:
         make_folder(pages)
         check_gallery(pages, [job.name for job in jobs])
@@ -302,7 +302,7 @@ def run(argv: list[str]) -> int:
         remove_leftovers(out, mark_of(REPORT))
         stale = _find_stale(scans, arguments)
         check_stale(stale, root, prune=arguments.prune)
-        plan = _look_at(jobs, arguments)
+        plan = _plan_with_bar(jobs, arguments)
         check_room(plan)
         _remove_stale(stale, scans)
         return _convert(plan, out, arguments)
@@ -312,7 +312,7 @@ def _check(arguments: Arguments) -> None:
     """Raise if values are out of range or incompatible."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ConfigError(f"expected --workers >= 1, got {arguments.workers}.")
-    flags.bytes_of_limit(arguments.limit_memory)
+    flags.limit_in_bytes(arguments.limit_memory)
     table = arguments.table or PLANES_FILE
     if Path(table).name != table or Path(table).suffix not in TABLE_SUFFIXES or table == RECORD:
         raise ConfigError(
@@ -321,7 +321,7 @@ def _check(arguments: Arguments) -> None:
         )
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address with --engine ray, got --engine local; add it.")
-    if _pages_of(arguments) is not None:
+    if _page_folder(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):
         flags.check_level(arguments.level, arguments.partition)
@@ -331,8 +331,8 @@ def _check(arguments: Arguments) -> None:
                 "stores no scanner positions."
             )
         has_superpoints = arguments.superpoints or arguments.layout != "pointcept"
-        usual = (SuperpointsConfig(), 0)
-        if not has_superpoints and (arguments.partition, arguments.level) != usual:
+        defaults = (SuperpointsConfig(), 0)
+        if not has_superpoints and (arguments.partition, arguments.level) != defaults:
             raise ConfigError(
                 "expected --superpoints with --partition or --level, got none; add it."
             )
@@ -343,12 +343,12 @@ def _check(arguments: Arguments) -> None:
             )
 
 
-def _pages_of(arguments: Arguments) -> Path | None:
+def _page_folder(arguments: Arguments) -> Path | None:
     """Return the directory for viewers, or None."""
     return arguments.pages if isinstance(arguments, CloudArguments) else None
 
 
-def _look_at(jobs: list[Job], arguments: Arguments) -> Plan:
+def _plan_with_bar(jobs: list[Job], arguments: Arguments) -> Plan:
     """Make the plan, with a progress bar."""
     with tqdm(total=len(jobs), desc="looking", unit="scan", leave=False, disable=None) as bar:
         return make_plan(jobs, force=arguments.force, threads=num_cores(), on_scan=bar.update)
@@ -369,7 +369,7 @@ def _remove_stale(stale: list[StaleResult], scans: list[Job]) -> None:
     for result in stale:
         remove_stale(result)
         if result.files:
-            say(f"{result.folder}: removed: {result.reason}")
+            print_lines(f"{result.folder}: removed: {result.reason}")
     note_data_set(scans, stale)
 
 
@@ -399,7 +399,7 @@ def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
     code = _finish(report, out, unit=arguments.unit)
     if not report.disk_full:
         plan.jobs[0].source.write_lists(out, mark_of(REPORT))
-    pages = _pages_of(arguments)
+    pages = _page_folder(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
     return code
@@ -407,7 +407,7 @@ def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
 
 def _memory_limit(arguments: Arguments) -> int:
     """Return the memory limit for all concurrent scans, in bytes."""
-    return flags.bytes_of_limit(arguments.limit_memory, spare_memory())
+    return flags.limit_in_bytes(arguments.limit_memory, spare_memory())
 
 
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
@@ -419,10 +419,10 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
         scan = done[job.name]
         words = f"{scan.num_points:,} points, {scan.num_regions:,} planes"
         try:
-            entries.append(draw_entry(folder, scan.name, read_result(job.folder), words=words))
+            entries.append(write_entry(folder, scan.name, read_result(job.folder), words=words))
         except (TorchrgError, OSError) as error:
             warn(f"{scan.name}: no page: {error}")
-    say(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
+    print_lines(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
 
 
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
@@ -432,7 +432,7 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     else:
         print(format_report(report, unit=unit))
     for scan in report.scans:
-        tell_failure(scan)
+        print_failure(scan)
     try:
         write_report(out, report)
     except FormatError as error:
@@ -440,12 +440,12 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
             raise
         warn(str(error))
     state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
-    again = "Rerun the same command to resume."
+    hint = "Rerun the same command to resume."
     if report.disk_full:
-        return fail(f"{out}: the disk is full; {state}. Free space. {again}", code=SOME_FAILED)
+        return fail(f"{out}: the disk is full; {state}. Free space. {hint}", code=SOME_FAILED)
     if report.interrupted:
-        return fail(f"interrupted; {state}. {again}", code=INTERRUPTED)
+        return fail(f"interrupted; {state}. {hint}", code=INTERRUPTED)
     if len(report.complete) < len(report.scans):
         return fail(f"{state}; see {out / REPORT}.", code=SOME_FAILED)
-    say(f"{state} -> {out}")
+    print_lines(f"{state} -> {out}")
     return 0

@@ -17,8 +17,8 @@ from torchrg.batch.records import describe_run
 from torchrg.batch.sources import write_frame
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say, warn, warnings_as_lines
-from torchrg.cli.loop import check_apart, note_input, output_paths, paths_beside, run_each
+from torchrg.cli.ending import print_lines, print_warnings, warn
+from torchrg.cli.loop import check_distinct, note_input, output_paths, run_each, sidecar_paths
 from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd import fit_camera
 from torchrg.datasets.rgbd_files import (
@@ -37,15 +37,15 @@ from torchrg.render import color_planes, write_png
 from torchrg.result import PLANES_FILE, write_table
 from torchrg.structures import Cloud
 
-_COLORED_FROM = 200
+_COLORING_PIXELS = 200
 """Number of pixels along the longer side, evenly spaced, from which adjacent planes are found to
 color them differently. Coloring from all pixels would take as long as segmentation."""
-_NO_IMAGES = ("planes", "points", "neighbors", "sampling", "num_copies")
+_NOT_IMAGES = ("planes", "points", "neighbors", "sampling", "num_copies")
 """Fields of an image segmentation that are not images."""
 _MAX_MISFIT = 0.01
 """Maximum median reprojection distance of points for a camera to fit a cloud, as a fraction of the
 longer image side."""
-_MIN_BYTES_A_PIXEL = 300
+_MIN_BYTES_PER_PIXEL = 300
 """Lower bound of the memory for segmentation, in bytes per pixel."""
 
 
@@ -101,18 +101,18 @@ def run(argv: list[str]) -> int:
         len(inputs) > 1 and arguments.out.suffix.lower() not in (".png", *FORMATS)
     )
     targets = output_paths(inputs, arguments.out, suffix="" if is_folder else ".png")
-    pictures = paths_beside(targets, arguments.picture, suffixes=(".png",))
-    asked = paths_beside(targets, arguments.table, suffixes=TABLE_SUFFIXES)
-    tables = [set() if path is None else {path} for path in asked]
+    pictures = sidecar_paths(targets, arguments.picture, suffixes=(".png",))
+    table_paths = sidecar_paths(targets, arguments.table, suffixes=TABLE_SUFFIXES)
+    tables = [set() if path is None else {path} for path in table_paths]
     if not is_folder and _is_png(targets[0]):
         if arguments.picture is None:
             pictures = [targets[0].with_name(f"{targets[0].stem}_planes.png")]
         tables[0].add(targets[0].with_suffix(".json"))
-    beside = [
+    sidecars = [
         path for path in (*pictures, *itertools.chain(*map(sorted, tables))) if path is not None
     ]
-    check_apart([*targets, *beside], [*inputs, Path(arguments.intrinsics or "")])
-    for path in beside:
+    check_distinct([*targets, *sidecars], [*inputs, Path(arguments.intrinsics or "")])
+    for path in sidecars:
         check_place(path)
     for path in targets if is_folder else []:
         check_place(path / PLANES_FILE if path.is_dir() else path)
@@ -127,7 +127,7 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
     """
     refuse_recording(path)
     if path.is_dir():
-        with warnings_as_lines():
+        with print_warnings():
             frame, *others = RGBDFrames.from_folder(
                 path, intrinsics=camera, depth_scale=arguments.depth_scale
             ).frames
@@ -141,8 +141,8 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
         if arguments.depth_scale is not None:
             warn(f"{path}: --depth-scale is ignored for point clouds.")
         return None
-    own = None if camera is None else camera.depth_scale
-    scale = own if arguments.depth_scale is None else arguments.depth_scale
+    camera_scale = None if camera is None else camera.depth_scale
+    scale = camera_scale if arguments.depth_scale is None else arguments.depth_scale
     if camera is None or scale is None:
         flag, hint = "--depth-scale", "1000 for millimeters, 1 for meters"
         if camera is None:
@@ -169,7 +169,7 @@ def _label(
     scale = arguments.depth_scale
     if isinstance(given, RGBDFrame):
         scale = given.depth_scale
-        with warnings_as_lines():
+        with print_warnings():
             cloud, depth, camera = _read_image(given)
     else:
         cloud, depth, camera = _read_cloud(source, given)
@@ -190,10 +190,10 @@ def _label(
     if num_planes == 0:
         warn(f"{source}: no plane found: {flags.reason_for_no_plane(arguments.depth)}.")
     if picture is not None:
-        apart = -(-max(points.shape) // _COLORED_FROM)
-        few = torch.full_like(points, torch.nan)
-        few[::apart, ::apart] = points[::apart, ::apart]
-        write_png(picture, color_planes(seg.labels, few) * (depth > 0)[..., None])
+        step = -(-max(points.shape) // _COLORING_PIXELS)
+        sparse = torch.full_like(points, torch.nan)
+        sparse[::step, ::step] = points[::step, ::step]
+        write_png(picture, color_planes(seg.labels, sparse) * (depth > 0)[..., None])
     if is_folder:
         write_frame(target, depth, torch.from_numpy(cloud.coordinates).view(*points.shape), seg)
     elif is_image:
@@ -205,14 +205,14 @@ def _label(
             "depth_scale": scale,
             "orient": arguments.orient,
         }
-        images = {name: values for name, values in vars(seg).items() if name not in _NO_IMAGES}
+        images = {name: values for name, values in vars(seg).items() if name not in _NOT_IMAGES}
         rows = replace(seg, **{name: image.flatten(0, 1) for name, image in images.items()})
         write_cloud(target, cloud, rows, provenance=provenance)
     for table in tables:
         write_table(table, describe_planes(seg.planes, origin=origin.tolist()))
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
     percent = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
-    say(
+    print_lines(
         f"{source}: {width} x {height} pixels, {num_seen:,} with depth, {num_planes:,} planes, "
         f"{percent:.1f} % of these labeled, {time.perf_counter() - begin:.1f} s -> {target}"
     )
@@ -222,7 +222,7 @@ def _check_memory(image: Path) -> None:
     """Raise before reading if the pixels of an image do not fit into memory."""
     is_depth, free = image.suffix.lower() in DEPTH_SUFFIXES, available_memory()
     size = num_pixels(image) if is_depth else 0
-    if (needed := size * _MIN_BYTES_A_PIXEL) > free:
+    if (needed := size * _MIN_BYTES_PER_PIXEL) > free:
         raise FormatError(
             f"{image}: not enough memory for {size:,} pixels: needs at least {needed / 1e9:,.1f} "
             f"GB, {free / 1e9:,.1f} GB are free; scale it down, or use a machine with more memory."

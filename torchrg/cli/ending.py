@@ -33,7 +33,7 @@ def printable(text: str) -> str:
     return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def say(*lines: str) -> None:
+def print_lines(*lines: str) -> None:
     """Print lines to stdout."""
     print(*map(printable, lines), sep="\n", flush=True)
 
@@ -50,7 +50,7 @@ def warn(message: str) -> None:
 
 
 @contextlib.contextmanager
-def warnings_as_lines() -> Iterator[None]:
+def print_warnings() -> Iterator[None]:
     """Print the warnings of a block as single lines, without duplicates."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -59,14 +59,14 @@ def warnings_as_lines() -> Iterator[None]:
         warn(line)
 
 
-def end_at_once(*_: object) -> NoReturn:
+def exit_interrupted(*_: object) -> NoReturn:
     """Exit immediately after an interrupt, with one line."""
     with contextlib.suppress(OSError):
         os.write(2, f"torchrg: {INTERRUPTED_LINE}\n".encode())
     os._exit(INTERRUPTED)
 
 
-def on_interrupts(handler: Callable[..., Any] | signal.Handlers) -> dict[signal.Signals, Any]:
+def handle_interrupts(handler: Callable[..., Any] | signal.Handlers) -> dict[signal.Signals, Any]:
     """Set the handler of interrupts and return the previous handlers.
 
     Ignored signals stay ignored, as for background jobs of a shell.
@@ -84,7 +84,7 @@ def raising_interrupts() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = on_interrupts(signal.default_int_handler)
+    before = handle_interrupts(signal.default_int_handler)
     try:
         yield
     finally:

@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal
 
 import torch
 
-from torchrg.cli.arguments import ALSO, Argument
-from torchrg.cli.ending import warn, warnings_as_lines
+from torchrg.cli.arguments import ALIASES, Argument
+from torchrg.cli.ending import print_warnings, warn
 from torchrg.config import (
     DEFAULT_PRESET,
     WHITENESS,
@@ -171,7 +171,7 @@ class PlaneSettings:
         return cls(resolved=resolved.at_angle(angle))
 
 
-def choice_of(sampling: Sampling, settings: Mapping[str, Any]) -> str:
+def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
     """Describe the measured sampling of a cloud and the settings selected by it.
 
     Example:
@@ -216,7 +216,7 @@ def split_columns(columns: str | None) -> tuple[str, ...] | None:
     return None if columns is None else tuple(name.strip() for name in columns.split(","))
 
 
-def columns_of(path: str | os.PathLike[str], columns: str | None) -> tuple[str, ...] | None:
+def file_columns(path: str | os.PathLike[str], columns: str | None) -> tuple[str, ...] | None:
     """Return the column names for a file; None if the file stores its own."""
     return split_columns(columns) if takes_columns(path) else None
 
@@ -237,7 +237,7 @@ def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) 
         )
 
 
-def spell_counts(argv: Sequence[str]) -> list[str]:
+def expand_counts(argv: Sequence[str]) -> list[str]:
     """Move the numbers after ``--superpoints`` into a separate flag.
 
     Example:
@@ -246,7 +246,7 @@ def spell_counts(argv: Sequence[str]) -> list[str]:
     """
     spelled: list[str] = []
     for argument in argv:
-        names = ("--superpoints", *ALSO["--superpoints"])
+        names = ("--superpoints", *ALIASES["--superpoints"])
         is_after = spelled[-1:] and spelled[-1] in names
         name, _, numbers = argument.rpartition("=")
         if re.fullmatch(r"\d+(,\d+)*", numbers) and (name in names or (is_after and not name)):
@@ -286,7 +286,7 @@ def parse_intrinsics(text: str | None) -> Pinhole | None:
     with suppress(OSError):
         is_file = Path(text).is_file()
     if is_file or text.lower().endswith(SUFFIXES[1:]):
-        with warnings_as_lines():
+        with print_warnings():
             return read_camera(Path(text))
     raise ConfigError(
         "expected --intrinsics fx,fy,cx,cy (four numbers without spaces) or a camera file, got "
@@ -303,10 +303,10 @@ def use_threads(threads: int | None) -> None:
     torch.set_num_threads(threads)
 
 
-def bytes_of_limit(limit_memory: float | None, usual: int = 0) -> int:
-    """Convert a memory limit to bytes; return ``usual`` if unset, raise if out of range."""
+def limit_in_bytes(limit_memory: float | None, default: int = 0) -> int:
+    """Convert a memory limit to bytes; return ``default`` if unset, raise if out of range."""
     if limit_memory is None:
-        return usual
+        return default
     if not 0 < limit_memory <= _MAX_GIGABYTES:
         raise ConfigError(
             f"expected --limit-memory above 0 and at most {_MAX_GIGABYTES:,} GB, got "

@@ -9,8 +9,8 @@ import torch
 
 from torchrg import kernels
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say
-from torchrg.cli.flags import ColumnsFlag, check_columns, choice_of, columns_of
+from torchrg.cli.ending import print_lines
+from torchrg.cli.flags import ColumnsFlag, check_columns, describe_sampling, file_columns
 from torchrg.config import load_config
 from torchrg.io import read_cloud
 from torchrg.neighbors import distinct_points, measure_sampling, search_knn
@@ -45,12 +45,12 @@ def run(argv: list[str]) -> int:
     """Parse the arguments and print the summary."""
     arguments = parse(Arguments, argv, prog="torchrg info")
     check_columns(arguments.columns, [arguments.file])
-    cloud = read_cloud(arguments.file, columns=columns_of(arguments.file, arguments.columns))
+    cloud = read_cloud(arguments.file, columns=file_columns(arguments.file, arguments.columns))
     for name, value in describe_cloud(cloud).items():
-        say(f"{name:<12}{value}")
+        print_lines(f"{name:<12}{value}")
     for note in filter(None, (*cloud.notes, cloud.precision_note)):
-        say(f"{'note':<12}{note}")
-    say(f"{'kernels':<12}{kernels.name_of_library() or 'none (several times slower)'}")
+        print_lines(f"{'note':<12}{note}")
+    print_lines(f"{'kernels':<12}{kernels.name_of_library() or 'none (several times slower)'}")
     return 0
 
 
@@ -77,9 +77,9 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
             sampling = measure_sampling(torch.from_numpy(places), near)
             chosen = load_config().measured(sampling)["settings"]
-            facts["height"] = f"{sampling.height:g} (least extent along the principal axes)"
+            facts["height"] = f"{sampling.height:g} (smallest extent along the principal axes)"
             facts["density"] = f"{sampling.density:g} points on a square of side 1"
-            facts["surfaces"] = choice_of(sampling, chosen)
+            facts["surfaces"] = describe_sampling(sampling, chosen)
     for name, values in cloud.fields.items():
         shape = " x ".join(map(str, values.shape[1:])) or "1"
         facts[name] = f"{shape} {values.dtype}"

@@ -21,7 +21,7 @@ from torchrg.structures import Cloud
 # In Python 3.14 the default lock of tqdm starts a process that imports from the working directory.
 tqdm.set_lock(RLock())
 
-DRAWINGS = (".png", ".html")
+IMAGE_SUFFIXES = (".png", ".html")
 """File extensions of images and viewers."""
 STAGES = ("neighbors", "normals", "regions", "planes", "orientation")
 """Stages of the segmentation of a cloud, as in progress bars."""
@@ -64,20 +64,20 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
     return results
 
 
-def check_apart(results: Sequence[Path], inputs: Sequence[Path]) -> None:
+def check_distinct(results: Sequence[Path], inputs: Sequence[Path]) -> None:
     """Raise FormatError if a result would overwrite an input or another result."""
     taken = {str(path.resolve()) for path in inputs}
-    files = {_file_number(path) for path in inputs} - {None}
+    files = {_file_id(path) for path in inputs} - {None}
     for path in results:
-        place = str(path.resolve())
-        if not taken.isdisjoint((place, folded_name(place))) or _file_number(path) in files:
+        output = str(path.resolve())
+        if not taken.isdisjoint((output, folded_name(output))) or _file_id(path) in files:
             raise FormatError(
                 f"{path}: would overwrite an input or another result; choose another output path."
             )
-        taken.add(folded_name(place))
+        taken.add(folded_name(output))
 
 
-def _file_number(path: Path) -> tuple[int, int] | None:
+def _file_id(path: Path) -> tuple[int, int] | None:
     """Return the device and inode of a file, which ignore case; None if it does not exist."""
     try:
         status = path.stat()
@@ -86,31 +86,31 @@ def _file_number(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def paths_beside(
-    results: Sequence[Path], place: Path | None, *, suffixes: Sequence[str] = DRAWINGS
+def sidecar_paths(
+    results: Sequence[Path], output: Path | None, *, suffixes: Sequence[str] = IMAGE_SUFFIXES
 ) -> Sequence[Path | None]:
     """Return the path of the image or table of each result, like :func:`output_paths`.
 
     Files in a directory get the first of the extensions.
     """
-    if place is None:
+    if output is None:
         return [None] * len(results)
-    if not place.is_dir():
-        if len(results) == 1 and place.suffix:
-            check_beside(place, suffixes=suffixes)
-            return [place]
-        if place.suffix.lower() in suffixes:
+    if not output.is_dir():
+        if len(results) == 1 and output.suffix:
+            check_sidecar(output, suffixes=suffixes)
+            return [output]
+        if output.suffix.lower() in suffixes:
             raise FormatError(
-                f"{place}: expected a directory for {len(results)} files, got a file name."
+                f"{output}: expected a directory for {len(results)} files, got a file name."
             )
-    make_folder(place)
-    paths = [place / f"{path.stem}{suffixes[0]}" for path in results]
+    make_folder(output)
+    paths = [output / f"{path.stem}{suffixes[0]}" for path in results]
     for path in paths:
         check_place(path)
     return paths
 
 
-def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
+def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> None:
     """Raise if an image, viewer or table cannot be written; call before long computations."""
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
@@ -118,11 +118,11 @@ def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
             f"{path}: expected a file ending in {endings}, got {path.suffix!r}; rename it."
         )
     check_place(path)
-    if is_page(path):
+    if is_viewer(path):
         check_library()
 
 
-def is_page(path: Path) -> bool:
+def is_viewer(path: Path) -> bool:
     """Return whether a path is a viewer."""
     return path.suffix.lower() == ".html"
 
@@ -132,7 +132,7 @@ def is_archive(path: Path) -> bool:
     return path.suffix.lower() == ".npz"
 
 
-def name_of(source: Path | Sequence[Path]) -> str:
+def display_name(source: Path | Sequence[Path]) -> str:
     """Return the name of an input in messages: a file, or several merged files."""
     first, *others = [source] if isinstance(source, Path) else source
     return f"{first} and {len(others)} more" if others else f"{first}"
@@ -158,22 +158,22 @@ def run_each(
 
         def work(begin: Begin, row: Sequence[Any] = row) -> TaskReport:
             write(arguments, *row)
-            return TaskReport(name_of(row[0]), "converted")
+            return TaskReport(display_name(row[0]), "converted")
 
-        report = report_on(name_of(row[0]), work)
-        tell_failure(report)
+        report = report_on(display_name(row[0]), work)
+        print_failure(report)
         num_failed += report.status == "failed"
         if report.disk_full:
             state = f"{number + 1 - num_failed:,} of {len(rows):,} inputs are complete"
-            told = f"the disk is full; {state}. Free space and rerun the command."
-            return fail(f"{arguments.out}: {told}", code=SOME_FAILED)
+            message = f"the disk is full; {state}. Free space and rerun the command."
+            return fail(f"{arguments.out}: {message}", code=SOME_FAILED)
     if num_failed:
-        told = f"{num_failed} of {len(rows)} inputs failed, the remaining ones are written."
-        return fail(told, code=SOME_FAILED)
+        message = f"{num_failed} of {len(rows)} inputs failed, the remaining ones are written."
+        return fail(message, code=SOME_FAILED)
     return 0
 
 
-def tell_failure(report: TaskReport) -> None:
+def print_failure(report: TaskReport) -> None:
     """Print the reason of a failed task."""
     if report.status == "failed":
         fail(f"{report.name}: {report.reason.removeprefix(f'{report.name}: ')}")
@@ -188,7 +188,7 @@ def note_input(
         warn(f"{source}: {note}.")
 
 
-def left_out(target: Path, fields: Collection[str]) -> str:
+def dropped_fields_note(target: Path, fields: Collection[str]) -> str:
     """Describe the fields of a cloud that its result omits."""
     names = [name for name in fields if name not in KEPT_FIELDS and is_archive(target)]
     return f" (without its own {', '.join(names)})" if names else ""

@@ -10,7 +10,7 @@ from torchrg.cli.ending import printable
 _SECONDS_PER_SCAN = 0.03
 """Time for a scan of 40 points on one core of an AMD EPYC, in seconds: hashing and flushing
 files."""
-_SHORT = 100
+_MIN_NEXT_UNIT = 100
 """Durations from this many seconds or minutes on are printed in the next larger unit."""
 MAX_ROWS = 300
 """Maximum number of scans in a report with one row per scan."""
@@ -71,8 +71,8 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     for scan in shown:
         if scan.status != "failed":
             again = [f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []
-            told = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
-            notes += [printable(f"{scan.name}: {note}") for note in told]
+            lines = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
+            notes += [printable(f"{scan.name}: {note}") for note in lines]
     if len(report.scans) > MAX_ROWS and (num_noted := sum(bool(s.warnings) for s in report.scans)):
         notes.append(f"{num_noted:,} {unit}s have notes; see report.json")
     seconds = report.seconds or math.inf
@@ -90,10 +90,10 @@ def _format_time(seconds: float) -> str:
         >>> _format_time(8), _format_time(500), _format_time(9000)
         ('8 s', '8 min', '2.5 h')
     """
-    if seconds < _SHORT:
+    if seconds < _MIN_NEXT_UNIT:
         return f"{math.ceil(seconds)} s"
     minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < _SHORT else f"{minutes / 60:,.1f} h"
+    return f"{minutes:.0f} min" if minutes < _MIN_NEXT_UNIT else f"{minutes / 60:,.1f} h"
 
 
 def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:

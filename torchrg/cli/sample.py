@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say
+from torchrg.cli.ending import print_lines
 from torchrg.io import check_output, write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -38,5 +38,5 @@ def run(argv: list[str]) -> int:
     fields = {"labels": room.labels.numpy(), "normals": room.normals.numpy()}
     write_cloud(arguments.out, Cloud(room.points.numpy(), fields))
     num_faces = int(room.labels.max()) + 1
-    say(f"{arguments.out}: {len(room.points):,} points, {num_faces} planes")
+    print_lines(f"{arguments.out}: {len(room.points):,} points, {num_faces} planes")
     return 0

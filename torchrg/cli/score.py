@@ -11,8 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import warn, warnings_as_lines
-from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
+from torchrg.cli.ending import print_warnings, warn
+from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.metrics import (
@@ -80,12 +80,12 @@ def run(argv: list[str]) -> int:
     for path in (predicted, truth):
         if not path.exists():
             raise FormatError(f"{path}: file not found.")
-    of_folders = _holds_scans(predicted)
-    if of_folders != _holds_scans(truth):
-        file, folder = (truth, predicted) if of_folders else (predicted, truth)
+    are_folders = _is_data_set(predicted)
+    if are_folders != _is_data_set(truth):
+        file, folder = (truth, predicted) if are_folders else (predicted, truth)
         raise FormatError(f"{file}: expected a folder like {folder}; or pass two files.")
-    if of_folders:
-        with warnings_as_lines():
+    if are_folders:
+        with print_warnings():
             pairs = _pair_scans(predicted, truth).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
         scans = {name: _score_files(arguments, *files) for name, files in bar}
@@ -93,9 +93,9 @@ def run(argv: list[str]) -> int:
     else:
         scans, scores = {}, _score_files(arguments, predicted, truth)
     if arguments.json:
-        print(json.dumps({"scans": scans, "mean": scores} if of_folders else scores))
+        print(json.dumps({"scans": scans, "mean": scores} if are_folders else scores))
         return 0
-    if of_folders:
+    if are_folders:
         print(f"mean of {len(scans):,} scans")
     for part, values in scores.items():
         print(part)
@@ -104,7 +104,7 @@ def run(argv: list[str]) -> int:
     return 0
 
 
-def _holds_scans(path: Path) -> bool:
+def _is_data_set(path: Path) -> bool:
     """Return whether a path is a folder of scans rather than a single scan."""
     return path.is_dir() and not is_scene(path)
 
@@ -129,7 +129,7 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     """Evaluate all parts present in both scans."""
     check_columns(arguments.columns, (predicted, truth))
     ours, theirs = (
-        read_result(path, columns=columns_of(path, arguments.columns)).cloud
+        read_result(path, columns=file_columns(path, arguments.columns)).cloud
         for path in (predicted, truth)
     )
     for cloud in (ours, theirs):
@@ -139,10 +139,12 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     if arguments.match_distance is None:
         _check_rows(predicted, truth, ours, theirs)
     else:
-        ours, scores["match"] = _nearest(arguments.match_distance, predicted, truth, ours, theirs)
+        ours, scores["match"] = _match_nearest(
+            arguments.match_distance, predicted, truth, ours, theirs
+        )
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
-            scores[part] = _known(score(ours.fields[part], theirs.fields[part])._asdict())
+            scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
         for path, cloud, field in ((predicted, ours, "superpoints"), (truth, theirs, "labels")):
             if field not in cloud.fields:
@@ -157,7 +159,7 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
             boundary_distance=arguments.boundary_distance,
             ignore=arguments.ignore,
         )
-        scores["superpoints"] = _known(indices._asdict())
+        scores["superpoints"] = _defined(indices._asdict())
     if not scores.keys() - {"match"}:
         raise FormatError(
             f"{predicted}: has neither labels nor normals in common with {truth}; pass a result of "
@@ -184,7 +186,7 @@ def _check_rows(predicted: Path, truth: Path, ours: Cloud, theirs: Cloud) -> Non
         )
 
 
-def _nearest(
+def _match_nearest(
     distance: float, predicted: Path, truth: Path, ours: Cloud, theirs: Cloud
 ) -> tuple[Cloud, dict[str, float | None]]:
     """Transfer the results to the nearest ground-truth points, and count unmatched points."""
@@ -212,7 +214,7 @@ def _nearest(
     return Cloud(theirs.coordinates, fields, source=ours.source), {**matched}
 
 
-def _known(values: Mapping[str, float | None]) -> dict[str, float | None]:
+def _defined(values: Mapping[str, float | None]) -> dict[str, float | None]:
     """Drop scores that were not computed; replace NaN by None, as JSON has no NaN."""
     return {
         name: None if math.isnan(value) else value

@@ -17,17 +17,17 @@ from torchrg.batch.records import Record, describe_run
 from torchrg.batch.run import REPORT, lock_folder
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.ending import say, warn
+from torchrg.cli.ending import print_lines, warn
 from torchrg.cli.loop import (
     STAGES,
-    check_apart,
-    is_page,
-    left_out,
-    name_of,
+    check_distinct,
+    display_name,
+    dropped_fields_note,
+    is_viewer,
     note_input,
     output_paths,
-    paths_beside,
     run_each,
+    sidecar_paths,
     stage_bar,
 )
 from torchrg.clouds import find_objects, note_on_copies, segment_cloud
@@ -48,7 +48,7 @@ from torchrg.io.files import check_space, mark_of
 from torchrg.merge import merge_clouds
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
-from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes, write_index
+from torchrg.render.gallery import Entry, check_gallery, write_entry, write_index, write_planes
 from torchrg.result import Result, write_table
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
@@ -110,8 +110,8 @@ class Arguments:
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
-    _refuse_images(argv)
-    argv = flags.spell_counts(argv)
+    _reject_images(argv)
+    argv = flags.expand_counts(argv)
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
     if arguments.layout not in (None, "pointcept"):
@@ -129,7 +129,7 @@ def run(argv: list[str]) -> int:
             "contain all levels."
         )
     flags.use_threads(arguments.threads)
-    flags.bytes_of_limit(arguments.limit_memory)
+    flags.limit_in_bytes(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
@@ -138,22 +138,22 @@ def run(argv: list[str]) -> int:
     firsts = tuple(sources[0] for sources in clouds if sources)
     suffix = ".npz" if arguments.layout is None else ""
     outputs = output_paths(firsts, arguments.out, suffix=suffix)
-    pictures = paths_beside(outputs, arguments.picture)
-    tables = paths_beside(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
-    check_apart([*outputs, *filter(None, tables)], arguments.inputs)
+    pictures = sidecar_paths(outputs, arguments.picture)
+    tables = sidecar_paths(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
+    check_distinct([*outputs, *filter(None, tables)], arguments.inputs)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    with _sharing(arguments, outputs):
+    with _layout_lock(arguments, outputs):
         code = run_each(_segment, arguments, clouds, outputs, tables, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
-        say(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
+        print_lines(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
     return code
 
 
 @contextlib.contextmanager
-def _sharing(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
+def _layout_lock(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
     """Lock the output directory and update the lists of a layout that shares folders."""
     if arguments.layout in (None, "pointcept"):
         yield
@@ -177,7 +177,7 @@ def _page_of(picture: Path) -> Path:
     return picture.with_suffix(".html")
 
 
-def _refuse_images(argv: list[str]) -> None:
+def _reject_images(argv: list[str]) -> None:
     """Raise an error that refers to torchrg depth if the arguments are depth images."""
     for last, argument in pairwise(("", *argv)):
         is_flag = argument.partition("=")[0] in IMAGE_FLAGS
@@ -199,14 +199,14 @@ def _segment(
     picture: Path | None,
 ) -> None:
     """Segment a cloud with a progress bar, and print one line about the result."""
-    begin, source = time.perf_counter(), name_of(sources)
-    limit = flags.bytes_of_limit(arguments.limit_memory, available_memory() // 2)
+    begin, source = time.perf_counter(), display_name(sources)
+    limit = flags.limit_in_bytes(arguments.limit_memory, available_memory() // 2)
     _check_limit(source, sum(map(estimate_points, sources)), limit)  # Before reading.
     clouds = [
-        read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources
+        read_cloud(path, columns=flags.file_columns(path, arguments.columns)) for path in sources
     ]
     cloud = merge_clouds(clouds)
-    where = _arrays_of(arguments, source, target, len(cloud), limit)
+    where = _array_storage(arguments, source, target, len(cloud), limit)
     find_objects(cloud, arguments.within)  # An unknown field fails before any warning.
     _check_points(arguments, source, cloud, target)
     stages = (*STAGES, *["superpoints"] * arguments.superpoints)
@@ -223,7 +223,7 @@ def _segment(
             warn=lambda note: warn(f"{source}: {note}."),
         )
     for note in note_on_copies(seg.num_copies, len(cloud)):
-        say(f"{source}: {note}")
+        print_lines(f"{source}: {note}")
     if arguments.layout is None:
         provenance = _describe(arguments, sources, seg)
         write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)
@@ -236,13 +236,13 @@ def _segment(
     if superpoints is not None:
         levels = superpoints.by_level().values()
         counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)
-        say(f"{source}: superpoints of each level: {counts}")
+        print_lines(f"{source}: superpoints of each level: {counts}")
     if seg.sampling is not None:
         settings = arguments.settings.resolved.measured(seg.sampling)["settings"]
-        say(f"{source}: {flags.choice_of(seg.sampling, settings)}")
-    place = f"{target}{left_out(target, cloud.fields)}"
+        print_lines(f"{source}: {flags.describe_sampling(seg.sampling, settings)}")
+    destination = f"{target}{dropped_fields_note(target, cloud.fields)}"
     reason = flags.reason_for_no_plane(arguments.settings.resolved)
-    _report(source, seg, cloud, place, reason, time.perf_counter() - begin)
+    _report(source, seg, cloud, destination, reason, time.perf_counter() - begin)
 
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
@@ -255,7 +255,7 @@ def _check_limit(source: str, num_points: int, limit: int) -> None:
         )
 
 
-def _arrays_of(
+def _array_storage(
     arguments: Arguments, source: str, target: Path, num_points: int, limit: int
 ) -> contextlib.AbstractContextManager[None]:
     """Return the context for large arrays: memory, or disk if they exceed the limit."""
@@ -266,7 +266,7 @@ def _arrays_of(
     normals = arguments.settings.resolved.normals
     k = max(normals.k, normals.adaptive_k or 0)
     check_space(folder, num_points * k * scratch.BYTES_PER_NEIGHBOR, "the work")
-    say(
+    print_lines(
         f"{source}: about {num_points:,} points need {needed / 1e9:.2f} GB of memory, the limit "
         f"is {limit / 1e9:.2f} GB: moving the largest arrays to disk in {folder}"
     )
@@ -321,11 +321,11 @@ def _write_layout(
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
     """Write the image or viewer of a result, or both."""
     if arguments.pages:
-        draw_entry(picture.parent, picture.stem, result)
-    elif is_page(picture):
+        write_entry(picture.parent, picture.stem, result)
+    elif is_viewer(picture):
         write_page(picture, make_page(result))
     else:
-        draw_planes(picture, result)
+        write_planes(picture, result)
 
 
 def _report(
@@ -334,11 +334,11 @@ def _report(
     """Print the summary line of a result, and a warning if it has no plane."""
     if len(seg.planes) == 0:
         finite = cloud.coordinates[cloud.finite]
-        is_place = (finite == finite[0]).all()
-        warn(f"{source}: no plane found: {'all points are identical' if is_place else reason}.")
+        are_equal = (finite == finite[0]).all()
+        warn(f"{source}: no plane found: {'all points are identical' if are_equal else reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes)
     percent = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
-    say(
+    print_lines(
         f"{source}: {num_points:,} points, {num_planes:,} planes, {percent:.1f} % of the points "
         f"labeled, {seconds:.1f} s -> {target}"
     )

@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say, warn
-from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
-from torchrg.cli.loop import check_beside, is_page
+from torchrg.cli.ending import print_lines, warn
+from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
+from torchrg.cli.loop import check_sidecar, is_viewer
 from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.io.colors import narrow_colors
@@ -73,7 +73,7 @@ class Arguments:
     truth: Path | None = None
     """Ground truth for the same points, with labels or normals; shows errors in a viewer."""
     max_points: int = MAX_POINTS
-    """Maximum points in the viewer; larger clouds are randomly downsampled (the viewer says so)."""
+    """Maximum points in the viewer; larger clouds are randomly downsampled, with a note."""
     unit: str | None = None
     """Unit of the coordinates, such as m, for lengths and areas in a viewer. Default: m if the
     cloud is 2 to 6 units high, like a room in meters."""
@@ -83,18 +83,18 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, render the cloud and write the output."""
     arguments = parse(Arguments, argv, prog="torchrg view")
-    check_beside(arguments.out)
+    check_sidecar(arguments.out)
     files = (arguments.file, arguments.beside, arguments.truth)
     check_columns(arguments.columns, [path for path in files if path is not None])
-    write = _write_page if is_page(arguments.out) else _write_picture
-    said = write(arguments, _read(arguments.file, arguments))
-    say(f"{arguments.file} -> {arguments.out} ({said})")
+    write = _write_page if is_viewer(arguments.out) else _write_picture
+    summary = write(arguments, _read(arguments.file, arguments))
+    print_lines(f"{arguments.file} -> {arguments.out} ({summary})")
     return 0
 
 
 def _read(path: Path, arguments: Arguments) -> Result:
     """Read a cloud or result, and print its notes."""
-    result = read_result(path, columns=columns_of(path, arguments.columns))
+    result = read_result(path, columns=file_columns(path, arguments.columns))
     for note in result.cloud.notes:
         warn(f"{path}: {note}.")
     return result
@@ -106,9 +106,9 @@ def _write_picture(arguments: Arguments, result: Result) -> str:
         raise ConfigError(
             f"expected --truth with a viewer, got {arguments.out}; use --out PAGE.html."
         )
-    halves = [_draw(arguments, result)]
+    halves = [_render(arguments, result)]
     if arguments.beside is not None:
-        halves.append(_draw(arguments, _read(arguments.beside, arguments), result))
+        halves.append(_render(arguments, _read(arguments.beside, arguments), result))
     height = max(len(half) for half in halves)
     level = [
         functional.pad(half, (0, 0, 0, 0, 0, height - len(half)), value=255) for half in halves
@@ -117,7 +117,7 @@ def _write_picture(arguments: Arguments, result: Result) -> str:
     return f"{sum(half.shape[1] for half in halves)} x {height} pixels"
 
 
-def _draw(arguments: Arguments, result: Result, first: Result | None = None) -> Tensor:
+def _render(arguments: Arguments, result: Result, first: Result | None = None) -> Tensor:
     """Render a result; with the same points as the first, use its camera and colors."""
     cloud, normals = result.cloud, result.cloud.fields.get("normals")
     reference = None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from torchrg.errors import FormatError
 from torchrg.io.files import atomic_path, check_place
 from torchrg.render.colors import color_planes
-from torchrg.render.page import check_library, make_page, template_of, write_page
+from torchrg.render.page import check_library, load_template, make_page, write_page
 from torchrg.render.pictures import render_cloud, write_png
 from torchrg.result import Result
 
@@ -34,7 +34,7 @@ class Entry(NamedTuple):
     words: str = ""
 
 
-def draw_planes(path: str | os.PathLike[str], result: Result) -> None:
+def write_planes(path: str | os.PathLike[str], result: Result) -> None:
     """Write an image of the superpoints of a result, or of its planes without superpoints."""
     fields, points = result.fields, result.cloud.points
     normals = fields.get("normals")
@@ -76,7 +76,7 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
             check_place(page)
 
 
-def draw_entry(folder: Path, name: str, result: Result, *, words: str = "") -> Entry:
+def write_entry(folder: Path, name: str, result: Result, *, words: str = "") -> Entry:
     """Write the image and viewer of a result, and return its index entry.
 
     Raises:
@@ -85,7 +85,7 @@ def draw_entry(folder: Path, name: str, result: Result, *, words: str = "") -> E
     """
     entry = Entry(name, f"{name}.png", f"{name}.html", words)
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    draw_planes(folder / entry.picture, result)
+    write_planes(folder / entry.picture, result)
     write_page(folder / entry.page, make_page(result, title=name))
     return entry
 
@@ -97,7 +97,7 @@ def write_index(folder: Path, title: str, entries: Sequence[Entry]) -> Path:
         FormatError: If it cannot be written.
         MissingDependencyError: If viewers cannot be created.
     """
-    text = template_of("gallery.html.jinja").render(title=title, entries=entries)
-    with atomic_path(folder / INDEX) as beside:
-        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
+    text = load_template("gallery.html.jinja").render(title=title, entries=entries)
+    with atomic_path(folder / INDEX) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
     return folder / INDEX

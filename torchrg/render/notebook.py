@@ -8,7 +8,7 @@ from typing import Any
 from torchrg._optional import require
 from torchrg.errors import ConfigError
 from torchrg.plane_table import describe_planes, tabulate_planes
-from torchrg.render.gallery import draw_planes
+from torchrg.render.gallery import write_planes
 from torchrg.render.page import Page, make_page
 from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
@@ -49,7 +49,7 @@ def as_html(segmentation: Segmentation) -> str:
     if segmentation.points is not None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "planes.png"
-            draw_planes(path, _result_of(segmentation))
+            write_planes(path, _result_of(segmentation))
             content = base64.b64encode(path.read_bytes()).decode("ascii")
         picture = f'<img src="data:image/png;base64,{content}" style="max-width: 640px" alt="">'
     planes, labels = describe_planes(segmentation.planes)["planes"], segmentation.labels
