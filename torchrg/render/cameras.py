@@ -9,12 +9,12 @@ from torch import Tensor
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_MARGIN = 0.03
+_MARGIN_FRACTION = 0.03
 """Margin on each side of the image, as a fraction of its size."""
-_NEAREST = 0.25
+_MIN_DISTANCE_FRACTION = 0.25
 """Minimum distance from the camera to the nearest point, as a fraction of the depth of the cloud. A
 nearer camera would exaggerate the foreground."""
-_FLATTEST = 0.25
+_MIN_ASPECT_RATIO = 0.25
 """Minimum aspect ratio (height to width) of an image without a given height."""
 
 
@@ -96,10 +96,10 @@ def fit_camera(
     forward = across[:, 2] - nearest
     longer = max(width, height or width)
     half = math.tan(math.radians(field_of_view_deg) / 2)
-    distance = _NEAREST * (farthest - nearest)
+    distance = _MIN_DISTANCE_FRACTION * (farthest - nearest)
     middle = across.new_zeros(2)
     for axis, size in enumerate((width, height or width)):
-        tangent = half * (1 - 2 * _MARGIN) * size / longer
+        tangent = half * (1 - 2 * _MARGIN_FRACTION) * size / longer
         _, high = _bounds(across[:, axis] - tangent * forward)
         low, _ = _bounds(across[:, axis] + tangent * forward)
         middle[axis] = (low + high) / 2
@@ -129,10 +129,10 @@ def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "
     ahead = points[points[:, 2] > 0].double()
     rays = ahead[:, :2] / ahead[:, 2:]
     (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
-    room = (1 - 2 * _MARGIN) * width, (1 - 2 * _MARGIN) * (height or width)
+    available = (1 - 2 * _MARGIN_FRACTION) * width, (1 - 2 * _MARGIN_FRACTION) * (height or width)
     scales = [
         size / span
-        for size, span in zip(room, (right - left, bottom - top), strict=True)
+        for size, span in zip(available, (right - left, bottom - top), strict=True)
         if span > 0
     ]
     return _frame(torch.eye(4), min(scales, default=float(width)), rays, width, height)
@@ -144,8 +144,8 @@ def _frame(
     """Center the camera on rays ``(N, 2)``, and fit the height if None."""
     (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
     if height is None:
-        needed = focal * (bottom - top) / (1 - 2 * _MARGIN)
-        height = max(1, round(min(max(needed, _FLATTEST * width), width)))
+        needed = focal * (bottom - top) / (1 - 2 * _MARGIN_FRACTION)
+        height = max(1, round(min(max(needed, _MIN_ASPECT_RATIO * width), width)))
     center = (
         (width - 1) / 2 - focal * (left + right) / 2,
         (height - 1) / 2 - focal * (top + bottom) / 2,

@@ -72,7 +72,7 @@ class Channel(NamedTuple):
     legend: Legend
 
 
-def channels_of(
+def make_channels(
     fields: Mapping[str, Tensor],
     truth: Mapping[str, Tensor],
     palettes: Mapping[str, tuple[Tensor, Tensor]],
@@ -87,15 +87,15 @@ def channels_of(
             of ``plane`` and ``superpoint``, with rows of the n points.
     """
     if "labels" in fields:
-        yield _of_regions("plane", fields["labels"], *palettes["plane"])
+        yield _region_channel("plane", fields["labels"], *palettes["plane"])
     if "superpoints" in fields:
-        yield _of_regions("superpoint", fields["superpoints"], *palettes["superpoint"])
+        yield _region_channel("superpoint", fields["superpoints"], *palettes["superpoint"])
     if "color" in fields:
         yield Channel("color", fields["color"].numpy(), None, [])
     if "normals" in fields:
-        yield _of_normals(fields["normals"])
+        yield _normal_channel(fields["normals"])
     if "curvature" in fields:
-        yield _of_curvature(fields["curvature"])
+        yield _curvature_channel(fields["curvature"])
     if "sharp" in fields:
         colors = color_sharp(torch.tensor([False, True])).numpy()
         legend = [(colors[0].tolist(), "smooth"), (colors[1].tolist(), "sharp")]
@@ -106,10 +106,10 @@ def channels_of(
         colors = np.array([color for color, _ in meanings], dtype=np.uint8)
         yield Channel("error", values, colors, meanings)
     if "normals" in fields and "normals" in truth:
-        yield _of_angles(unsigned_angle_deg(fields["normals"], truth["normals"]))
+        yield _angle_channel(unsigned_angle_deg(fields["normals"], truth["normals"]))
 
 
-def _of_regions(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Channel:
+def _region_channel(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Channel:
     """Return the colors of regions by label; the last color is for unlabeled points."""
     none = int(labels.max()) + 1 if len(labels) else 0
     values = torch.where(labels < 0, none, labels)
@@ -119,7 +119,7 @@ def _of_regions(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Cha
     return Channel(mode, values.numpy().astype(np.min_scalar_type(none)), colors.numpy(), legend)
 
 
-def _of_normals(normals: Tensor) -> Channel:
+def _normal_channel(normals: Tensor) -> Channel:
     """Return the colors of directions, by their octahedral coordinates."""
     places = encode_directions(normals)
     shift = 8 - _DIRECTION_BITS
@@ -134,7 +134,7 @@ def _of_normals(normals: Tensor) -> Channel:
     return Channel("normal", values, colors, legend)
 
 
-def _on_scale(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Channel:
+def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Channel:
     """Return the colors of fractions of a scale, with a legend for selected values."""
     steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
     colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
@@ -145,17 +145,17 @@ def _on_scale(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Chann
     return Channel(mode, values, colors, legend)
 
 
-def _of_curvature(curvature: Tensor) -> Channel:
+def _curvature_channel(curvature: Tensor) -> Channel:
     """Return the colors of curvature, on a square-root scale."""
     shown = {math.sqrt(value / _CURVATURE_END): f"{value:g}" for value in (0.0, 0.01, 0.03)}
     shown[1.0] = f"{_CURVATURE_END:g} and more"
-    return _on_scale("curvature", (curvature / _CURVATURE_END).clamp(min=0).sqrt(), shown)
+    return _scale_channel("curvature", (curvature / _CURVATURE_END).clamp(min=0).sqrt(), shown)
 
 
-def _of_angles(angles_deg: Tensor) -> Channel:
+def _angle_channel(angles_deg: Tensor) -> Channel:
     """Return the colors of the angles between normals and ground truth."""
     shown = {angle / _WORST_ANGLE_DEG: f"{angle:g} degrees" for angle in (0, 5, 20, 45)}
-    return _on_scale("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
+    return _scale_channel("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
 
 
 def outcomes_of(

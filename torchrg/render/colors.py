@@ -60,18 +60,18 @@ _VIVID = (
     "fe8eb2 fe928c f99960 d7aa4b abb850 76c26d 16c897 14c4c1 13c1df 13bdfe 84b1fe bea1ff f08fdf"
 )
 """Colors of small planes, more visible: 13 hues of chroma up to 54, lightness 44, 58 and 72."""
-_LARGE = 0.03
+_MIN_LARGE_FRACTION = 0.03
 """Minimum fraction of all points in a large plane."""
-_ALIKE = 120.0
+_SIMILAR = 120.0
 """Squared distance in CIE Lab of two colors that look about the same."""
-_WITHOUT_CONE = 0.5
+_DICHROMACY_WEIGHT = 0.5
 """Weight of color vision deficiency. With less, adjacent planes look alike to color-blind viewers;
 with more, to all other viewers."""
-_AXES_WITHOUT_CONE = ((0.0, 1.0), (1.07, 0.56))
+_DICHROMACY_AXES = ((0.0, 1.0), (1.07, 0.56))
 """Directions in the a-b plane of CIE Lab visible without one kind of cones: blue-yellow without the
 long or middle ones, red-cyan without the short ones. Fitted to the palette under the model of
 Machado et al., A physiologically-based model for simulation of color vision deficiency, 2009."""
-_ELSEWHERE = 0.005
+_MIN_WEIGHT = 0.005
 """Minimum weight of a plane that is not adjacent; adjacent planes have weight 1."""
 _GRAY_WEIGHT = 0.05
 """Weight of the gray of unlabeled points, which occur nearly everywhere."""
@@ -79,7 +79,7 @@ PALETTE = torch.tensor([list(bytes.fromhex(row)) for row in f"{_CALM} {_VIVID}".
 """Colors of planes, calm ones first, shape ``(59, 3)``, uint8."""
 
 
-def _likeness() -> Tensor:
+def _similarity() -> Tensor:
     """Return the similarity of palette colors to each other and to gray, ``(59, 60)``.
 
     Combines normal color vision with the weighted worst dichromacy.
@@ -87,9 +87,9 @@ def _likeness() -> Tensor:
     gray = PALETTE.new_full((1, 3), UNLABELED_GRAY)
     labs = rgb_to_lab(torch.cat([PALETTE, gray]).double() / 255)
     light, a, b = (labs[: len(PALETTE), None] - labs).unbind(dim=2)
-    worst = torch.stack([(a * x + b * y).square() for x, y in _AXES_WITHOUT_CONE]).amin(dim=0)
-    usual, worst = light**2 + a**2 + b**2, light**2 + worst
-    return 1 / (usual + _ALIKE) + _WITHOUT_CONE / (worst + _ALIKE)
+    worst = torch.stack([(a * x + b * y).square() for x, y in _DICHROMACY_AXES]).amin(dim=0)
+    trichromatic, worst = light**2 + a**2 + b**2, light**2 + worst
+    return 1 / (trichromatic + _SIMILAR) + _DICHROMACY_WEIGHT / (worst + _SIMILAR)
 
 
 def choose_colors(
@@ -110,9 +110,9 @@ def choose_colors(
         >>> len(choices.unique())
         2
     """
-    repulsion = _likeness().T
+    repulsion = _similarity().T
     fraction = sizes / sizes.sum()
-    strength = (8 * fraction).clamp(_ELSEWHERE, 1).double()
+    strength = (8 * fraction).clamp(_MIN_WEIGHT, 1).double()
     choices = torch.full_like(sizes, -1) if fixed is None else fixed.clone()
     done = choices >= 0
     field = strength[done] @ repulsion[choices[done]] + _GRAY_WEIGHT * repulsion[-1]
@@ -127,7 +127,7 @@ def choose_colors(
         near = slice(starts[plane], starts[plane + 1])
         placed = choices[others[near]]
         cost = field + (pull[near] * (placed >= 0)) @ repulsion[placed]
-        calm = bool(fraction[plane] > _LARGE)
+        calm = bool(fraction[plane] > _MIN_LARGE_FRACTION)
         pick = cost[:num_calm].argmin() if calm else num_calm + cost[num_calm:].argmin()
         choices[plane] = pick
         field += strength[plane] * repulsion[pick]
@@ -333,7 +333,7 @@ def _choose(
     if points is not None:
         counted = (rows >= 0) & points.isfinite().all(dim=-1)
         for num_voxels, weight in _NEIGHBORHOODS:
-            pairs.append(_touching_planes(points[counted], rows[counted], num_voxels))
+            pairs.append(_adjacent_planes(points[counted], rows[counted], num_voxels))
             weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
     choices = choose_colors(
         sizes.cpu(),
@@ -344,7 +344,7 @@ def _choose(
     return rows, choices.to(labels.device)
 
 
-def _touching_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
+def _adjacent_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
     """Return the pairs of planes in adjacent voxels, shape ``(E, 2)``."""
     extent = float((points.amax(dim=0) - points.amin(dim=0)).amax()) if len(points) else 0.0
     if extent == 0:

@@ -29,17 +29,17 @@ PAGE_EXTENT = 10.0
 """Longest side of a cloud in a viewer; independent of the unit."""
 _OUTLINE_POINTS = 200_000
 """Number of points from which polygons are traced; enough for display."""
-_NOT_SHOWN = ("id", "centroid", "axes", "center", "outline")
+_OMITTED_COLUMNS = ("id", "centroid", "axes", "center", "outline")
 """Columns of the plane table that a viewer draws or omits."""
-_USUAL_RADIUS = 128
+_MEDIAN_RADIUS = 128
 """Encoded median radius, in the middle of the byte range."""
-_STEPS_OF_OCTAVE = 16
+_STEPS_PER_OCTAVE = 16
 """Steps of the encoded radius per factor of two: one step is 4 percent."""
-_LARGEST_SPACING = 3.0
+_MAX_SPACING_RATIO = 3.0
 """Maximum ratio of a point's radius to the median, in either direction."""
 
 
-class Frame(NamedTuple):
+class PageFrame(NamedTuple):
     """Axes of a viewer: z up, the center of the first cloud at the origin.
 
     Attributes:
@@ -52,13 +52,13 @@ class Frame(NamedTuple):
     rotation: Tensor
     scale: float
 
-    def place(self, points: Tensor, origin: NDArray[np.float64]) -> Tensor:
+    def transform(self, points: Tensor, origin: NDArray[np.float64]) -> Tensor:
         """Transform points relative to an origin to viewer axes, float32."""
         moved = points.double() + (torch.from_numpy(origin) - self.origin)
         return (moved @ self.rotation.T / self.scale).float()
 
 
-class Shown(NamedTuple):
+class PointSample(NamedTuple):
     """Points of a cloud displayed in a viewer.
 
     Attributes:
@@ -78,7 +78,7 @@ class Shown(NamedTuple):
     sides: Sides
 
 
-def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
+def make_frame(cloud: Cloud, up: tuple[float, float, float]) -> PageFrame:
     """Return the axes of a viewer for its first cloud."""
     third = unit_direction("make_page", up)
     # With z up, x stays x; otherwise use the axis most perpendicular to the up direction.
@@ -88,20 +88,20 @@ def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
     rotation = torch.stack([first, torch.linalg.cross(third, first), third])
     finite = cloud.coordinates[cloud.finite]
     if len(finite) == 0:
-        return Frame(torch.zeros(3, dtype=torch.float64), rotation, 1.0)
+        return PageFrame(torch.zeros(3, dtype=torch.float64), rotation, 1.0)
     low, high = (
         torch.from_numpy(end(axis=0).astype(np.float64)) for end in (finite.min, finite.max)
     )
     extent = float((high - low).amax())
-    return Frame(low + (high - low) / 2, rotation, extent / PAGE_EXTENT if extent > 0 else 1.0)
+    return PageFrame(low + (high - low) / 2, rotation, extent / PAGE_EXTENT if extent > 0 else 1.0)
 
 
-def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
+def choose_points(result: Result, frame: PageFrame, max_points: int) -> PointSample:
     """Sample the points to display, in random strata, independent of their order."""
     cloud = result.cloud
     finite = finite_rows(cloud.points)
-    mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
-    strata = [stratum.sort().values for stratum in mixed.tensor_split(NUM_STRATA)]
+    shuffled = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
+    strata = [stratum.sort().values for stratum in shuffled.tensor_split(NUM_STRATA)]
     levels = torch.tensor([len(stratum) for stratum in strata]).cumsum(0).tolist()
     rows = finite[torch.cat(strata)]
     fields = {
@@ -117,33 +117,33 @@ def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
     if "superpoints" in fields:
         parts = result.fields["superpoints"].long()
         fields["superpoints"] = number_labels(parts.clamp(min=-1))[1][rows]
-    points = frame.place(cloud.points[rows], cloud.origin)
+    points = frame.transform(cloud.points[rows], cloud.origin)
     surface = sample_surface(points)
     labels = fields["labels"][surface.rows] if "labels" in fields else None
     sides = find_sides(surface, labels, torch.tensor([0.0, 0.0, 1.0]))
-    return Shown(rows, levels, points, fields, surface, sides)
+    return PointSample(rows, levels, points, fields, surface, sides)
 
 
-def radii_of(shown: Shown) -> Tensor:
+def encode_radii(shown: PointSample) -> Tensor:
     """Return the encoded radius of each point: 16 steps per factor of two, 128 is the median."""
     surface, labels = shown.surface, shown.fields.get("labels")
-    usual = float(surface.spacing.median()) if len(surface.spacing) else 0.0
-    if usual == 0:
-        return torch.full((len(surface.rows),), _USUAL_RADIUS, dtype=torch.uint8)
+    median_spacing = float(surface.spacing.median()) if len(surface.spacing) else 0.0
+    if median_spacing == 0:
+        return torch.full((len(surface.rows),), _MEDIAN_RADIUS, dtype=torch.uint8)
     labels = None if labels is None else labels[surface.rows]
-    ratio = surface.disc_spacing(_LARGEST_SPACING, labels) / usual
-    octaves = ratio.clamp(min=1 / _LARGEST_SPACING).log2()
-    return (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round().to(torch.uint8)
+    ratio = surface.disc_spacing(_MAX_SPACING_RATIO, labels) / median_spacing
+    octaves = ratio.clamp(min=1 / _MAX_SPACING_RATIO).log2()
+    return (octaves * _STEPS_PER_OCTAVE + _MEDIAN_RADIUS).round().to(torch.uint8)
 
 
-def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, object]]:
+def page_planes(result: Result, shown: PointSample, frame: PageFrame) -> list[dict[str, object]]:
     """Return the plane entries of a viewer, by viewer label.
 
     Entries have the columns of :func:`torchrg.result.describe_planes` that are not drawn, ``rings``
     in viewer axes, and ``meets``: adjacent planes with angle and boundary length. Planes without
     classes are classified by the up axis of the viewer.
     """
-    planes, origin, table = result.planes, result.cloud.origin, describe_shown(result, frame)
+    planes, origin, table = result.planes, result.cloud.origin, displayed_table(result, frame)
     if not planes:
         return []
     meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
@@ -155,18 +155,18 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     rings = planes.outline or _trace(planes, shown.rows, result)
     corners = _rectangles(planes)
     return [
-        {name: value for name, value in row.items() if name not in _NOT_SHOWN}
+        {name: value for name, value in row.items() if name not in _OMITTED_COLUMNS}
         | {
             "name": row["id"],
             "kind": PLANE_KINDS.index(row["kind"]),
-            "rings": [rounded(frame.place(ring, origin)) for ring in outline or (rectangle,)],
+            "rings": [rounded(frame.transform(ring, origin)) for ring in outline or (rectangle,)],
             "meets": met,
         }
         for row, outline, rectangle, met in zip(table["planes"], rings, corners, meets, strict=True)
     ]
 
 
-def describe_shown(result: Result, frame: Frame) -> Json:
+def displayed_table(result: Result, frame: PageFrame) -> Json:
     """Return the plane table of a viewer, with the labels of the file as IDs."""
     planes = result.planes
     if not planes:

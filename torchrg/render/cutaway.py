@@ -34,15 +34,15 @@ _MAX_WALLS = 60
 _ANGLE_DEG = 4.0
 """Maximum angle for region growing on voxels, in degrees. Voxels have little noise; with more,
 ceilings grow into walls."""
-_ALIKE = 0.9
+_MIN_SIDE_COSINE = 0.9
 """Minimum cosine between the directions of walls that are hidden together."""
-_MAX_BEYOND = 0.03
+_MAX_BEYOND_FRACTION = 0.03
 """Maximum fraction of the cloud beyond an outer wall: scanners see through doors and windows."""
-_MIN_INSIDE = 0.05
+_MIN_INSIDE_FRACTION = 0.05
 """Minimum fraction of the cloud on the inner side of an outer wall."""
 _THICKNESS = 1.5
 """Distance to a wall, in voxel edges plus twice its noise, up to which voxels belong to it."""
-_BELOW_CEILING = 0.15
+_CEILING_DEPTH = 0.15
 """Depth below a ceiling that is hidden with it, as a fraction of the cloud height, for lamps and
 beams."""
 _MAX_PIXELS = 500
@@ -104,21 +104,21 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
     low, high = altitude.quantile(altitude.new_tensor([0.02, 0.98])).tolist()
     kind = classify_planes(planes, centers, numbers, up)
     walls, ceilings = (kind == PLANE_KINDS.index(name) for name in ("wall", "ceiling"))
-    directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
+    directions, covered = _find_outer_sides(surface, planes, walls, ceilings, up, high - low)
     powers = 1 << torch.arange(MAX_SIDES, device=centers.device)
-    by_place = (covered * powers).sum(dim=1)
+    bits_by_position = (covered * powers).sum(dim=1)
     is_labeled = of_points >= 0
     inside = torch.zeros(len(present) + 1, MAX_SIDES, device=centers.device)
     inside.index_add_(0, of_points[is_labeled], covered[surface.voxel_of[is_labeled]].float())
     counts = torch.bincount(of_points[is_labeled], minlength=len(inside))
     of_planes = ((2 * inside > counts[:, None]) * powers).sum(dim=1)
-    voxels = torch.where(of_voxels < 0, by_place, of_planes[of_voxels])
-    points = torch.where(of_points < 0, by_place[surface.voxel_of], of_planes[of_points])
+    voxels = torch.where(of_voxels < 0, bits_by_position, of_planes[of_voxels])
+    points = torch.where(of_points < 0, bits_by_position[surface.voxel_of], of_planes[of_points])
     heading = _heading(planes.normal[walls], planes.area[walls], up)
     return Sides(directions, voxels.to(torch.uint8), points.to(torch.uint8), heading)
 
 
-def _outer(
+def _find_outer_sides(
     surface: Surface, planes: Planes, walls: Tensor, ceilings: Tensor, up: Tensor, height: float
 ) -> tuple[Tensor, Tensor]:
     """Return the directions of outer sides, and the mask of voxels in each, ``(V, MAX_SIDES)``."""
@@ -127,25 +127,25 @@ def _outer(
     local = surface.centers[:, None] - planes.center[rows]
     across = torch.einsum("vmi,mji->vmj", local, planes.axes[rows]).abs()
     thickness = _THICKNESS * surface.size + 2 * planes.rms[rows]
-    depth = torch.where(ceilings[rows], thickness.clamp(min=_BELOW_CEILING * height), thickness)
-    beside = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
+    depth = torch.where(ceilings[rows], thickness.clamp(min=_CEILING_DEPTH * height), thickness)
+    in_rectangle = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
     heights = (local * planes.normal[rows]).sum(dim=2)
     directions: list[Tensor] = []
     covered = torch.zeros(len(local), MAX_SIDES, dtype=torch.bool, device=local.device)
     for place, row in enumerate(rows.tolist()):
         for sign in (1, -1):
             outward, above = sign * planes.normal[row], sign * heights[:, place]
-            beyond = (beside[:, place] & (above > thickness[place])).float().mean()
+            beyond = (in_rectangle[:, place] & (above > thickness[place])).float().mean()
             inside = (above < -thickness[place]).float().mean()
-            is_outer = bool((beyond <= _MAX_BEYOND) & (inside >= _MIN_INSIDE))
+            is_outer = bool((beyond <= _MAX_BEYOND_FRACTION) & (inside >= _MIN_INSIDE_FRACTION))
             if not is_outer or (ceilings[row] and outward @ up < 0):
                 continue
-            alike = [n for n, each in enumerate(directions) if each @ outward > _ALIKE]
-            if not alike and len(directions) < MAX_SIDES:
-                alike = [len(directions)]
+            similar = [n for n, each in enumerate(directions) if each @ outward > _MIN_SIDE_COSINE]
+            if not similar and len(directions) < MAX_SIDES:
+                similar = [len(directions)]
                 directions.append(outward)
-            for side in alike[:1]:
-                covered[:, side] |= beside[:, place] & (above > -depth[place])
+            for side in similar[:1]:
+                covered[:, side] |= in_rectangle[:, place] & (above > -depth[place])
     return torch.stack([up.new_zeros(3), *directions])[1:], covered
 
 
@@ -214,7 +214,7 @@ def choose_viewpoint(
         viewpoints.append(Viewpoint(toward, picture_up, sides.bits_toward(toward, view)))
     if len(viewpoints) == 1:
         return viewpoints[0]
-    return max(viewpoints, key=lambda viewpoint: _count_seen(surface, sides, viewpoint))
+    return max(viewpoints, key=lambda viewpoint: _count_visible(surface, sides, viewpoint))
 
 
 def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: float) -> Tensor:
@@ -226,7 +226,7 @@ def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: floa
     return turned
 
 
-def _count_seen(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
+def _count_visible(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
     """Return the number of visible voxels, in an orthographic view without the hidden sides."""
     centers = surface.centers[(sides.of_voxels & viewpoint.cut) == 0]
     if len(centers) == 0 or surface.size == 0:

@@ -32,17 +32,17 @@ from torchrg.io.files import atomic_path
 from torchrg.linalg import unit_direction
 from torchrg.neighbors.order import restore_rows
 from torchrg.plane_table import encode_csv
-from torchrg.render.channels import MODES, channels_of, encode_directions
+from torchrg.render.channels import MODES, encode_directions, make_channels
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
     PAGE_EXTENT,
-    Frame,
-    Shown,
+    PageFrame,
+    PointSample,
     choose_points,
-    describe_shown,
-    frame_of,
-    planes_of_page,
-    radii_of,
+    displayed_table,
+    encode_radii,
+    make_frame,
+    page_planes,
     rounded,
 )
 from torchrg.render.cutaway import MIN_FACING, View, choose_viewpoint
@@ -125,7 +125,7 @@ def make_page(
     cloud = result.cloud
     up = _check_settings(cloud, truth, up, view, max_points)
     library = _read_library()
-    frame = frame_of(cloud, up)
+    frame = make_frame(cloud, up)
     true_fields = {} if truth is None else Result(truth).fields
     shown = choose_points(result, frame, max_points)
     described = [_describe_cloud(result, shown, true_fields, None, frame)]
@@ -149,7 +149,7 @@ def make_page(
         "title": title or " and ".join(scene["name"] for scene in scenes),
         "modes": [(mode, MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
-        "toward": rounded(_direction_of_view(shown, view, frame, azimuth_deg)),
+        "toward": rounded(_initial_direction(shown, view, frame, azimuth_deg)),
         "cut": view in MIN_FACING,
         "minFacing": MIN_FACING["above" if view == "above" else "cutaway"],
         "frame": {
@@ -199,8 +199,8 @@ def write_page(path: str | os.PathLike[str], page: Page) -> None:
     Raises:
         FormatError: If the file cannot be written.
     """
-    with atomic_path(path) as beside:
-        beside.write_text(page.html, encoding="utf-8", errors="backslashreplace")
+    with atomic_path(path) as temporary:
+        temporary.write_text(page.html, encoding="utf-8", errors="backslashreplace")
 
 
 def check_library() -> None:
@@ -222,10 +222,10 @@ def _read_library() -> str:
 
 def _describe_cloud(
     result: Result,
-    shown: Shown,
+    shown: PointSample,
     truth: Mapping[str, Tensor],
     reference: Tensor | None,
-    frame: Frame,
+    frame: PageFrame,
 ) -> tuple[dict[str, Any], str]:
     """Return the entry of a result in the description, and the packed arrays of its points."""
     cloud = result.cloud
@@ -233,8 +233,8 @@ def _describe_cloud(
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     palettes = _palettes(result, shown, reference)
-    channels = list(channels_of(shown.fields, true_fields, palettes))
-    planes = planes_of_page(result, shown, frame)
+    channels = list(make_channels(shown.fields, true_fields, palettes))
+    planes = page_planes(result, shown, frame)
     covered = restore_rows(shown.sides.of_points, shown.surface.rows, len(shown.rows))
     if planes:
         labels = shown.fields["labels"]
@@ -247,10 +247,10 @@ def _describe_cloud(
     steps = ((shown.points - low) * (_STEPS / PAGE_EXTENT)).round().clamp(0, _STEPS)
     arrays: dict[str, NDArray[np.generic]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
-    radii = radii_of(shown)
+    radii = encode_radii(shown)
     arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
     if planes:
-        arrays["table"] = np.frombuffer(encode_csv(describe_shown(result, frame)), np.uint8)
+        arrays["table"] = np.frombuffer(encode_csv(displayed_table(result, frame)), np.uint8)
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:
@@ -279,7 +279,7 @@ def _describe_cloud(
 
 
 def _palettes(
-    result: Result, shown: Shown, reference: Tensor | None
+    result: Result, shown: PointSample, reference: Tensor | None
 ) -> dict[str, tuple[Tensor, Tensor]]:
     """Return the colors of planes and superpoints, the same as in images of the cloud."""
     regions = {}
@@ -294,7 +294,9 @@ def _palettes(
     return palettes
 
 
-def _direction_of_view(shown: Shown, view: View, frame: Frame, azimuth_deg: float | None) -> Tensor:
+def _initial_direction(
+    shown: PointSample, view: View, frame: PageFrame, azimuth_deg: float | None
+) -> Tensor:
     """Return the initial direction toward the viewer, in viewer axes, shape ``(3,)``."""
     if view == "sensor":
         return frame.rotation[:, 2].float().neg()
@@ -341,8 +343,8 @@ def _encode_library(library: str) -> str:
 def _encode(content: bytes) -> str:
     """Compress bytes and encode them as base64."""
     # Above level 6 the time grows faster than the size shrinks.
-    squeezer = zlib.compressobj(6, wbits=zlib.MAX_WBITS | 16)
-    return base64.b64encode(squeezer.compress(content) + squeezer.flush()).decode("ascii")
+    compressor = zlib.compressobj(6, wbits=zlib.MAX_WBITS | 16)
+    return base64.b64encode(compressor.compress(content) + compressor.flush()).decode("ascii")
 
 
 def _fill_template(description: Mapping[str, object], blobs: Iterable[str], library: str) -> str:
@@ -350,7 +352,7 @@ def _fill_template(description: Mapping[str, object], blobs: Iterable[str], libr
     from markupsafe import Markup
 
     script = (_ASSETS / "page.js").read_text(encoding="utf-8")
-    text: str = template_of("page.html.jinja").render(
+    text: str = load_template("page.html.jinja").render(
         title=description["title"],
         description=Markup(_json_for_html(description)),  # noqa: S704 Escaped there.
         blobs=[Markup(blob) for blob in blobs],  # noqa: S704 Base64.
@@ -360,7 +362,7 @@ def _fill_template(description: Mapping[str, object], blobs: Iterable[str], libr
     return text
 
 
-def template_of(name: str) -> "Template":
+def load_template(name: str) -> "Template":
     """Load a template of this folder, with autoescaping.
 
     Raises:

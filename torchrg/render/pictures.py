@@ -30,25 +30,25 @@ from torchrg.render.surface import Surface, sample_surface
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_POINTS_AT_ONCE = 131_072
+_CHUNK_POINTS = 131_072
 """Number of points drawn at a time; bounds the memory."""
 _RADIUS = 1.3
 """Radius of a disc, in local spacings; leaves only a few gaps in a surface."""
-_LARGEST = 4
+_MAX_RADIUS_RATIO = 4
 """Maximum radius of a disc in a plane, in median radii; elsewhere the median is the maximum."""
-_WIDEST = 0.02
+_RADIUS_FRACTION = 0.02
 """Maximum radius of a disc, as a fraction of the image width; bounds the drawing time."""
-_ALWAYS, _MAX_RADIUS = 8.0, 64.0
+_SMALL_RADIUS, _MAX_RADIUS = 8.0, 64.0
 """Maximum radii of a disc in pixels: for small images, and for any image, since the time grows with
 the square of the radius."""
 _MAX_SIDE, _MAX_SUPERSAMPLING = 2**13, 16
 """Maximum number of pixels per side (an 8K screen), and of subpixels per pixel and axis; bounds the
 memory."""
-_GAP = 0.6
+_GAP_RADIUS = 0.6
 """Half the width of the gaps that are closed, in radii of a disc."""
-_STEEPEST = 0.05
+_MIN_COSINE = 0.05
 """Minimum cosine of the viewing angle of a disc (87 degrees), beyond which slopes diverge."""
-_FAR_APART = 6
+_OUTLIER_SPACING = 6
 """Distance to the neighbors, in median spacings, beyond which points are outliers that do not
 affect the image section."""
 
@@ -79,10 +79,10 @@ def draw_picture(
     """
     width, height = int(camera.width), int(camera.height)
     project = projection_of(camera, surface.origin, finer=supersampling)
-    lengths = _RADIUS * surface.disc_spacing(_LARGEST, labels)
+    lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)
     places = is_shown.nonzero().squeeze(-1)
-    radius, length = _usual_radius(project, surface.points, lengths, places)
-    widest = supersampling * min(max(_ALWAYS, _WIDEST * width), _MAX_RADIUS)
+    radius, length = _median_radius(project, surface.points, lengths, places)
+    widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
     buffer = DepthBuffer(
         width * supersampling, height * supersampling, max_radius=widest, device=places.device
     )
@@ -90,16 +90,16 @@ def draw_picture(
     def discs_of(chunk: Tensor) -> Discs:
         rows = surface.rows[chunk]
         slant = surface.normals_at(chunk) if normals is None else normals[rows]
-        place, least = surface.points[chunk], supersampling / 2
-        return _discs(project, place, colors[rows], slant.float(), lengths[chunk], least=least)
+        place, floor = surface.points[chunk], supersampling / 2
+        return _discs(project, place, colors[rows], slant.float(), lengths[chunk], floor=floor)
 
-    parts = torch.split(places, _POINTS_AT_ONCE)
+    parts = torch.split(places, _CHUNK_POINTS)
     for chunk in parts:
         buffer.draw(discs_of(chunk))
     buffer.end_drawing()
     for chunk in parts:
         buffer.paint(discs_of(chunk))
-    reach = max(1, round(_GAP * min(radius, widest)))
+    reach = max(1, round(_GAP_RADIUS * min(radius, widest)))
     depth, paint = depth_and_colors(close_gaps(buffer.keys(), reach=reach, thickness=length))
     brightness = shade_hollows(
         _reduce(depth, supersampling, torch.maximum),
@@ -110,11 +110,11 @@ def draw_picture(
     return (total * (brightness / supersampling**2)[..., None]).round_().to(torch.uint8)
 
 
-def _usual_radius(
+def _median_radius(
     project: Projection, points: Tensor, lengths: Tensor, places: Tensor
 ) -> tuple[float, float]:
     """Return the median radius of the discs, in pixels and in units of the cloud."""
-    sample = places[:: max(1, len(places) // _POINTS_AT_ONCE)]
+    sample = places[:: max(1, len(places) // _CHUNK_POINTS)]
     depth = project(points[sample])[0][:, 2]
     sample, depth = sample[depth > 0], depth[depth > 0]
     if len(sample) == 0:
@@ -131,9 +131,9 @@ def _discs(
     normals: Tensor,
     lengths: Tensor,
     *,
-    least: float,
+    floor: float,
 ) -> Discs:
-    """Return shaded discs of radii ``lengths``, in units of the cloud, at least ``least`` pixels.
+    """Return shaded discs of radii ``lengths``, in units of the cloud, at least ``floor`` pixels.
 
     Points behind the camera are dropped.
     """
@@ -146,13 +146,15 @@ def _discs(
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
     along = torch.where(
-        along.abs() < _STEEPEST, torch.where(along < 0, -_STEEPEST, _STEEPEST), along
+        along.abs() < _MIN_COSINE,
+        torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE),
+        along,
     )
     return Discs(
         pixels,
         inverse,
         light_colors(colors, normals, positions),
-        (lengths * inverse * project.focal).clamp(min=least),
+        (lengths * inverse * project.focal).clamp(min=floor),
         # n . X = const gives 1 / z = n . ray / const, with the gradient n_xy / focal in pixels.
         slopes=normals[:, :2] * (inverse / (along * project.focal))[:, None],
         max_change=lengths * inverse * inverse,
@@ -234,7 +236,7 @@ def render_cloud(
     if len(surface.rows) == 0:
         return _white(height or round(0.75 * width), width, cloud.device)
     planes = None if planes is None else planes[surface.rows]
-    near = surface.spacing <= _FAR_APART * surface.spacing.median()
+    near = surface.spacing <= _OUTLIER_SPACING * surface.spacing.median()
     is_shown = torch.ones_like(near)
     if view == "sensor":
         camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
@@ -337,11 +339,11 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic])
     from kornia_rs import io
 
     repair = "; rename it, image file names must be valid UTF-8"
-    with atomic_path(path) as beside, refusing(f"{path}: ", UnicodeEncodeError, repair=repair):
+    with atomic_path(path) as temporary, refusing(f"{path}: ", UnicodeEncodeError, repair=repair):
         if is_picture:
-            io.write_image_png_u8(str(beside), np.ascontiguousarray(values), "rgb")
+            io.write_image_png_u8(str(temporary), np.ascontiguousarray(values), "rgb")
         else:
-            io.write_image_png_u16(str(beside), values.astype(np.uint16)[..., None], "mono")
+            io.write_image_png_u16(str(temporary), values.astype(np.uint16)[..., None], "mono")
 
 
 def _check_cloud(
@@ -362,8 +364,8 @@ def _check_cloud(
     return cloud, paint, None if slant is None else slant.detach()
 
 
-def _check_sizes(caller: str, most: int, **settings: int | None) -> None:
-    """Raise ConfigError unless numbers of pixels are from 1 to ``most``."""
+def _check_sizes(caller: str, limit: int, **settings: int | None) -> None:
+    """Raise ConfigError unless numbers of pixels are from 1 to ``limit``."""
     for name, value in settings.items():
-        if value is not None and not 1 <= value <= most:
-            raise ConfigError(f"{caller}: expected {name} from 1 to {most:,}, got {value!r}.")
+        if value is not None and not 1 <= value <= limit:
+            raise ConfigError(f"{caller}: expected {name} from 1 to {limit:,}, got {value!r}.")

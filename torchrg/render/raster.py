@@ -30,9 +30,9 @@ _FLAT = 0.1
 planes of its discs. With 0 more pixels of noisy boxes get the color of another surface."""
 _LIGHT = (-0.45, -0.7, -0.55)
 """Direction toward the light in camera axes: from the left, above and behind the camera."""
-_DARKEST = 0.62
+_MIN_BRIGHTNESS = 0.62
 """Brightness of a surface that faces away from the light; its color stays recognizable."""
-_DEEPEST = 0.6
+_MAX_DARKENING = 0.6
 """Maximum fraction of brightness lost in a hollow. More looks like dirt."""
 _REACHES = ((1, 0.5), (2, 0.3), (3, 0.2))
 """Distances at which hollows are detected, in radii of a disc, with weights. The weights sum to 1
@@ -42,7 +42,7 @@ _NOISE = 0.7
 _MAX_SEARCH = 20
 """Maximum reach for an exhaustive search, in pixels; its time grows with the square. Clouds of
 20,000 points and more need less in an image of 1,600 pixels."""
-_WIDEST_SHADE = 4.0
+_MAX_SHADE_RADIUS = 4.0
 """Maximum radius for detecting hollows, in pixels; larger ones create halos."""
 
 
@@ -70,13 +70,13 @@ class Discs(NamedTuple):
     slopes: Tensor
     max_change: Tensor
 
-    def off_pixels(self) -> Tensor:
+    def pixel_offsets(self) -> Tensor:
         """Return the offsets of the centers from their pixel centers, shape ``(N, 2)``."""
         return self.pixels - self.pixels.round()
 
-    def depth_of_pixels(self) -> Tensor:
+    def pixel_depths(self) -> Tensor:
         """Return the inverse depth of the planes at the pixels of the centers."""
-        return self.inverse_depth - (self.slopes * self.off_pixels()).sum(dim=1)
+        return self.inverse_depth - (self.slopes * self.pixel_offsets()).sum(dim=1)
 
     def at(self, rows: Tensor) -> "Discs":
         """Return the selected discs."""
@@ -120,7 +120,7 @@ class DepthBuffer:
         self._colors = torch.full((size,), _WHITE, dtype=torch.int64, device=device)
         # Column, row and inverse depth of the centers of all discs, after an empty entry; the same
         # for the nearest disc of each pixel, and its inverse depth there.
-        self._middles, self._nearest = (torch.zeros(1, n, device=device) for n in (3, 4))
+        self._centers, self._nearest = (torch.zeros(1, n, device=device) for n in (3, 4))
 
     def keys(self) -> Tensor:
         """Return the key of each pixel ``(height, width)``, int64; see :func:`depth_and_colors`."""
@@ -133,15 +133,15 @@ class DepthBuffer:
 
     def draw(self, discs: Discs) -> None:
         """First pass: find the nearest disc of each pixel."""
-        number = torch.arange(len(discs.pixels), device=self._front.device) + len(self._middles)
-        middles = torch.cat([discs.pixels, discs.inverse_depth[:, None]], dim=1)
-        self._middles = torch.cat([self._middles, middles])
+        number = torch.arange(len(discs.pixels), device=self._front.device) + len(self._centers)
+        centers = torch.cat([discs.pixels, discs.inverse_depth[:, None]], dim=1)
+        self._centers = torch.cat([self._centers, centers])
         order, sizes, places = self._by_size(discs)
         shown, number = discs.at(order), number.index_select(0, order)
-        start = shown.depth_of_pixels()
+        start = shown.pixel_depths()
         dome = _DOME * shown.max_change / sizes.clamp(min=1).square_()
         for dx, dy, count in _pixels_of(sizes):
-            depth = _depth_beside(shown, start, dx, dy, count)
+            depth = _depth_at_offset(shown, start, dx, dy, count)
             depth.sub_(dome[:count], alpha=dx * dx + dy * dy)
             keys = depth.view(torch.int32).long() << _DEPTH_BITS
             place = places[:count] + self._step(dx, dy)
@@ -151,14 +151,14 @@ class DepthBuffer:
         """Look up the nearest discs between the passes."""
         number = self._front & (2**_DEPTH_BITS - 1)
         depth = (self._front >> _DEPTH_BITS).int().view(torch.float32)[:, None]
-        self._nearest = torch.cat([self._middles.index_select(0, number), depth], dim=1)
+        self._nearest = torch.cat([self._centers.index_select(0, number), depth], dim=1)
 
     def paint(self, discs: Discs) -> None:
         """Second pass: color the covered pixels."""
         order, sizes, places = self._by_size(discs)
         shown = discs.at(order)
-        away_x, away_y = shown.off_pixels().T.contiguous()
-        start = shown.depth_of_pixels()
+        away_x, away_y = shown.pixel_offsets().T.contiguous()
+        start = shown.pixel_depths()
         slope_x, slope_y = shown.slopes.T
         # The inverse depth of a disc's plane in the corner of the image, plus the noise tolerance.
         corner = shown.inverse_depth - (shown.slopes * shown.pixels).sum(dim=1)
@@ -169,7 +169,7 @@ class DepthBuffer:
         for dx, dy, count in _pixels_of(sizes):
             place = places[:count] + self._step(dx, dy)
             x, y, at_middle, front = self._nearest.index_select(0, place).unbind(dim=1)
-            depth = _depth_beside(shown, start, dx, dy, count)
+            depth = _depth_at_offset(shown, start, dx, dy, count)
             seen = depth.add_(shown.max_change[:count], alpha=_OVERHANG) >= front
             seen &= x.mul_(slope_x[:count]) + y.mul_(slope_y[:count]) + corner[:count] >= at_middle
             sq_distance = (away_x[:count] - dx).square_()
@@ -183,15 +183,15 @@ class DepthBuffer:
 
     def _by_size(self, discs: Discs) -> tuple[Tensor, Tensor, Tensor]:
         """Return the visible discs by descending size, their radii, and flat center indices."""
-        middle = discs.pixels.round()
-        inside = (middle >= 0) & (middle < middle.new_tensor([self.width, self.height]))
+        center = discs.pixels.round()
+        inside = (center >= 0) & (center < center.new_tensor([self.width, self.height]))
         # Few distinct sizes and a stable sort keep neighboring discs close in memory.
         sizes = (2 * discs.radii.clamp(max=self.max_radius)).round() / 2
         sizes, order = torch.where(inside.all(dim=-1), sizes, -1.0).sort(
             descending=True, stable=True
         )
         order = order[: int((sizes >= 0).sum())]
-        column, row = (middle[order] + self._margin).long().unbind(dim=-1)
+        column, row = (center[order] + self._margin).long().unbind(dim=-1)
         return order, sizes[: len(order)], row * self._stride + column
 
 
@@ -211,18 +211,18 @@ def _pixels_of(sizes: Tensor) -> Iterator[tuple[int, int, int]]:
             yield dx, dy, count
 
 
-def _depth_beside(discs: Discs, start: Tensor, dx: int, dy: int, count: int) -> Tensor:
+def _depth_at_offset(discs: Discs, start: Tensor, dx: int, dy: int, count: int) -> Tensor:
     """Return the inverse depth of the first discs at an offset, negative beyond their rims.
 
     ``start`` is the inverse depth of their planes at the center pixel, which all discs cover.
     """
     slope_x, slope_y = discs.slopes[:count].unbind(dim=-1)
-    middle, limit = discs.inverse_depth[:count], discs.max_change[:count]
-    change = (slope_y * dy).add_(slope_x, alpha=dx).add_(start[:count]).sub_(middle)
+    center, limit = discs.inverse_depth[:count], discs.max_change[:count]
+    change = (slope_y * dy).add_(slope_x, alpha=dx).add_(start[:count]).sub_(center)
     if dx == dy == 0:
-        return change.clamp_(-limit, limit).add_(middle)
+        return change.clamp_(-limit, limit).add_(center)
     ends = change.abs() > limit
-    return change.add_(middle).masked_fill_(ends, -torch.inf)
+    return change.add_(center).masked_fill_(ends, -torch.inf)
 
 
 def depth_and_colors(keys: Tensor) -> tuple[Tensor, Tensor]:
@@ -243,39 +243,39 @@ def close_gaps(keys: Tensor, *, reach: int, thickness: float) -> Tensor:
     in front of the closing. With a reach beyond 20 pixels, as for a few large discs, it takes the
     key of the closing, at constant cost.
     """
-    around = _largest_around(keys, reach)
-    closing = -_largest_around(-around, reach)
+    around = _window_maximum(keys, reach)
+    closing = -_window_maximum(-around, reach)
     depth, closed = depth_and_colors(keys)[0], depth_and_colors(closing)[0]
     rows, columns = (closed > depth + thickness * depth * closed).nonzero().unbind(dim=-1)
     best, closed = closing[rows, columns], closed[rows, columns]
     if reach <= _MAX_SEARCH:
         limit = closed / (1 - thickness * closed).clamp(min=0.5)
         # The largest key of this depth.
-        most = (limit.view(torch.int32).long() << _DEPTH_BITS) + 2**_DEPTH_BITS - 1
+        max_keys = (limit.view(torch.int32).long() << _DEPTH_BITS) + 2**_DEPTH_BITS - 1
         best = around[rows, columns]
-        is_left = best > most
+        is_left = best > max_keys
         best[is_left] = _nearest_behind(
-            keys, (rows[is_left], columns[is_left]), most[is_left], reach=reach
+            keys, (rows[is_left], columns[is_left]), max_keys[is_left], reach=reach
         )
     return keys.index_put((rows, columns), best)
 
 
 def _nearest_behind(
-    keys: Tensor, pixels: tuple[Tensor, Tensor], most: Tensor, *, reach: int
+    keys: Tensor, pixels: tuple[Tensor, Tensor], max_keys: Tensor, *, reach: int
 ) -> Tensor:
-    """Return the largest key within reach of each pixel that is at most ``most``, ``(n,)`` each."""
+    """Return the largest key within reach of each pixel, at most ``max_keys``, ``(n,)`` each."""
     padded = functional.pad(keys, [reach] * 4)
     stride, values = padded.shape[1], padded.flatten()
     first = pixels[0] * stride + pixels[1]
-    best = torch.zeros_like(most)
+    best = torch.zeros_like(max_keys)
     for dy in range(2 * reach + 1):
         for dx in range(2 * reach + 1):
             near = values.index_select(0, first + (dy * stride + dx))
-            torch.maximum(best, near.masked_fill_(near > most, 0), out=best)
+            torch.maximum(best, near.masked_fill_(near > max_keys, 0), out=best)
     return best
 
 
-def _largest_around(image: Tensor, reach: int) -> Tensor:
+def _window_maximum(image: Tensor, reach: int) -> Tensor:
     """Return the maximum in the square window around each pixel of an image ``(H, W)``.
 
     Windows of double width are combined from two windows, so the cost grows with the logarithm.
@@ -284,10 +284,10 @@ def _largest_around(image: Tensor, reach: int) -> Tensor:
         >>> _largest_around(torch.tensor([[1, 2, 3, 9], [0, 0, 0, 0]]), 1).tolist()
         [[2, 3, 9, 9], [2, 3, 9, 9]]
     """
-    least = torch.iinfo(image.dtype).min
+    lowest = torch.iinfo(image.dtype).min
     for axis in (0, 1):
         sides = [0, 0, reach, reach] if axis == 0 else [reach, reach]
-        image, width = functional.pad(image, sides, value=least), 1
+        image, width = functional.pad(image, sides, value=lowest), 1
         while width < 2 * reach + 1:
             step = min(width, 2 * reach + 1 - width)
             count = image.shape[axis] - step
@@ -309,7 +309,7 @@ def light_colors(colors: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
     light = functional.normalize(normals.new_tensor(_LIGHT), dim=0)
     away = (normals * positions).sum(dim=-1) > 0
     cosine = torch.where(away, -1.0, 1.0) * (normals @ light)
-    brightness = _DARKEST + (1 - _DARKEST) * (0.5 + 0.5 * cosine)
+    brightness = _MIN_BRIGHTNESS + (1 - _MIN_BRIGHTNESS) * (0.5 + 0.5 * cosine)
     return (colors * brightness[:, None]).round_().to(torch.uint8)
 
 
@@ -333,7 +333,7 @@ def shade_hollows(inverse_depth: Tensor, *, focal: float, radius: float) -> Tens
     depth = torch.where(drawn, 1 / inverse_depth, 0.0)
     darkness = torch.zeros_like(inverse_depth)
     for factor, weight in _REACHES:
-        reach = max(1, round(factor * min(radius, _WIDEST_SHADE)))
+        reach = max(1, round(factor * min(radius, _MAX_SHADE_RADIUS)))
         padded = functional.pad(inverse_depth[None, None], [reach] * 4, mode="replicate")[0, 0]
         for dx, dy in ((reach, 0), (0, reach), (reach, reach), (reach, -reach)):
             after, before = (
@@ -348,4 +348,4 @@ def shade_hollows(inverse_depth: Tensor, *, focal: float, radius: float) -> Tens
             hollow.sub_(_NOISE * radius / reach).clamp_(min=0)
             hollow.div_(slope.square_().add_(1).sqrt_())
             darkness.add_(hollow.div_(hollow + 1), alpha=weight / 4)
-    return torch.where(drawn, 1 - _DEEPEST * darkness, 1.0)
+    return torch.where(drawn, 1 - _MAX_DARKENING * darkness, 1.0)

@@ -13,7 +13,7 @@ _BITS = 20
 """The longest side of a cloud has ``2**_BITS`` steps; points of one step are duplicates."""
 _MAX_VOXELS = 60_000
 """Maximum number of voxels of a cloud: every 5 cm in a room of 6 m."""
-_ALL_BELOW = 1000
+_MAX_SINGLE_VOXELS = 1000
 """Number of points up to which each point has its own voxel."""
 _NEIGHBORS = 16
 """Number of neighboring voxels for density and normals."""
@@ -65,21 +65,21 @@ class Surface(NamedTuple):
         best = heights.argmin(dim=1)
         return normals.index_copy(0, at_edge, around[torch.arange(len(best)), best])
 
-    def disc_spacing(self, most: float, labels: Tensor | None = None) -> Tensor:
+    def disc_spacing(self, cap: float, labels: Tensor | None = None) -> Tensor:
         """Return the spacing that the disc of each of the n points must cover, shape ``(n,)``.
 
-        It is at most ``most`` times the median for points in a plane, and at most the median
+        It is at most ``cap`` times the median for points in a plane, and at most the median
         elsewhere, so that outliers stay small.
 
         Args:
-            most: Maximum ratio to the median spacing.
+            cap: Maximum ratio to the median spacing.
             labels: Plane of each of the n points, shape ``(n,)``, or negative. Default: points of
                 planar voxels are in a plane.
         """
         in_plane = (self.normals != 0).any(dim=1)[self.voxel_of]
         if labels is not None:
             in_plane = in_plane & (labels >= 0)
-        return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, most, 1.0))
+        return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, cap, 1.0))
 
 
 def sample_surface(points: Tensor) -> Surface:
@@ -128,9 +128,9 @@ def sample_surface(points: Tensor) -> Surface:
 
 def _level_of_voxels(codes: Tensor) -> int:
     """Return how often steps are doubled until voxels have two points on average, within limits."""
-    most = min(_MAX_VOXELS, max(_ALL_BELOW, len(codes) // 2))
+    cap = min(_MAX_VOXELS, max(_MAX_SINGLE_VOXELS, len(codes) // 2))
     level = 0
-    while int((codes >> 3 * level).diff().count_nonzero()) >= most:
+    while int((codes >> 3 * level).diff().count_nonzero()) >= cap:
         level += 1
     return level
 
