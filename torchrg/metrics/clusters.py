@@ -10,15 +10,15 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import check_labels, check_one_device, number_labels
+from torchrg.metrics.contingency import check_labels, check_same_device, number_labels
 from torchrg.metrics.sphere import (
     chord_table,
     chord_to_angle,
     chords_between,
+    chunk_rows,
     find_centers,
     measure_spreads,
     merge_directions,
-    rows_at_once,
     unit_vectors,
 )
 from torchrg.neighbors import canonical_order
@@ -126,7 +126,7 @@ def score_clusters(
     (labels,) = check_labels("score_clusters", labels=labels)
     check_shapes("score_clusters", normals=(normals, "N 3"), labels=(labels, "N"))
     check_floating("score_clusters", normals=normals)
-    check_one_device("score_clusters", normals=normals, labels=labels)
+    check_same_device("score_clusters", normals=normals, labels=labels)
     for name, value, least in (("min_size", min_size, 1), ("sample_size", sample_size, 2)):
         if value < least:
             raise ConfigError(f"score_clusters: expected {name} >= {least}, got {value!r}.")
@@ -184,7 +184,7 @@ def _separation(centers: Tensor, spreads: Tensor) -> tuple[float, float]:
     count = len(centers)
     if count < 2:
         return math.nan, math.nan
-    total, worst, rows = 0.0, 0.0, rows_at_once(count)
+    total, worst, rows = 0.0, 0.0, chunk_rows(count)
     for start in range(0, count, rows):
         block = slice(start, start + rows)
         distances = chord_to_angle(chord_table(centers[block], centers))
@@ -262,7 +262,7 @@ def _refine(cells: Tensor, points: Tensor, level: int) -> tuple[Tensor, Tensor]:
 
 def _closest_others(points: Tensor, clusters: Tensor) -> Tensor:
     """Return the chord from each point to the closest point of another cluster, shape ``(C,)``."""
-    rows = rows_at_once(len(points))
+    rows = chunk_rows(len(points))
     closest = []
     for chunk, owners in zip(torch.split(points, rows), torch.split(clusters, rows), strict=True):
         chords = chord_table(chunk, points)

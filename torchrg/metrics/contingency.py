@@ -99,7 +99,7 @@ def count_overlaps(
         _, rows, sizes = torch.unique(labels, return_inverse=True, return_counts=True)
         labels = labels.masked_fill((sizes < min_size)[rows], UNLABELED)
     if ignore is not None:
-        scored = have_other_label(truth, ignore)
+        scored = is_not_ignored(truth, ignore)
         labels, truth = labels[scored], truth[scored]
     region_labels, regions = number_labels(labels)
     face_labels, faces = number_labels(truth)
@@ -135,11 +135,11 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
                 f"{caller}: expected {name} of integers, got {dtype}; convert with .long()."
             )
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
-    check_one_device(caller, **tensors)
+    check_same_device(caller, **tensors)
     return [tensor.long() for tensor in tensors.values()]
 
 
-def have_other_label(truth: Tensor, ignore: int | None) -> Tensor:
+def is_not_ignored(truth: Tensor, ignore: int | None) -> Tensor:
     """Return the mask of points without the ignored label; labels beyond int64 never match.
 
     Example:
@@ -151,7 +151,7 @@ def have_other_label(truth: Tensor, ignore: int | None) -> Tensor:
     return truth != ignore
 
 
-def check_one_device(caller: str, **arguments: Tensor) -> None:
+def check_same_device(caller: str, **arguments: Tensor) -> None:
     """Raise ShapeError for tensors on different devices."""
     devices = [str(tensor.device) for tensor in arguments.values()]
     if len(set(devices)) > 1:

@@ -13,7 +13,7 @@ from torchrg.metrics.contingency import (
     check_labels,
     contingency_table,
     fraction,
-    have_other_label,
+    is_not_ignored,
 )
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.structures import UNLABELED
@@ -105,14 +105,14 @@ def score_partition(
         points = as_tensor("score_partition", "points", points)
         check_shapes("score_partition", points=(points, "N 3"), truth=(truth, "N"))
         check_floating("score_partition", points=points)
-    scored = (truth != UNLABELED) & have_other_label(truth, ignore)
+    scored = (truth != UNLABELED) & is_not_ignored(truth, ignore)
     has_one = superpoints != UNLABELED
     count = len(torch.unique(superpoints[has_one]))
     num_right, miou = _score_oracle(superpoints[scored], truth[scored])
     recall = precision = None
     if points is not None:
         used = scored & points.isfinite().all(dim=1)
-        recall, precision, boundary_distance = _score_borders(
+        recall, precision, boundary_distance = _score_boundaries(
             superpoints[used], truth[used], points[used].detach(), boundary_distance
         )
     num_scored = int(scored.sum())
@@ -133,20 +133,20 @@ def _score_oracle(superpoints: Tensor, truth: Tensor) -> tuple[int, float]:
     table = contingency_table(superpoints, truth)
     num_parts = len(table.face_sizes)
     # Overlaps are sorted by superpoint, then by object, so ties go to the lowest label.
-    most = torch.zeros_like(table.region_sizes).scatter_reduce(
+    max_overlaps = torch.zeros_like(table.region_sizes).scatter_reduce(
         0, table.regions, table.overlaps, "amax"
     )
-    largest = table.overlaps == most[table.regions]
+    largest = table.overlaps == max_overlaps[table.regions]
     most_frequent = torch.full_like(table.region_sizes, num_parts).scatter_reduce(
         0, table.regions[largest], table.faces[largest], "amin"
     )
-    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, most)
+    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, max_overlaps)
     sizes = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, table.region_sizes)
     iou = right.double() / (sizes + table.face_sizes - right)
     return int(right.sum()), fraction(float(iou.sum()), num_parts)
 
 
-def _score_borders(
+def _score_boundaries(
     superpoints: Tensor, truth: Tensor, points: Tensor, distance: float | None
 ) -> tuple[float, float, float]:
     """Return recall and precision of superpoint boundaries, and the distance used."""

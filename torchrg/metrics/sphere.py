@@ -38,7 +38,7 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(exists[..., None], unit / length, 0), exists
 
 
-def rows_at_once(length: int) -> int:
+def chunk_rows(length: int) -> int:
     """Return how many rows of distances of this length to compute at a time."""
     return max(1, _MAX_PAIRS // max(1, length))
 
@@ -103,7 +103,7 @@ def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
         >>> merge_directions(torch.stack([axes[0], axes[1], -axes[0]])).tolist()
         [0, 1, 0]
     """
-    longest = 2 * math.sin(math.radians(max_angle_deg) / 2)
+    max_chord = 2 * math.sin(math.radians(max_angle_deg) / 2)
     groups = torch.full((len(centers),), -1, device=centers.device)
     group = 0
     while len(free := (groups < 0).nonzero().squeeze(1)):
@@ -112,8 +112,8 @@ def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
             groups[newest] = group
             free = free[groups[free] < 0]
             near = torch.zeros_like(free, dtype=torch.bool)
-            for chunk in torch.split(newest, rows_at_once(len(free))):
-                near |= (chord_table(centers[chunk], centers[free]) <= longest).any(dim=0)
+            for chunk in torch.split(newest, chunk_rows(len(free))):
+                near |= (chord_table(centers[chunk], centers[free]) <= max_chord).any(dim=0)
             newest = free[near]
         group += 1
     return groups
@@ -129,7 +129,7 @@ def measure_spreads(
     """
     means, diameters, num_sampled, exact = [], [], 0, True
     for directions, center in zip(parts, centers, strict=True):
-        ends = _rim(directions, center)
+        ends = _diameter_candidates(directions, center)
         means.append(_mean_pairwise_angle(_subsample(directions, sample_size, seed)))
         angles = _upper_angles(_subsample(ends, sample_size, seed))
         diameters.append(max((float(block.max()) for block in angles), default=0.0))
@@ -155,13 +155,13 @@ def _upper_angles(directions: Tensor) -> Iterator[Tensor]:
     aligned = bool(count) and float((directions @ directions[0]).min()) > 0.5**0.5
     start = 0
     while start < count:
-        rows = rows_at_once(count - start)
+        rows = chunk_rows(count - start)
         chords = chord_table(directions[start : start + rows], directions[start:], aligned=aligned)
         yield chord_to_angle(chords)
         start += rows
 
 
-def _rim(directions: Tensor, center: Tensor) -> Tensor:
+def _diameter_candidates(directions: Tensor, center: Tensor) -> Tensor:
     """Return the directions of a cluster that can be an end of its diameter.
 
     A pair at distance ``d`` or more has both ends at least ``d - r`` from the center, where ``r``
