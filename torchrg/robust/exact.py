@@ -63,7 +63,7 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Te
         across = _reject(edge, axes)
         height = sum_squares(across).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
-        lanes, near = _majorities(columns, origins, axes, candidates, reach, size)
+        lanes, near = _find_majorities(columns, origins, axes, candidates, reach, size)
         if len(lanes):
             on_flat = refine_flat(take_lanes(columns, lanes), near, tolerance[lanes], len(axes))
             is_full = on_flat.sum(dim=0) >= size
@@ -80,7 +80,7 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Te
     return dimension, members
 
 
-def _majorities(
+def _find_majorities(
     columns: list[Tensor],
     origins: list[Tensor],
     axes: list[list[Tensor]],
@@ -100,11 +100,11 @@ def _majorities(
     across = _reject(offsets, [[component[simplex, lane] for component in axis] for axis in axes])
     near = sum_squares(across) <= reach[simplex, lane] ** 2
     # Prefer the most accurate candidate; an inaccurate one may include points off the flat.
-    ruler = torch.where(near.sum(dim=0) >= size, reach[simplex, lane], torch.inf)
+    accuracy = torch.where(near.sum(dim=0) >= size, reach[simplex, lane], torch.inf)
     best = reach.new_full((len(open_lanes),), torch.inf)
-    best.scatter_reduce_(0, place, ruler, "amin")
+    best.scatter_reduce_(0, place, accuracy, "amin")
     order = torch.arange(len(place), device=place.device)
-    order = order.masked_fill((ruler > best[place]) | ruler.isinf(), len(place))
+    order = order.masked_fill((accuracy > best[place]) | accuracy.isinf(), len(place))
     winner = torch.full_like(open_lanes, len(place)).scatter_reduce_(0, place, order, "amin")
     winner = winner[winner < len(place)]
     return lane[winner], near[:, winner]

@@ -80,14 +80,14 @@ def eigenvectors(matrices: Tensor) -> Tensor:
 
 def map_values(
     on_cpu: Callable[..., NDArray[np.floating]],
-    elsewhere: Callable[..., Tensor],
+    in_torch: Callable[..., Tensor],
     values: Tensor,
     *more: float,
 ) -> Tensor:
     """Apply NumPy's function on a CPU, which is independent of the position, unlike torch's."""
     if values.device.type == "cpu":
         return torch.from_numpy(on_cpu(values.numpy(), *more))
-    return elsewhere(values, *more)
+    return in_torch(values, *more)
 
 
 class Ellipsoid(NamedTuple):
@@ -118,14 +118,14 @@ def fit_ellipsoid(
     """
     means = [sum_points(weights * column) / total for column in columns]
     residuals = [column - mean for column, mean in zip(columns, means, strict=True)]
-    least = floor * total
+    min_square = floor * total
     squares: list[Tensor] = []
     singular = torch.zeros_like(floor, dtype=torch.bool)
     for j, pivot in enumerate(residuals):
         weighted = weights * pivot
         square = sum_points(weighted * pivot)
-        singular = singular | (square <= least)
-        squares.append(torch.maximum(square, least))
+        singular = singular | (square <= min_square)
+        squares.append(torch.maximum(square, min_square))
         for k in range(j + 1, len(residuals)):
             slope = sum_points(weighted * residuals[k]) / squares[j]
             residuals[k] = residuals[k].sub_(slope * pivot)

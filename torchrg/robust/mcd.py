@@ -42,10 +42,10 @@ from torchrg.robust.weights import (
 _MAX_STEPS = 100
 """Maximum number of concentration steps, after which alternating sets of tied points are kept."""
 
-_NUM_KEPT = 10
+_NUM_BEST = 10
 """Number of random starts that are concentrated to convergence, as published."""
 
-_MAX_COMPARED = 16
+_MAX_COMPARED_STARTS = 16
 """Maximum number of starts per patch for which duplicate sets are detected; with more, comparing
 costs more than it saves."""
 
@@ -217,7 +217,7 @@ def fit_fastmcd(
         marks = columns[0].new_zeros(len(sets), num_points).scatter_(1, sets, 1.0)
         initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
         quick = _concentrate(columns, initial, num_coordinates + 1, size, floor, max_steps=1)
-        return _concentrate(columns, _distinct_best(quick, _NUM_KEPT), size, size, floor)
+        return _concentrate(columns, _distinct_best(quick, _NUM_BEST), size, size, floor)
 
     settings = _Settings(support_fraction, quantile, small_sample)
     return _fit_mcd("fit_fastmcd", patches, mask, settings, min_dimension, chunk_size, search)
@@ -328,31 +328,31 @@ def _concentrate(
     members = initial.reshape(num_points, -1)
     final = torch.zeros_like(members)
     best = torch.full_like(floor, torch.inf, dtype=torch.float64).repeat(num_starts)
-    places = torch.arange(num_starts * num_lanes, device=floor.device)
-    distinct = _first_of_equal(members, places, shape)
-    places, members = places[distinct], members.index_select(1, distinct)
-    points, floors = take_lanes(columns, places % num_lanes), floor[places % num_lanes]
-    distances, _ = _to_sets(members, floor.new_tensor(initial_size), floors, *points)
+    indices = torch.arange(num_starts * num_lanes, device=floor.device)
+    distinct = _first_occurrences(members, indices, shape)
+    indices, members = indices[distinct], members.index_select(1, distinct)
+    points, floors = take_lanes(columns, indices % num_lanes), floor[indices % num_lanes]
+    distances, _ = _fit_sets(members, floor.new_tensor(initial_size), floors, *points)
     members, full_size = smallest_points(distances, size), floor.new_tensor(size)
-    moving, previous = _first_of_equal(members, places, shape), best[places]
+    moving, previous = _first_occurrences(members, indices, shape), best[indices]
     for step in range(max_steps + 1):
         points, members = take_lanes(points, moving), members.index_select(1, moving)
-        floors, places, previous = floors[moving], places[moving], previous[moving]
-        distances, value = _to_sets(members, full_size, floors, *points)
+        floors, indices, previous = floors[moving], indices[moving], previous[moving]
+        distances, value = _fit_sets(members, full_size, floors, *points)
         candidate = smallest_points(distances, size)
         # Rounding may increase the determinant, or make two sets of tied points alternate.
         converged = (sum_points(candidate * members) >= size) | ~(value < previous)
         converged |= step == max_steps
         done, moving = torch.nonzero(converged).squeeze(1), torch.nonzero(~converged).squeeze(1)
-        final.index_copy_(1, places[done], members.index_select(1, done))
-        best[places[done]] = value[done]
+        final.index_copy_(1, indices[done], members.index_select(1, done))
+        best[indices[done]] = value[done]
         if len(moving) == 0:
             break
         members, previous = candidate, value
     return _Concentrated(final.reshape(num_points, *shape), best.reshape(shape))
 
 
-def _to_sets(
+def _fit_sets(
     members: Tensor, size: Tensor, floor: Tensor, *columns: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return squared distances ``(K, M)`` to the scatters of sets, and their determinants."""
@@ -360,19 +360,19 @@ def _to_sets(
     return sq_distances(ellipsoid, size - 1), determinant(ellipsoid, size - 1)
 
 
-def _first_of_equal(members: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return the first occurrences among sets ``(K, n)`` at ``places`` of ``(S, M)``."""
+def _first_occurrences(members: Tensor, indices: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the first occurrences among sets ``(K, n)`` at ``indices`` of ``(S, M)``."""
     num_starts, num_lanes = shape
-    if not 1 < num_starts <= _MAX_COMPARED:
-        return torch.arange(len(places), device=places.device)
+    if not 1 < num_starts <= _MAX_COMPARED_STARTS:
+        return torch.arange(len(indices), device=indices.device)
     digits = 2.0 ** (torch.arange(len(members), device=members.device) % _DIGITS)
     weighted = members * digits.to(members.dtype)[:, None]
     parts = [sum_points(weighted[chunk]) for chunk in chunks_of(len(members), _DIGITS)]
     numbers = members.new_zeros(len(parts), num_starts * num_lanes)
-    numbers[:, places] = torch.stack(parts)
+    numbers[:, indices] = torch.stack(parts)
     numbers = numbers.reshape(-1, num_starts, num_lanes)
     first = torch.ones(shape, dtype=torch.bool, device=members.device)
     for start in range(1, num_starts):
         same = (numbers[:, :start] == numbers[:, start : start + 1]).all(dim=0)
         first[start] = ~same.any(dim=0)
-    return torch.nonzero(first.reshape(-1)[places]).squeeze(1)
+    return torch.nonzero(first.reshape(-1)[indices]).squeeze(1)

@@ -135,11 +135,11 @@ def fit_detmm(
         first, scale = _best_s_estimate(columns, floor, size, starts)
         cutoff = efficiency_constant(len(columns), tuned_for)
         weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
-        final = _shape_of(columns, weights, floor)
+        final = _fit_shape(columns, weights, floor)
         sq_unit = cutoff * cutoff * scale * scale
         before = sum_points(_bisquare_loss(first.distances / sq_unit))
         after = sum_points(_bisquare_loss(final.distances / sq_unit))
-        final = _shape_of(columns, torch.where(after <= before, weights, first.weights), floor)
+        final = _fit_shape(columns, torch.where(after <= before, weights, first.weights), floor)
         return _estimate(columns, first, final, scale, quantile)
 
     cutoff_of = partial(efficiency_constant, target=tuned_for)
@@ -191,7 +191,7 @@ def _best_s_estimate(
         members = initial.reshape(num_points, -1)
         ellipsoid = fit_ellipsoid(points, members, count, floors)
         members = smallest_points(sq_distances(ellipsoid, count), size)
-        shape = _shape_of(points, members, floors)
+        shape = _fit_shape(points, members, floors)
         scale = _m_scale(shape.distances, cutoff)
         converged, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
         weights.append(converged.reshape(num_points, num_starts, num_lanes))
@@ -199,7 +199,7 @@ def _best_s_estimate(
     scale = torch.cat(scales)
     best = scale.argmin(dim=0)
     chosen = torch.cat(weights, dim=1).gather(1, best.expand(num_points, 1, -1)).squeeze(1)
-    return _shape_of(columns, chosen, floor), scale.gather(0, best[None]).squeeze(0)
+    return _fit_shape(columns, chosen, floor), scale.gather(0, best[None]).squeeze(0)
 
 
 def _estimate(
@@ -245,14 +245,14 @@ def _reweight(
     eps = machine_epsilon(scale.dtype)
     enough = _CONVERGED[scale.dtype] * eps
     weights, scales = start.weights.clone(), scale.clone()
-    places = torch.arange(len(scale), device=scale.device)
+    indices = torch.arange(len(scale), device=scale.device)
     points, floors = columns, floor
     distances, previous = start.distances, start.weights
     for step in range(1, _MAX_STEPS + 1):
         if adapt_scale:
             scale = _m_scale_step(distances, scale, cutoff)
         current = _bisquare_weights(distances / (cutoff * scale) ** 2)
-        distances = _shape_of(points, current, floors).distances
+        distances = _fit_shape(points, current, floors).distances
         if step % _CHECK_EVERY and step != _MAX_STEPS:
             previous = current
             continue
@@ -262,18 +262,18 @@ def _reweight(
             converged |= True
         done, moving = torch.nonzero(converged).squeeze(1), torch.nonzero(~converged).squeeze(1)
         if len(done):
-            weights.index_copy_(1, places[done], current.index_select(1, done))
-            scales[places[done]] = scale[done]
+            weights.index_copy_(1, indices[done], current.index_select(1, done))
+            scales[indices[done]] = scale[done]
             if len(moving) == 0:
                 break
             points = take_lanes(points, moving)
-            places, scale, floors = places[moving], scale[moving], floors[moving]
+            indices, scale, floors = indices[moving], scale[moving], floors[moving]
             distances, current = take_lanes([distances, current], moving)
         previous = current
     return weights, scales
 
 
-def _shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> _Shape:
+def _fit_shape(columns: list[Tensor], weights: Tensor, floor: Tensor) -> _Shape:
     """Fit the weighted points of each lane, and scale the scatter to determinant one."""
     total = sum_points(weights)
     ellipsoid = fit_ellipsoid(columns, weights, total, floor)

@@ -24,7 +24,7 @@ from torchrg.robust.weights import (
     reweight,
 )
 
-_LANES_AT_ONCE = 1024
+_LANES_PER_CHUNK = 1024
 """Number of sets times patches processed at a time, so that their data fits into the cache."""
 
 
@@ -115,7 +115,7 @@ def _smallest_ellipsoid(
     num_coordinates = len(columns)
     best = torch.full_like(floor, torch.inf, dtype=torch.float64)
     chosen = torch.zeros_like(best, dtype=torch.int64)
-    step = max(1, _LANES_AT_ONCE // num_lanes)
+    step = max(1, _LANES_PER_CHUNK // num_lanes)
     wide = [column.repeat(1, step) for column in columns]
     floors = floor.repeat(step)
     for first in range(0, len(sets), step):
@@ -131,8 +131,8 @@ def _smallest_ellipsoid(
             value = value * reach
         value = value.reshape(len(tried), num_lanes)
         index = value.argmin(dim=0)
-        least = value.gather(0, index[None]).squeeze(0)
-        better = least < best
-        best = torch.where(better, least, best)
+        smallest = value.gather(0, index[None]).squeeze(0)
+        better = smallest < best
+        best = torch.where(better, smallest, best)
         chosen = torch.where(better, first + index, chosen)
     return best, chosen

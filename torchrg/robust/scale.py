@@ -63,7 +63,7 @@ def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         >>> median(torch.tensor([4.0, 1.0, 3.0, 2.0])).item()
         2.5
     """
-    return _along("median", x, dim, mask)
+    return _reduce_axis("median", x, dim, mask)
 
 
 def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -75,7 +75,7 @@ def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         >>> mad(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])).item()
         1.4825999736785889
     """
-    return _along("mad", x, dim, mask)
+    return _reduce_axis("mad", x, dim, mask)
 
 
 def qn(
@@ -97,7 +97,7 @@ def qn(
         >>> qn(torch.tensor([1.0, 2.0, 4.0, 8.0, 100.0]))
         tensor(6.6657)
     """
-    return _along("qn", x, dim, mask, finite_sample)
+    return _reduce_axis("qn", x, dim, mask, finite_sample)
 
 
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -128,13 +128,13 @@ def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         >>> tau(torch.tensor([1.0, 2.0, 3.0, 4.0, 1000.0]))
         tensor(1.7441)
     """
-    return _along("tau", x, dim, mask)
+    return _reduce_axis("tau", x, dim, mask)
 
 
 Scale = Literal["median", "mad", "qn", "tau"]
 
 
-def _along(
+def _reduce_axis(
     name: Scale, x: Tensor, dim: int, mask: Tensor | None, finite_sample: bool = False
 ) -> Tensor:
     """Check the arguments of a scale, and reduce an axis."""
@@ -165,17 +165,17 @@ def scale_of_rows(
     if not torch.is_grad_enabled():
         rows = rows.detach()
     if name == "median":
-        return _per_count(rows, mask, _sorted_median)
+        return _map_counts(rows, mask, _sorted_median)
     if name == "mad":
-        return _per_count(rows, mask, lambda ascending: MAD_FACTOR * _median_deviation(ascending))
+        return _map_counts(rows, mask, lambda ascending: MAD_FACTOR * _median_deviation(ascending))
     if name == "tau":
-        return _per_count(rows, mask, tau_of_sorted)
-    return _per_count(
+        return _map_counts(rows, mask, tau_of_sorted)
+    return _map_counts(
         rows, mask, lambda ascending: qn_of_sorted(ascending, finite_sample=finite_sample)
     )
 
 
-def _per_count(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]) -> Tensor:
+def _map_counts(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]) -> Tensor:
     """Apply a function of sorted rows ``(B, n)`` to rows ``(*, n)``, grouped by number of values.
 
     Masked-out values become +inf, sort last, and are cut off. A NaN would sort behind them, so rows
@@ -306,9 +306,9 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
         (differences,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
-        endless = differences.isnan().nonzero().squeeze(1)
-        if len(endless):
-            differences[endless] = _difference_by_lags(sorted_rows[endless])
+        infinite = differences.isnan().nonzero().squeeze(1)
+        if len(infinite):
+            differences[infinite] = _difference_by_lags(sorted_rows[infinite])
         return differences
     return _difference_by_lags(sorted_rows)
 

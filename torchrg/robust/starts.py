@@ -31,10 +31,10 @@ from torchrg.robust.scale import (
 
 Starts = Literal["paper", "robustbase", "planes", "more"]
 
-_LONG = 1000
+_MIN_TAU_VALUES = 1000
 """Number of values from which tau replaces Qn, which needs all differences, as in robustbase."""
 
-_STARTS_AT_ONCE = 3
+_STARTS_PER_CHUNK = 3
 """Number of starts processed at a time, so that their data fits into the cache."""
 
 _NUM_PLANES = 64
@@ -43,7 +43,7 @@ _NUM_PLANES = 64
 _NUM_PLANE_STARTS = 4
 """Number of planes used as starts."""
 
-_PLANES_AT_ONCE = 8
+_PLANES_PER_CHUNK = 8
 """Number of planes processed at a time, so that their data fits into the cache."""
 
 
@@ -65,7 +65,7 @@ def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
     standard = [_standardize(column) for column in columns]
     distances = [
         _sphered_distances(standard, eigenvectors(matrices))
-        for matrices in torch.split(_scatter_matrices(standard), _STARTS_AT_ONCE)
+        for matrices in torch.split(_scatter_matrices(standard), _STARTS_PER_CHUNK)
     ]
     sets = [smallest_points(group.flatten(1), size).view_as(group) for group in distances]
     return torch.cat(sets, dim=1)
@@ -80,7 +80,7 @@ def _standardize(column: Tensor) -> Tensor:
 
 def _scale(rows: Tensor) -> Tensor:
     """Qn of sorted rows with its finite-sample factor; tau for long rows, as in robustbase."""
-    if rows.shape[1] >= _LONG:
+    if rows.shape[1] >= _MIN_TAU_VALUES:
         return tau_of_sorted(rows)
     return qn_of_sorted(rows, finite_sample=True)
 
@@ -218,8 +218,8 @@ def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
     num_points, num_lanes = columns[0].shape
     sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
     scores = []
-    for first in range(0, len(sets), _PLANES_AT_ONCE):
-        tried = sets[first : first + _PLANES_AT_ONCE]
+    for first in range(0, len(sets), _PLANES_PER_CHUNK):
+        tried = sets[first : first + _PLANES_PER_CHUNK]
         nearest = sorted_points(_sq_residuals(columns, tried[:, :, None]))[:, size - 1]
         scores.append(nearest.reshape(len(tried), num_lanes))
     score = torch.cat(scores)
@@ -240,14 +240,14 @@ def _sq_residuals(columns: list[Tensor], sets: Tensor) -> Tensor:
         for k in range(len(columns))
     ]
     edges = [[a - b for a, b in zip(corner, corners[0], strict=True)] for corner in corners[1:]]
-    normal = _across(edges, corners[0])
+    normal = _orthogonal_direction(edges, corners[0])
     residual = dot([column[:, None] for column in columns], normal)
     # Points that span no hyperplane get an infinite distance.
     residual -= torch.where(sum_squares(normal) > 0, dot(corners[0], normal), torch.inf)
     return (residual * residual).reshape(num_points, -1)
 
 
-def _across(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
+def _orthogonal_direction(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
     """Unit vectors orthogonal to P - 1 edges; zero if these do not span a hyperplane."""
     size = len(like)
     if size == 1:
