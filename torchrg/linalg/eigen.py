@@ -15,7 +15,7 @@ _JACOBI_SWEEPS = 5
 """Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either
 dtype."""
 
-_FIRST_STEPS, _MORE_STEPS = 4, 36
+_FIRST_STEPS, _MAX_MORE_STEPS = 4, 36
 """Number of Newton steps for a simple root, and maximum number of further steps for a nearly double
 one, where each step halves the distance until the two roots separate."""
 
@@ -96,7 +96,7 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     check_floating("eigh3", matrices=matrices)
     if not matrices.requires_grad and has_values(matrices):
         return _jacobi(matrices)
-    operation = _Eigh3 if torch.compiler.is_compiling() else _Refusing
+    operation = _Eigh3 if torch.compiler.is_compiling() else _ReverseOnly
     values, vectors = operation.apply(matrices)  # type: ignore[no-untyped-call]
     return values, vectors
 
@@ -129,13 +129,13 @@ class _Eigh3(torch.autograd.Function):
         distinct = gap.detach().abs() > rank_tolerance(3, values.dtype) * largest
         turn = (vectors.mT @ of_vectors) / torch.where(distinct, gap, 1.0)
         inner = torch.where(distinct, turn, 0.0) + torch.diag_embed(of_values)
-        whole: Tensor = vectors @ inner @ vectors.mT
+        gradient: Tensor = vectors @ inner @ vectors.mT
         # Only the upper triangle is read, but both halves share the gradient, as in
         # torch.linalg.eigh.
-        return (whole + whole.mT) / 2
+        return (gradient + gradient.mT) / 2
 
 
-class _Refusing(_Eigh3):
+class _ReverseOnly(_Eigh3):
     """The same outside of compilers, which reject operations with a rule for forward mode."""
 
     @staticmethod
@@ -194,7 +194,7 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     minors = xx * yy - xy * xy + (xx * zz - xz * xz) + (yy * zz - yz * yz)
     determinant = zz * (xx * yy - xy * xy) - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
     root = _smallest_root(trace, minors, determinant)
-    u, v, w = _kernel((xx - root, yy - root, zz - root), (yz, xz, xy))
+    u, v, w = _null_vectors((xx - root, yy - root, zz - root), (yz, xz, xy))
     # If Newton's method has not converged, the Rayleigh quotient is accurate to second order.
     smallest = u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz
     smallest = smallest.clamp(min=0)
@@ -212,7 +212,7 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     # Convergence is quadratic except near a double root, so few need more steps.
     moving = step.abs() > _CONVERGED * coefficients[0]
     rows = moving.nonzero().squeeze(1)
-    for _ in range(_MORE_STEPS):
+    for _ in range(_MAX_MORE_STEPS):
         if len(rows) == 0:
             break
         root[rows], step = _newton(root[rows], coefficients[:, rows], 1)
@@ -233,15 +233,15 @@ def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor,
     return root, step
 
 
-def _kernel(
-    diagonal: tuple[Tensor, Tensor, Tensor], beside: tuple[Tensor, Tensor, Tensor]
+def _null_vectors(
+    diagonal: tuple[Tensor, Tensor, Tensor], off_diagonal: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit vectors in the kernel of singular semidefinite matrices.
 
-    ``beside`` are the off-diagonal entries without coordinate 0, 1 and 2, respectively.
+    ``off_diagonal`` are the off-diagonal entries without coordinate 0, 1 and 2, respectively.
     """
     x, y, z = diagonal
-    yz, xz, xy = beside
+    yz, xz, xy = off_diagonal
     # Any column of the adjugate works; the one with the largest diagonal entry is the longest.
     a, b, c = y * z - yz * yz, x * z - xz * xz, x * y - xy * xy
     ab, ac, bc = xz * yz - xy * z, xy * yz - xz * y, xy * xz - x * yz
@@ -253,12 +253,12 @@ def _kernel(
     u, v, w = u / length, v / length, w / length
     rank_one = best < _NEARLY_EQUAL
     if bool(rank_one.any()):
-        x, y, z, yz, xz, xy = (entry[rank_one] for entry in (*diagonal, *beside))
-        u[rank_one], v[rank_one], w[rank_one] = _across((x, xy, xz), (xy, y, yz), (xz, yz, z))
+        x, y, z, yz, xz, xy = (entry[rank_one] for entry in (*diagonal, *off_diagonal))
+        u[rank_one], v[rank_one], w[rank_one] = _orthogonal((x, xy, xz), (xy, y, yz), (xz, yz, z))
     return u, v, w
 
 
-def _across(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def _orthogonal(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit vectors orthogonal to the direction of rank-one matrices, given by their rows."""
     first, second, third = rows
     # The row of the largest diagonal entry, and the axis with its smallest component.

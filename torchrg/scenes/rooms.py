@@ -52,7 +52,7 @@ _CLEARANCES = (1.0, 0.6, 0.4, 0.2)
 """Free space around a scanner in meters, in order of preference."""
 _MAX_SIDE, _MAX_COUNT = 1000, 1000
 """Maximum side of a room in meters, and number of objects of a kind; bounds the list of cells."""
-_PLACE_TRIES = 50
+_POSITION_TRIES = 50
 """Maximum number of attempts to find a scanner position with each clearance."""
 
 
@@ -191,19 +191,19 @@ def furnish(
     is_flat = [surface.plane is not None for surface in parts[0].surfaces[-len(walls) :]]
     wall_places = [
         (wall, along)
-        for wall, along in _wall_places(layout.size)
+        for wall, along in _wall_cells(layout.size)
         if is_flat[wall] and _is_away(walls[wall].moved(along), middles, _DOORWAY_AISLE)
     ]
     wall_places = [wall_places[row] for row in rng.permutation(len(wall_places))]
     floor_places = [
         (x, y)
-        for x, y in _floor_places(layout.size)
+        for x, y in _floor_cells(layout.size)
         if _is_away(room.moved(x, y), middles, _DOORWAY_SPACE)
     ]
     floor_places = [floor_places[row] for row in rng.permutation(len(floor_places))]
 
     def place(drawn: Iterator[Part]) -> None:
-        parts.append(_first_apart(drawn, parts, layout.min_plane_gap))
+        parts.append(_first_separated(drawn, parts, layout.min_plane_gap))
 
     def open_wall(kind: str, draw_hole: Callable[[np.random.Generator, float], Hole]) -> None:
         wall, middle = _take(wall_places, "walls")
@@ -270,10 +270,10 @@ def _is_away(place: Frame, middles: Sequence[Array], distance: float) -> bool:
     return all(np.vecdot(gap, gap) >= distance * distance for gap in gaps)
 
 
-def _first_apart(drawn: Iterator[Part], others: Sequence[Part], gap: float) -> Part:
+def _first_separated(drawn: Iterator[Part], others: Sequence[Part], gap: float) -> Part:
     """Return the first generated object without a face in the plane of another."""
     for part in islice(drawn, _TRIES):
-        if not _shares_plane(part, others, gap):
+        if not _has_coplanar_face(part, others, gap):
             return part
     raise ConfigError(
         f"build_room: expected faces at least min_plane_gap={gap} from the planes of others, "
@@ -291,31 +291,31 @@ def _take(places: list[T], where: str) -> T:
     return places.pop()
 
 
-def _wall_places(size: Triple) -> list[tuple[int, float]]:
+def _wall_cells(size: Triple) -> list[tuple[int, float]]:
     """Return the cells on the four walls: wall, and distance from its start."""
     return [
         (wall, _CORNER + middle)
         for wall, length in enumerate((size[0], size[1]) * 2)
-        for middle in _middles(length - 2 * _CORNER, _WALL_CELL)
+        for middle in _cell_centers(length - 2 * _CORNER, _WALL_CELL)
     ]
 
 
-def _floor_places(size: Triple) -> list[tuple[float, float]]:
+def _floor_cells(size: Triple) -> list[tuple[float, float]]:
     """Return the cells on the floor, away from the walls."""
     xs, ys = (
-        [_AISLE + middle for middle in _middles(length - 2 * _AISLE, cell)]
+        [_AISLE + middle for middle in _cell_centers(length - 2 * _AISLE, cell)]
         for length, cell in zip(size[:2], _FLOOR_CELL, strict=True)
     )
     return list(product(xs, ys))
 
 
-def _middles(length: float, cell: float) -> list[float]:
+def _cell_centers(length: float, cell: float) -> list[float]:
     """Return the centers of as many equal cells of at least ``cell`` as fit into a length."""
     count = max(int(length / cell), 0)
     return [length * (number + 0.5) / count for number in range(count)]
 
 
-def _shares_plane(part: Part, others: Sequence[Part], min_gap: float) -> bool:
+def _has_coplanar_face(part: Part, others: Sequence[Part], min_gap: float) -> bool:
     """Return whether a face is closer than ``min_gap`` to the plane of a parallel one."""
     mine = [surface for surface in part.surfaces if surface.plane is not None]
     theirs = [surface for other in others for surface in other.surfaces if surface.plane]
@@ -340,7 +340,7 @@ def free_places(
     length, width, _ = layout.size
     places: list[Array] = []
     for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
-        for _ in range(_PLACE_TRIES if len(places) == number else 0):
+        for _ in range(_POSITION_TRIES if len(places) == number else 0):
             x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
             place = room.moved(x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)).origin
             near = place + clearance * (2 * rng.random((64, 3)) - 1)

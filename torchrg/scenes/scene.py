@@ -21,7 +21,7 @@ PLACES, NOISE = range(2)
 """Purposes of the random numbers; positions do not depend on the noise."""
 _CLEARANCE = 1e-7
 """Free space required in front of a visible surface, as a fraction of the scene size."""
-_SPARE = 1.02
+_OVERSAMPLING = 1.02
 """Oversampling factor, which avoids repetitions."""
 
 
@@ -151,7 +151,7 @@ def sample_scene(
             f"{noise_direction!r}."
         )
     rng = seeded_generator(seed, PLACES)
-    points, normals, labels = _draw_places(model, num_points, rng)
+    points, normals, labels = _sample_faces(model, num_points, rng)
     if noise > 0:
         shake = seeded_generator(seed, NOISE)
         if noise_direction == "normal":
@@ -163,7 +163,7 @@ def sample_scene(
     return label_points(model, points[rows], labels[rows], normals[rows])
 
 
-def _draw_places(
+def _sample_faces(
     model: SceneModel, num_points: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Sample exactly ``num_points`` points with normals and faces, face by face."""
@@ -171,7 +171,7 @@ def _draw_places(
     drawn: list[tuple[Floats, Floats, NDArray[np.int64]]] = []
     missing, fraction_kept = num_points, 1.0
     while missing > 0:
-        num_tried = int(missing / fraction_kept * _SPARE) + 16
+        num_tried = int(missing / fraction_kept * _OVERSAMPLING) + 16
         num_kept = 0
         for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
             tried = model.surfaces[face].sample(rng, int(count))

@@ -97,22 +97,22 @@ class Flat(Surface):
     def _corners(self) -> Array:
         corner, first, second = self.cells[:, 0], self.cells[:, 1], self.cells[:, 2]
         ends = [corner, corner + first, corner + second, corner + first + second]
-        return in_space(np.concatenate(ends))
+        return append_zero(np.concatenate(ends))
 
     def _draw(self, rng: np.random.Generator, count: int) -> Array:
         counts = rng.multinomial(count, self._cell_areas / self._cell_areas.sum())
-        first, second = self._shares(*rng.random((2, count)))
+        first, second = self._edge_fractions(*rng.random((2, count)))
         corner, edge, other = self.cells[np.repeat(np.arange(len(counts)), counts)].swapaxes(0, 1)
-        return in_space(corner + (first[:, None] * edge + second[:, None] * other))
+        return append_zero(corner + (first[:, None] * edge + second[:, None] * other))
 
-    def _shares(self, first: Array, second: Array) -> tuple[Array, Array]:
+    def _edge_fractions(self, first: Array, second: Array) -> tuple[Array, Array]:
         """Map random numbers to the fractions of both edges of a cell."""
         return first, second
 
 
-def in_space(places: Array) -> Array:
+def append_zero(positions: Array) -> Array:
     """Append a zero coordinate to plane coordinates of shape ``(N, 2)``."""
-    return np.column_stack([places, np.zeros(len(places))])
+    return np.column_stack([positions, np.zeros(len(positions))])
 
 
 def rectangle(
