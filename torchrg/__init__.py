@@ -64,11 +64,11 @@ else:
         """Load a name or module on first access, so that commands start before torch is loaded."""
         from importlib import import_module
 
-        place = f"torchrg.{_MODULES.get(name, name)}"
+        path = f"torchrg.{_MODULES.get(name, name)}"
         try:
-            module = import_module(place) if not name.startswith("_") else None
+            module = import_module(path) if not name.startswith("_") else None
         except ModuleNotFoundError as error:
-            if error.name != place:
+            if error.name != path:
                 raise
             module = None
         if module is None:

@@ -179,7 +179,7 @@ def _plain(value: object) -> object:
 
 @contextmanager
 def made_on_cpu() -> Iterator[None]:
-    """Create tensors on the CPU, whatever ``torch.set_default_device`` says.
+    """Create tensors on the CPU, ignoring ``torch.set_default_device``.
 
     Example:
         >>> with torch.device("meta"), made_on_cpu():

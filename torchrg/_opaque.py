@@ -181,7 +181,7 @@ class _Differentiable(torch.autograd.Function):
         if torch.compiler.is_compiling():
             first = _backward(tensors, ctx.call)
         else:
-            first = _Once.apply(ctx.call, *tensors)  # type: ignore[no-untyped-call]
+            first = _Gradient.apply(ctx.call, *tensors)  # type: ignore[no-untyped-call]
         return None, first, *[None] * (len(ctx.saved_tensors) - 1)
 
     @staticmethod
@@ -191,7 +191,7 @@ class _Differentiable(torch.autograd.Function):
         return outputs, (0,) * len(outputs)
 
 
-class _Refusing(_Differentiable):
+class _ReverseOnly(_Differentiable):
     """The same outside of compilers, which reject operations with a rule for forward mode."""
 
     @staticmethod
@@ -200,10 +200,10 @@ class _Refusing(_Differentiable):
 
 
 def _operation() -> type[_Differentiable]:
-    return _Differentiable if torch.compiler.is_compiling() else _Refusing
+    return _Differentiable if torch.compiler.is_compiling() else _ReverseOnly
 
 
-class _Once(torch.autograd.Function):
+class _Gradient(torch.autograd.Function):
     """Gradient of an opaque function, without second derivatives."""
 
     @staticmethod
@@ -222,7 +222,7 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
         first = _with_batch_first(info.batch_size, places[1:], list(tensors))
-        return _Once.apply(call, *first), 0  # type: ignore[no-untyped-call]
+        return _Gradient.apply(call, *first), 0  # type: ignore[no-untyped-call]
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401

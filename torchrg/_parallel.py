@@ -48,7 +48,7 @@ _MIN_ROWS = 4096
 """Minimum number of rows per thread: at a few tenths of a microsecond each they outweigh its
 start."""
 
-_KEPT_BYTES = 31 * 2**20
+_RETAINED_BYTES = 31 * 2**20
 """Just below 32 MiB, the largest freed block that raises the trim threshold of glibc."""
 
 
@@ -145,7 +145,7 @@ def map_tasks(
     """
     if device.type != "cpu":
         return [work(task) for task in tasks]
-    _keep_freed_memory()
+    _retain_freed_memory()
     num_threads = min(allowed_threads(), len(tasks))
     with sequential_operations():
         if num_threads < 2:
@@ -154,8 +154,8 @@ def map_tasks(
 
         def take_tasks() -> None:
             try:
-                for place, task in waiting:
-                    results[place] = work(task)
+                for index, task in waiting:
+                    results[index] = work(task)
             finally:
                 # Drain the queue after an error, so that no further task starts.
                 for _ in waiting:
@@ -164,7 +164,7 @@ def map_tasks(
         # The calling thread also processes tasks.
         settings = torch.is_grad_enabled(), torch.is_inference_mode_enabled(), copy_context()
         with ThreadPoolExecutor(
-            num_threads - 1, initializer=_begin_thread, initargs=settings
+            num_threads - 1, initializer=_init_thread, initargs=settings
         ) as pool:
             others = [pool.submit(take_tasks) for _ in range(num_threads - 1)]
             token = _THREADS.set(1)
@@ -174,7 +174,7 @@ def map_tasks(
                 _THREADS.reset(token)
             for other in others:
                 other.result()
-        return [results[place] for place in range(len(tasks))]
+        return [results[index] for index in range(len(tasks))]
 
 
 @contextmanager
@@ -196,11 +196,11 @@ def sequential_operations() -> Iterator[None]:
         yield
         return
     token = _THREADS.set(torch.get_num_threads())
-    before = _set_own_threads([1] * (1 + len(_openmp_libraries())))
+    before = _set_thread_counts([1] * (1 + len(_openmp_libraries())))
     try:
         yield
     finally:
-        _set_own_threads(before)
+        _set_thread_counts(before)
         _THREADS.reset(token)
 
 
@@ -218,25 +218,25 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_OF_THREAD = threading.local()
+_THREAD_LOCAL = threading.local()
 
 
-def _begin_thread(grad_enabled: bool, inference: bool, context: Context) -> None:
+def _init_thread(grad_enabled: bool, inference: bool, context: Context) -> None:
     """Limit a worker thread to sequential operations, with the settings of its parent."""
     for variable, value in context.items():
         variable.set(value)
     _THREADS.set(1)
     # Torch sets the number of threads of a thread at its first query.
     torch.get_num_threads()
-    _set_own_threads([1] * (1 + len(_openmp_libraries())))
+    _set_thread_counts([1] * (1 + len(_openmp_libraries())))
     torch.set_grad_enabled(grad_enabled)
     if inference:
         # The mode lasts as long as its guard, here as long as the thread.
-        _OF_THREAD.inference = torch.inference_mode()
-        _OF_THREAD.inference.__enter__()
+        _THREAD_LOCAL.inference = torch.inference_mode()
+        _THREAD_LOCAL.inference.__enter__()
 
 
-def _set_own_threads(numbers: Sequence[int]) -> list[int]:
+def _set_thread_counts(numbers: Sequence[int]) -> list[int]:
     """Set this thread's MKL (0: default) and OpenMP thread counts; return the previous ones."""
     mkl, libraries = _mkl_setter(), _openmp_libraries()
     before = [mkl(numbers[0]), *(library.num_threads for library in libraries)]
@@ -265,13 +265,13 @@ def _mkl_setter() -> Callable[[int], int]:
 
 
 @lru_cache(maxsize=1)
-def _keep_freed_memory() -> None:
+def _retain_freed_memory() -> None:
     """Free one large block once, so that glibc keeps freed memory instead of returning it.
 
     Otherwise every temporary tensor of some hundred kilobytes is paged in again: segmenting 200,000
     points then takes a third more CPU time.
     """
-    block = torch.empty(_KEPT_BYTES, dtype=torch.uint8)
+    block = torch.empty(_RETAINED_BYTES, dtype=torch.uint8)
     del block
 
 

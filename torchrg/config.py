@@ -77,8 +77,8 @@ class NormalsConfig:
     def __post_init__(self) -> None:
         check_values(self)
         _require(self, "k", ">= 3", self.k >= 3)
-        most = self.adaptive_k
-        _require(self, "adaptive_k", ">= k or none", most is None or most >= self.k)
+        limit = self.adaptive_k
+        _require(self, "adaptive_k", ">= k or none", limit is None or limit >= self.k)
         _require(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
         _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
         _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
@@ -88,7 +88,7 @@ class NormalsConfig:
         """Resolve ``auto`` values; see :meth:`PipelineConfig.at_sampling`."""
         if self.noise_scope != "auto":
             return self
-        is_regional = _facets(sampling) < 0.5 and sampling.variation < _VARIATION
+        is_regional = _shape_fraction(sampling) < 0.5 and sampling.variation < _VARIATION
         return dataclasses.replace(self, noise_scope="regional" if is_regional else "local")
 
 
@@ -197,20 +197,20 @@ class GrowingConfig:
         """Resolve ``auto`` values; see :meth:`PipelineConfig.at_sampling`."""
         least, tolerance = self.min_size, self.facet_tolerance
         if least == "auto":
-            side, (low, high) = _SIDE_OF_REGION, _MIN_SIZES
-            drawn = _facets(sampling) * _ramp(sampling.exactness, *_EXACTNESS)
-            side += drawn * (_SIDE_OF_FACETS - side)
-            high += round(drawn * (_MIN_OF_FACETS - high))
+            side, (low, high) = _MIN_SIDE_FRACTION, _MIN_SIZES
+            drawn = _shape_fraction(sampling) * _ramp(sampling.exactness, *_EXACTNESS)
+            side += drawn * (_MIN_FACET_SIDE_FRACTION - side)
+            high += round(drawn * (_MAX_FACET_MIN_SIZE - high))
             size = round(sampling.density * (side * sampling.height) ** 2)
             least = min(max(size, low), high)
         if tolerance == "auto":
             reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
-            most = min(_FACETS_BY_HEIGHT * sampling.height, _FACETS_BY_REACH * reach)
-            fraction = max(_facets(sampling), _WHITE_FRACTION)
-            tolerance = float(f"{fraction * most:.3g}") or None
+            limit = min(_FACET_HEIGHT_FRACTION * sampling.height, _FACET_RADIUS_FRACTION * reach)
+            fraction = max(_shape_fraction(sampling), _WHITE_FRACTION)
+            tolerance = float(f"{fraction * limit:.3g}") or None
         faceted = self.faceted
         if faceted == "auto" and tolerance is not None:
-            faceted = _facets(sampling) > 0.5
+            faceted = _shape_fraction(sampling) > 0.5
         return dataclasses.replace(self, min_size=least, facet_tolerance=tolerance, faceted=faceted)
 
 
@@ -218,25 +218,25 @@ WHITENESS = 0.4, 0.6
 """Whiteness up to which surfaces are faceted or bent, and from which noise is white."""
 _VARIATION = 0.38
 """Variation of the spacing below which points are mesh vertices or a grid."""
-_FACETS_BY_HEIGHT, _FACETS_BY_REACH = 1 / 240, 0.3
+_FACET_HEIGHT_FRACTION, _FACET_RADIUS_FRACTION = 1 / 240, 0.3
 """Facet tolerance as a fraction of the cloud height, and its upper bound as a fraction of the
 radius of 50 neighbors. The bound matters for scans of many stories."""
 _WHITE_FRACTION = 0.45
 """Fraction of the facet tolerance used if noise is white (5 mm in a room), since cushions and other
 bent surfaces are split there too."""
-_SIDE_OF_REGION = 1 / 27
+_MIN_SIDE_FRACTION = 1 / 27
 """Side of the smallest region as a fraction of the cloud height: 10 cm in a room of 2.7 m."""
 _MIN_SIZES = 20, 50
 """Bounds of the automatic min_size. Regions with fewer points have no reliable plane; 50 is the
 paper's value."""
 _EXACTNESS = 0.1, 0.2
 """Exactness up to which points are measured, and from which they are sampled from a mesh."""
-_SIDE_OF_FACETS, _MIN_OF_FACETS = 1 / 13, 200
+_MIN_FACET_SIDE_FRACTION, _MAX_FACET_MIN_SIZE = 1 / 13, 200
 """Side of the smallest region as a fraction of the cloud height, and upper bound of min_size, for
 points sampled from a mesh: smaller regions (20 cm in a room) are facets of curved surfaces."""
 
 
-def _facets(sampling: Sampling) -> float:
+def _shape_fraction(sampling: Sampling) -> float:
     """Return how much of the deviation from planes is shape rather than noise, in [0, 1]."""
     return 1 - _ramp(sampling.whiteness, *WHITENESS)
 
@@ -528,7 +528,7 @@ def settings_of(
     elif isinstance(config, Mapping):
         heads = {str(key).partition(".")[0] for key in config}
         is_whole = kind is PipelineConfig or (is_part and heads & {"base", *_SECTIONS})
-        config = _configured(config, caller) if is_whole else _changed(kind(), config, caller)
+        config = _apply_to_base(config, caller) if is_whole else _override(kind(), config, caller)
     elif config is None:
         config = kind()
     if isinstance(config, PipelineConfig) and is_part:
@@ -540,7 +540,7 @@ def settings_of(
             f"{caller}: expected config to be a {kind.__name__} or a dictionary{presets}, got "
             f"{type(config).__name__}."
         )
-    return _changed(config, changes, caller) if changes else config
+    return _override(config, changes, caller) if changes else config
 
 
 def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
@@ -558,26 +558,26 @@ def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: expected YAML, got {reason}.") from error
-    return _configured({} if values is None else values, str(path))
+    return _apply_to_base({} if values is None else values, str(path))
 
 
-def _configured(values: object, where: str) -> PipelineConfig:
+def _apply_to_base(values: object, where: str) -> PipelineConfig:
     """Apply the values of a file or dictionary to its base."""
     base = PipelineConfig()
     if isinstance(values, Mapping) and "base" in values:
         expected = f"{where}: expected base to be one of"
         base = _read_config(_preset_file(values["base"], expected=expected), where)
         values = {key: value for key, value in values.items() if key != "base"}
-    return _changed(base, values, where)
+    return _override(base, values, where)
 
 
-_MEASURED_NOW = ("s3dis", "scannet", "laser", "rgbd")
+_REMOVED_PRESETS = ("s3dis", "scannet", "laser", "rgbd")
 """Presets of earlier versions, one per kind of data; replaced by measurement."""
 
 
 def _preset_file(name: object, *, expected: str) -> Path:
     """Return the file of a preset; raise if it does not exist."""
-    if name in _MEASURED_NOW:
+    if name in _REMOVED_PRESETS:
         raise ConfigError(
             f"{expected} {', '.join(preset_names())}, got {name!r}; leave it out: the default "
             "adapts to the data. Set the up axis with up."
@@ -587,7 +587,7 @@ def _preset_file(name: object, *, expected: str) -> Path:
     return _preset_folder() / f"{name}.yaml"
 
 
-def _changed(config: Settings, values: object, where: str) -> Settings:
+def _override(config: Settings, values: object, where: str) -> Settings:
     """Override settings; raise for unknown keys and wrong types.
 
     ``where`` is the file and section, or the caller, for messages.
@@ -603,27 +603,27 @@ def _changed(config: Settings, values: object, where: str) -> Settings:
         else:
             settings[section] = value
     if isinstance(config, PipelineConfig) and "angle_deg" in settings:
-        angle = _checked(settings.pop("angle_deg"), float, f"{where}: angle_deg")
+        angle = _convert(settings.pop("angle_deg"), float, f"{where}: angle_deg")
         _check_angle(where, angle)
         # Explicit values of the two angles take precedence.
         config = typing.cast(Settings, config.at_angle(angle))
     for key, value in settings.items():
         if key not in hints:
-            raise ConfigError(f"{where}: unknown setting {key!r}; {_repair(key, value, kind)}.")
+            raise ConfigError(f"{where}: unknown setting {key!r}; {_fix_for(key, value, kind)}.")
         current = getattr(config, key)
         at = f"{where}: {key}"
         is_section = dataclasses.is_dataclass(current) and not dataclasses.is_dataclass(value)
         settings[key] = (
-            _changed(current, value, at) if is_section else _checked(value, hints[key], at)
+            _override(current, value, at) if is_section else _convert(value, hints[key], at)
         )
     try:
         changed = dataclasses.replace(config, **settings)  # type: ignore[type-var]
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    return _changed(changed, dotted, where) if dotted else changed
+    return _override(changed, dotted, where) if dotted else changed
 
 
-_WORDS_OF_OTHERS = {
+_FIXES = {
     "preset": "pass the preset as the first argument, config",
     "radius": "neighborhoods have k points; max_distance bounds their radius",
     "offset": "batches with an offset are supported by torchrg.transforms",
@@ -632,7 +632,7 @@ _WORDS_OF_OTHERS = {
 """Fixes for setting names of other libraries."""
 
 
-def _repair(key: str, value: object, kind: type) -> str:
+def _fix_for(key: str, value: object, kind: type) -> str:
     """Return the fix for an unknown key."""
     names = own_names = [*typing.get_type_hints(kind), *["angle_deg"] * (kind is PipelineConfig)]
     for section, section_kind in _SECTIONS.items() if kind is PipelineConfig else ():
@@ -640,14 +640,14 @@ def _repair(key: str, value: object, kind: type) -> str:
     tails = {name.rpartition(".")[2]: name for name in reversed(names)}
     if key in tails:
         return f"it is {tails[key]}, as in **{{{tails[key]!r}: {value!r}}}"
-    if key in _WORDS_OF_OTHERS:
-        return _WORDS_OF_OTHERS[key]
+    if key in _FIXES:
+        return _FIXES[key]
     if near := difflib.get_close_matches(key, [*tails, *names], 1):
         return f"the nearest is {tails.get(near[0], near[0])}"
     return f"{kind.__name__} has {', '.join(own_names)}"
 
 
-def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
+def _convert(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
     """Convert a value to its annotated type, or raise."""
     unions = (types.UnionType, typing.Union)
     choices = typing.get_args(hint) if typing.get_origin(hint) in unions else (hint,)
@@ -658,15 +658,15 @@ def _checked(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
         elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
             return float(value) if abs(value) <= FARTHEST else value  # The range check raises.
         elif typing.get_origin(choice) is tuple and isinstance(value, str) and _is_words(choice):
-            return _checked(tuple(value.replace(" ", "").split(",")), choice, where)
+            return _convert(tuple(value.replace(" ", "").split(",")), choice, where)
         elif typing.get_origin(choice) is tuple and not isinstance(value, str | Mapping | None):
             kind, *others = typing.get_args(choice)
             parts = tuple(value) if isinstance(value, Iterable) else (value,)
             if others == [...] or len(parts) == len(others) + 1:
-                return tuple(_checked(item, kind, where) for item in parts)
+                return tuple(_convert(item, kind, where) for item in parts)
         elif type(value) is choice:
             return value
-    allowed = [_spelled(choice) for choice in choices]
+    allowed = [_type_name(choice) for choice in choices]
     raise ConfigError(f"{where}: expected {' or '.join(allowed)}, got {value!r}.")
 
 
@@ -675,7 +675,7 @@ def _is_words(choice: Any) -> bool:  # noqa: ANN401
     return typing.get_origin(typing.get_args(choice)[0]) is Literal
 
 
-def _spelled(choice: Any) -> str:  # noqa: ANN401
+def _type_name(choice: Any) -> str:  # noqa: ANN401
     """Return the name of a type for messages."""
     if typing.get_origin(choice) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(choice)))
@@ -725,7 +725,7 @@ def _preset_folder() -> Path:
     return inside if inside.is_dir() else Path(__file__).parents[1] / "configs"
 
 
-def _refuse(config: object, name: str, value: object) -> NoReturn:
+def _raise_immutable(config: object, name: str, value: object) -> NoReturn:
     """Raise an error that shows how to copy settings with a change."""
     kind = type(config)
     section = next((key for key, type_ in _SECTIONS.items() if type_ is kind), "")
@@ -752,12 +752,12 @@ def _values_of_presets() -> dict[str, dict[str, Any]]:
     return {name: dict(_flat_values(load_config(name))) for name in names}
 
 
-def _show(config: Any) -> str:  # noqa: ANN401
+def _format_call(config: Any) -> str:  # noqa: ANN401
     """Return a call that creates the settings, with the differences from the defaults."""
     kind, values = type(config), dict(_flat_values(config))
     if kind is not PipelineConfig:
-        usual = dict(_flat_values(kind()))
-        changed = [f"{name}={value!r}" for name, value in values.items() if value != usual[name]]
+        defaults = dict(_flat_values(kind()))
+        changed = [f"{name}={value!r}" for name, value in values.items() if value != defaults[name]]
         return f"{kind.__name__}({', '.join(changed)})"
     others = {
         name: {key: value for key, value in values.items() if value != preset[key]}
@@ -775,7 +775,7 @@ _KINDS: list[Any] = [
     DepthConfig,
 ]
 for _kind in _KINDS:
-    _kind.__setattr__ = _refuse
-    _kind.__repr__ = _show
+    _kind.__setattr__ = _raise_immutable
+    _kind.__repr__ = _format_call
 # Lets torch.load(weights_only=True) read checkpoints that contain settings.
 torch.serialization.add_safe_globals(_KINDS)

@@ -49,7 +49,7 @@ def find_fronts(
         >>> find_fronts([np.array([[0, 2, 1]])], square, np.ones(4, bool)).tolist()
         [[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]
     """
-    places, count = coordinates.astype(np.float64, copy=False), len(coordinates)
+    positions, count = coordinates.astype(np.float64, copy=False), len(coordinates)
     sums, areas = np.zeros((3, count)), np.zeros(count)
     for block in faces:
         if block.shape[1] > _MAX_CORNERS * count:
@@ -64,7 +64,7 @@ def find_fronts(
         for start in range(0, len(corners) if corners.shape[1] > 2 else 0, at_once):
             part = corners[start : start + at_once]
             part = part[finite[part].all(axis=1)]
-            normals = _vector_areas(places, part)
+            normals = _vector_areas(positions, part)
             sizes = np.linalg.norm(normals, axis=1)
             for total, values in zip((areas, *sums), (sizes, *normals.T), strict=True):
                 np.add.at(total, part.reshape(-1), np.repeat(values, part.shape[1]))
@@ -74,8 +74,8 @@ def find_fronts(
     return np.ascontiguousarray(fronts.T, dtype=np.float32)
 
 
-def _vector_areas(places: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def _vector_areas(positions: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the normals of faces, scaled to twice their areas, shape ``(n, 3)``."""
-    arms = places[faces[:, 1:]] - places[faces[:, :1]]
-    areas: NDArray[np.float64] = np.cross(arms[:, :-1], arms[:, 1:]).sum(axis=1)
+    edges = positions[faces[:, 1:]] - positions[faces[:, :1]]
+    areas: NDArray[np.float64] = np.cross(edges[:, :-1], edges[:, 1:]).sum(axis=1)
     return areas

@@ -234,7 +234,7 @@ def _rows(columns: Json) -> list[Json]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def arrays_of_description(described: Json) -> Arrays:
+def described_to_arrays(described: Json) -> Arrays:
     """Convert the result of :func:`describe_planes` to that of :func:`planes_to_arrays`."""
     rows, pairs = described["planes"], described.get("adjacency")
     arrays = {

@@ -16,7 +16,7 @@ from torchrg.errors import PrecisionWarning
 _COARSE, _COARSE_GRID = 0.1, 0.5
 """Rounding steps, in spacings of the points, above which there is a note: for float32, and for the
 scale of a file."""
-_SURELY_FINE = 1e-3
+_MAX_FINE_STEP = 1e-3
 """Rounding step, in spacings of a uniform surface, up to which no search is needed: for it to be
 too coarse, half of the points would have to be a hundred times closer."""
 _QUARTILES = (0.25, 0.75)
@@ -40,7 +40,7 @@ def note_on_steps(
     points: NDArray[np.floating],
     *,
     scale: float = 0.0,
-    cure: str = "write float64, or subtract an offset before saving",
+    fix: str = "write float64, or subtract an offset before saving",
 ) -> str:
     """Return a note if the rounding step of coordinates is coarse for their spacing.
 
@@ -51,7 +51,7 @@ def note_on_steps(
         points: Input coordinates, shape ``(N, 3)``, float32 or float64. Non-finite points and the
             rounding step of float64 are ignored.
         scale: Step of the coordinates in their file. Default: none.
-        cure: Fix if the type, not the scale, is too coarse.
+        fix: Fix if the type, not the scale, is too coarse.
 
     Example:
         >>> points = np.random.default_rng(0).random((1000, 3), dtype=np.float32)
@@ -78,21 +78,21 @@ def note_on_steps(
         single = float(np.spacing(reach)) if is_single else 0.0
     step = max(single, scale)
     even = width / math.sqrt(len(finite_points))
-    if not 0 < width < math.inf or step <= _SURELY_FINE * even:
+    if not 0 < width < math.inf or step <= _MAX_FINE_STEP * even:
         return ""
     spacing = _spacing(finite_points, _CELL * even) if step < even else even
     is_grid = scale > _COARSE_GRID * spacing
     if not is_grid and single <= _COARSE * spacing:
         return ""
-    step, cure = (scale, "write it with a finer scale") if is_grid else (single, cure)
-    return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {cure}"
+    step, fix = (scale, "write it with a finer scale") if is_grid else (single, fix)
+    return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {fix}"
 
 
 def warn_of_steps(caller: str, points: Tensor) -> None:
     """Warn about :func:`note_on_steps`, at the caller of a decorated public function."""
     coordinates = points.detach().cpu().numpy()
     note = note_on_steps(
-        coordinates, cure="pass float64, or subtract an offset before it is float32"
+        coordinates, fix="pass float64, or subtract an offset before it is float32"
     )
     if note:
         warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=_ABOVE_DECORATORS)

@@ -27,7 +27,7 @@ from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.plane_table import (
     Arrays,
     Json,
-    arrays_of_description,
+    described_to_arrays,
     encode_csv,
     planes_from_arrays,
 )
@@ -66,9 +66,9 @@ _KINDS = {
     "valid": ("b", ()),
 }
 """NumPy's kind of numbers of a field, and shape of a row."""
-_MAX_SEARCHED = 100_000
+_MAX_SAMPLED_POINTS = 100_000
 """Number of points of a random sample from which adjacent planes are found if unknown."""
-_NEIGHBORS = 50
+_NUM_NEIGHBORS = 50
 """Number of neighbors, equal to the default for normals, so that a cloud that is not sampled gets
 the same adjacency as its result."""
 
@@ -125,10 +125,10 @@ class Result:
         }
         if superpoints is not None:
             results |= superpoints.by_level()
-        labelled = replace(cloud, fields=put_results(cloud.fields, results))
+        labeled = replace(cloud, fields=put_results(cloud.fields, results))
         plane_of_superpoint = None if superpoints is None else superpoints.plane
         neighbors = segmentation.neighbors
-        return cls(labelled, segmentation.planes, plane_of_superpoint, neighbors=neighbors)
+        return cls(labeled, segmentation.planes, plane_of_superpoint, neighbors=neighbors)
 
     @cached_property
     def fields(self) -> dict[str, Tensor]:
@@ -204,9 +204,9 @@ class Result:
         if neighbors is not None and len(neighbors.indices) != len(rows):
             neighbors = None
         if neighbors is None and bool((self.labels[rows] >= 0).any()):
-            places = np.random.default_rng(0).permutation(len(rows))[:_MAX_SEARCHED]
+            places = np.random.default_rng(0).permutation(len(rows))[:_MAX_SAMPLED_POINTS]
             sampled = rows[torch.from_numpy(places).sort().values]
-            k = min(_NEIGHBORS, len(sampled))
+            k = min(_NUM_NEIGHBORS, len(sampled))
             neighbors = search_knn(self.cloud.points[sampled], k, canonical=True)
         points, (present, labels) = self.cloud.points[sampled], number_labels(self.labels[sampled])
         if table is None:
@@ -277,8 +277,8 @@ def write_table(path: Path, described: Json) -> None:
     """Write the result of :func:`describe_planes` as JSON or CSV, by file extension."""
     is_json = path.suffix.lower() == ".json"
     content = json.dumps(described, indent=1).encode() if is_json else encode_csv(described)
-    with atomic_path(path) as beside:
-        beside.write_bytes(content)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Result:
@@ -309,7 +309,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
     """
     source = Path(path)
     if source.is_dir():
-        cloud, beside = _read_folder(source)
+        cloud, extras = _read_folder(source)
     else:
         cloud = read_cloud(source, columns=columns)
         # Text files have a single type for all columns.
@@ -319,18 +319,18 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
             if name.startswith("superpoints") and values.dtype.kind == "f" and are_whole(values)
         }
         cloud = replace(cloud, fields={**cloud.fields, **whole})
-        beside = read_beside(source) if source.suffix.lower() == ".npz" else {}
-    planes = beside.get("plane_of_superpoint", np.zeros(()))
+        extras = read_beside(source) if source.suffix.lower() == ".npz" else {}
+    planes = extras.get("plane_of_superpoint", np.zeros(()))
     result = Result(
         cloud,
         plane_of_superpoint=torch.from_numpy(planes) if planes.dtype == np.int64 else None,
-        provenance=_record(str(beside.get("provenance", ""))),
+        provenance=_parse_record(str(extras.get("provenance", ""))),
     )
-    if "plane_count" not in beside:
+    if "plane_count" not in extras:
         return result
     try:
         normals = result.fields.get("normals", cloud.points)
-        table = planes_from_arrays(beside, cloud.origin, normals.dtype)
+        table = planes_from_arrays(extras, cloud.origin, normals.dtype)
         sizes = torch.bincount(result.labels + 1, minlength=1)[1:]
         named = torch.equal(result.names, torch.arange(len(sizes)))
         if named and torch.equal(sizes, table.count):
@@ -359,19 +359,19 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
     coord = arrays["coord"]
     grid = coord.shape[:2] if coord.ndim == 3 else None
     cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder), notes=notes)
-    beside: Arrays = {}
+    extras: Arrays = {}
     if (folder / RECORD).is_file():
-        beside["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
+        extras["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
     if (folder / PLANES_FILE).is_file():
         try:
             text = (folder / PLANES_FILE).read_text(encoding="utf-8")
-            beside |= arrays_of_description(json.loads(text))
+            extras |= described_to_arrays(json.loads(text))
         except DAMAGES:
-            beside["plane_count"] = np.zeros(0)
-    return cloud, beside
+            extras["plane_count"] = np.zeros(0)
+    return cloud, extras
 
 
-def _record(text: str) -> dict[str, Any]:
+def _parse_record(text: str) -> dict[str, Any]:
     """Parse a provenance record; return an empty one if invalid."""
     try:
         content = json.loads(text)

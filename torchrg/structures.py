@@ -157,8 +157,8 @@ class Cloud:
             return note
         if finite.dtype == np.float32:
             return ""
-        cure = "leave out points that are far off, or cut the cloud into parts"
-        return note_on_steps(self._local.numpy(), cure=cure)
+        fix = "leave out points that are far off, or cut the cloud into parts"
+        return note_on_steps(self._local.numpy(), fix=fix)
 
     def about(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates relative to ``origin`` ``(3,)``, float32, shape ``(N, 3)``."""
