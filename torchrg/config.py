@@ -102,8 +102,7 @@ class GrowingConfig:
 
     max_angle_deg: float = 6.5
     """Maximum angle between the normals of a point and a neighbor that joins its region, in
-    degrees; theta in the paper. Higher values merge more. angle_deg of a configuration sets it
-    together with normals.sharp_angle_deg."""
+    degrees; theta in the paper. Higher values merge more."""
     curvature_quantile: float = 0.95
     """Curvature quantile below which points can be seeds."""
     curvature_scope: Literal["cloud", "neighborhood"] = "cloud"

@@ -323,7 +323,7 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str, complete: bool 
     blocks = [usage, *map(_wrap, paragraphs if complete else paragraphs[:1])]
     for title, members in groups.items():
         entries = [_long_entry(flag) if complete else _short_entry(flag) for flag in members]
-        blocks.append("\n".join([f"{title}:", *entries]))
+        blocks.append("\n".join([title if ":" in title else f"{title}:", *entries]))
     if len(common) < len(flags):
         blocks.append(f"{prog} --help-all explains these and {len(flags) - len(common)} more.")
     if examples := example_lines(kind):
