@@ -384,7 +384,7 @@ def test_segmentations_of_other_points_and_other_files_are_refused(tmp_path, clo
 def test_superpoints_of_numbers_beyond_that_of_points_are_numbered_anew(tmp_path, cloud, parts):
     numbers = parts.labels.numpy()
     far = numbers * 100_000_000_000 + 2**31
-    torchrg.write_cloud(tmp_path / "a.npz", replace(cloud, fields={"superpoints": far}))
+    torchrg.write_cloud(tmp_path / "a.npz", replace(cloud, fields={"superpoint": far}))
     found = torchrg.read_result(tmp_path / "a.npz").superpoints
     assert found.labels.tolist() == numbers.tolist()
     assert len(found.plane) == numbers.max() + 1

@@ -75,7 +75,7 @@ else:
             repair = "; seg.show() shows a result" if name == "show" else ""
             near = [word for word in __all__ if word.startswith(f"{name}_")]
             if near:
-                repair = f". Did you mean {near[0]!r}?"
+                repair = f". Did you mean {' or '.join(map(repr, reversed(near)))}?"
             raise AttributeError(f"module 'torchrg' has no attribute {name!r}{repair}")
         globals()[name] = getattr(module, name) if name in _MODULES else module
         return globals()[name]

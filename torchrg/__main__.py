@@ -1,7 +1,12 @@
 """Process of a command: ``torchrg`` and ``python -m torchrg``."""
 
+import gc
 import os
 import sys
+
+# The collector would go through the objects of torch several times while they are made: a fifth
+# of the time until a command begins. Commands and workers enable it again.
+gc.disable()
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):
     # Python puts the working directory first; modules there must not be imported, except torchrg

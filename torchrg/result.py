@@ -50,15 +50,15 @@ PLANES_FILE, RECORD = "planes.json", "provenance.json"
 last, so that a scan without it is incomplete."""
 _FOLDER_FIELDS = {
     "plane": "labels",
+    "superpoint": "superpoint",
     "normal": "normals",
     "curvature": "curvature",
     "color": "color",
-    "superpoint": "superpoints",
 }
 """Fields of a cloud by the names of their arrays in a folder."""
 _KINDS = {
     "labels": ("iu", ()),
-    "superpoints": ("iu", ()),
+    "superpoint": ("iu", ()),
     "color": ("u", (3,)),
     "normals": ("f", (3,)),
     "curvature": ("f", ()),
@@ -79,8 +79,8 @@ class Result:
 
     Args:
         cloud: The points. Its fields include the known results: ``labels``, ``normals``,
-            ``curvature``, the masks ``sharp`` and ``valid``, and ``superpoints``, with coarser
-            levels as ``superpoints_1`` and so on.
+            ``curvature``, the masks ``sharp`` and ``valid``, and ``superpoint``, with coarser
+            levels as ``superpoint_1`` and so on.
         table: Plane table relative to :attr:`Cloud.origin`; its rows are the labels, ascending.
             Default: no table.
         plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
@@ -260,10 +260,10 @@ class Result:
 
         Labels are renumbered if they exceed the number of points, as after removing points.
         """
-        if "superpoints" not in self.fields:
+        if "superpoint" not in self.fields:
             return None
-        fields, labels = self.cloud.fields, self.fields["superpoints"].long()
-        coarser = (f"superpoints_{i}" for i in range(1, len(fields)))
+        fields, labels = self.cloud.fields, self.fields["superpoint"].long()
+        coarser = (f"superpoint_{i}" for i in range(1, len(fields)))
         levels = (torch.from_numpy(fields[name]).long() for name in coarser if name in fields)
         plane = self.plane_of_superpoint
         if len(labels) and labels.max() >= len(labels):
@@ -316,7 +316,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         whole = {
             name: values.astype(np.int64)
             for name, values in cloud.fields.items()
-            if name.startswith("superpoints") and values.dtype.kind == "f" and are_whole(values)
+            if name.startswith("superpoint") and values.dtype.kind == "f" and are_whole(values)
         }
         cloud = replace(cloud, fields={**cloud.fields, **whole})
         extras = read_beside(source) if source.suffix.lower() == ".npz" else {}
@@ -350,7 +350,7 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
         for name, values in arrays.items()
         if name in _FOLDER_FIELDS
     }
-    for name in fields.keys() & {"labels", "superpoints"}:
+    for name in fields.keys() & {"labels", "superpoint"}:
         fields[name] = fields[name].astype(np.int64)
     notes: tuple[str, ...] = ()
     if "color" in fields:

@@ -575,11 +575,9 @@ class Superpoints:
         Example:
             >>> one = torch.tensor([0, 0, 1])
             >>> list(Superpoints(one, torch.tensor([-1, -1]), (one // 2, one // 2)).by_level())
-            ['superpoints', 'superpoints_1', 'superpoints_2']
+            ['superpoint', 'superpoint_1', 'superpoint_2']
         """
         return {
-            "superpoints" if i == 0 else f"superpoints_{i}": level.numpy(force=True).astype(
-                np.int32
-            )
+            "superpoint" if i == 0 else f"superpoint_{i}": level.numpy(force=True).astype(np.int32)
             for i, level in enumerate((self.labels, *self.levels))
         }

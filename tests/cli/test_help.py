@@ -134,6 +134,20 @@ def test_what_is_written_wrongly_is_one_line(line, message):
         parse(Command, line.split(), prog="f")
 
 
+@pytest.mark.parametrize(
+    ("word", "flag"),
+    [
+        ("--min-size", "--growing.min-size"),
+        ("--k", "--normals.k"),
+        ("--max-angle-deg", "--growing.max-angle-deg"),
+        ("--strengths", "--partition.strengths"),
+    ],
+)
+def test_a_setting_without_its_section_is_suggested(word, flag):
+    with pytest.raises(ConfigError, match=f"option {word}. Did you mean {flag}?"):
+        parse(KINDS["torchrg segment"], ["a.ply", word, "3"], prog="torchrg segment")
+
+
 @pytest.mark.parametrize("prog", KINDS)
 def test_examples_are_understood(prog, capsys):
     kind = KINDS[prog]

@@ -24,7 +24,7 @@ def folder(folder_of_clouds):
     fields = {
         "labels": labels,
         "normals": truth.fields["normals"] + rng.normal(0, 0.1, (SIZE, 3)).astype(np.float32),
-        "superpoints": (truth.fields["labels"] * 2 + rng.integers(0, 2, SIZE)).astype(np.int32),
+        "superpoint": (truth.fields["labels"] * 2 + rng.integers(0, 2, SIZE)).astype(np.int32),
     }
     write_cloud(place / "ours.npz", Cloud(truth.coordinates, fields))
     return place
@@ -106,14 +106,14 @@ def test_points_without_a_match_are_told_and_count_as_unlabelled(folder, run, re
     scores, truth = json.loads(done.out), read_cloud(folder / "truth.npz")
     assert scores["match"] == {"points": SIZE, "unmatched": SIZE // 2, "unused": 0}
     ours = {name: v.copy() for name, v in read_cloud(folder / "ours.npz").fields.items()}
-    ours["labels"][lost] = ours["superpoints"][lost] = -1
+    ours["labels"][lost] = ours["superpoint"][lost] = -1
     ours["normals"][lost] = 0
     labels = score_labels(ours["labels"], truth.fields["labels"])
     assert scores["labels"] == labels._asdict()
     normals = score_normals(ours["normals"], truth.fields["normals"])
     assert scores["normals"]["rms"] == normals.rms
     assert scores["normals"]["invalid"] == SIZE // 2
-    parts = score_partition(ours["superpoints"], truth.fields["labels"], truth.points)
+    parts = score_partition(ours["superpoint"], truth.fields["labels"], truth.points)
     assert scores["superpoints"] == parts._asdict()
 
 

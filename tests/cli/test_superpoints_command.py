@@ -29,8 +29,8 @@ def test_the_result_holds_every_level(folder):
     config = SuperpointsConfig(strengths=(0.3, 3.0))
     expected = make_superpoints(cloud.points, segment_planes(cloud.points), config)
     with np.load(folder / "all.npz", allow_pickle=False) as result:
-        assert np.array_equal(result["superpoints"], expected.labels)
-        assert np.array_equal(result["superpoints_1"], expected.levels[0])
+        assert np.array_equal(result["superpoint"], expected.labels)
+        assert np.array_equal(result["superpoint_1"], expected.levels[0])
         assert np.array_equal(result["plane_of_superpoint"], expected.plane)
         provenance = json.loads(str(result["provenance"]))
     assert provenance["superpoints"]["strengths"] == [0.3, 3.0]
@@ -43,7 +43,7 @@ def test_numbers_of_superpoints_are_asked_for_in_a_word(folder, tmp_path, run, f
     path = tmp_path / "parts.npz"
     assert run("segment", folder / "room.npz", "--out", path, *flags).code == 0
     with np.load(path, allow_pickle=False) as result:
-        numbers = [len(np.unique(result[name])) for name in ("superpoints", "superpoints_1")]
+        numbers = [len(np.unique(result[name])) for name in ("superpoint", "superpoint_1")]
         provenance = json.loads(str(result["provenance"]))
     assert numbers == [300, 40]
     assert provenance["superpoints"]["counts"] == [300, 40]
@@ -52,7 +52,7 @@ def test_numbers_of_superpoints_are_asked_for_in_a_word(folder, tmp_path, run, f
 def test_every_point_has_the_superpoint_of_its_voxel(folder):
     cloud = read_cloud(folder / "room.npz")
     inverse = sample_voxels(cloud.points, 0.3).inverse.numpy()
-    superpoints = read_cloud(folder / "voxel.ply").fields["superpoints"]
+    superpoints = read_cloud(folder / "voxel.ply").fields["superpoint"]
     assert superpoints.min() == 0
     pairs = np.unique(np.stack([inverse, superpoints]), axis=1)
     assert pairs.shape[1] == inverse.max() + 1
@@ -63,12 +63,12 @@ def test_superpoints_are_scored_when_asked(folder, run):
     flags = ["--superpoints", "--ignore", "0", "--boundary-distance", "0.2", "--json"]
     scores = json.loads(run("score", result, truth, *flags).out)
     ours, theirs = read_cloud(result), read_cloud(truth)
-    arrays = ours.fields["superpoints"], theirs.fields["labels"], ours.points
+    arrays = ours.fields["superpoint"], theirs.fields["labels"], ours.points
     expected = score_partition(*arrays, ignore=0, boundary_distance=0.2)
     assert scores["superpoints"] == expected._asdict()
     assert set(json.loads(run("score", result, truth, "--json").out)) == {"labels", "normals"}
     error = run("score", truth, result, "--superpoints").error
-    assert "missing superpoints, required by --superpoints" in error
+    assert "missing superpoint, required by --superpoints" in error
 
 
 def test_superpoints_are_drawn(folder, tmp_path, run):

@@ -148,13 +148,13 @@ def test_own_fields_that_a_result_has_too_are_kept_aside(
 def test_own_superpoints_are_kept_aside_too(tmp_path, make_cloud):
     cloud = make_cloud(60)
     parts = Superpoints(torch.arange(60) // 2, torch.full((30,), -1), (torch.arange(60) // 4,))
-    own = {"superpoints": np.arange(60, dtype=np.int32)}
+    own = {"superpoint": np.arange(60, dtype=np.int32)}
     for kind in (".npz", ".ply"):
         write_cloud(tmp_path / f"a{kind}", replace(cloud, fields=own), superpoints=parts)
         fields = read_cloud(tmp_path / f"a{kind}").fields
-        assert fields.keys() == {"superpoints", "superpoints_1", "superpoints_input"}
-        np.testing.assert_array_equal(fields["superpoints"], parts.labels)
-        np.testing.assert_array_equal(fields["superpoints_input"], own["superpoints"])
+        assert fields.keys() == {"superpoint", "superpoint_1", "superpoint_input"}
+        np.testing.assert_array_equal(fields["superpoint"], parts.labels)
+        np.testing.assert_array_equal(fields["superpoint_input"], own["superpoint"])
 
 
 def test_result_file_has_exactly_the_documented_arrays(tmp_path, make_cloud, make_segmentation):

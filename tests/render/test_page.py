@@ -34,7 +34,7 @@ def room(num_points=1600, **changes):
         "normals": made.normals.numpy(),
         "curvature": np.linspace(0, 0.3, num_points, dtype=np.float32),
         "sharp": np.arange(num_points) % 7 == 0,
-        "superpoints": np.arange(num_points) // 50,
+        "superpoint": np.arange(num_points) // 50,
         "color": np.full((num_points, 3), 90, dtype=np.uint8),
     }
     return Cloud(made.points.numpy(), {**fields, **changes}, source="room.npz")
@@ -84,7 +84,7 @@ def test_a_page_holds_every_point_where_it_is_and_what_the_file_says_of_it():
     nearest, rows = distances.min(dim=1)
     assert float(nearest.max()) <= what["clouds"][0]["step"] * what["frame"]["scale"]
     assert sorted(rows.tolist()) == list(range(len(cloud)))
-    for name, field in (("plane", "labels"), ("superpoint", "superpoints"), ("sharp", "sharp")):
+    for name, field in (("plane", "labels"), ("superpoint", "superpoint"), ("sharp", "sharp")):
         assert (arrays[name][:, 0] == cloud.fields[field][rows]).all()
     assert (arrays["color"] == 90).all()
     normals = decode_directions(np.ascontiguousarray(arrays["normals"]))
@@ -153,7 +153,7 @@ def test_colours_are_those_of_pictures(mode):
     fields = {name: torch.from_numpy(values) for name, values in cloud.fields.items()}
     colors = {
         "plane": color_planes(fields["labels"], cloud.points),
-        "superpoint": color_planes(fields["superpoints"], cloud.points),
+        "superpoint": color_planes(fields["superpoint"], cloud.points),
         "normal": color_normals(fields["normals"], up=(0.0, 1.0, 0.0)),
         "curvature": color_curvature(fields["curvature"]),
         "sharp": color_sharp(fields["sharp"]),

@@ -1,6 +1,7 @@
 """The local engine: processes of one thread each, as many as memory allows."""
 
 import contextlib
+import gc
 import os
 import signal
 from collections.abc import Iterator, Sequence
@@ -147,6 +148,8 @@ def _serve(pipe: Connection, stderr: Connection | None) -> None:
     """Convert scans until the pipe closes; from the first on errors go to ``stderr``."""
     import torch
 
+    gc.freeze()  # Loaded modules are no garbage.
+    gc.enable()
     Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     # Reading and writing fail once the process that hands over scans is gone.

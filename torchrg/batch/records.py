@@ -5,11 +5,11 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import scipy
 import torch
 
 from torchrg import kernels, version
@@ -57,7 +57,7 @@ def describe_versions() -> dict[str, str]:
         "torchrg": version.__version__,
         "torch": str(torch.__version__),
         "numpy": np.__version__,
-        "scipy": scipy.__version__,
+        "scipy": metadata.version("scipy"),
         "kernels": "none" if kernels.name_of_library() is None else "C++",
     }
 

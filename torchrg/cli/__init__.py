@@ -1,6 +1,7 @@
 """Command line: ``torchrg COMMAND ...``."""
 
 import difflib
+import gc
 import importlib
 import os
 import sys
@@ -98,6 +99,9 @@ def _run(arguments: list[str]) -> int:
         hint = f" Did you mean {near[0]}?" if near else ""
         raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.{hint}")
     command = importlib.import_module(f"torchrg.cli.{name}")
+    if not gc.isenabled():  # See torchrg.__main__: loaded modules are no garbage.
+        gc.freeze()
+        gc.enable()
     with raising_interrupts(), warnings.catch_warnings():
         # Commands print the precision of each file themselves (check_finite).
         warnings.simplefilter("ignore", PrecisionWarning)

@@ -207,8 +207,9 @@ def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]
         )
     asked = word.partition("=")[0].replace("_", "-")
     names = {flag.name: flag.name for flag in flags if not flag.is_positional}
-    # A setting without its part takes precedence.
-    tails = {f"--{name.lstrip('-').rpartition('.')[2]}": name for name in reversed(names)}
+    # The first flag of a tail wins; settings of superpoints, which are rarely changed, come last.
+    ordered = sorted(names, key=lambda name: name.startswith("--partition."))
+    tails = {f"--{name.lstrip('-').rpartition('.')[2]}": name for name in reversed(ordered)}
     near = difflib.get_close_matches(asked, [*tails, *names], n=1)
     tail = f"--{asked.lstrip('-').rpartition('.')[2]}"
     name = tails.get(tail) or next((names.get(word) or tails[word] for word in near), "")

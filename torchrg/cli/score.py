@@ -146,14 +146,14 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
         if part in ours.fields and part in theirs.fields:
             scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
-        for path, cloud, field in ((predicted, ours, "superpoints"), (truth, theirs, "labels")):
+        for path, cloud, field in ((predicted, ours, "superpoint"), (truth, theirs, "labels")):
             if field not in cloud.fields:
                 named = ", ".join(cloud.fields) or "points alone"
                 raise FormatError(
                     f"{path}: missing {field}, required by --superpoints; has {named}."
                 )
         indices = score_partition(
-            ours.fields["superpoints"],
+            ours.fields["superpoint"],
             theirs.fields["labels"],
             ours.points,
             boundary_distance=arguments.boundary_distance,
@@ -204,7 +204,7 @@ def _match_nearest(
             "as unlabeled."
         )
     fields = {}
-    for name in ("labels", "normals", "superpoints"):
+    for name in ("labels", "normals", "superpoint"):
         if name in ours.fields:
             values = ours.fields[name][rows].astype(np.result_type(ours.fields[name], np.int8))
             values[~is_matched] = UNLABELED if values.ndim == 1 else 0

@@ -86,7 +86,7 @@ class Arguments:
     """Voxel size, in units of the cloud. Segments one point per voxel and copies the result to all
     points of that voxel. Default: no downsampling."""
     superpoints: bool = False
-    """Also partition all points into superpoints, stored as "superpoints" (finest), "superpoints_1"
+    """Also partition all points into superpoints, stored as "superpoint" (finest), "superpoint_1"
     and so on. Optional numbers set how many per level, as in --superpoints 1000,300. Uses point
     colors if the cloud has them. Images then show superpoints instead of planes."""
     level: int = 0
@@ -276,7 +276,7 @@ def _array_storage(
 def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:
     """Warn about the input before the computation; raise if the output cannot be written."""
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
-    parts = [f"superpoints_{i}" if i else "superpoints" for i in levels]
+    parts = [f"superpoint_{i}" if i else "superpoint" for i in levels]
     written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
     note_input(source, cloud, target, written)
     if arguments.layout is None:

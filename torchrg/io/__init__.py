@@ -175,7 +175,7 @@ def write_cloud(
         ``sharp``, ``valid``, the table of planes as
         :func:`torchrg.plane_table.planes_to_arrays` gives it in the input's coordinates, and
         ``provenance``. Equal input gives equal bytes. Superpoints are
-        ``superpoints``, and ``superpoints_1`` and so on for the coarser levels; in ``.npz`` also
+        ``superpoint``, and ``superpoint_1`` and so on for the coarser levels; in ``.npz`` also
         ``plane_of_superpoint``. ``.vg`` holds coordinates, colours, normals and the planes as
         vertex groups, see :mod:`torchrg.io.vg`; it is not read.
 

@@ -22,7 +22,7 @@ from torchrg.structures import UNLABELED
 
 MODES = {
     "plane": ("planes", "labels"),
-    "superpoint": ("superpoints", "superpoints"),
+    "superpoint": ("superpoints", "superpoint"),
     "color": ("point colors", "color"),
     "normal": ("normals", "normals"),
     "curvature": ("curvature", "curvature"),
@@ -88,8 +88,8 @@ def make_channels(
     """
     if "labels" in fields:
         yield _region_channel("plane", fields["labels"], *palettes["plane"])
-    if "superpoints" in fields:
-        yield _region_channel("superpoint", fields["superpoints"], *palettes["superpoint"])
+    if "superpoint" in fields:
+        yield _region_channel("superpoint", fields["superpoint"], *palettes["superpoint"])
     if "color" in fields:
         yield Channel("color", fields["color"].numpy(), None, [])
     if "normals" in fields:

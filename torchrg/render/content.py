@@ -114,9 +114,9 @@ def choose_points(result: Result, frame: PageFrame, max_points: int) -> PointSam
         fields["normals"] = fields["normals"] @ frame.rotation.T.float()
     if "labels" in fields:
         fields["labels"] = result.labels[rows]
-    if "superpoints" in fields:
-        parts = result.fields["superpoints"].long()
-        fields["superpoints"] = number_labels(parts.clamp(min=-1))[1][rows]
+    if "superpoint" in fields:
+        parts = result.fields["superpoint"].long()
+        fields["superpoint"] = number_labels(parts.clamp(min=-1))[1][rows]
     points = frame.transform(cloud.points[rows], cloud.origin)
     surface = sample_surface(points)
     labels = fields["labels"][surface.rows] if "labels" in fields else None

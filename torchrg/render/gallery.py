@@ -40,7 +40,7 @@ def write_planes(path: str | os.PathLike[str], result: Result) -> None:
     normals = fields.get("normals")
     picture = render_cloud(
         points,
-        color_planes(fields.get("superpoints", result.labels), points),
+        color_planes(fields.get("superpoint", result.labels), points),
         normals=None if normals is None else normals.to(points.dtype),
         labels=fields.get("labels"),
     )

@@ -96,7 +96,7 @@ def make_page(
     """Create a viewer of a result, or of two results with a shared camera.
 
     Available color modes depend on the fields of the cloud: ``labels`` (planes, with the plane
-    table), ``superpoints``, ``color``, ``normals``, ``curvature``, ``sharp``. The output contains
+    table), ``superpoint``, ``color``, ``normals``, ``curvature``, ``sharp``. The output contains
     no time and no path: identical inputs produce identical bytes.
 
     Args:
@@ -285,8 +285,8 @@ def _palettes(
     regions = {}
     if "labels" in result.fields:
         regions["plane"] = result.labels, reference
-    if "superpoints" in result.fields:
-        regions["superpoint"] = result.fields["superpoints"].long().clamp(min=-1), None
+    if "superpoint" in result.fields:
+        regions["superpoint"] = result.fields["superpoint"].long().clamp(min=-1), None
     palettes = {}
     for mode, (labels, same) in regions.items():
         rows, colors = palette_of_planes(labels, result.cloud.points, reference=same)
