@@ -121,7 +121,7 @@ def _backward(tensors: list[Tensor], call: str) -> Tensor:
     def differentiate() -> Tensor:
         values = arguments[name].detach().clone().requires_grad_()
         outputs = _as_list(function.run(**{**arguments, name: values}))
-        chosen = [outputs[place] for place in function.differentiable]
+        chosen = [outputs[index] for index in function.differentiable]
         (gradient,) = torch.autograd.grad(chosen, values, gradients)
         copied: Tensor = gradient.clone()
         return copied
@@ -141,23 +141,23 @@ def _(tensors: list[Tensor], call: str) -> Tensor:
     return torch.empty_like(tensors[0])
 
 
-def _with_batch_first(size: int, places: list[int | None], tensors: list[Tensor]) -> list[Tensor]:
+def _with_batch_first(size: int, in_dims: list[int | None], tensors: list[Tensor]) -> list[Tensor]:
     """Move the batch axis of each tensor to the front."""
     return [
-        tensor.expand(size, *tensor.shape) if place is None else tensor.movedim(place, 0)
-        for tensor, place in zip(tensors, places, strict=True)
+        tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+        for tensor, dim in zip(tensors, in_dims, strict=True)
     ]
 
 
 @_forward.register_vmap
-def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
-    outputs = _forward(_with_batch_first(info.batch_size, places[0], tensors), call)
+def _(info: Any, in_dims: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+    outputs = _forward(_with_batch_first(info.batch_size, in_dims[0], tensors), call)
     return outputs, [0] * len(outputs)
 
 
 @_backward.register_vmap
-def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
-    return _backward(_with_batch_first(info.batch_size, places[0], tensors), call), 0
+def _(info: Any, in_dims: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+    return _backward(_with_batch_first(info.batch_size, in_dims[0], tensors), call), 0
 
 
 class _Differentiable(torch.autograd.Function):
@@ -171,13 +171,13 @@ class _Differentiable(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ANN401
         ctx.call, *tensors = inputs
         ctx.save_for_backward(*tensors)
-        places = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
-        ctx.mark_non_differentiable(*(o for i, o in enumerate(output) if i not in places))
+        indices = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
+        ctx.mark_non_differentiable(*(o for i, o in enumerate(output) if i not in indices))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:  # noqa: ANN401
-        places = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
-        tensors = [*ctx.saved_tensors, *(gradients[place].contiguous() for place in places)]
+        indices = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
+        tensors = [*ctx.saved_tensors, *(gradients[index].contiguous() for index in indices)]
         if torch.compiler.is_compiling():
             first = _backward(tensors, ctx.call)
         else:
@@ -185,8 +185,8 @@ class _Differentiable(torch.autograd.Function):
         return None, first, *[None] * (len(ctx.saved_tensors) - 1)
 
     @staticmethod
-    def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
-        first = _with_batch_first(info.batch_size, places[1:], list(tensors))
+    def vmap(info: Any, in_dims: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
+        first = _with_batch_first(info.batch_size, in_dims[1:], list(tensors))
         outputs = _operation().apply(call, *first)  # type: ignore[no-untyped-call]
         return outputs, (0,) * len(outputs)
 
@@ -220,8 +220,8 @@ class _Gradient(torch.autograd.Function):
         raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")
 
     @staticmethod
-    def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
-        first = _with_batch_first(info.batch_size, places[1:], list(tensors))
+    def vmap(info: Any, in_dims: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
+        first = _with_batch_first(info.batch_size, in_dims[1:], list(tensors))
         return _Gradient.apply(call, *first), 0  # type: ignore[no-untyped-call]
 
     @staticmethod

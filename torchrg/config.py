@@ -184,8 +184,8 @@ class GrowingConfig:
         facets = self.facet_tolerance
         is_open = facets is None or facets == "auto"
         _require(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets or 0) > 0)
-        least = self.min_size
-        _require(self, "min_size", ">= 1 or auto", least == "auto" or int(least) >= 1)
+        size = self.min_size
+        _require(self, "min_size", ">= 1 or auto", size == "auto" or int(size) >= 1)
         residual = self.max_plane_residual
         _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
         _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
@@ -194,14 +194,14 @@ class GrowingConfig:
 
     def at_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.at_sampling`."""
-        least, tolerance = self.min_size, self.facet_tolerance
-        if least == "auto":
+        count, tolerance = self.min_size, self.facet_tolerance
+        if count == "auto":
             side, (low, high) = _MIN_SIDE_FRACTION, _MIN_SIZES
             drawn = _shape_fraction(sampling) * _ramp(sampling.exactness, *_EXACTNESS)
             side += drawn * (_MIN_FACET_SIDE_FRACTION - side)
             high += round(drawn * (_MAX_FACET_MIN_SIZE - high))
             size = round(sampling.density * (side * sampling.height) ** 2)
-            least = min(max(size, low), high)
+            count = min(max(size, low), high)
         if tolerance == "auto":
             reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
             limit = min(_FACET_HEIGHT_FRACTION * sampling.height, _FACET_RADIUS_FRACTION * reach)
@@ -210,7 +210,7 @@ class GrowingConfig:
         faceted = self.faceted
         if faceted == "auto" and tolerance is not None:
             faceted = _shape_fraction(sampling) > 0.5
-        return dataclasses.replace(self, min_size=least, facet_tolerance=tolerance, faceted=faceted)
+        return dataclasses.replace(self, min_size=count, facet_tolerance=tolerance, faceted=faceted)
 
 
 WHITENESS = 0.4, 0.6

@@ -45,8 +45,8 @@ def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
         (their plane IDs).
     """
 
-    def moved(places: Tensor) -> NDArray[np.float64]:
-        return places.numpy(force=True).astype(np.float64) + origin
+    def moved(positions: Tensor) -> NDArray[np.float64]:
+        return positions.numpy(force=True).astype(np.float64) + origin
 
     arrays: Arrays = {
         f"plane_{name}": getattr(planes, name).numpy(force=True) for name in PLANE_COLUMNS
@@ -214,10 +214,10 @@ def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float])
     """
     polygons: list[list[str]] = []
     for ring in rings:
-        places = np.array(ring) - ring[0]
-        if np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0) @ normal > 0:
+        positions = np.array(ring) - ring[0]
+        if np.cross(positions, np.roll(positions, -1, axis=0)).sum(axis=0) @ normal > 0:
             polygons.append([])
-        polygons[-1].append(", ".join(" ".join(map(repr, place)) for place in [*ring, ring[0]]))
+        polygons[-1].append(", ".join(" ".join(map(repr, point)) for point in [*ring, ring[0]]))
     texts = [f"(({'), ('.join(polygon)}))" for polygon in polygons]
     if len(texts) > 1:
         return f"MULTIPOLYGON Z ({', '.join(texts)})"

@@ -109,7 +109,7 @@ def _spacing(points: NDArray[np.floating], side: float) -> float:
     hashes = np.bitwise_xor.reduce(cells * _PRIMES, axis=1).view(np.uint64) * np.uint64(_MIXING)
     fraction = min(_SAMPLE / len(points), 1.0)
     chosen = points[hashes <= fraction * np.iinfo(np.uint64).max]
-    places = np.unique(chosen.astype(np.float64), axis=0)
-    if len(places) < 2:
+    positions = np.unique(chosen.astype(np.float64), axis=0)
+    if len(positions) < 2:
         return math.inf
-    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    return float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))

@@ -89,8 +89,8 @@ class Result:
 
     Example:
         >>> points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [5, 5, 5]])
-        >>> labelled = Cloud(points, {"labels": np.array([7, 7, 7, 7, -1])})
-        >>> result = Result(labelled)
+        >>> labeled = Cloud(points, {"labels": np.array([7, 7, 7, 7, -1])})
+        >>> result = Result(labeled)
         >>> result.names.tolist(), result.planes.offset.tolist(), result.planes.count.tolist()
         ([7], [2.0], [4])
     """
@@ -204,8 +204,8 @@ class Result:
         if neighbors is not None and len(neighbors.indices) != len(rows):
             neighbors = None
         if neighbors is None and bool((self.labels[rows] >= 0).any()):
-            places = np.random.default_rng(0).permutation(len(rows))[:_MAX_SAMPLED_POINTS]
-            sampled = rows[torch.from_numpy(places).sort().values]
+            chosen = np.random.default_rng(0).permutation(len(rows))[:_MAX_SAMPLED_POINTS]
+            sampled = rows[torch.from_numpy(chosen).sort().values]
             k = min(_NUM_NEIGHBORS, len(sampled))
             neighbors = search_knn(self.cloud.points[sampled], k, canonical=True)
         points, (present, labels) = self.cloud.points[sampled], number_labels(self.labels[sampled])

@@ -201,9 +201,9 @@ def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDAr
     low, high = low.astype(np.float64), high.astype(np.float64)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return np.zeros(3)
-    middle = low + (high - low) / 2
+    midpoint = low + (high - low) / 2
     reach, half_extent = np.abs([low, high]).max(), (high - low).max() / 2
-    return middle if half_extent * 4 < reach else np.zeros(3)
+    return midpoint if half_extent * 4 < reach else np.zeros(3)
 
 
 class Neighbors(NamedTuple):

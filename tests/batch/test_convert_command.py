@@ -95,8 +95,8 @@ def test_a_dry_run_writes_nothing(rooms, tmp_path, convert):
     shown = convert("folder", rooms, tmp_path / "out", "--dry-run", "--only", "east/*").out
     assert "1 scans to convert" in shown
     assert "disk: about 0.000 GB of " in shown
-    assert "memory: about 0.4 GB for 1 at a time" in shown
-    assert "time: about 1 s, at 10 s of a core for a million points" in shown
+    assert "memory: about 0.4 GB, 1 at a time" in shown
+    assert "time: about 1 s, at 10 core seconds per million points" in shown
     assert not (tmp_path / "out").exists()
 
 

@@ -91,16 +91,16 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
     # The transform in file coordinates; points are relative to the cloud's origin.
-    whole = motion.clone()
-    whole[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
-    moved = move_cloud(cloud, whole)
+    file_motion = motion.clone()
+    file_motion[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
+    moved = move_cloud(cloud, file_motion)
     moved_seg = _move(seg, motion, moved.origin) if arguments.segment else None
-    provenance = describe_run(source, settings) | {"motion": whole.tolist()}
+    provenance = describe_run(source, settings) | {"motion": file_motion.tolist()}
     write_cloud(target, moved, moved_seg, provenance=provenance)
     if arguments.matrix is not None:
-        _write_matrix(arguments.matrix, whole.numpy())
-    tilt = torch.rad2deg(whole[2, 2].clamp(-1, 1).acos())
-    turn = torch.rad2deg(torch.atan2(whole[1, 0], whole[0, 0]))
+        _write_matrix(arguments.matrix, file_motion.numpy())
+    tilt = torch.rad2deg(file_motion[2, 2].clamp(-1, 1).acos())
+    turn = torch.rad2deg(torch.atan2(file_motion[1, 0], file_motion[0, 0]))
     seconds = time.perf_counter() - begin
     print_lines(
         f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "

@@ -221,7 +221,7 @@ def _join_dashed_values(flags: Sequence[Flag], arguments: Sequence[str]) -> list
 
     Example:
         >>> up = Flag("up", "--up", "--up {z,-z}", "", "", Literal["z", "-z"], False)
-        >>> _joined([up], ["--up", "-z", "--up", "z"])
+        >>> _join_dashed_values([up], ["--up", "-z", "--up", "z"])
         ['--up=-z', '--up', 'z']
     """
     choices = {

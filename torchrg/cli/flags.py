@@ -175,7 +175,7 @@ def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
     """Describe the measured sampling of a cloud and the settings selected by it.
 
     Example:
-        >>> choice_of(Sampling(0.06, 0.5, 0.6, 4000.0, 2.7), {"growing.min_size": 173})
+        >>> describe_sampling(Sampling(0.06, 0.5, 0.6, 4000.0, 2.7), {"growing.min_size": 173})
         'faces in facets or bent (whiteness 0.06): min_size 173'
     """
     low, high = WHITENESS
@@ -241,7 +241,7 @@ def expand_counts(argv: Sequence[str]) -> list[str]:
     """Move the numbers after ``--superpoints`` into a separate flag.
 
     Example:
-        >>> spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
+        >>> expand_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
         ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
     """
     spelled: list[str] = []

@@ -68,14 +68,14 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
             facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
         distinct = distinct_points(torch.from_numpy(finite - cloud.origin))
         facts["duplicates"] = f"{distinct.num_copies:,}"
-        places = distinct.points.numpy()
+        positions = distinct.points.numpy()
         facts["spacing"] = "none"
-        if len(places) > 1:
-            near = search_knn(places, min(_NUM_NEIGHBORS, len(places)), canonical=True)
-            nearest = places[near.indices[:, 1].numpy()]
-            spacing = np.median(np.linalg.norm(places - nearest, axis=1))
+        if len(positions) > 1:
+            near = search_knn(positions, min(_NUM_NEIGHBORS, len(positions)), canonical=True)
+            nearest = positions[near.indices[:, 1].numpy()]
+            spacing = np.median(np.linalg.norm(positions - nearest, axis=1))
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
-            sampling = measure_sampling(torch.from_numpy(places), near)
+            sampling = measure_sampling(torch.from_numpy(positions), near)
             chosen = load_config().measured(sampling)["settings"]
             facts["height"] = f"{sampling.height:g} (smallest extent along the principal axes)"
             facts["density"] = f"{sampling.density:g} points on a square of side 1"

@@ -247,10 +247,10 @@ def _segment(
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
     """Raise if a cloud exceeds the memory limit even with its large arrays on disk."""
-    least = memory_of_scan(num_points, on_disk=True)
-    if least > limit:
+    minimum = memory_of_scan(num_points, on_disk=True)
+    if minimum > limit:
         raise ConfigError(
-            f"{source}: expected --limit-memory of at least {least / 1e9:.2f} GB for about "
+            f"{source}: expected --limit-memory of at least {minimum / 1e9:.2f} GB for about "
             f"{num_points:,} points, got {limit / 1e9:.2f} GB; raise it, or split the cloud."
         )
 

@@ -136,8 +136,8 @@ class Segments:
     def _take_rows(self, labels: Tensor, most: int | None) -> None:
         num_regions = int(labels.max()) + 1 if len(labels) else 0
         self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
-        self.sizes, places = self.counts.new_empty(2, len(self.counts))
-        written = self.counts, self.sizes, places
+        self.sizes, indices = self.counts.new_empty(2, len(self.counts))
+        written = self.counts, self.sizes, indices
         (rows,) = kernels.call("segment_rows", labels.long(), most or len(labels) + 1, *written)
         self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)

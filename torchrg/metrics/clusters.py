@@ -127,9 +127,9 @@ def score_clusters(
     check_shapes("score_clusters", normals=(normals, "N 3"), labels=(labels, "N"))
     check_floating("score_clusters", normals=normals)
     check_same_device("score_clusters", normals=normals, labels=labels)
-    for name, value, least in (("min_size", min_size, 1), ("sample_size", sample_size, 2)):
-        if value < least:
-            raise ConfigError(f"score_clusters: expected {name} >= {least}, got {value!r}.")
+    for name, value, minimum in (("min_size", min_size, 1), ("sample_size", sample_size, 2)):
+        if value < minimum:
+            raise ConfigError(f"score_clusters: expected {name} >= {minimum}, got {value!r}.")
     if not 0 <= max_angle_deg <= 90:
         raise ConfigError(
             f"score_clusters: expected max_angle_deg in [0, 90], got {max_angle_deg!r}."

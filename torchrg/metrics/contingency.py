@@ -143,7 +143,7 @@ def is_not_ignored(truth: Tensor, ignore: int | None) -> Tensor:
     """Return the mask of points without the ignored label; labels beyond int64 never match.
 
     Example:
-        >>> have_other_label(torch.tensor([0, 1]), 1), have_other_label(torch.tensor([0]), 10**23)
+        >>> is_not_ignored(torch.tensor([0, 1]), 1), is_not_ignored(torch.tensor([0]), 10**23)
         (tensor([ True, False]), tensor([True]))
     """
     if ignore is None or not -(2**63) <= ignore < 2**63:

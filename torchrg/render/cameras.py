@@ -97,20 +97,20 @@ def fit_camera(
     longer = max(width, height or width)
     half = math.tan(math.radians(field_of_view_deg) / 2)
     distance = _MIN_DISTANCE_FRACTION * (farthest - nearest)
-    middle = across.new_zeros(2)
+    midpoint = across.new_zeros(2)
     for axis, size in enumerate((width, height or width)):
         tangent = half * (1 - 2 * _MARGIN_FRACTION) * size / longer
         _, high = _bounds(across[:, axis] - tangent * forward)
         low, _ = _bounds(across[:, axis] + tangent * forward)
-        middle[axis] = (low + high) / 2
+        midpoint[axis] = (low + high) / 2
         distance = max(distance, (high - low) / (2 * tangent))
     if bool((across == across[:1]).all()):
         distance = 1.0
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = axes
-    matrix[:2, 3], matrix[2, 3] = -middle, distance - nearest
+    matrix[:2, 3], matrix[2, 3] = -midpoint, distance - nearest
     focal = longer / 2 / half
-    rays = (across[:, :2] - middle) / (forward + distance)[:, None]
+    rays = (across[:, :2] - midpoint) / (forward + distance)[:, None]
     return _frame(matrix, focal, rays, width, height)
 
 

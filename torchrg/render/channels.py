@@ -121,9 +121,9 @@ def _region_channel(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) ->
 
 def _normal_channel(normals: Tensor) -> Channel:
     """Return the colors of directions, by their octahedral coordinates."""
-    places = encode_directions(normals)
+    codes = encode_directions(normals)
     shift = 8 - _DIRECTION_BITS
-    values = (places[:, 0].astype(np.uint16) >> shift << _DIRECTION_BITS) | (places[:, 1] >> shift)
+    values = (codes[:, 0].astype(np.uint16) >> shift << _DIRECTION_BITS) | (codes[:, 1] >> shift)
     values[(normals == 0).all(dim=1).numpy()] = 1 << 2 * _DIRECTION_BITS
     steps = (np.arange(1 << _DIRECTION_BITS) << shift) + (1 << shift - 1)
     square = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -191,10 +191,10 @@ def outcomes_of(
     main[rows] = table.face_labels[table.faces[order[first]]]
     outcome = torch.full_like(regions, 3)
     labeled = regions != UNLABELED
-    places = torch.searchsorted(table.region_labels, regions[labeled])
+    indices = torch.searchsorted(table.region_labels, regions[labeled])
     face = faces[labeled]
     outcome[labeled] = torch.where(
-        partner[places] == face, 0, torch.where(main[places] == face, 1, 2)
+        partner[indices] == face, 0, torch.where(main[indices] == face, 1, 2)
     )
     return outcome
 
@@ -221,14 +221,14 @@ def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
     return steps.numpy().astype(np.uint8)
 
 
-def decode_directions(places: NDArray[np.uint8]) -> NDArray[np.float32]:
+def decode_directions(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Decode the unit vectors ``(n, 3)`` of :func:`encode_directions`.
 
     Example:
         >>> decode_directions(np.array([[254, 127]], dtype=np.uint8)).tolist()
         [[1.0, 0.0, 0.0]]
     """
-    x, y = (places.astype(np.float32) / _OCTAHEDRON_STEPS * 2 - 1).T
+    x, y = (codes.astype(np.float32) / _OCTAHEDRON_STEPS * 2 - 1).T
     z = 1 - np.abs(x) - np.abs(y)
     fold = np.maximum(-z, 0)
     directions = np.stack([x - np.copysign(fold, x), y - np.copysign(fold, y), z], axis=1)

@@ -217,10 +217,10 @@ def color_curvature(
         raise ConfigError(
             f"color_curvature: expected max_curvature to be positive, got {max_curvature!r}."
         )
-    place = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
-    before = place.long().clamp(max=len(_RAMP) - 2)
+    position = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
+    before = position.long().clamp(max=len(_RAMP) - 2)
     ramp = tensor.new_tensor(_RAMP)
-    lab = torch.lerp(ramp[before], ramp[before + 1], (place - before)[..., None])
+    lab = torch.lerp(ramp[before], ramp[before + 1], (position - before)[..., None])
     return _to_bytes(_lab_to_rgb(lab))
 
 

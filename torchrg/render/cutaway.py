@@ -71,7 +71,7 @@ class Sides(NamedTuple):
     def bits_toward(self, toward: Tensor, view: View) -> int:
         """Return the bits of the sides hidden in a view from a direction."""
         facing = self.directions @ toward > MIN_FACING.get(view, math.inf)
-        return sum(1 << place for place, cut in enumerate(facing.tolist()) if cut)
+        return sum(1 << side for side, cut in enumerate(facing.tolist()) if cut)
 
 
 def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
@@ -132,11 +132,11 @@ def _find_outer_sides(
     heights = (local * planes.normal[rows]).sum(dim=2)
     directions: list[Tensor] = []
     covered = torch.zeros(len(local), MAX_SIDES, dtype=torch.bool, device=local.device)
-    for place, row in enumerate(rows.tolist()):
+    for column, row in enumerate(rows.tolist()):
         for sign in (1, -1):
-            outward, above = sign * planes.normal[row], sign * heights[:, place]
-            beyond = (in_rectangle[:, place] & (above > thickness[place])).float().mean()
-            inside = (above < -thickness[place]).float().mean()
+            outward, above = sign * planes.normal[row], sign * heights[:, column]
+            beyond = (in_rectangle[:, column] & (above > thickness[column])).float().mean()
+            inside = (above < -thickness[column]).float().mean()
             is_outer = bool((beyond <= _MAX_BEYOND_FRACTION) & (inside >= _MIN_INSIDE_FRACTION))
             if not is_outer or (ceilings[row] and outward @ up < 0):
                 continue
@@ -145,7 +145,7 @@ def _find_outer_sides(
                 similar = [len(directions)]
                 directions.append(outward)
             for side in similar[:1]:
-                covered[:, side] |= in_rectangle[:, place] & (above > -depth[place])
+                covered[:, side] |= in_rectangle[:, column] & (above > -depth[column])
     return torch.stack([up.new_zeros(3), *directions])[1:], covered
 
 
@@ -232,10 +232,10 @@ def _count_visible(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
     if len(centers) == 0 or surface.size == 0:
         return 0
     right = torch.linalg.cross(viewpoint.up, viewpoint.toward)
-    places = centers @ torch.stack([right, viewpoint.up], dim=1)
-    places -= places.amin(dim=0)
-    pitch = max(1.5 * surface.size, float(places.amax()) / _MAX_PIXELS)
-    column, row = (places / pitch).long().unbind(dim=1)
+    positions = centers @ torch.stack([right, viewpoint.up], dim=1)
+    positions -= positions.amin(dim=0)
+    pitch = max(1.5 * surface.size, float(positions.amax()) / _MAX_PIXELS)
+    column, row = (positions / pitch).long().unbind(dim=1)
     pixels, height = column * (int(row.amax()) + 1) + row, centers @ viewpoint.toward
     front = height.new_full((int(pixels.amax()) + 1,), -torch.inf)
     front.scatter_reduce_(0, pixels, height, "amax")

@@ -80,20 +80,20 @@ def draw_picture(
     width, height = int(camera.width), int(camera.height)
     project = projection_of(camera, surface.origin, finer=supersampling)
     lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)
-    places = is_shown.nonzero().squeeze(-1)
-    radius, length = _median_radius(project, surface.points, lengths, places)
+    indices = is_shown.nonzero().squeeze(-1)
+    radius, length = _median_radius(project, surface.points, lengths, indices)
     widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
     buffer = DepthBuffer(
-        width * supersampling, height * supersampling, max_radius=widest, device=places.device
+        width * supersampling, height * supersampling, max_radius=widest, device=indices.device
     )
 
     def discs_of(chunk: Tensor) -> Discs:
         rows = surface.rows[chunk]
         slant = surface.normals_at(chunk) if normals is None else normals[rows]
-        place, floor = surface.points[chunk], supersampling / 2
-        return _discs(project, place, colors[rows], slant.float(), lengths[chunk], floor=floor)
+        position, floor = surface.points[chunk], supersampling / 2
+        return _discs(project, position, colors[rows], slant.float(), lengths[chunk], floor=floor)
 
-    parts = torch.split(places, _CHUNK_POINTS)
+    parts = torch.split(indices, _CHUNK_POINTS)
     for chunk in parts:
         buffer.draw(discs_of(chunk))
     buffer.end_drawing()
@@ -111,10 +111,10 @@ def draw_picture(
 
 
 def _median_radius(
-    project: Projection, points: Tensor, lengths: Tensor, places: Tensor
+    project: Projection, points: Tensor, lengths: Tensor, indices: Tensor
 ) -> tuple[float, float]:
     """Return the median radius of the discs, in pixels and in units of the cloud."""
-    sample = places[:: max(1, len(places) // _CHUNK_POINTS)]
+    sample = indices[:: max(1, len(indices) // _CHUNK_POINTS)]
     depth = project(points[sample])[0][:, 2]
     sample, depth = sample[depth > 0], depth[depth > 0]
     if len(sample) == 0:

@@ -136,7 +136,7 @@ class DepthBuffer:
         number = torch.arange(len(discs.pixels), device=self._front.device) + len(self._centers)
         centers = torch.cat([discs.pixels, discs.inverse_depth[:, None]], dim=1)
         self._centers = torch.cat([self._centers, centers])
-        order, sizes, places = self._by_size(discs)
+        order, sizes, indices = self._by_size(discs)
         shown, number = discs.at(order), number.index_select(0, order)
         start = shown.pixel_depths()
         dome = _DOME * shown.max_change / sizes.clamp(min=1).square_()
@@ -144,8 +144,8 @@ class DepthBuffer:
             depth = _depth_at_offset(shown, start, dx, dy, count)
             depth.sub_(dome[:count], alpha=dx * dx + dy * dy)
             keys = depth.view(torch.int32).long() << _DEPTH_BITS
-            place = places[:count] + self._step(dx, dy)
-            self._front.scatter_reduce_(0, place, keys.bitwise_or_(number[:count]), "amax")
+            index = indices[:count] + self._step(dx, dy)
+            self._front.scatter_reduce_(0, index, keys.bitwise_or_(number[:count]), "amax")
 
     def end_drawing(self) -> None:
         """Look up the nearest discs between the passes."""
@@ -155,7 +155,7 @@ class DepthBuffer:
 
     def paint(self, discs: Discs) -> None:
         """Second pass: color the covered pixels."""
-        order, sizes, places = self._by_size(discs)
+        order, sizes, indices = self._by_size(discs)
         shown = discs.at(order)
         away_x, away_y = shown.pixel_offsets().T.contiguous()
         start = shown.pixel_depths()
@@ -167,15 +167,15 @@ class DepthBuffer:
         keys[:, :3] = shown.colors
         nearness, keys = keys.view(torch.float32)[:, 1], keys.view(torch.int64).squeeze(-1)
         for dx, dy, count in _pixels_of(sizes):
-            place = places[:count] + self._step(dx, dy)
-            x, y, at_middle, front = self._nearest.index_select(0, place).unbind(dim=1)
+            index = indices[:count] + self._step(dx, dy)
+            x, y, at_middle, front = self._nearest.index_select(0, index).unbind(dim=1)
             depth = _depth_at_offset(shown, start, dx, dy, count)
             seen = depth.add_(shown.max_change[:count], alpha=_OVERHANG) >= front
             seen &= x.mul_(slope_x[:count]) + y.mul_(slope_y[:count]) + corner[:count] >= at_middle
             sq_distance = (away_x[:count] - dx).square_()
             sq_distance += (away_y[:count] - dy).square_()
             nearness[:count] = sq_distance.add_(1).reciprocal_().mul_(seen)
-            self._colors.scatter_reduce_(0, place, keys[:count], "amax")
+            self._colors.scatter_reduce_(0, index, keys[:count], "amax")
 
     def _step(self, dx: int, dy: int) -> int:
         """Return the offset of a pixel in the flat buffer."""
@@ -281,7 +281,7 @@ def _window_maximum(image: Tensor, reach: int) -> Tensor:
     Windows of double width are combined from two windows, so the cost grows with the logarithm.
 
     Example:
-        >>> _largest_around(torch.tensor([[1, 2, 3, 9], [0, 0, 0, 0]]), 1).tolist()
+        >>> _window_maximum(torch.tensor([[1, 2, 3, 9], [0, 0, 0, 0]]), 1).tolist()
         [[2, 3, 9, 9], [2, 3, 9, 9]]
     """
     lowest = torch.iinfo(image.dtype).min

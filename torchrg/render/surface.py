@@ -49,17 +49,17 @@ class Surface(NamedTuple):
     near: Tensor
     size: float
 
-    def normals_at(self, places: Tensor) -> Tensor:
+    def normals_at(self, rows: Tensor) -> Tensor:
         """Return unit normals of the selected points, ``(*, 3)``; zero without a plane.
 
         In a voxel at an edge, a point gets the normal of the nearest plane of a neighboring voxel.
         """
-        voxel = self.voxel_of[places]
+        voxel = self.voxel_of[rows]
         normals = self.normals[voxel]
         at_edge = (normals == 0).all(dim=1).nonzero().squeeze(1)
         near = self.near[voxel[at_edge]]
         around = self.normals[near]
-        away = self.points[places[at_edge], None] - self.centers[near]
+        away = self.points[rows[at_edge], None] - self.centers[near]
         heights = (away * around).sum(dim=2).abs()
         heights.masked_fill_((around == 0).all(dim=2), torch.inf)
         best = heights.argmin(dim=1)

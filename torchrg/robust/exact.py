@@ -91,8 +91,8 @@ def _find_majorities(
     """Return the lanes ``(F,)`` with enough points on a candidate, and these points ``(K, F)``."""
     open_lanes = torch.nonzero(candidates.any(dim=0)).squeeze(1)
     first = candidates[:, open_lanes]
-    simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
-    lane = open_lanes[place]
+    simplex, index = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
+    lane = open_lanes[index]
     offsets = [
         points - origin[simplex, lane]
         for points, origin in zip(take_lanes(columns, lane), origins, strict=True)
@@ -102,11 +102,11 @@ def _find_majorities(
     # Prefer the most accurate candidate; an inaccurate one may include points off the flat.
     accuracy = torch.where(near.sum(dim=0) >= size, reach[simplex, lane], torch.inf)
     best = reach.new_full((len(open_lanes),), torch.inf)
-    best.scatter_reduce_(0, place, accuracy, "amin")
-    order = torch.arange(len(place), device=place.device)
-    order = order.masked_fill((accuracy > best[place]) | accuracy.isinf(), len(place))
-    winner = torch.full_like(open_lanes, len(place)).scatter_reduce_(0, place, order, "amin")
-    winner = winner[winner < len(place)]
+    best.scatter_reduce_(0, index, accuracy, "amin")
+    order = torch.arange(len(index), device=index.device)
+    order = order.masked_fill((accuracy > best[index]) | accuracy.isinf(), len(index))
+    winner = torch.full_like(open_lanes, len(index)).scatter_reduce_(0, index, order, "amin")
+    winner = winner[winner < len(index)]
     return lane[winner], near[:, winner]
 
 

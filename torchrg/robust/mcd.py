@@ -303,8 +303,8 @@ def _distinct_best(sets: _Concentrated, number: int) -> Tensor:
     values, order = sets.determinants.sort(dim=0, stable=True)
     repeated = torch.zeros_like(values, dtype=torch.bool)
     repeated[1:] = values[1:] == values[:-1]
-    place = torch.where(repeated, torch.inf, values).argsort(dim=0, stable=True)[:number]
-    chosen = order.gather(0, place)
+    ranks = torch.where(repeated, torch.inf, values).argsort(dim=0, stable=True)[:number]
+    chosen = order.gather(0, ranks)
     return sets.members.gather(1, chosen.expand(len(sets.members), -1, -1))
 
 

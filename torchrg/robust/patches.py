@@ -84,12 +84,12 @@ class RobustFit(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """Transform from lanes to patches: ``point = (lane / zoom + middle) / unit``.
+    """Transform from lanes to patches: ``point = (lane / zoom + offset) / unit``.
 
     The factors are powers of two, which preserve all digits.
     """
 
-    middle: Tensor
+    offset: Tensor
     unit: Tensor
     zoom: Tensor
 
@@ -99,7 +99,7 @@ class _Frame(NamedTuple):
 
     def point(self, lanes: Tensor) -> Tensor:
         """Transform points ``(B, P)`` to the coordinates of their patches."""
-        return (lanes / self.zoom[:, None] + self.middle) / self.unit[:, None]
+        return (lanes / self.zoom[:, None] + self.offset) / self.unit[:, None]
 
     def matrix(self, lanes: Tensor) -> Tensor:
         """Transform scatter matrices ``(B, P, P)`` to the units of their patches."""
@@ -357,13 +357,13 @@ def _to_lanes(patches: Tensor) -> tuple[list[Tensor], _Frame, Tensor]:
     unit = _power_of_two(patches.abs().amax(dim=(1, 2)))
     patches = patches * unit[:, None, None]
     columns = columns_of_points(patches)
-    middle = [median_points(column) for column in columns]
-    columns = [column - center for column, center in zip(columns, middle, strict=True)]
+    offset = [median_points(column) for column in columns]
+    columns = [column - center for column, center in zip(columns, offset, strict=True)]
     extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
     zoom = _power_of_two(extent)
     tolerance = flatness_tolerance(patches, extent) * zoom
     columns = [column * zoom for column in columns]
-    return columns, _Frame(torch.stack(middle, dim=-1), unit, zoom), tolerance
+    return columns, _Frame(torch.stack(offset, dim=-1), unit, zoom), tolerance
 
 
 def _power_of_two(length: Tensor) -> Tensor:

@@ -338,9 +338,9 @@ def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
     """Express the selected difference of each row by its first matching pair."""
     rows = sorted_rows.detach()
     # The sum may have a rounding error; the partner is at this index or next to it.
-    place = torch.searchsorted(rows, rows + difference[:, None])
+    index = torch.searchsorted(rows, rows + difference[:, None])
     last = rows.shape[1] - 1
-    partners = torch.stack([(place + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
+    partners = torch.stack([(index + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
     numbers = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
     gaps = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
     is_pair = (gaps == difference[:, None, None]) & (partners > numbers)

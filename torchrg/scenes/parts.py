@@ -161,8 +161,8 @@ def draw_box(rng: np.random.Generator, frame: Frame) -> Part:
 
 def draw_small_box(rng: np.random.Generator, top: Frame) -> Part:
     """Return a box on a table, placed near the center of the table top."""
-    place = top.moved(between(rng, -0.08, 0.08), between(rng, -0.08, 0.08), 0)
-    frame = Frame.upright(place.origin, between(rng, -90, 90))
+    position = top.moved(between(rng, -0.08, 0.08), between(rng, -0.08, 0.08), 0)
+    frame = Frame.upright(position.origin, between(rng, -90, 90))
     size = (between(rng, 0.2, 0.35), between(rng, 0.2, 0.3), between(rng, 0.15, 0.4))
     return block("box", frame, size, without=("bottom",))
 

@@ -202,7 +202,7 @@ def furnish(
     ]
     floor_places = [floor_places[row] for row in rng.permutation(len(floor_places))]
 
-    def place(drawn: Iterator[Part]) -> None:
+    def add(drawn: Iterator[Part]) -> None:
         parts.append(_first_separated(drawn, parts, layout.min_plane_gap))
 
     def open_wall(kind: str, draw_hole: Callable[[np.random.Generator, float], Hole]) -> None:
@@ -214,7 +214,7 @@ def furnish(
                 holes[wall][-1] = draw_hole(rng, middle)
                 yield recess(kind, walls[wall], holes[wall][-1], between(rng, 0.06, 0.16))
 
-        place(recesses())
+        add(recesses())
 
     def standing(middle: tuple[float, float], max_heading_deg: float) -> Frame:
         x, y = (value + between(rng, -0.1, 0.1) for value in middle)
@@ -233,17 +233,17 @@ def furnish(
     ]
     for draw_at in (draw_at for number, draw_at in on_walls for _ in range(number)):
         wall, along = _take(wall_places, "walls")
-        place(draw_at(rng, walls[wall], along + between(rng, -0.1, 0.1)) for _ in count())
+        add(draw_at(rng, walls[wall], along + between(rng, -0.1, 0.1)) for _ in count())
     for number in range(layout.num_tables):
         middle = _take(floor_places, "floor")
-        place(draw.draw_table(rng, standing(middle, 12), plate) for _ in count())
+        add(draw.draw_table(rng, standing(middle, 12), plate) for _ in count())
         if number < layout.num_small_boxes:
             [top] = [surface for surface in parts[-1].surfaces if surface.kind == "table top"]
             middle_of_top = Frame.upright(top.bounds.mean(axis=0))
-            place(draw.draw_small_box(rng, middle_of_top) for _ in count())
+            add(draw.draw_small_box(rng, middle_of_top) for _ in count())
     for draw_on in (draw_on for number, draw_on in layout.furniture() for _ in range(number)):
         middle = _take(floor_places, "floor")
-        place(draw_on(rng, standing(middle, 90)) for _ in count())
+        add(draw_on(rng, standing(middle, 90)) for _ in count())
     return tuple(parts)
 
 
@@ -264,9 +264,9 @@ def _shell(
     )
 
 
-def _is_away(place: Frame, middles: Sequence[Array], distance: float) -> bool:
+def _is_away(position: Frame, middles: Sequence[Array], distance: float) -> bool:
     """Return whether a position is at least ``distance`` from all doorways."""
-    gaps = (middle - place.origin for middle in middles)
+    gaps = (middle - position.origin for middle in middles)
     return all(np.vecdot(gap, gap) >= distance * distance for gap in gaps)
 
 
@@ -281,14 +281,14 @@ def _first_separated(drawn: Iterator[Part], others: Sequence[Part], gap: float) 
     )
 
 
-def _take(places: list[T], where: str) -> T:
+def _take(cells: list[T], where: str) -> T:
     """Take the next free position."""
-    if not places:
+    if not cells:
         raise ConfigError(
             f"build_room: expected enough space on the {where}, got too many objects; enlarge the "
             "room."
         )
-    return places.pop()
+    return cells.pop()
 
 
 def _wall_cells(size: Triple) -> list[tuple[int, float]]:
@@ -338,17 +338,19 @@ def free_places(
         ConfigError: If there is no free space.
     """
     length, width, _ = layout.size
-    places: list[Array] = []
+    positions: list[Array] = []
     for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
-        for _ in range(_POSITION_TRIES if len(places) == number else 0):
+        for _ in range(_POSITION_TRIES if len(positions) == number else 0):
             x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
-            place = room.moved(x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)).origin
-            near = place + clearance * (2 * rng.random((64, 3)) - 1)
+            position = room.moved(
+                x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)
+            ).origin
+            near = position + clearance * (2 * rng.random((64, 3)) - 1)
             if not is_occupied(parts, near).any():
-                places.append(place)
+                positions.append(position)
                 break
-    if len(places) < layout.num_viewpoints:
+    if len(positions) < layout.num_viewpoints:
         raise ConfigError(
             "build_room: expected free space for a scanner, got none; enlarge the room."
         )
-    return np.stack(places)
+    return np.stack(positions)
