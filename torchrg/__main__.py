@@ -4,8 +4,8 @@ import gc
 import os
 import sys
 
-# The collector would go through the objects of torch several times while they are made: a fifth
-# of the time until a command begins. Commands and workers enable it again.
+# The garbage collector would scan torch's objects several times during import, a fifth of the
+# startup time. Commands and workers enable it again.
 gc.disable()
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):

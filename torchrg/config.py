@@ -339,9 +339,9 @@ class PipelineConfig(SelectionConfig):
         the cloud height, at most 0.3 of the radius of 50 neighbors. From 0.6 noise is white, and it
         is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``.
         Regional noise is used if noise is white and the distances to the nearest point vary by less
-        than 0.38, which holds only for mesh vertices and grids. ``min_size`` is the number of
-        points in a square with sides 1/27 of the height, or 1/13 for points sampled from a mesh,
-        where facets of curved surfaces are not planes.
+        than 0.38, as in mesh vertices and grids. ``min_size`` is the number of points in a square
+        with sides 1/27 of the height. They are 1/13 for points sampled from a mesh, where small
+        facets belong to curved surfaces.
 
         Example:
             >>> mesh = Sampling(0.06, variation=0.5, exactness=0.6, density=4e3, height=2.7)

@@ -46,9 +46,9 @@ def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
 def unsigned_angle_deg(a: Tensor, b: Tensor) -> Tensor:
     """Return the angle ``(*)`` between unsigned directions, in [0, 90] degrees, eq. (8).
 
-    Computed from the chord as ``2 asin(min(|a - b|, |a + b|) / 2)``, accurate for small angles,
-    where the arc cosine of a float32 product is wrong by up to 0.02 degrees. Unit vectors ``a`` and
-    ``b``, ``(*, 3)``, are broadcast.
+    Computed from the chord as ``2 asin(min(|a - b|, |a + b|) / 2)``, accurate for small angles.
+    There, the arc cosine of a float32 product is wrong by up to 0.02 degrees. Unit vectors ``a``
+    and ``b``, ``(*, 3)``, are broadcast.
 
     Example:
         >>> a = torch.tensor([[1.0, 0, 0], [1, 0, 0]])

@@ -70,10 +70,10 @@ def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Eigen-decompose symmetric 3x3 matrices ``(*, 3, 3)`` by a fixed number of Jacobi rotations.
 
-    Scale-free (each matrix is first divided by its largest entry), branch-free and elementwise, so
-    it is memory-bound on any device, unlike ``torch.linalg.eigh``, which is slow on tiny matrices.
-    Cyclic Jacobi [1] keeps eigenvectors orthogonal to rounding even for equal eigenvalues, unlike
-    closed formulas with ``acos``. Only the upper triangle is read.
+    Scale-free (each matrix is first divided by its largest entry), branch-free and elementwise. It
+    is memory-bound on any device, whereas ``torch.linalg.eigh`` is slow on tiny matrices. Cyclic
+    Jacobi [1] keeps eigenvectors orthogonal to rounding even for equal eigenvalues, unlike closed
+    formulas with ``acos``. Only the upper triangle is read.
 
     Returns:
         Eigenvalues in ascending order ``(*, 3)`` and unit eigenvectors as columns ``(*, 3, 3)``.

@@ -212,8 +212,8 @@ def closest_between(directions: Tensor, clusters: Tensor) -> float:
 
     Exact for clouds of any size, in two steps. A grid on the sphere is refined step by step; cells
     farther from all other clusters than a known close pair are dropped. This suffices for separated
-    clusters. The remaining points of many overlapping clusters go to kd-trees: cluster indices
-    differ in at least one binary digit, so for each digit the directions are split by it, and the
+    clusters. The remaining points of many overlapping clusters go to kd-trees. Cluster indices
+    differ in at least one binary digit: for each digit, the directions are split by it, and the
     closest pair across the split is found.
 
     Unit vectors have shape ``(N, 3)``, float64; infinite for fewer than two clusters.

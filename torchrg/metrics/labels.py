@@ -128,8 +128,8 @@ def match_regions(table: ContingencyTable) -> Tensor:
     """Pair regions and faces that are each other's largest overlap.
 
     This is the paper's pairing, see :func:`score_labels`. Ties in overlap go to the larger
-    intersection over union, that is the smaller partner, then to the lower label. (The paper also
-    mentions "the maximum or second maximum overlap", without defining the use of the second.)
+    intersection over union, that is the smaller partner, then to the lower label. The paper also
+    mentions "the maximum or second maximum overlap", without defining the use of the second.
     Returns the rows of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64.
 
     Example:

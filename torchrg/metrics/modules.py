@@ -40,7 +40,7 @@ class PlaneMetric(Metric):
     """Mean of a metric over the scans for which it is defined, or of all metrics of a part.
 
     The states are sums of all metrics of the part, so they reduce across workers and processes by
-    addition, and metrics of one part in a ``MetricCollection`` evaluate each scan once.
+    addition. Metrics of one part in a ``MetricCollection`` evaluate each scan once.
 
     Args:
         index: A part of :data:`torchrg.metrics.METRICS`, for a dict of all its metrics, or the name

@@ -2,7 +2,7 @@
 "use strict";
 
 const $ = (id) => document.getElementById(id);
-const say = (text) => { $("message").textContent = text; $("message").hidden = !text; };
+const showMessage = (text) => { $("message").textContent = text; $("message").hidden = !text; };
 const TYPES = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
 const HIDDEN = 128; // Bit of a point's mask: its plane is hidden.
 const FIELD_OF_VIEW = 50; // Vertical, in degrees, as in deck.gl's view.
@@ -313,9 +313,9 @@ function layersOf({ PathLayer, LineLayer }) {
     // deck.gl rebuilds lines if their data is a new object, so reuse it unless it may differ.
     const cuts = [cloud.changes, bits, top, near === 1e9 ? 0 : [near, ...ahead]].join();
     const side = Math.round(state.camera.rotationOrbit / 45);
-    const outlines = () => remembered(cloud, "outlines", cuts, () => rings(inView));
-    const ofPicked = () => remembered(cloud, "picked", picked, () => rings((_, n) => n === picked));
-    const normals = () => remembered(cloud, "normals", `${cuts} ${side}`, () => normalLines(cloud, isCut));
+    const outlines = () => cached(cloud, "outlines", cuts, () => rings(inView));
+    const ofPicked = () => cached(cloud, "picked", picked, () => rings((_, n) => n === picked));
+    const normals = () => cached(cloud, "normals", `${cuts} ${side}`, () => normalLines(cloud, isCut));
     const lines = (id, data, color, width) => new PathLayer({
       id: `${id}-${c}`, data, getPath: (row) => row.ring, getColor: color, getWidth: width,
       widthUnits: "pixels", jointRounded: true, capRounded: true,
@@ -350,7 +350,7 @@ function layersOf({ PathLayer, LineLayer }) {
   });
 }
 
-function remembered(cloud, name, key, make) {
+function cached(cloud, name, key, make) {
   if (cloud.lines[name]?.key !== key) cloud.lines[name] = { key, data: make() };
   return cloud.lines[name].data;
 }
@@ -787,7 +787,7 @@ async function begin() {
   const library = element("script", new TextDecoder().decode(await bytesOf("blob0")));
   for (const [c, cloud] of page.clouds.entries()) preparePoints(cloud, await bytesOf(`blob${c + 1}`));
   fillPanel();
-  if (page.clouds.every((cloud) => !cloud.shown)) return say("The cloud has no finite points.");
+  if (page.clouds.every((cloud) => !cloud.shown)) return showMessage("The cloud has no finite points.");
   if (!document.createElement("canvas").getContext("webgl2"))
     throw new Error("This browser does not support WebGL 2.");
   document.head.append(library); // Runs at once: the content security policy allows its hash.
@@ -812,7 +812,7 @@ async function begin() {
     },
     onAfterRender: afterFrame,
     onError: fail,
-    onLoad: () => { say(""); page.ready = true; },
+    onLoad: () => { showMessage(""); page.ready = true; },
     _pickable: false, // Enabled on click: picking on hover costs a frame each time.
     layers: layersOf(globalThis.deck),
   });
@@ -822,7 +822,7 @@ async function begin() {
 
 let failed = false;
 function fail(error) { // The first error is the cause; later ones follow from it.
-  if (!failed) say(`This page cannot be displayed: ${error.message}`);
+  if (!failed) showMessage(`This page cannot be displayed: ${error.message}`);
   failed = true;
   console.error(error.message);
 }

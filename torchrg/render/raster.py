@@ -3,8 +3,8 @@
 The first pass finds the nearest disc of each pixel. Discs extend beyond the edge of their surface
 and hide the surface behind it. The second pass therefore chooses, for each pixel, the disc with the
 nearest center in the image, among those that the nearest disc may wrongly hide. Such a disc is at
-most a disc diameter behind, and the center of the nearest disc is not in front of its plane, unlike
-for a real occluder. Ties are broken by color, not by the order of the points.
+most a disc diameter behind. Unlike for a real occluder, the center of the nearest disc is not in
+front of its plane. Ties are broken by color, not by the order of the points.
 """
 
 import math
@@ -228,8 +228,8 @@ def _depth_at_offset(discs: Discs, start: Tensor, dx: int, dy: int, count: int) 
 def depth_and_colors(keys: Tensor) -> tuple[Tensor, Tensor]:
     """Return views of the inverse depth ``(*)``, 0 for empty pixels, and of the colors ``(*, 3)``.
 
-    A key has the bits of the inverse depth, a positive float that sorts like an integer, above
-    three bytes of color, so the nearest disc has the largest key.
+    A key has the bits of the inverse depth above three bytes of color. Positive floats sort like
+    integers, so the nearest disc has the largest key.
     """
     halves = keys.view(torch.float32).view(*keys.shape, 2)
     return halves[..., 1], keys.view(torch.uint8).view(*keys.shape, 8)[..., :3]

@@ -192,9 +192,9 @@ def fit_fastmcd(
     sets are concentrated to convergence, and the smallest determinant wins [1]. Unlike DetMCD it is
     affine equivariant, and it nearly always finds the best set, at a hundred times the cost.
 
-    Every patch gets the same ``num_starts`` random sets, from ``generator`` or a fixed seed, or all
-    sets if there are at most five times as many (up to 17 points of P = 3 with 500). Other
-    arguments, errors and results are as in :func:`fit_detmcd`.
+    Every patch gets the same ``num_starts`` random sets, from ``generator`` or a fixed seed. If
+    there are at most five times that number, it gets all sets (up to 17 points of P = 3 with 500).
+    Other arguments, errors and results are as in :func:`fit_detmcd`.
 
     References:
         [1] P. J. Rousseeuw, K. Van Driessen. A fast algorithm for the minimum covariance

@@ -66,9 +66,9 @@ def fit_dets(
 ) -> RobustFit:
     """Fit location and scatter of each patch by the deterministic S-estimator.
 
-    The scatter has minimum volume under the condition that the mean bisquare loss of the distances
-    is half of its maximum, so half of the points may be arbitrary. Each deterministic start is
-    iterated to a local minimum, and the smallest wins [1]. Arguments and errors are as in
+    The scatter has minimum volume with a mean bisquare loss of the distances of half of its
+    maximum. Half of the points may therefore be arbitrary. Each deterministic start is iterated to
+    a local minimum, and the smallest wins [1]. Arguments and errors are as in
     :func:`torchrg.robust.fit_detmcd`; the ``"robustbase"`` starts are those of R's rrcov.
 
     Returns:

@@ -299,8 +299,8 @@ def half_size(n: int) -> int:
 def _majority_difference(sorted_rows: Tensor) -> Tensor:
     """Return the C(h, 2)-th smallest pairwise difference of each sorted row; NaN with a NaN.
 
-    Two values at least h ranks apart enclose at least C(h + 1, 2) pairs that are no farther apart,
-    so only lags 1 to h - 1 of the sorted row can contain the result.
+    Two values at least h ranks apart enclose at least C(h + 1, 2) pairs that are no farther apart.
+    Only lags 1 to h - 1 of the sorted row can contain the result.
     """
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))

@@ -111,8 +111,8 @@ def sample_scene(
 ) -> Scene:
     """Sample the visible surface of a scene.
 
-    Points are drawn independently and uniformly from all surfaces with free space in front of them,
-    so the number of points of a face is proportional to its visible area. Surfaces occluded from a
+    Points are drawn independently and uniformly from all surfaces with free space in front of them.
+    The number of points of a face is proportional to its visible area. Surfaces occluded from a
     scanner are sampled as well.
 
     Args:
