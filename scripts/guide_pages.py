@@ -1,9 +1,9 @@
-"""Guides: pages of Markdown whose examples run while the page is made, with what they print.
+"""Markdown guides with examples that run, and their output.
 
-Blocks of ``python`` share their names within a page; blocks of ``bash`` hold commands of torchrg,
-and ``mkdir``. Both run in a folder of the page alone. Blocks called ``python hidden`` only run, and
-what those called ``python page`` print is a part of the page. Blocks of another kind (``console``,
-``yaml``, ``text``) are only shown.
+``python`` blocks share their names within a page; ``bash`` blocks contain commands of torchrg and
+``mkdir``. Both run in a separate folder per page. ``python hidden`` blocks run and are not shown,
+and the output of ``python page`` blocks is part of the page. Other blocks (``console``, ``yaml``,
+``text``) are only shown. Output lacks the times and paths of the machine that builds the pages.
 """
 
 import contextlib
@@ -19,21 +19,25 @@ from torchrg.cli import main
 
 GUIDES = Path(__file__).parent / "guides"
 MADE = "made"
-"""Folder beside the pages that holds what the examples of each of them write."""
+"""Folder next to the pages with the files that their examples write."""
 BLOCK = re.compile(r"^```(\w+)( hidden| page)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-_PICTURE = re.compile(r"(!\[[^\]]*\]\()")
+_IMAGE = re.compile(r"(!\[[^\]]*\]\()")
 _NAME = re.compile(r"`(torchrg(?:\.\w+)*)`")
+_TIMES = re.compile(r", [\d.,]+ s(?= -> )|^[\d,]+ points in .* a second\n?", re.MULTILINE)
+"""Run times in one-line summaries, and the speed of a conversion."""
+_TIME_COLUMN, _CELLS = re.compile(r"  \S+ \(s\)"), re.compile(r"  [\d., ]+")
+"""Head of the first time column of a table, and its cells."""
 _MAX_LINES = 40
-"""Lines of what a block prints that a page shows."""
+"""Output lines shown per block."""
 
 
 def guide_files() -> list[Path]:
-    """Return the guides; that of the index comes first."""
+    """Return the guides, the index first."""
     return sorted(GUIDES.glob("*.md"), key=lambda path: (path.stem != "index", path))
 
 
 def make_page(guide: Path, folder: Path) -> Path:
-    """Run the examples of a guide, and write its page, Markdown for Sphinx, into a folder.
+    """Run the examples of a guide and write its page as Markdown for Sphinx.
 
     Raises:
         RuntimeError: If an example fails; the message names its line.
@@ -62,17 +66,17 @@ def make_page(guide: Path, folder: Path) -> Path:
 
 
 def _linked(prose: str, stem: str) -> str:
-    """Return text whose pictures are those that were made, and whose names lead to the reference.
+    """Return text with paths of generated images, and with names linked to the API reference.
 
     Example:
         >>> _linked("`torchrg.Cloud`: ![one](a.png)", "guide")
         '{py:obj}`torchrg.Cloud`: ![one](made/guide/a.png)'
     """
-    return _NAME.sub(r"{py:obj}`\1`", _PICTURE.sub(rf"\1{MADE}/{stem}/", prose))
+    return _NAME.sub(r"{py:obj}`\1`", _IMAGE.sub(rf"\1{MADE}/{stem}/", prose))
 
 
 def _shown(printed: str) -> str:
-    """Return what an example prints as a block below it."""
+    """Return the output of an example as a code block."""
     lines = printed.splitlines()
     more = [f"... {len(lines) - _MAX_LINES} more lines"] if len(lines) > _MAX_LINES else []
     shown = "\n".join([*lines[:_MAX_LINES], *more])
@@ -80,7 +84,7 @@ def _shown(printed: str) -> str:
 
 
 def _run(kind: str, lines: str, names: dict[str, Any], where: str) -> str:
-    """Run a block and return what it prints."""
+    """Run a block and return its output."""
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed):
@@ -91,11 +95,31 @@ def _run(kind: str, lines: str, names: dict[str, Any], where: str) -> str:
                     _run_command(line)
     except (Exception, SystemExit) as error:
         raise RuntimeError(f"{where}: {type(error).__name__}: {error}") from error
-    return printed.getvalue().rstrip()
+    return _portable(printed.getvalue().rstrip())
+
+
+def _portable(printed: str) -> str:
+    r"""Return output without the times and paths of this machine.
+
+    Example:
+        >>> print(_portable("scan  points  read (s)\nroom     500       0.1"))
+        scan  points
+        room     500
+        >>> _portable("room.ply: 7 planes, 0.4 s -> planes.npz")
+        'room.ply: 7 planes -> planes.npz'
+    """
+    lines, end = [], None
+    for line in _TIMES.sub("", printed.replace(f"{Path.cwd()}{os.sep}", "")).splitlines():
+        if start := _TIME_COLUMN.search(line):
+            end = start.start()
+        elif end is not None and not _CELLS.fullmatch(line[end:]):
+            end = None
+        lines.append(line[:end])
+    return "\n".join(lines)
 
 
 def _run_command(line: str) -> None:
-    """Run a command of torchrg as a shell would; a line may end in a comment."""
+    """Run a command of torchrg as a shell does; a line may end in a comment."""
     words = shlex.split(line, comments=True)
     if words[:1] == ["mkdir"]:
         for name in words[1:]:
@@ -106,7 +130,7 @@ def _run_command(line: str) -> None:
         raise ValueError(f"expected a command of torchrg, got {line!r}")
     try:
         code = main(words[1:])
-    except SystemExit as stop:  # As --help does.
+    except SystemExit as stop:  # --help exits.
         code = int(stop.code or 0)
     if code:
         raise ValueError(f"exit code {code} of {line!r}")
@@ -114,7 +138,7 @@ def _run_command(line: str) -> None:
 
 @contextlib.contextmanager
 def _inside(folder: Path) -> Iterator[None]:
-    """Work in a folder for a while."""
+    """Change the working directory temporarily."""
     before = Path.cwd()
     os.chdir(folder)
     try:

@@ -35,6 +35,7 @@ html_title = f"torchrg {release}"
 html_copy_source = False
 html_static_path = [str(Path(__file__).with_name("printed.css"))]
 html_css_files = ["printed.css"]
+html_search_scorer = str(Path(__file__).with_name("search.js"))
 
 
 def show_public_bases(_app: Sphinx, _name: str, _of: type, _options: object, bases: Any) -> None:  # noqa: ANN401

@@ -1,8 +1,11 @@
 """Morton codes hold the bits of three numbers; the canonical order follows them."""
 
+import numpy as np
+import pytest
 import torch
 
-from torchrg.neighbors.order import canonical_order, spread_bits
+from tests.kernels.clouds import definitions, needs_library
+from torchrg.neighbors.order import canonical_order, morton_codes, spread_bits
 
 
 def test_morton_codes_hold_the_bits_of_three_numbers(rng):
@@ -13,6 +16,18 @@ def test_morton_codes_hold_the_bits_of_three_numbers(rng):
             str(triple[axis] >> bit & 1) for bit in reversed(range(21)) for axis in (2, 1, 0)
         )
         assert code == int(bits, 2)
+
+
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+@pytest.mark.parametrize("origin", [0.0, -3e6])
+def test_kernel_of_morton_codes_equals_the_definition(precision, origin):
+    points = (np.random.default_rng(0).random((5000, 3)) * (8, 6, 3) + origin).astype(precision)
+    found = morton_codes(points)
+    with definitions():
+        expected = morton_codes(points)
+    assert len(np.unique(expected)) > 100
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_duplicates_are_side_by_side_in_the_order_they_came_in(rng):

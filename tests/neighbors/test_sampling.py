@@ -8,8 +8,13 @@ import pytest
 import torch
 
 from torchrg import load_config, search_knn
-from torchrg.neighbors import canonical_order, sample_voxels
-from torchrg.neighbors.sampling import measure_sampling
+from torchrg.neighbors import (
+    canonical_order,
+    distinct_points,
+    measure_sampling,
+    prepare_search,
+    sample_voxels,
+)
 from torchrg.structures import Sampling
 
 K = 50
@@ -56,6 +61,14 @@ def reconstruction(seed: int) -> np.ndarray:
 
 
 CLOUDS = {"scan": scan, "reconstruction": reconstruction}
+
+
+@pytest.mark.parametrize("kind", CLOUDS)
+def test_neighbors_of_the_sample_alone_give_the_same_measures(kind):
+    cloud = torch.as_tensor(CLOUDS[kind](0), dtype=torch.float32)
+    cloud = distinct_points(cloud).points
+    expected = measure_sampling(cloud, search_knn(cloud, K))
+    assert measure_sampling(cloud, prepare_search(cloud.numpy(), K)) == expected
 
 
 @pytest.fixture(params=CLOUDS)

@@ -55,6 +55,28 @@ def test_examples_run_share_names_and_show_what_they_print(tmp_path):
     assert text.endswith("\n\n## 1\n")
 
 
+def test_pages_show_no_times_and_paths_of_the_build_machine(tmp_path):
+    guide = tmp_path / "guide.md"
+    lines = [
+        "scan  points  read (s)  GB",
+        "room     500       0.1   2",
+        "500 points in 2.4 s: 208 points, 0.42 scans a second",
+        "room.ply: 500 points, 1,126.5 s -> here/planes.npz",
+        "a longer line, which is no row of the table: 0.1  2",
+    ]
+    guide.write_text(
+        "# A guide\n\n```python\nfrom pathlib import Path\n\n"
+        f"print({chr(10).join(lines)!r}.replace('here', str(Path.cwd())))\n```\n"
+    )
+    shown = guide_pages.make_page(guide, tmp_path / "out").read_text().partition("printed\n\n")[2]
+    assert shown.splitlines()[:-1] == [
+        "scan  points",
+        "room     500",
+        "room.ply: 500 points -> planes.npz",
+        lines[-1],
+    ]
+
+
 @pytest.mark.parametrize(
     ("block", "message"),
     [
@@ -85,6 +107,9 @@ def test_what_leads_nowhere_fails_the_site(tmp_path, text, code):
     pages.mkdir()
     (pages / "index.md").write_text(f"# Title\n\n{text}\n")
     assert docs.build_site(pages, tmp_path / "site") == code
+    if code == 0:
+        search = (tmp_path / "site" / "_static" / "language_data.js").read_text()
+        assert "guides come before module pages" in search
 
 
 @pytest.mark.parametrize("prog", command_page.PROGS)

@@ -13,7 +13,7 @@ from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, describe_sampling, file_columns
 from torchrg.config import load_config
 from torchrg.io import read_cloud
-from torchrg.neighbors import distinct_points, measure_sampling, search_knn
+from torchrg.neighbors import distinct_points, measure_sampling, prepare_search
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
@@ -23,6 +23,9 @@ resolve a millimeter at a thousand kilometers."""
 
 _NUM_NEIGHBORS = 50
 """Number of neighbors for measuring the surfaces, as in the default preset."""
+
+_NUM_FOR_SPACING = 10_000
+"""Number of points, evenly along the canonical order, from which the spacing is measured."""
 
 
 @dataclass(frozen=True)
@@ -66,16 +69,19 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         digits = _DIGITS[cloud.coordinates.dtype.itemsize]
         for name, values in (("lowest", low), ("highest", high), ("extent", high - low)):
             facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
-        distinct = distinct_points(torch.from_numpy(finite - cloud.origin))
+        centered = finite - cloud.origin if cloud.origin.any() else finite
+        distinct = distinct_points(torch.from_numpy(centered))
         facts["duplicates"] = f"{distinct.num_copies:,}"
         positions = distinct.points.numpy()
         facts["spacing"] = "none"
         if len(positions) > 1:
-            near = search_knn(positions, min(_NUM_NEIGHBORS, len(positions)), canonical=True)
-            nearest = positions[near.indices[:, 1].numpy()]
-            spacing = np.median(np.linalg.norm(positions - nearest, axis=1))
+            search = prepare_search(positions, min(_NUM_NEIGHBORS, len(positions)))
+            rows = np.arange(0, len(positions), -(-len(positions) // _NUM_FOR_SPACING))
+            spacing = np.median(
+                np.linalg.norm(positions[rows] - positions[search(rows)[:, 1]], axis=1)
+            )
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
-            sampling = measure_sampling(torch.from_numpy(positions), near)
+            sampling = measure_sampling(torch.from_numpy(positions), search)
             chosen = load_config().measured(sampling)["settings"]
             facts["height"] = f"{sampling.height:g} (smallest extent along the principal axes)"
             facts["density"] = f"{sampling.density:g} points on a square of side 1"

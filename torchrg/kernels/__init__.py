@@ -34,6 +34,8 @@ SIGNATURES = {
     "choose_planes": "f[N8] i[Nk] b[Nk]? f[N3] l[n] n x x x x -> f[n3] f[n]",
     "inliers": "f[N3] i[Nk] b[Nk]? f[N3] f[N] f[N] l[n] x -> f[n] f[n3]",
     "fit_paraboloids": "f[N3] i[Nk] b[Nk]? f[N3] l[n] x -> f[n3] f[n] f[n]",
+    "morton_codes": "f[N3] x x x x -> l[N]",
+    "morton_codes_double": "d[N3] x x x x -> l[N]",
     "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N] d[N3]",
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",

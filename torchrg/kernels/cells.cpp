@@ -46,7 +46,39 @@ INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
   return farthest;
 }
 
+// Puts two zero bits between the bits of a number below 2^21.
+INLINE int64_t spread(int64_t bits) {
+  bits = (bits | bits << 32) & 0x1F00000000FFFF;
+  bits = (bits | bits << 16) & 0x1F0000FF0000FF;
+  bits = (bits | bits << 8) & 0x100F00F00F00F00F;
+  bits = (bits | bits << 4) & 0x10C30C30C30C30C3;
+  return (bits | bits << 2) & 0x1249249249249249;
+}
+
+template <class T>
+INLINE int64_t fill_codes(int64_t num_points, const T* points, const double (&low)[3],
+                          double extent, int64_t* codes) {
+  for (int64_t i = 0; i < num_points; i++) {
+    int64_t code = 0;
+    for (int axis = 0; axis < 3; axis++)
+      code |= spread(int64_t((points[3 * i + axis] - low[axis]) / extent * 2097151)) << axis;
+    codes[i] = code;
+  }
+  return DONE;
+}
+
 }  // namespace
+
+// Morton codes of finite points in a cube: torchrg/neighbors/order.py.
+KERNEL morton_codes(int64_t num_points, const float* points, double x, double y, double z,
+                    double extent, int64_t* codes) {
+  return fill_codes(num_points, points, {x, y, z}, extent, codes);
+}
+
+KERNEL morton_codes_double(int64_t num_points, const double* points, double x, double y, double z,
+                           double extent, int64_t* codes) {
+  return fill_codes(num_points, points, {x, y, z}, extent, codes);
+}
 
 // Sorts points by cells: `starts` gets the first place of each cell, of which the last is the end.
 KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, int32_t* starts,

@@ -4,6 +4,7 @@ from torchrg.neighbors.knn import (
     check_neighbors,
     gather_columns,
     gather_patches,
+    prepare_search,
     search_knn,
     search_nearest,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "gather_patches",
     "mark_first",
     "measure_sampling",
+    "prepare_search",
     "restore_points",
     "restore_rows",
     "sample_voxels",

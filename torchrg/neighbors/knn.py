@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,9 @@ from torchrg.structures import MAX_POINTS, Neighbors, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Points that tell how far the k-th neighbour is."""
+
+SomeNeighbors = Callable[[NDArray[np.integer]], NDArray[np.integer]]
+"""Function from rows ``(n,)`` to their neighbors ``(n, k)``, each first its own."""
 
 _MIN_FOR_CELLS = 2000
 """Points below which a tree is as fast as cells."""
@@ -260,6 +264,23 @@ def _cloud_bounds(offset: Tensor | None, num_points: int) -> list[tuple[int, int
             f"{ends}."
         )
     return [(start, stop) for start, stop in bounds if stop > start]
+
+
+def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
+    """Return a function that finds the neighbors of some rows only, as :func:`search_knn` does.
+
+    ``points`` ``(N, 3)`` are distinct and in canonical order, at least ``k``.
+
+    Example:
+        >>> search = prepare_search(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
+        >>> search(np.array([2, 0])).tolist()
+        [[2, 1], [0, 1]]
+    """
+    from scipy.spatial import cKDTree
+
+    places = points.astype(np.float64, copy=False)
+    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+    return lambda rows: _query(tree, places[rows], k)[1]
 
 
 @sequential_operations()

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import ROWS_AT_ONCE, chunks_of, places_of
 from torchrg.structures import UNLABELED, bounding_box
@@ -218,7 +219,12 @@ def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
     extent = float((high - low).max())
     if extent == 0:
         return codes
+    kernel = {"f4": "morton_codes", "f8": "morton_codes_double"}.get(coordinates.dtype.str[1:])
     for rows in chunks_of(len(codes), ROWS_AT_ONCE):
+        if kernel and kernels.serve():
+            points = as_tensor("morton_codes", "coordinates", coordinates[rows])
+            codes[rows] = kernels.call(kernel, points, *low.tolist(), extent)[0].numpy()
+            continue
         relative = (coordinates[rows] - low) / extent
         steps = torch.from_numpy((relative * (2**MORTON_BITS - 1)).astype(np.int64))
         for axis in range(3):

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg.neighbors.knn import SomeNeighbors
 from torchrg.structures import Neighbors, Sampling
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ _DIGITS = 3
 """Digits of a measure: fewer than what another unit or origin rounds."""
 
 
-def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
+def measure_sampling(points: Tensor, neighbors: Neighbors | SomeNeighbors) -> Sampling:
     """Measure how a cloud samples its surfaces, on 600 points evenly along their canonical order.
 
     The deviation ``s_k`` of the k nearest points from their own plane, of k - 3 degrees of freedom,
@@ -39,7 +40,8 @@ def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
 
     Args:
         points: Finite points in canonical order, shape ``(N, 3)``.
-        neighbors: Neighbours of each, as :func:`torchrg.search_knn` finds them.
+        neighbors: Neighbors of each, as :func:`torchrg.search_knn` finds them, or a function that
+            returns those of given rows; see :func:`prepare_search`.
 
     Returns:
         The measures, in three digits. They do not depend on the order of the points, on threads,
@@ -55,8 +57,9 @@ def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
         (True, True)
     """
     rows = _evenly(len(points), _NUM_SAMPLES)
-    indices = neighbors.indices.cpu().numpy()
-    rows, distances, patches = _nearest(points, rows, indices[rows], indices.shape[1])
+    lists_of = neighbors if callable(neighbors) else neighbors.indices.cpu().numpy().__getitem__
+    lists = lists_of(rows)
+    rows, distances, patches = _nearest(points, rows, lists, lists.shape[1])
     k = distances.shape[1]
     if k <= _SMALL:
         return Sampling()
@@ -68,7 +71,7 @@ def measure_sampling(points: Tensor, neighbors: Neighbors) -> Sampling:
     flat = flatness <= np.median(flatness)
     small = np.median(_deviations(patches[flat, :_SMALL]))
     rows = rows[flat]
-    lent = indices[indices[rows, ::_LENDERS]].reshape(len(rows), -1)
+    lent = lists_of(lists_of(rows)[:, ::_LENDERS].ravel()).reshape(len(rows), -1)
     large = np.median(_deviations(_nearest(points, rows, lent, _LARGE)[-1]))
     whiteness = min(float(small / large), 1.0) if large > 0 else 1.0
     measures = whiteness, variation, float(exact.mean()), density, _height(points)
@@ -81,7 +84,7 @@ def _evenly(count: int, most: int) -> NDArray[np.int64]:
 
 
 def _nearest(
-    points: Tensor, rows: NDArray[np.int64], lists: NDArray[np.int32], most: int
+    points: Tensor, rows: NDArray[np.int64], lists: NDArray[np.integer], most: int
 ) -> tuple[NDArray[np.int64], Array, Array]:
     """Return the nearest of the different places in lists ``(n, L)``, from the point itself on.
 
