@@ -42,6 +42,8 @@ SIGNATURES = {
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
     "meet_others": "i[N] i[n] i[nk] b[nk]? -> b[n]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
+    "link_nodes": "i[L] i[L] b[L] I[N] B[N] B[N] -> ",
+    "flatten_nodes": "I[N] B[N] B[N] -> ",
     "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",
     "gather_borders": "i[e] i[e] d[e]? d[e] L[r] L[r] -> l[e] i[e] i[e] d[e] d[e] l[1]",
     "merging_costs": "d[R] d[RF] d[Rc] d[Rc] i[E] i[E] d[E] d[E] x x -> d[E]",

@@ -7,11 +7,10 @@ holds one copy of each of its nodes, and is a face.
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import scratch
-from torchrg._parallel import ROWS_IN_CACHE, map_chunks, places_of
+from torchrg import kernels, scratch
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, places_of
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
@@ -143,25 +142,39 @@ def _join_patches(
         local implicit quadric regression. IEEE Visualization, 2003.
     """
     rows, num_faces = places_of(faces < 0), int(faces.max()) + 1
-    ends = gather_lists(near, rows, [rank for rank in _RANKS if rank < near.shape[1]])
-    cosine, bend = _compare(points, normals, rows, ends)
-    usual = float(bend[::8].median()) if bend.numel() else 0.0
+    ranks = [rank for rank in _RANKS if rank < near.shape[1]]
+    bend = _compare(points, normals, rows[::8], gather_lists(near, rows[::8], ranks))[1]
+    typical = float(bend.median()) if bend.numel() else 0.0
+    limit = min(max(_BENDS * typical, _MIN_BEND), _MAX_BEND)
     node = torch.full((len(points),), -1, dtype=torch.int32)
     node[rows] = torch.arange(len(rows), dtype=torch.int32)
-    there = node[ends]
-    is_smooth = (bend <= min(max(_BENDS * usual, _MIN_BEND), _MAX_BEND)) & (there >= 0)
-    starts = torch.repeat_interleave(is_smooth.sum(dim=1, dtype=torch.int32))
-    smooth = (values.numpy() for values in (starts, there[is_smooth], cosine[is_smooth] < 0))
-    patch, sign = _find_components(len(rows), *smooth)
-    del node, there, starts, smooth
+    patches = _Components(len(rows))
+    for chunk in torch.split(rows, ROWS_AT_ONCE):
+        ends = gather_lists(near, chunk, ranks)
+        cosine, bend = _compare(points, normals, chunk, ends)
+        there = node[ends]
+        is_smooth = (bend <= limit) & (there >= 0)
+        starts = node[chunk].repeat_interleave(is_smooth.sum(dim=1))
+        patches.link(starts, there[is_smooth], cosine[is_smooth] < 0)
+    patch, sign = patches.find()
+    del node, patches
     faces, signs = faces.clone(), signs.clone()
     faces[rows], signs[rows] = num_faces + patch, sign.to(signs)
-    is_between = faces[ends] != faces[rows, None]
-    starts, ends = rows[torch.repeat_interleave(is_between.sum(dim=1))], ends[is_between]
-    cosine, trust = cosine[is_between], (1 - bend[is_between] / 2).clamp(min=0) ** _TRUST_POWER
-    agreement = trust * cosine.sign() * signs[starts] * signs[ends]
+    links = []
+    for chunk in torch.split(rows, ROWS_AT_ONCE):
+        ends = gather_lists(near, chunk, ranks)
+        is_between = faces[ends] != faces[chunk, None]
+        has_any = is_between.any(dim=1)
+        chunk, ends, is_between = chunk[has_any], ends[has_any], is_between[has_any]
+        cosine, bend = (values[is_between] for values in _compare(points, normals, chunk, ends))
+        starts = chunk.repeat_interleave(is_between.sum(dim=1))
+        ends = ends[is_between]
+        trust = (1 - bend / 2).clamp(min=0) ** _TRUST_POWER
+        agreement = trust * cosine.sign() * signs[starts] * signs[ends]
+        links.append((faces[starts], faces[ends], agreement))
+    low, high, agreement = (torch.cat(parts) for parts in zip(*links, strict=True))
     sizes = torch.bincount(faces)
-    joined, turns = _join_faces(faces[starts], faces[ends], agreement, sizes, strong)
+    joined, turns = _join_faces(low, high, agreement, sizes, strong)
     return joined[faces], signs * turns[faces].to(signs)
 
 
@@ -216,9 +229,18 @@ def _join_faces(
         # Of equal ones the first, so that no more than two faces choose each other in a circle.
         chosen = np.flatnonzero((strength == most[owner]) & (strength > 0))
         chosen = chosen[np.unique(owner[chosen], return_index=True)[1]]
-        joined, turns = _find_components(
-            len(sizes), owner[chosen], both.indices[chosen], both.data[chosen] < 0
+        components = _Components(len(sizes))
+        components.link(
+            *(
+                torch.from_numpy(values)
+                for values in (
+                    owner[chosen].astype(np.int32),
+                    both.indices[chosen].astype(np.int32),
+                    both.data[chosen] < 0,
+                )
+            )
         )
+        joined, turns = components.find()
         if int(joined.max()) + 1 == len(sizes):
             return numbers, signs
         numbers, signs = joined[numbers], signs * turns[numbers]
@@ -229,31 +251,56 @@ def _join_faces(
         low, high = joined[low], joined[high]
 
 
-def _find_components(
-    num_nodes: int,
-    starts: NDArray[np.integer],
-    ends: NDArray[np.integer],
-    is_turned: NDArray[np.bool_],
-) -> tuple[Tensor, Tensor]:
-    """Return the component of each node, and its sign there, by links ``(L,)`` ascending by start.
+class _Components:
+    """Connected components of a signed graph: the signs of two nodes agree along a link, or differ.
 
-    Signs differ along links that are turned, else they agree. Where that cannot be, as a component
-    holds both copies of its nodes, each of these is left alone.
+    Components that no signs fit are taken apart: each of their nodes is a component.
     """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
 
-    num_links = np.cumsum(np.bincount(starts, minlength=num_nodes))
-    bounds = np.concatenate([[0], num_links, num_links[-1:] + num_links])
-    other = np.int32(num_nodes) * is_turned
-    ends = ends.astype(np.int32, copy=False)
-    copies = np.concatenate([ends + other, ends + (np.int32(num_nodes) - other)])
-    links = np.ones(len(copies), np.int8), copies, bounds.astype(np.int32)
-    graph = csr_array(links, shape=(2 * num_nodes, 2 * num_nodes))
-    upright, opposite = connected_components(graph, directed=False)[1].reshape(2, num_nodes)
-    alone = 2 * num_nodes + np.arange(num_nodes)
-    component = np.where(upright == opposite, alone, np.minimum(upright, opposite))
-    is_used = np.zeros(3 * num_nodes, dtype=np.int64)
-    is_used[component] = 1
-    numbers = np.cumsum(is_used)[component] - 1
-    return torch.from_numpy(numbers), torch.from_numpy(np.where(upright <= opposite, 1.0, -1.0))
+    def __init__(self, num_nodes: int) -> None:
+        self.parents = torch.arange(num_nodes, dtype=torch.int32)
+        self.is_turned = torch.zeros(num_nodes, dtype=torch.bool)
+        self.is_torn = torch.zeros(num_nodes, dtype=torch.bool)
+        self.links: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def link(self, starts: Tensor, ends: Tensor, is_turned: Tensor) -> None:
+        """Add links between nodes ``(L,)``, int32; signs differ along those that are turned."""
+        if kernels.serve():
+            forest = self.parents, self.is_turned, self.is_torn
+            kernels.call("link_nodes", starts, ends, is_turned, *forest)
+        else:
+            self.links.append((starts, ends, is_turned))
+
+    def find(self) -> tuple[Tensor, Tensor]:
+        """Return the component of each node, by its first node, and its sign there, 1 or -1."""
+        if kernels.serve():
+            kernels.call("flatten_nodes", self.parents, self.is_turned, self.is_torn)
+        elif self.links:
+            self._search()
+        nodes = torch.arange(len(self.parents))
+        # Single nodes come last.
+        roots = torch.where(self.is_torn, len(nodes) + nodes, self.parents)
+        is_used = torch.zeros(2 * len(nodes), dtype=torch.bool).index_fill_(0, roots, True)
+        signs = torch.where(self.is_turned & ~self.is_torn, -1.0, 1.0)
+        return is_used.cumsum(0)[roots] - 1, signs
+
+    def _search(self) -> None:
+        """Find components on a double cover, whose nodes are each there with both signs."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        count = len(self.parents)
+        starts, ends, is_turned = (
+            torch.cat(parts).numpy() for parts in zip(*self.links, strict=True)
+        )
+        other = count * is_turned.astype(np.int32)
+        pairs = np.append(starts, starts + count), np.append(ends + other, ends + count - other)
+        cover = coo_array((np.ones(2 * len(starts)), pairs), shape=(2 * count, 2 * count))
+        upright, opposite = connected_components(cover, directed=False)[1].reshape(2, count)
+        _, first, inverse = np.unique(
+            np.minimum(upright, opposite), return_index=True, return_inverse=True
+        )
+        self.parents = torch.from_numpy(first[inverse].astype(np.int32))
+        self.is_turned, self.is_torn = map(
+            torch.from_numpy, (upright > opposite, upright == opposite)
+        )
