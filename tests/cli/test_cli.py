@@ -295,7 +295,7 @@ def test_names_of_columns_count_for_each_file_without_its_own(tmp_path, run):
     write_cloud(tmp_path / "b.ply", Cloud(flat[:100] + np.eye(3)[2], {"d": flat[:100, 0]}))
     inputs, out = (tmp_path / "a.npy", tmp_path / "b.ply"), tmp_path / "r.npz"
     shown = run("segment", *inputs, "--merge", *CLASSIC, "--out", out, "--columns", "x,y,z,d")
-    assert "(without its own d)" in shown.out
+    assert "(without the input fields d)" in shown.out
     assert shown.err == ""
     with np.load(out) as result:
         np.testing.assert_array_equal(result["points"][:2_000], flat)
@@ -339,7 +339,7 @@ def test_what_gives_way_to_a_result_is_told(room_file, tmp_path, run):
     # Archives hold the result alone, which the line about it says.
     shown = run("segment", room_file, *CLASSIC, "--out", tmp_path / "a.npz")
     assert shown.err == ""
-    assert shown.out.endswith("a.npz (without its own labels, normals)\n")
+    assert shown.out.endswith("a.npz (without the input fields labels, normals)\n")
 
 
 def test_codes_for_missing_points_are_no_points(room, tmp_path, run):

@@ -49,7 +49,7 @@ def test_names_are_printed_with_escapes(cloud, tmp_path, shown_by):
     said = shown_by("segment", cloud, "--out", out, *flags)
     assert said.count("\n") == 1
     assert f"{SHOWN}.npz: 600 points" in said
-    assert f"without its own {SHOWN}" in said
+    assert f"without the input fields {SHOWN}" in said
     assert f"{SHOWN}.ply\n" in shown_by("normals", cloud, "--out", again, "--method", "pca")
     assert f"{SHOWN}.x: " in shown_by("info", f"{EVIL}.x", code=2)
     convert = ("convert", "folder", cloud.parent, tmp_path / "out", *flags)

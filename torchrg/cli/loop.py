@@ -191,7 +191,7 @@ def note_input(
 def dropped_fields_note(target: Path, fields: Collection[str]) -> str:
     """Describe the fields of a cloud that its result omits."""
     names = [name for name in fields if name not in KEPT_FIELDS and is_archive(target)]
-    return f" (without its own {', '.join(names)})" if names else ""
+    return f" (without the input fields {', '.join(names)})" if names else ""
 
 
 @contextlib.contextmanager

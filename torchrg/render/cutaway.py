@@ -150,7 +150,7 @@ def _find_outer_sides(
 
 
 def _heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor:
-    """Return the direction nearest to x along or across the largest wall, horizontal."""
+    """Return the horizontal direction, along or across the largest wall, nearest to an axis."""
     east = torch.zeros_like(up)
     east[up.abs().argmin()] = 1
     east = functional.normalize(east - (east @ up) * up, dim=0)
