@@ -180,7 +180,7 @@ def changes(settings, base):
 @pytest.mark.parametrize("name", ["s3dis", "scannet", "laser", "rgbd"])
 def test_presets_for_a_kind_of_data_say_what_took_their_place(name, tmp_path):
     for ask in (load_config, lambda name: load_config(base_file(tmp_path, name))):
-        with pytest.raises(ConfigError, match=f"got '{name}'; leave it out: the default measures"):
+        with pytest.raises(ConfigError, match=f"got '{name}'; leave it out: the default adapts"):
             ask(name)
 
 
@@ -291,10 +291,10 @@ def test_sections_and_other_settings_come_by_dictionary_too():
             "unknown setting 'normal'; the nearest is normals",
         ),
         (lambda: SegmentPlanes(**{"normals.k": "3"}), "SegmentPlanes: normals: k: expected int"),
-        (lambda: segment_planes(torch.zeros(3, 3), preset="classic"), "the argument before"),
+        (lambda: segment_planes(torch.zeros(3, 3), preset="classic"), "as the first argument"),
         (
             lambda: estimate_normals(torch.zeros(3, 3), radius=0.1),
-            "radius.*bounded by max_distance",
+            "radius.*max_distance bounds",
         ),
         (lambda: make_superpoints(torch.zeros(3, 3), n=10), "numbers of superpoints are counts"),
         (lambda: MakeSuperpoints("classic"), "a SuperpointsConfig or a dictionary, got str"),
@@ -310,7 +310,7 @@ def test_wrong_keywords_name_the_repair(ask, message):
 
 @pytest.mark.parametrize("config", [load_config().normals, DepthConfig(), load_config()])
 def test_settings_that_are_assigned_say_how_others_are_made(config):
-    with pytest.raises(AttributeError, match=r"not changed in place; .*min_size.*7.* makes others"):
+    with pytest.raises(AttributeError, match=r"is immutable; use .*min_size.*7"):
         config.min_size = 7
 
 

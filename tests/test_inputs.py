@@ -151,7 +151,7 @@ def test_what_users_look_for_elsewhere_is_named():
 
 @pytest.mark.parametrize("name", CLOUDS)
 def test_clouds_on_meta_are_refused(name):
-    with pytest.raises(ShapeError, match="expected points with values, got those of vmap"):
+    with pytest.raises(ShapeError, match="expected points with values, got a tensor of vmap"):
         CALLS[name](argument(name).to("meta"))
 
 

@@ -50,7 +50,7 @@ def test_fields_that_differ_are_left_out_and_named_in_one_line():
         ]
     )
     assert merged.fields == {}
-    assert merged.notes == ("fields left out, as not all files have them alike: a, b, c, d",)
+    assert merged.notes == ("fields left out, because not all files share them: a, b, c, d",)
 
 
 def test_kinds_of_numbers_are_joined_and_colours_only_of_as_many_bits():
@@ -59,7 +59,7 @@ def test_kinds_of_numbers_are_joined_and_colours_only_of_as_many_bits():
     fields = {"color": eight, "n": np.array([1, 2], np.uint8), "m": np.ones(2, np.float32)}
     more = {"color": eight.astype(np.uint16), "n": np.ones(2), "m": np.array([0.1, 2])}
     merged = merge_clouds([Cloud(points, fields), Cloud(points, more)])
-    assert merged.notes == ("fields left out, as not all files have them alike: color, n",)
+    assert merged.notes == ("fields left out, because not all files share them: color, n",)
     assert merged.fields["m"].tolist() == [1, 1, 0.1, 2]
     again = merge_clouds([Cloud(points, fields)] * 2)
     assert again.fields["color"].dtype == np.uint8
@@ -69,7 +69,7 @@ def test_kinds_of_numbers_are_joined_and_colours_only_of_as_many_bits():
 def test_sizes_of_other_units_are_noted():
     points = random_points()
     merged = merge_clouds([Cloud(points, source="a.ply"), Cloud(points * 1000, source="b.ply")])
-    message = "b.ply is 1,000 times as large as a.ply; expected coordinates of one unit"
+    message = "b.ply is 1,000 times as large as a.ply; check that both use the same unit"
     assert merged.notes == (message,)
     nothing = Cloud(np.full((2, 3), np.nan))
     one = Cloud(np.zeros((1, 3)))
@@ -79,7 +79,7 @@ def test_sizes_of_other_units_are_noted():
 def test_a_file_that_is_named_twice_is_noted():
     cloud = Cloud(random_points(), source="a.ply")
     merged = merge_clouds([cloud, cloud, replace(cloud, source="b.ply")])
-    assert merged.notes == ("a.ply is taken 2 times",)
+    assert merged.notes == ("a.ply is used 2 times",)
 
 
 def test_one_cloud_is_itself_and_none_is_refused(make_cloud):
@@ -113,7 +113,7 @@ def test_las_tiles_keep_a_header_whose_grid_holds_them(tmp_path):
     np.testing.assert_allclose(after.x, merged.coordinates[:, 0], rtol=0, atol=0.0025)
     # The header of the file that was read is its own.
     assert tiles[0].header["las"].scales.tolist() == [0.01] * 3
-    lost = ("facts of the header left out, as not all files have them alike: las",)
+    lost = ("header entries left out, because not all files share them: las",)
     for other in (
         las_tile(tmp_path / "far.las", 2.5e7),
         las_tile(tmp_path / "other.las", 0.0, point_format=6),
@@ -129,7 +129,9 @@ def test_coordinate_systems_that_differ_are_refused(tmp_path):
     other = las_tile(tmp_path / "c.las", 0.0, system=b"two")
     none = las_tile(tmp_path / "d.las", 0.0)
     assert merge_clouds([first, same]).notes == ()
-    assert merge_clouds([none, same]).notes == ("only 1 of 2 files name a coordinate system",)
+    assert merge_clouds([none, same]).notes == (
+        "only 1 of 2 files have a coordinate reference system",
+    )
     with pytest.raises(FormatError, match=r"c\.las: expected the coordinate reference system of"):
         merge_clouds([first, none, other])
     clouds = [
@@ -164,7 +166,7 @@ def test_gps_times_that_count_differently_are_refused(tmp_path):
         with pytest.raises(FormatError, match=message):
             merge_clouds(clouds)
     assert merge_clouds([unused, standard]).notes == (
-        "fields left out, as not all files have them alike: gps_time",
+        "fields left out, because not all files share them: gps_time",
     )
     merged = merge_clouds([standard, replace(standard, source="b.las")])
     write_cloud(tmp_path / "all.las", merged)
@@ -185,7 +187,7 @@ def test_extra_dimensions_that_are_described_differently_are_plain_numbers(tmp_p
         data.Range = np.arange(9) + 1
         data.write(tmp_path / f"{name}.las")
     merged = merge_clouds([read_cloud(tmp_path / f"{name}.las") for name in "ab"])
-    assert merged.notes == ("facts of the header left out, as not all files have them alike: las",)
+    assert merged.notes == ("header entries left out, because not all files share them: las",)
     write_cloud(tmp_path / "all.las", merged)
     after = laspy.read(tmp_path / "all.las")
     assert not after.point_format.dimension_by_name("Range").is_scaled
@@ -200,7 +202,7 @@ def test_entries_of_the_header_that_differ_are_told():
     )
     assert merge_clouds([plain, usual]).notes == merge_clouds([usual, usual]).notes == ()
     assert merge_clouds([seen, seen]).header == {"viewpoint": away}
-    lost = ("facts of the header left out, as not all files have them alike: viewpoint",)
+    lost = ("header entries left out, because not all files share them: viewpoint",)
     assert merge_clouds([plain, seen]).notes == merge_clouds([seen, usual]).notes == lost
     scanned = Cloud(random_points(), header={"scans": (ScanPose("a"),)})
     assert merge_clouds([plain, scanned]).notes == (lost[0].replace("viewpoint", "scans"),)
@@ -222,6 +224,6 @@ def test_scans_of_several_e57_files_are_all_there_and_their_numbers_left_out():
     first = Cloud(random_points(20), {"scan": number}, header=two)
     second = Cloud(random_points(5), header=one, front=np.ones((5, 3), np.float32))
     merged = merge_clouds([first, first, second])
-    assert merged.notes == ("fields left out, as not all files have them alike: scan",)
+    assert merged.notes == ("fields left out, because not all files share them: scan",)
     assert [scan.name for scan in merged.header["scans"]] == ["a", "b", "a", "b", "c"]
     assert merged.front.any(axis=1).tolist() == [False] * 40 + [True] * 5

@@ -103,7 +103,7 @@ def test_normals_of_patches_by_every_estimator(rng, method):
         (lambda: modules.MVE(quantile=1.5), "quantile above 0 and below 1, got 1.5"),
         (lambda: modules.DetS(starts="nope"), "starts to be one of"),
         (lambda: modules.DetMM(tuned_for="nope"), "tuned_for to be one of shape, location"),
-        (lambda: modules.Qn(dim=0.5), "Qn: expected dim to be a whole number, got 0.5"),
+        (lambda: modules.Qn(dim=0.5), "Qn: expected dim to be an integer, got 0.5"),
         (lambda: modules.PatchNormals("svd"), "method to be one of pca, jet, irls, .*, got 'svd'"),
         (lambda: modules.PatchNormals("irls"), "expected noise > 0 with method='irls'"),
         (lambda: modules.PatchNormals("detmcd", start="paper"), "unexpected keyword .* 'start'"),

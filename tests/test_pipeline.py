@@ -184,7 +184,7 @@ def test_wrong_shapes_are_refused():
 @pytest.mark.parametrize("given", [[[0.0, 0.0, 1.0]], None, 3])
 def test_what_is_no_points_is_refused_with_the_repair(given):
     with pytest.raises(
-        ShapeError, match=r"got (list; torch.tensor makes|(NoneType|int); read_cloud)"
+        ShapeError, match=r"got (list; use torch.tensor|(NoneType|int); use read_cloud)"
     ):
         segment_planes(given)
 

@@ -168,8 +168,8 @@ def test_commands_say_it_once_a_file(places, tmp_path, run, command):
         done = run(name, path, "--out", tmp_path / "out.npz", *flags)
         assert done.code == 0
         lines += [line for line in done.err.splitlines() if "steps" in line]
-    cure = "write float64, or subtract an offset before saving"
-    assert lines == [f"torchrg: warning: {tmp_path / 'single.npy'}: {LINE}; {cure}."]
+    fix = "write float64, or subtract an offset before saving"
+    assert lines == [f"torchrg: warning: {tmp_path / 'single.npy'}: {LINE}; {fix}."]
 
 
 def test_reports_of_convert_and_info_say_it_too(places, tmp_path, run):

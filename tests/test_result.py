@@ -322,7 +322,7 @@ def test_a_table_that_is_not_of_the_labels_is_left_out(tmp_path, cloud, seg, cha
     np.savez(tmp_path / "b.npz", **arrays)
     result = torchrg.read_result(tmp_path / "b.npz")
     assert result.table is None
-    assert result.cloud.notes == ("its table of planes left out, as it is not that of its labels",)
+    assert result.cloud.notes == ("plane table left out, because it does not match the labels",)
     counts = np.unique(arrays["labels"][arrays["labels"] >= 0], return_counts=True)[1]
     assert result.planes.count.tolist() == counts.tolist()
 
@@ -338,7 +338,7 @@ def test_a_table_of_others_in_a_folder_is_left_out(tmp_path, cloud, seg, content
     result = torchrg.read_result(tmp_path)
     assert result.provenance == {}
     assert result.table is None
-    assert "table of planes left out" in result.cloud.notes[0]
+    assert "plane table left out" in result.cloud.notes[0]
     assert torch.equal(result.planes.count, seg.planes.count)
 
 

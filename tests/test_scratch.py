@@ -133,7 +133,7 @@ def test_a_full_disk_is_one_line(tmp_path, small, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(scratch.os, "posix_fallocate", refuse)
-    message = r"expected 0\.00 GB of disk for the work, got: No space left on device; make room, or"
+    message = r"expected 0\.00 GB of free disk space, got: No space left on device; free space, or"
     with scratch.on_disk(tmp_path), pytest.raises(FormatError, match=message):
         segment_planes(torch.rand(30, 3), "classic")
     assert not list(tmp_path.iterdir())

@@ -1,25 +1,25 @@
 """Robust normals, curvature and plane labels for indoor point clouds.
 
-From a file to planes and back: :func:`read_cloud`, :func:`segment_planes` with settings of
-:func:`load_config`, :func:`write_cloud`, :func:`read_result`. Single stages: :func:`search_knn`,
-:func:`estimate_normals`, :func:`grow_regions`, :func:`make_superpoints`, :func:`align_axes`. The
-modules of :mod:`torchrg.transforms` do the same to the samples of a loader,
-:mod:`torchrg.datasets` reads data sets, :mod:`torchrg.metrics` scores, :mod:`torchrg.config` has
-every setting, and :mod:`torchrg.robust` and :mod:`torchrg.nn` are for patches of points.
+Files: :func:`read_cloud`, :func:`read_result`, :func:`write_cloud`. Segmentation:
+:func:`segment_planes` with the settings of :func:`load_config`. Single stages: :func:`search_knn`,
+:func:`estimate_normals`, :func:`grow_regions`, :func:`make_superpoints`, :func:`align_axes`.
+:mod:`torchrg.transforms` applies them to samples of data loaders, :mod:`torchrg.datasets` reads
+data sets, :mod:`torchrg.metrics` evaluates results, :mod:`torchrg.config` documents all settings.
+:mod:`torchrg.robust` and :mod:`torchrg.nn` work on patches of points.
 
 Functions of patches (``covariance``, ``eigh3``, ``median``, ``mad``, ``qn``, ``tau``,
 ``fit_normals_pca``, ``fit_normals_jet``, ``fit_normals_irls``, ``fit_normals_robust``,
-``fit_detmcd``, ``fit_fastmcd``, ``fit_mve``, ``fit_dets``, ``fit_detmm``) are like those of torch:
-they have gradients, and run under ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)``,
-``torch.export`` and ``torch.autocast``. All but ``covariance`` have derivatives in reverse mode
-only, not in that of ``jacfwd`` and ``hessian``. The robust fits, scales and ``fit_normals_irls``
-are one operation of their own to ``vmap``, ``torch.func`` and compilers, and have no second
-derivatives there. Functions of clouds (``search_knn``,
-``estimate_normals``, ``orient_normals``, ``grow_regions``, ``segment_planes``,
-``make_superpoints``, ``segment_depth``) search neighbours and grow regions on the CPU: a compiler
-breaks its graph there and compiles the rest, ``vmap`` and ``torch.func`` are refused in one line,
-and ``torch.export`` does not take them. Normals of ``estimate_normals`` and ``orient_normals`` have
-gradients, but for the method ``consensus``; labels have none. On CUDA nothing was run yet.
+``fit_detmcd``, ``fit_fastmcd``, ``fit_mve``, ``fit_dets``, ``fit_detmm``) are differentiable and
+support ``vmap``, ``torch.func``, ``torch.compile(fullgraph=True)``, ``torch.export`` and
+``torch.autocast``. Except for ``covariance``, they support reverse mode only, not ``jacfwd`` and
+``hessian``. The robust fits, scales and ``fit_normals_irls`` are opaque operations for ``vmap``,
+``torch.func`` and compilers, and have no second derivatives there.
+
+Functions of clouds (``search_knn``, ``estimate_normals``, ``orient_normals``, ``grow_regions``,
+``segment_planes``, ``make_superpoints``, ``segment_depth``) search neighbors and grow regions on
+the CPU. A compiler breaks its graph there; ``vmap`` and ``torch.func`` raise an error;
+``torch.export`` does not support them. Normals of ``estimate_normals`` and ``orient_normals`` are
+differentiable, except for the method ``consensus``. CUDA is untested.
 
 Example:
     >>> import torchrg
@@ -32,7 +32,7 @@ Example:
 from torchrg import _display
 from torchrg.version import __version__ as __version__
 
-TYPE_CHECKING = False  # As that of typing, without loading it.
+TYPE_CHECKING = False  # Like typing.TYPE_CHECKING, without importing typing.
 if TYPE_CHECKING:
     from types import ModuleType
 
@@ -61,14 +61,14 @@ else:
     _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
     def __getattr__(name):  # noqa: ANN001, ANN202
-        """Load a name or module when it is asked for: a command starts before torch is loaded."""
+        """Load a name or module on first access, so that commands start before torch is loaded."""
         from importlib import import_module
 
-        place = f"torchrg.{_MODULES.get(name, name)}"
+        path = f"torchrg.{_MODULES.get(name, name)}"
         try:
-            module = import_module(place) if not name.startswith("_") else None
+            module = import_module(path) if not name.startswith("_") else None
         except ModuleNotFoundError as error:
-            if error.name != place:
+            if error.name != path:
                 raise
             module = None
         if module is None:
@@ -81,12 +81,12 @@ else:
         return globals()[name]
 
     def __dir__():  # noqa: ANN202
-        """Return what is there, loaded or not."""
+        """Return all names, loaded or not."""
         return sorted({*globals(), *__all__})
 
 
 def _load_display() -> "ModuleType":
-    """Load what shows results in a notebook."""
+    """Load the module that displays results in notebooks."""
     from torchrg.render import notebook
 
     return notebook

@@ -1,49 +1,50 @@
-"""The process of a command: ``torchrg`` and ``python -m torchrg``."""
+"""Process of a command: ``torchrg`` and ``python -m torchrg``."""
 
 import gc
 import os
 import sys
 
-# The collector would go through the objects of torch several times while they are made: a fifth
-# of the time until a command begins. Commands and workers enable it again.
+# The garbage collector would scan torch's objects several times during import, a fifth of the
+# startup time. Commands and workers enable it again.
 gc.disable()
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):
-    # Python has put the folder of the command first; what lies there is data, but for this package.
+    # Python puts the working directory first; modules there must not be imported, except torchrg
+    # itself.
     sys.path[:1] = sys.path[:1] if __file__ == f"{sys.path[0]}/torchrg/__main__.py" else []
 
 try:
     import signal
 
     from torchrg import cli
-    from torchrg.cli.ending import end_at_once, on_interrupts
+    from torchrg.cli.ending import exit_interrupted, handle_interrupts
 except KeyboardInterrupt:
-    from torchrg.cli.ending import end_at_once
+    from torchrg.cli.ending import exit_interrupted
 
-    end_at_once()
+    exit_interrupted()
 
 
 def main() -> int:
-    """Run the command that the arguments of the process name, and return its exit code.
+    """Run the command of the process arguments and return its exit code.
 
-    Ctrl-C and SIGTERM end it with one line at any moment. While modules load nothing is being
-    written, and libraries lose or show exceptions, so the process ends on the spot. When all is
-    done they come too late: what is left is Python's own end.
+    Ctrl-C and SIGTERM end the process with one line. While modules load, nothing is being written
+    and libraries may swallow exceptions, so the process exits immediately. After the command,
+    interrupts are ignored.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
-        # One that is closed would be the next file that is opened, with all that is printed in it.
+        # Otherwise the next opened file would take the descriptor and receive all output.
         if getattr(sys, name) is None:
-            place = os.open(os.devnull, os.O_RDWR)
-            os.dup2(place, number)
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            os.dup2(descriptor, number)
             os.set_inheritable(number, True)
             setattr(sys, name, os.fdopen(number, "w" if number else "r"))
     try:
-        on_interrupts(end_at_once)
+        handle_interrupts(exit_interrupted)
         return cli.main()
     except KeyboardInterrupt:
-        end_at_once()
+        exit_interrupted()
     finally:
-        on_interrupts(signal.SIG_IGN)
+        handle_interrupts(signal.SIG_IGN)
 
 
 if __name__ == "__main__":

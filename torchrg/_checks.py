@@ -1,4 +1,4 @@
-"""Argument checks that never read tensor values, so they cost no device synchronisation."""
+"""Argument checks that never read tensor values, and so need no device synchronization."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,11 +16,10 @@ Result = TypeVar("Result")
 
 
 def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
-    """Return a tensor as it is, and a NumPy array as a tensor that shares its memory.
+    """Return a tensor unchanged, and a NumPy array as a tensor that shares its memory.
 
-    Big-endian and read-only arrays are copied. Here and in all checks ``caller`` is the public
-    function that the message begins with, and what does not pass is a ShapeError, a setting a
-    ConfigError.
+    Big-endian and read-only arrays are copied. In all checks, ``caller`` is the public function
+    that starts the message. Invalid tensors raise ShapeError, invalid settings ConfigError.
 
     Example:
         >>> as_tensor("f", "points", np.zeros((2, 3), dtype=np.float32)).dtype
@@ -34,12 +33,9 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
     repair = ""
     if isinstance(values, list | tuple):
-        repair = "; torch.tensor makes one of numbers, with_format('torch') those of a data set"
+        repair = "; use torch.tensor, or with_format('torch') for a data set"
     elif name == "points" and not isinstance(values, np.ndarray):
-        repair = (
-            "; read_cloud(path).points is that of a file, numpy.asarray(cloud.points) that of a "
-            "cloud of Open3D"
-        )
+        repair = "; use read_cloud(path).points, or numpy.asarray(cloud.points) for Open3D"
     raise ShapeError(
         f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}{repair}."
     )
@@ -62,7 +58,7 @@ def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
 
 
 def check_floating(caller: str, **arguments: Tensor | None) -> None:
-    """Check that tensors hold float32 or float64, all the same, on one device; None is skipped."""
+    """Check that tensors are float32 or float64, of one dtype and device; None is skipped."""
     tensors = {name: tensor for name, tensor in arguments.items() if tensor is not None}
     for name, tensor in tensors.items():
         if tensor.dtype not in (torch.float32, torch.float64):
@@ -74,7 +70,7 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
         if tensor.is_nested:
             raise ShapeError(
                 f"{caller}: expected {name} to be dense, got a nested tensor; pass "
-                f"torch.nested.to_padded_tensor({name}, 0.0), and a mask of what is there."
+                f"torch.nested.to_padded_tensor({name}, 0.0), and a mask of the valid entries."
             )
         if tensor.layout is not torch.strided:
             raise ShapeError(
@@ -91,7 +87,7 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
 
 
 def check_points(caller: str, points: Tensor) -> None:
-    """Check that points are those of a cloud, and say what to do with those of an image."""
+    """Check that points are a cloud; suggest a fix for images and extra columns."""
     if points.ndim == 3 and points.shape[2] == 3:
         raise ShapeError(
             f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass the depth "
@@ -109,9 +105,9 @@ def check_points(caller: str, points: Tensor) -> None:
 def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     """Check the axes of several tensors against patterns that share their letters.
 
-    Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for one
-    length, the same in every pattern; a number for that length; a leading ``*`` for any leading
-    axes, the same in every pattern. A tensor that is None is skipped.
+    Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for a length
+    that is equal in all patterns, a number for a fixed length, and a leading ``*`` for any leading
+    axes, equal in all patterns. None is skipped.
 
     Example:
         >>> check_shapes("f", patches=(torch.zeros(5, 8, 3), "* K 3"))
@@ -132,7 +128,7 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
 
 
 def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, ...]]) -> bool:
-    """Match a shape against axes, and note in ``bound`` the lengths met for the first time."""
+    """Match a shape against axes, and add new lengths to ``bound``."""
     fixed = axes[1:] if axes[0] == "*" else axes
     split = len(shape) - len(fixed)
     if split < 0 or (split > 0 and axes[0] != "*"):
@@ -146,12 +142,12 @@ def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, .
 
 
 def is_tensor(value: object) -> TypeGuard[Tensor]:
-    """Return whether something is a tensor."""
+    """Return whether a value is a tensor."""
     return isinstance(value, Tensor)
 
 
 def has_values(*tensors: Tensor | None) -> bool:
-    """Return whether tensors hold numbers that may be read: not in a compiler, nor under vmap.
+    """Return whether tensors have concrete data: not traced, vmapped or on the meta device.
 
     Example:
         >>> has_values(torch.zeros(2)), has_values(torch.zeros(2, device="meta"))
@@ -164,26 +160,26 @@ def has_values(*tensors: Tensor | None) -> bool:
     try:
         strided = [t for t in tensors if t is not None and t.layout is torch.strided]
         return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in strided)
-    except RuntimeError:  # the answer of what stands for another tensor
+    except RuntimeError:  # A tensor wrapper without storage.
         return False
 
 
 def refuse_forward_mode(caller: str) -> NoReturn:
-    """Say which derivatives there are, to ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
+    """Raise for ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
     raise NotImplementedError(
-        f"{caller}: has derivatives in reverse mode only; use torch.func.jacrev, vjp or grad in "
-        "place of jacfwd, jvp or hessian."
+        f"{caller}: supports reverse mode only; use torch.func.jacrev, vjp or grad instead of "
+        "jacfwd, jvp or hessian."
     )
 
 
 def _plain(value: object) -> object:
-    """Return tensors of a class of somebody's own, whose results would be too, as tensors."""
+    """Convert tensor subclasses to plain tensors, so that results are plain too."""
     return value.as_subclass(Tensor) if is_tensor(value) and type(value) is not Tensor else value
 
 
 @contextmanager
 def made_on_cpu() -> Iterator[None]:
-    """Let tensors be made on the CPU here, though ``torch.set_default_device`` names another.
+    """Create tensors on the CPU, ignoring ``torch.set_default_device``.
 
     Example:
         >>> with torch.device("meta"), made_on_cpu():
@@ -198,10 +194,10 @@ def made_on_cpu() -> Iterator[None]:
 
 
 def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Keep compilers out of a function of clouds, and refuse tensors without values.
+    """Exclude a function of clouds from compilation, and reject tensors without data.
 
-    A compiler breaks its graph there and compiles the rest of the model. Tensors are made on the
-    CPU, as by :func:`made_on_cpu`, and subclasses of tensors are taken as tensors.
+    A compiler breaks its graph there and compiles the remaining model. Tensors are created on the
+    CPU, as by :func:`made_on_cpu`, and tensor subclasses become plain tensors.
     """
 
     @wraps(function)
@@ -212,8 +208,8 @@ def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
             return result
         if not has_values(*(value for value in (*args, *kwargs.values()) if is_tensor(value))):
             raise ShapeError(
-                f"{function.__name__}: expected points with values, got those of vmap, torch.func "
-                "or the meta device; functions of clouds run outside of them."
+                f"{function.__name__}: expected points with values, got a tensor of vmap, "
+                "torch.func or the meta device; call it outside of them."
             )
         with made_on_cpu():
             plain: Callable[..., Result] = function
@@ -223,7 +219,7 @@ def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
 
 
 def in_own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Let a function that multiplies matrices keep its dtype under ``torch.autocast``."""
+    """Disable ``torch.autocast`` in a function that multiplies matrices."""
 
     @wraps(function)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

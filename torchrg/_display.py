@@ -1,6 +1,6 @@
-"""How results show themselves in a notebook: called here, and registered from above.
+"""Hook for displaying results in notebooks.
 
-A segmentation shows itself through what draws, which stands far above it and is loaded only then.
+The display functions live in a higher layer, and are loaded on first use.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,10 @@ _loaders: list[Callable[[], ModuleType]] = []
 
 
 def register(load: Callable[[], ModuleType]) -> None:
-    """Let results be shown by the functions of the module that is loaded by a call."""
+    """Register the loader of the module with the display functions."""
     _loaders[:] = [load]
 
 
 def call(name: str, *arguments: Any, **settings: Any) -> Any:  # noqa: ANN401
-    """Call a function of the registered module by its name."""
+    """Call a function of the registered module by name."""
     return getattr(_loaders[0](), name)(*arguments, **settings)

@@ -1,8 +1,8 @@
-"""Functions that read values, made opaque to what has none: compilers, ``vmap``, ``torch.func``.
+"""Custom operations for data-dependent functions under compilers, ``vmap`` and ``torch.func``.
 
-These run a function on tensors that stand for others. A function of patches that sorts with NumPy,
-or takes as many steps as its points need, is an operation of its own to them, with a rule for
-batches and one for gradients; called on ordinary tensors it is an ordinary function.
+These transforms trace functions without concrete values. A function that sorts with NumPy, or
+iterates until convergence, is therefore an opaque operation to them, with a batching rule and a
+gradient rule. On ordinary tensors it is called directly.
 """
 
 import ast
@@ -20,7 +20,7 @@ from torchrg.errors import ConfigError
 
 
 class _Function(NamedTuple):
-    """A function of patches, what it returns without values, and which of that has gradients."""
+    """A function of patches, its outputs without values, and the differentiable ones."""
 
     run: Callable[..., Any]
     outputs: Callable[[Tensor], Any]
@@ -33,11 +33,12 @@ _FUNCTIONS: dict[str, _Function] = {}
 def opaque(
     outputs: Callable[[Tensor], Any], *, differentiable: Collection[int] = (0,)
 ) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Return a decorator for a function of patches, which all have the same leading axes.
+    """Return a decorator for a function of patches with shared leading axes.
 
-    The first argument is a tensor and the one that has a gradient; others are tensors or literals.
-    ``outputs`` makes tensors of the right shape and dtype from the first, in the kind of tuple that
-    the function returns, or one; ``differentiable`` are the places of those that have a gradient.
+    The first argument is a tensor, the only differentiable one; the others are tensors or literals.
+    ``outputs`` makes tensors of the right shape and dtype from the first, as a tuple of the same
+    kind as the result, or as one tensor; ``differentiable`` are the indices of the differentiable
+    outputs.
     """
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -49,7 +50,7 @@ def opaque(
 
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            # Compilers of torch 2.5 follow neither a zip of unequal lengths nor a union of dicts.
+            # Compilers of torch 2.5 support neither a zip of unequal lengths nor a union of dicts.
             arguments: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
             arguments = {**arguments, **kwargs}
             tensors = {key: arguments[key] for key in parameters if is_tensor(arguments.get(key))}
@@ -70,16 +71,16 @@ def opaque(
 
 
 def _check_literal(name: str, key: str, value: object) -> None:
-    """Raise if a setting cannot be part of an operation."""
+    """Raise if a setting cannot be an argument of an operation."""
     if not isinstance(value, bool | int | float | str):
         raise ConfigError(
             f"{name}: expected no {key} in a compiler or under vmap and torch.func, got "
-            f"{type(value).__name__}; call it outside, or leave {key} out."
+            f"{type(value).__name__}; call it outside, or omit {key}."
         )
 
 
 def _apply(call: str, tensors: list[Tensor]) -> list[Tensor]:
-    """Run an opaque function, with gradients if the first tensor wants them or may want them."""
+    """Run an opaque function, with gradients if the first tensor may need them."""
     if torch.compiler.is_compiling() and not tensors[0].requires_grad:
         outputs: list[Tensor] = _forward(tensors, call)
         return outputs
@@ -87,7 +88,7 @@ def _apply(call: str, tensors: list[Tensor]) -> list[Tensor]:
 
 
 def _parse(call: str, tensors: list[Tensor]) -> tuple[_Function, dict[str, Any]]:
-    """Return the function of a call, and its arguments by name."""
+    """Return the function of an encoded call, and its arguments by name."""
     name, keys, *settings = call.split("|")
     pairs = (setting.split("=", 1) for setting in settings)
     arguments = dict(zip(keys.split(","), tensors, strict=False))
@@ -99,7 +100,7 @@ def _as_list(outputs: Any) -> list[Tensor]:  # noqa: ANN401
     return [tensor for tensor in tensors if tensor is not None]
 
 
-# With their schemas, as torch 2.5 infers none from list[Tensor].
+# Explicit schemas, because torch 2.5 infers none from list[Tensor].
 @torch.library.custom_op(
     "torchrg::patchwise", mutates_args=(), schema="(Tensor[] tensors, str call) -> Tensor[]"
 )
@@ -112,7 +113,7 @@ def _forward(tensors: list[Tensor], call: str) -> list[Tensor]:
     "torchrg::patchwise_gradient", mutates_args=(), schema="(Tensor[] tensors, str call) -> Tensor"
 )
 def _backward(tensors: list[Tensor], call: str) -> Tensor:
-    """Return the gradient of the first tensor; those of the outputs follow the inputs."""
+    """Return the gradient of the first tensor; the output gradients follow the inputs."""
     function, arguments = _parse(call, tensors)
     gradients = tensors[call.split("|")[1].count(",") + 1 :]
     name = next(iter(arguments))
@@ -120,12 +121,12 @@ def _backward(tensors: list[Tensor], call: str) -> Tensor:
     def differentiate() -> Tensor:
         values = arguments[name].detach().clone().requires_grad_()
         outputs = _as_list(function.run(**{**arguments, name: values}))
-        chosen = [outputs[place] for place in function.differentiable]
+        chosen = [outputs[index] for index in function.differentiable]
         (gradient,) = torch.autograd.grad(chosen, values, gradients)
         copied: Tensor = gradient.clone()
         return copied
 
-    # Within an operation nothing is recorded for gradients; another thread is in none.
+    # Autograd is off within a custom operation, but not in another thread.
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(differentiate).result()
 
@@ -140,27 +141,27 @@ def _(tensors: list[Tensor], call: str) -> Tensor:
     return torch.empty_like(tensors[0])
 
 
-def _with_batch_first(size: int, places: list[int | None], tensors: list[Tensor]) -> list[Tensor]:
-    """Return tensors whose first axis is that of the batch."""
+def _with_batch_first(size: int, in_dims: list[int | None], tensors: list[Tensor]) -> list[Tensor]:
+    """Move the batch axis of each tensor to the front."""
     return [
-        tensor.expand(size, *tensor.shape) if place is None else tensor.movedim(place, 0)
-        for tensor, place in zip(tensors, places, strict=True)
+        tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+        for tensor, dim in zip(tensors, in_dims, strict=True)
     ]
 
 
 @_forward.register_vmap
-def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
-    outputs = _forward(_with_batch_first(info.batch_size, places[0], tensors), call)
+def _(info: Any, in_dims: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+    outputs = _forward(_with_batch_first(info.batch_size, in_dims[0], tensors), call)
     return outputs, [0] * len(outputs)
 
 
 @_backward.register_vmap
-def _(info: Any, places: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
-    return _backward(_with_batch_first(info.batch_size, places[0], tensors), call), 0
+def _(info: Any, in_dims: Any, tensors: list[Tensor], call: str) -> Any:  # noqa: ANN401
+    return _backward(_with_batch_first(info.batch_size, in_dims[0], tensors), call), 0
 
 
 class _Differentiable(torch.autograd.Function):
-    """An opaque function with its gradient, which is another one."""
+    """An opaque function with its gradient, itself an opaque operation."""
 
     @staticmethod
     def forward(call: str, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -170,28 +171,28 @@ class _Differentiable(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ANN401
         ctx.call, *tensors = inputs
         ctx.save_for_backward(*tensors)
-        places = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
-        ctx.mark_non_differentiable(*(o for i, o in enumerate(output) if i not in places))
+        indices = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
+        ctx.mark_non_differentiable(*(o for i, o in enumerate(output) if i not in indices))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:  # noqa: ANN401
-        places = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
-        tensors = [*ctx.saved_tensors, *(gradients[place].contiguous() for place in places)]
+        indices = _FUNCTIONS[ctx.call.split("|")[0]].differentiable
+        tensors = [*ctx.saved_tensors, *(gradients[index].contiguous() for index in indices)]
         if torch.compiler.is_compiling():
             first = _backward(tensors, ctx.call)
         else:
-            first = _Once.apply(ctx.call, *tensors)  # type: ignore[no-untyped-call]
+            first = _Gradient.apply(ctx.call, *tensors)  # type: ignore[no-untyped-call]
         return None, first, *[None] * (len(ctx.saved_tensors) - 1)
 
     @staticmethod
-    def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
-        first = _with_batch_first(info.batch_size, places[1:], list(tensors))
+    def vmap(info: Any, in_dims: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
+        first = _with_batch_first(info.batch_size, in_dims[1:], list(tensors))
         outputs = _operation().apply(call, *first)  # type: ignore[no-untyped-call]
         return outputs, (0,) * len(outputs)
 
 
-class _Refusing(_Differentiable):
-    """The same outside of compilers, which take no operation with a rule for forward mode."""
+class _ReverseOnly(_Differentiable):
+    """The same outside of compilers, which reject operations with a rule for forward mode."""
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
@@ -199,11 +200,11 @@ class _Refusing(_Differentiable):
 
 
 def _operation() -> type[_Differentiable]:
-    return _Differentiable if torch.compiler.is_compiling() else _Refusing
+    return _Differentiable if torch.compiler.is_compiling() else _ReverseOnly
 
 
-class _Once(torch.autograd.Function):
-    """The gradient of an opaque function, which has none itself."""
+class _Gradient(torch.autograd.Function):
+    """Gradient of an opaque function, without second derivatives."""
 
     @staticmethod
     def forward(call: str, *tensors: Tensor) -> Tensor:
@@ -219,9 +220,9 @@ class _Once(torch.autograd.Function):
         raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")
 
     @staticmethod
-    def vmap(info: Any, places: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
-        first = _with_batch_first(info.batch_size, places[1:], list(tensors))
-        return _Once.apply(call, *first), 0  # type: ignore[no-untyped-call]
+    def vmap(info: Any, in_dims: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
+        first = _with_batch_first(info.batch_size, in_dims[1:], list(tensors))
+        return _Gradient.apply(call, *first), 0  # type: ignore[no-untyped-call]
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401

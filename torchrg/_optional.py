@@ -1,4 +1,4 @@
-"""Imports of optional packages, made where they are used."""
+"""Lazy imports of optional packages."""
 
 import importlib
 from types import ModuleType
@@ -7,9 +7,10 @@ from torchrg.errors import MissingDependencyError
 
 
 def require(module: str, *, extra: str, purpose: str) -> ModuleType:
-    """Import an optional module, or say how to install it.
+    """Import an optional module, or raise with the install command.
 
-    ``extra`` of torchrg brings it; ``purpose`` completes "... is needed to <purpose>".
+    ``extra`` is the extra of torchrg with the module; ``purpose`` completes "... is needed to
+    <purpose>".
 
     Raises:
         MissingDependencyError: If the module is not installed.

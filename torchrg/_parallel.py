@@ -1,8 +1,8 @@
-"""Work on many rows: chunks that fit the cache, on as many threads as torch may use.
+"""Chunked, multi-threaded work on rows.
 
-A thread here takes whole tasks and works alone on each operation. Threads of OpenMP, which torch
-would use within an operation, wait for each other while they compute: where another process wants
-a core, that takes ten times as long and more.
+Each thread takes whole tasks and runs every operation alone. OpenMP threads within an operation,
+torch's default, wait for each other. If another process needs a core, that takes ten times as long
+or more.
 """
 
 import ctypes
@@ -26,35 +26,37 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 CACHE_BYTES = 2**22
-"""Bytes of one array that a thread works on at a time, so that it stays in the cache."""
+"""Size of one array processed at a time by a thread, in bytes, so that it stays in the cache."""
 
 ROWS_IN_CACHE = 8192
-"""Rows of some fifty values that a thread works on at a time, so that they stay in the cache."""
+"""Number of rows of about 50 values processed at a time by a thread, so that they stay in the
+cache."""
 
 CHUNK_SIZE = 16384
-"""Points that each stage handles at a time by default."""
+"""Default number of points processed at a time by each stage."""
 
 ROWS_AT_ONCE = 65536
-"""Rows that one pass over a cloud takes at a time: few calls, and temporaries of bounded memory."""
+"""Number of rows per pass over a cloud: few calls, temporaries of bounded memory."""
 
 CHILD_ENVIRONMENT = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
 ) | {"PYTHONSAFEPATH": "1"}
-"""Environment of every process that is started here, set before Python and its libraries read it:
-one thread, and no module from the folder that the command runs in."""
+"""Environment of all child processes, read by Python and its libraries at startup: one thread, and
+no imports from the working directory."""
 
 _MIN_ROWS = 4096
-"""Rows at some tenths of a microsecond each that are worth a thread's start."""
+"""Minimum number of rows per thread: at a few tenths of a microsecond each they outweigh its
+start."""
 
-_KEPT_BYTES = 31 * 2**20
-"""Just below 32 MiB, the largest freed block from which glibc learns what to keep."""
+_RETAINED_BYTES = 31 * 2**20
+"""Just below 32 MiB, the largest freed block that raises the trim threshold of glibc."""
 
 
 @contextmanager
 def in_empty_folder() -> Iterator[None]:
-    """Start processes in a folder without modules, as Python 3.10 and libraries import from there.
+    """Start processes in an empty directory, because Python 3.10 and libraries import from there.
 
-    Paths that they are given have to be absolute.
+    Their paths must be absolute.
     """
     folder = Path.cwd()
     os.chdir("/")
@@ -65,7 +67,7 @@ def in_empty_folder() -> Iterator[None]:
 
 
 def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
-    """Cut ``num_rows`` rows into slices of at most ``chunk_size`` rows.
+    """Split ``num_rows`` rows into slices of at most ``chunk_size`` rows.
 
     Example:
         >>> chunks_of(5, 2)
@@ -84,10 +86,10 @@ def map_chunks(
     *,
     least: int = _MIN_ROWS,
 ) -> list[Result]:
-    """Call ``work`` on slices that together cover all rows, in their order; see :func:`map_tasks`.
+    """Call ``work`` on slices that cover all rows, in order; see :func:`map_tasks`.
 
-    Without rows it is called once, on an empty slice; ``least`` is the number of rows below which
-    another thread is not worth its start.
+    Without rows it is called once, on an empty slice. ``least`` is the minimum number of rows per
+    thread.
 
     Example:
         >>> map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu"))
@@ -96,7 +98,7 @@ def map_chunks(
         [slice(0, 0, None)]
     """
     num_threads = allowed_threads() if device.type == "cpu" else 1
-    # All threads have equally many slices.
+    # Each thread gets the same number of slices.
     num_chunks = -(-num_rows // (chunk_size * num_threads)) * num_threads
     size = max(-(-num_rows // max(num_chunks, 1)), min(least, chunk_size))
     return map_tasks(work, chunks_of(num_rows, size) or [slice(0, 0)], device)
@@ -105,10 +107,10 @@ def map_chunks(
 def map_rows(
     work: Callable[..., Sequence[Tensor]], columns: Sequence[Tensor], *others: Tensor
 ) -> list[Tensor]:
-    """Call ``work`` on an equal share of rows for each thread, and return what it returns, whole.
+    """Call ``work`` on one equal block of rows per thread, and concatenate the results.
 
-    It takes rows of each of the ``columns``, of one length, then the ``others`` as they are, and
-    returns tensors of rows.
+    It receives the rows of each of the ``columns``, which have the same length, then the ``others``
+    unchanged, and returns tensors of rows.
 
     Example:
         >>> map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3))
@@ -125,7 +127,7 @@ def map_rows(
 
 
 def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:
-    """Call ``work`` on chunks of the row numbers of the chosen points; see :func:`map_chunks`."""
+    """Call ``work`` on chunks of the row indices of the chosen points; see :func:`map_chunks`."""
     rows = places_of(chosen)
     return map_chunks(lambda chunk: work(rows[chunk]), len(rows), chunk_size, rows.device)
 
@@ -133,9 +135,9 @@ def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int
 def map_tasks(
     work: Callable[[Task], Result], tasks: Sequence[Task], device: torch.device
 ) -> list[Result]:
-    """Return what ``work`` returns for each task, on a CPU on as many threads as torch may use.
+    """Return the result of ``work`` for each task; on a CPU, multi-threaded.
 
-    Every task writes its own rows, so the result does not depend on the number of threads.
+    Every task writes different rows, so the result does not depend on the number of threads.
 
     Example:
         >>> map_tasks(len, ["a", "bc"], torch.device("cpu"))
@@ -143,7 +145,7 @@ def map_tasks(
     """
     if device.type != "cpu":
         return [work(task) for task in tasks]
-    _keep_freed_memory()
+    _retain_freed_memory()
     num_threads = min(allowed_threads(), len(tasks))
     with sequential_operations():
         if num_threads < 2:
@@ -152,17 +154,17 @@ def map_tasks(
 
         def take_tasks() -> None:
             try:
-                for place, task in waiting:
-                    results[place] = work(task)
+                for index, task in waiting:
+                    results[index] = work(task)
             finally:
-                # After an error nobody begins another task.
+                # Drain the queue after an error, so that no further task starts.
                 for _ in waiting:
                     pass
 
-        # This thread works too: until others run, and instead of them where no core is free.
+        # The calling thread also processes tasks.
         settings = torch.is_grad_enabled(), torch.is_inference_mode_enabled(), copy_context()
         with ThreadPoolExecutor(
-            num_threads - 1, initializer=_begin_thread, initargs=settings
+            num_threads - 1, initializer=_init_thread, initargs=settings
         ) as pool:
             others = [pool.submit(take_tasks) for _ in range(num_threads - 1)]
             token = _THREADS.set(1)
@@ -172,15 +174,15 @@ def map_tasks(
                 _THREADS.reset(token)
             for other in others:
                 other.result()
-        return [results[place] for place in range(len(tasks))]
+        return [results[index] for index in range(len(tasks))]
 
 
 @contextmanager
 def sequential_operations() -> Iterator[None]:
-    """Let each operation of torch run on this thread alone; also a decorator.
+    """Run each torch operation on this thread alone; also a decorator.
 
-    :func:`map_tasks` goes on to use as many threads as torch might before. Other threads keep their
-    setting, which :func:`torch.set_num_threads` would change for those that start meanwhile.
+    :func:`map_tasks` still uses torch's previous number of threads. Unlike
+    :func:`torch.set_num_threads`, this does not change other threads.
 
     Example:
         >>> before = torch.get_num_threads()
@@ -194,48 +196,48 @@ def sequential_operations() -> Iterator[None]:
         yield
         return
     token = _THREADS.set(torch.get_num_threads())
-    before = _set_own_threads([1] * (1 + len(_openmp_libraries())))
+    before = _set_thread_counts([1] * (1 + len(_openmp_libraries())))
     try:
         yield
     finally:
-        _set_own_threads(before)
+        _set_thread_counts(before)
         _THREADS.reset(token)
 
 
 _THREADS: ContextVar[int | None] = ContextVar("threads", default=None)
-"""How many threads the tasks of this call may use; None outside of calls."""
+"""Number of threads for the tasks of this call; None outside of calls."""
 
 
 def allowed_threads() -> int:
-    """Return on how many threads tasks may run."""
+    """Return the number of threads for tasks."""
     return _THREADS.get() or torch.get_num_threads()
 
 
 def num_cores() -> int:
-    """Return the number of cores that this process may use."""
+    """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_OF_THREAD = threading.local()
+_THREAD_LOCAL = threading.local()
 
 
-def _begin_thread(grad_enabled: bool, inference: bool, context: Context) -> None:
-    """Let a thread work alone on each operation, with the settings of the one that started it."""
+def _init_thread(grad_enabled: bool, inference: bool, context: Context) -> None:
+    """Limit a worker thread to sequential operations, with the settings of its parent."""
     for variable, value in context.items():
         variable.set(value)
     _THREADS.set(1)
-    # Torch gives a thread its number of threads when the thread first asks for it.
+    # Torch sets the number of threads of a thread at its first query.
     torch.get_num_threads()
-    _set_own_threads([1] * (1 + len(_openmp_libraries())))
+    _set_thread_counts([1] * (1 + len(_openmp_libraries())))
     torch.set_grad_enabled(grad_enabled)
     if inference:
-        # The mode lasts as long as its guard, and this as long as the thread.
-        _OF_THREAD.inference = torch.inference_mode()
-        _OF_THREAD.inference.__enter__()
+        # The mode lasts as long as its guard, here as long as the thread.
+        _THREAD_LOCAL.inference = torch.inference_mode()
+        _THREAD_LOCAL.inference.__enter__()
 
 
-def _set_own_threads(numbers: Sequence[int]) -> list[int]:
-    """Set MKL's threads of this thread (0: its default), then OpenMP's; return those before."""
+def _set_thread_counts(numbers: Sequence[int]) -> list[int]:
+    """Set this thread's MKL (0: default) and OpenMP thread counts; return the previous ones."""
     mkl, libraries = _mkl_setter(), _openmp_libraries()
     before = [mkl(numbers[0]), *(library.num_threads for library in libraries)]
     for library, number in zip(libraries, numbers[1:], strict=True):
@@ -245,15 +247,15 @@ def _set_own_threads(numbers: Sequence[int]) -> list[int]:
 
 @lru_cache(maxsize=1)
 def _openmp_libraries() -> list[Any]:
-    """Return the OpenMP libraries of this process, whose setting is one of each thread."""
+    """Return the OpenMP libraries of this process; their setting is per thread."""
     return list(ThreadpoolController().select(user_api="openmp").lib_controllers)
 
 
 @lru_cache(maxsize=1)
 def _mkl_setter() -> Callable[[int], int]:
-    """Return what sets and returns MKL's number of threads for this thread.
+    """Return the function that sets MKL's thread count of this thread and returns the previous one.
 
-    Torch sets it too, and MKL asks OpenMP only where it is 0; without MKL it stays 0.
+    Torch sets it too; MKL falls back to OpenMP's count only if it is 0. Without MKL it stays 0.
     """
     for library in Path(torch.__file__).parent.glob("lib/*torch_cpu.*"):
         setter = getattr(ctypes.CDLL(str(library)), "MKL_Set_Num_Threads_Local", None)
@@ -263,31 +265,31 @@ def _mkl_setter() -> Callable[[int], int]:
 
 
 @lru_cache(maxsize=1)
-def _keep_freed_memory() -> None:
-    """Free one large block, once: glibc then keeps what is freed instead of returning it.
+def _retain_freed_memory() -> None:
+    """Free one large block once, so that glibc keeps freed memory instead of returning it.
 
-    Otherwise every temporary tensor of some hundred kilobytes is fetched from the system page by
-    page again: without this, segmenting 200,000 points takes a third more CPU time.
+    Otherwise every temporary tensor of some hundred kilobytes is paged in again: segmenting 200,000
+    points then takes a third more CPU time.
     """
-    block = torch.empty(_KEPT_BYTES, dtype=torch.uint8)
+    block = torch.empty(_RETAINED_BYTES, dtype=torch.uint8)
     del block
 
 
 def return_freed_memory() -> None:
-    """Give the system back what the C library keeps of freed memory, where it can: with glibc."""
+    """Return freed memory that glibc keeps to the system; no effect with other C libraries."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)
 
 
 def places_of(mask: Tensor) -> Tensor:
-    """Return where a mask is True, counted along all its elements, shape ``(n,)``, int64.
+    """Return the flat indices of True elements, shape ``(n,)``, int64.
 
     Example:
         >>> places_of(torch.tensor([[True, False], [False, True]]))
         tensor([0, 3])
     """
     if mask.device.type == "cpu":
-        # Ten times faster than torch's, and than selecting by the mask.
+        # Ten times faster than nonzero in torch, and than indexing with the mask.
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.reshape(-1).nonzero().squeeze(1)

@@ -1,15 +1,15 @@
-"""Exceptions that torchrg raises on purpose, and warnings that have a class of their own.
+"""Exceptions and warnings of torchrg.
 
-All exceptions are a :class:`TorchrgError`; the message says what was expected, what came, and the
-repair.
+All exceptions derive from :class:`TorchrgError`; messages contain the requirement, the value and
+the fix.
 """
 
-OUT_OF_MEMORY = "out of memory; use a machine with more, or a smaller part of the data."
-"""Message where memory could not be had, whatever for."""
+OUT_OF_MEMORY = "out of memory; use a machine with more memory, or a smaller part of the data."
+"""Message of any out-of-memory error."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error says that memory ran out; torch raises a RuntimeError.
+    """Return whether an error means out of memory; torch raises a RuntimeError.
 
     Example:
         >>> is_out_of_memory(MemoryError()), is_out_of_memory(RuntimeError("shape mismatch"))
@@ -26,24 +26,24 @@ class TorchrgError(Exception):
 
 
 class ShapeError(TorchrgError, ValueError):
-    """A tensor has the wrong number of axes, axes that disagree, or the wrong dtype or device."""
+    """A tensor has an invalid or inconsistent shape, dtype or device."""
 
 
 class FormatError(TorchrgError, ValueError):
-    """A file is missing, damaged, or does not hold what was asked of it."""
+    """A file is missing, corrupt, or lacks the requested data."""
 
 
 class ConfigError(TorchrgError, ValueError):
-    """A setting is unknown, or its value is not allowed."""
+    """A setting is unknown, or its value is invalid."""
 
 
 class MissingDependencyError(TorchrgError, ImportError):
-    """An optional package is needed and is not installed."""
+    """A required optional package is not installed."""
 
 
 class PrecisionWarning(UserWarning):
-    """Coordinates have lost digits that the spacing of their points needs."""
+    """The rounding step of coordinates is coarse for the spacing of the points."""
 
 
 class DepthWarning(UserWarning):
-    """A camera or a depth scale is assumed, or hardly belongs to its depth image."""
+    """A camera or depth scale is assumed, or does not fit its depth image."""

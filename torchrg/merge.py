@@ -1,4 +1,4 @@
-"""Several clouds as one: the points of one after those of the other."""
+"""Concatenation of clouds."""
 
 import copy
 from collections import Counter
@@ -14,37 +14,37 @@ from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.structures import Cloud
 
 _SUSPICIOUS_RATIO = 100
-"""Ratio of the sizes of two clouds from which on the user is warned. Tiles of one survey differ
-less, and a cloud in centimetres differs from one in metres by this much."""
+"""Ratio of the extents of two clouds from which a warning is issued: tiles of one survey differ
+less, clouds in centimeters and meters by this factor."""
 _PROJECTION = "LASF_Projection"
-"""Owner of the records that say in which coordinates a LAS file is."""
+"""User ID of the LAS records that store the coordinate reference system."""
 
 
 def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
-    """Put the points of several clouds one after the other, with the fields that they share.
+    """Concatenate clouds, keeping the fields they share.
 
     Convention:
-        A field is kept if every cloud has it with as many columns of one kind of numbers, and
-        colours of as many bits. Coordinates are float64 if any are. Of the headers that is kept in
-        which all agree; of LAS files it is one with the finest scale, if they have the same
-        dimensions and its grid reaches all points; of E57 files all scans. The notes say in one
-        line what is left out.
+        A field is kept if all clouds have it with the same shape and kind of numbers, and colors
+        with the same bit depth. Coordinates are float64 if any are. Header entries are kept if
+        equal in all files. For LAS files the header with the finest scale is kept if the dimensions
+        agree and its grid covers all points; for E57 files all scans are kept. The notes list the
+        dropped data.
 
     Args:
-        clouds: The clouds, at least one; their coordinates are taken to be of one frame and unit.
+        clouds: At least one cloud; all must use the same frame and unit.
 
     Raises:
-        FormatError: If there are no clouds, or if two name different coordinate reference systems,
-            or LAS files count GPS times differently.
+        FormatError: If there are no clouds, two clouds have different coordinate reference systems,
+        or LAS files have different kinds of GPS times.
 
     Example:
         >>> clouds = [Cloud(np.eye(3), {"labels": np.arange(3)}), Cloud(np.zeros((1, 3)))]
         >>> merged = merge_clouds(clouds)
         >>> len(merged), merged.notes
-        (4, ('fields left out, as not all files have them alike: labels',))
+        (4, ('fields left out, because not all files share them: labels',))
     """
     if not clouds:
-        raise FormatError("merge: expected at least one cloud, got none; name a file.")
+        raise FormatError("merge: expected at least one cloud, got none; pass a file.")
     if len(clouds) == 1:
         return clouds[0]
     notes = [f"{cloud.source}: {note}" for cloud in clouds for note in cloud.notes]
@@ -59,11 +59,11 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
         for kind, entry in cloud.header.items()
         if kind not in header and entry != DEFAULT_VIEWPOINT
     )
-    for what, left in (("fields", lost), ("facts of the header", dropped)):
+    for what, left in (("fields", lost), ("header entries", dropped)):
         if left:
-            notes.append(f"{what} left out, as not all files have them alike: {', '.join(left)}")
+            notes.append(f"{what} left out, because not all files share them: {', '.join(left)}")
     times = Counter(cloud.source for cloud in clouds if cloud.source)
-    notes += [f"{name} is taken {count} times" for name, count in times.items() if count > 1]
+    notes += [f"{name} is used {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(clouds)
     fronts = [np.zeros((len(c), 3), np.float32) if c.front is None else c.front for c in clouds]
     has_front = any(cloud.front is not None for cloud in clouds)
@@ -78,7 +78,7 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
 
 
 def _kind(name: str, cloud: Cloud) -> object:
-    """Return what two clouds have to share of a field, which no two do of numbers of scans."""
+    """Return the properties of a field that clouds must share; scan numbers are never shared."""
     values = cloud.fields.get(name)
     if values is None or (name == "scan" and "scans" in cloud.header):
         return id(cloud)
@@ -86,7 +86,7 @@ def _kind(name: str, cloud: Cloud) -> object:
 
 
 def _note_sizes(clouds: Sequence[Cloud]) -> list[str]:
-    """Say which clouds differ so much in size that their units may, too."""
+    """Return a note if the extents of clouds differ so much that their units may differ."""
     finite = [(cloud.source, cloud.coordinates[cloud.finite]) for cloud in clouds]
     sizes = [(float(np.ptp(values, axis=0).max()), name) for name, values in finite if len(values)]
     positive = [size for size in sizes if size[0] > 0]
@@ -96,13 +96,13 @@ def _note_sizes(clouds: Sequence[Cloud]) -> list[str]:
     if large < _SUSPICIOUS_RATIO * small:
         return []
     return [
-        f"{largest} is {large / small:,.0f} times as large as {smallest}; expected coordinates of "
-        "one unit"
+        f"{largest} is {large / small:,.0f} times as large as {smallest}; check that both use the "
+        "same unit"
     ]
 
 
 def _common_header(clouds: Sequence[Cloud]) -> Mapping[str, Any]:
-    """Return the entries of the headers in which all clouds agree, and all scans."""
+    """Return the header entries equal in all clouds, and all scans."""
     headers = [cloud.header for cloud in clouds]
     common = dict[str, Any]()
     for kind, entry in headers[0].items():
@@ -118,9 +118,9 @@ def _common_header(clouds: Sequence[Cloud]) -> Mapping[str, Any]:
 
 
 def _common_las(clouds: Sequence[Cloud]) -> Mapping[str, Any]:
-    """Return the header of the first LAS file with a grid for all, if their dimensions agree."""
+    """Return the header of the first LAS file with a grid for all points, if dimensions agree."""
     headers = [cloud.header["las"] for cloud in clouds]
-    # As text, because the scales of a dimension of several elements do not compare to one truth.
+    # Compared as text, because scales of dimensions with several elements compare elementwise.
     if len({repr((h.point_format.id, [*h.point_format.dimensions])) for h in headers}) > 1:
         return {}
     header = copy.deepcopy(headers[0])
@@ -130,7 +130,7 @@ def _common_las(clouds: Sequence[Cloud]) -> Mapping[str, Any]:
 
 
 def _check_systems(clouds: Sequence[Cloud]) -> list[str]:
-    """Refuse clouds in different coordinate reference systems, and say if not all name one."""
+    """Raise for different coordinate reference systems; return a note if some clouds have none."""
     named = [(cloud, system) for cloud in clouds if (system := _system(cloud))]
     for kind in ("las", SYSTEM):
         systems = [(cloud.source, system) for cloud, system in named if kind in cloud.header]
@@ -142,12 +142,12 @@ def _check_systems(clouds: Sequence[Cloud]) -> list[str]:
     ]
     _check_equal(times, "kind of GPS times", "convert one of them, or leave gps_time out")
     if 0 < len(named) < len(clouds):
-        return [f"only {len(named)} of {len(clouds)} files name a coordinate system"]
+        return [f"only {len(named)} of {len(clouds)} files have a coordinate reference system"]
     return []
 
 
 def _check_equal(facts: Sequence[tuple[str, object]], what: str, repair: str) -> None:
-    """Raise FormatError if the facts about two files differ."""
+    """Raise FormatError if the values of two files differ."""
     for source, fact in facts[1:]:
         if fact != facts[0][1]:
             raise FormatError(
@@ -156,7 +156,7 @@ def _check_equal(facts: Sequence[tuple[str, object]], what: str, repair: str) ->
 
 
 def _system(cloud: Cloud) -> object:
-    """Return what says in which coordinate reference system a cloud is; empty if nothing does."""
+    """Return the coordinate reference system of a cloud; empty if unknown."""
     if "las" not in cloud.header:
         return cloud.header.get(SYSTEM, "")
     records = [*cloud.header["las"].vlrs, *(cloud.header["las"].evlrs or ())]

@@ -1,7 +1,7 @@
-"""Faces of a mesh: which side of the surface is the front at each vertex.
+"""Mesh faces: front direction of the surface at each vertex.
 
-A face is a list of three or more vertices, counter-clockwise as seen from its front. Nothing is
-kept of it but what it adds to sums at its vertices.
+A face is a list of at least three vertices, counter-clockwise seen from its front. Faces are not
+kept, only their contribution to the sums of their vertices.
 """
 
 from collections.abc import Iterable
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from torchrg.errors import FormatError
 
 Fronts = tuple[NDArray[np.float32] | None, tuple[str, ...]]
-"""Front of each point of a cloud, as :attr:`torchrg.Cloud.front`, and notes on it."""
+"""Front directions of a cloud, as in :attr:`torchrg.Cloud.front`, and notes about them."""
 _CORNERS_AT_ONCE = 1 << 18
-"""Corners of faces that are added up together, which take some tens of megabytes."""
+"""Number of face corners added at a time; they take some tens of megabytes."""
 _MAX_CORNERS = 2
-"""Corners of a face by the vertices of its mesh. A face with holes has the vertices of the edges
-that lead to them twice; a larger one is damage, for which no memory is taken."""
+"""Maximum number of corners of a face, as a multiple of the number of vertices. A face with holes
+visits some vertices twice; a larger face means a corrupt file."""
 _MIN_AGREEMENT = 1e-3
-"""Least length of a sum of normals as a share of the areas. A shorter one is rounding, as where
-each face is there twice, once for each of its sides."""
+"""Minimum length of a sum of normals, as a fraction of the sum of areas. Shorter sums are rounding
+noise, as for meshes with every face in both orientations."""
 
 
 def find_fronts(
@@ -28,42 +28,43 @@ def find_fronts(
     coordinates: NDArray[np.floating],
     finite: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """Return the direction in which the front of the surface lies at each vertex.
+    """Return the front direction of the surface at each vertex.
 
-    It is that of the sum of the normals of the faces at the vertex, weighted by area.
+    The direction is the area-weighted sum of the normals of the adjacent faces.
 
     Args:
-        faces: Vertices of faces with equally many corners, each of shape ``(n, corners)``.
-        coordinates: Those of the vertices, shape ``(N, 3)``.
-        finite: Which vertices have a place, shape ``(N,)``; faces with others do not count.
+        faces: Blocks of vertex indices of faces with the same number of corners, shape ``(n,
+            corners)``.
+        coordinates: Vertex coordinates, shape ``(N, 3)``.
+        finite: Mask of vertices with finite coordinates, shape ``(N,)``; other faces are ignored.
 
     Returns:
-        Unit vectors, shape ``(N, 3)``; zero where no face has the vertex, or its faces cancel.
+        Unit vectors, shape ``(N, 3)``; zero for vertices without faces, or whose faces cancel.
 
     Raises:
-        FormatError: If a face has a vertex that there is not.
+        FormatError: If a vertex index is out of range.
 
     Example:
         >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         >>> find_fronts([np.array([[0, 2, 1]])], square, np.ones(4, bool)).tolist()
         [[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]
     """
-    places, count = coordinates.astype(np.float64, copy=False), len(coordinates)
+    positions, count = coordinates.astype(np.float64, copy=False), len(coordinates)
     sums, areas = np.zeros((3, count)), np.zeros(count)
     for block in faces:
         if block.shape[1] > _MAX_CORNERS * count:
             raise FormatError(
-                f"expected faces of {count:,} vertices, got one of {block.shape[1]:,} corners"
+                f"expected at most {_MAX_CORNERS * count:,} corners a face, got {block.shape[1]:,}"
             )
         corners = block.astype(np.int64)
         if corners.size and not 0 <= corners.min() <= corners.max() < count:
             wrong = corners.min() if corners.min() < 0 else corners.max()
-            raise FormatError(f"expected faces of {count:,} vertices, got vertex {wrong:,}")
+            raise FormatError(f"expected vertex indices in [0, {count:,}), got {wrong:,}")
         at_once = max(_CORNERS_AT_ONCE // max(corners.shape[1], 1), 1)
         for start in range(0, len(corners) if corners.shape[1] > 2 else 0, at_once):
             part = corners[start : start + at_once]
             part = part[finite[part].all(axis=1)]
-            normals = _vector_areas(places, part)
+            normals = _vector_areas(positions, part)
             sizes = np.linalg.norm(normals, axis=1)
             for total, values in zip((areas, *sums), (sizes, *normals.T), strict=True):
                 np.add.at(total, part.reshape(-1), np.repeat(values, part.shape[1]))
@@ -73,8 +74,8 @@ def find_fronts(
     return np.ascontiguousarray(fronts.T, dtype=np.float32)
 
 
-def _vector_areas(places: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the normals of faces, twice as long as their areas, shape ``(n, 3)``."""
-    arms = places[faces[:, 1:]] - places[faces[:, :1]]
-    areas: NDArray[np.float64] = np.cross(arms[:, :-1], arms[:, 1:]).sum(axis=1)
+def _vector_areas(positions: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the normals of faces, scaled to twice their areas, shape ``(n, 3)``."""
+    edges = positions[faces[:, 1:]] - positions[faces[:, :1]]
+    areas: NDArray[np.float64] = np.cross(edges[:, :-1], edges[:, 1:]).sum(axis=1)
     return areas

@@ -1,7 +1,6 @@
-"""Module forms of the batched functions: they hold settings, checked when they are made.
+"""Modules for the batched functions, with settings checked at construction.
 
-A module takes tensors and gives what the next one takes, so that they stand in a
-:class:`torch.nn.Sequential`, and with other modules in a model:
+Modules take and return tensors, and can be chained in :class:`torch.nn.Sequential`:
 
 >>> rng = torch.Generator().manual_seed(0)
 >>> patches = torch.randn(8, 30, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.01])
@@ -13,9 +12,10 @@ True
 >>> model(patches).shape
 torch.Size([8, 2])
 
-Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, these to :class:`Eigh`, and this to
-:class:`Normal`; :class:`PatchNormals` does it in one, by any estimator. A robust fit is that of the
-majority, on a line too: with ``min_dimension=2`` lines are set aside, as normals need planes.
+Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, then to :class:`Eigh` and
+:class:`Normal`; :class:`PatchNormals` combines these steps for any estimator. A robust fit
+describes the majority, even points on a line; with ``min_dimension=2`` lines are excluded, since
+normals need planes.
 """
 
 from collections.abc import Callable
@@ -51,11 +51,11 @@ from torchrg.structures import NormalFit
 
 @dataclass(eq=False, repr=False)
 class _Function(nn.Module):
-    """A function whose settings are attributes, the fields of the class, checked and shown."""
+    """A function with its settings as fields."""
 
     def __post_init__(self) -> None:
         super().__init__()
-        # The function of no patches says what is wrong with the settings.
+        # A call without patches validates the settings.
         self(torch.empty(0, 4, 3))
 
     def extra_repr(self) -> str:
@@ -64,7 +64,7 @@ class _Function(nn.Module):
 
 
 class Covariance(_Function):
-    """Covariance of patches; their mean is the other result of :func:`torchrg.linalg.covariance`.
+    """Covariance of patches; see :func:`torchrg.linalg.covariance`, which also returns the mean.
 
     Example:
         >>> Covariance()(torch.tensor([[0.0, 0], [2, 0], [0, 4], [2, 4]])).diagonal()
@@ -85,7 +85,7 @@ class Eigen(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class Eigh(_Function):
-    """Eigenvalues, ascending, and eigenvectors of symmetric matrices, or of robust fits.
+    """Ascending eigenvalues and eigenvectors of symmetric matrices or robust fits.
 
     Example:
         >>> Eigh()(torch.diag(torch.tensor([3.0, 1.0, 2.0]))).values
@@ -136,7 +136,7 @@ class Qn(_Function):
 
     def __post_init__(self) -> None:
         if type(self.dim) is not int:
-            raise ConfigError(f"Qn: expected dim to be a whole number, got {self.dim!r}.")
+            raise ConfigError(f"Qn: expected dim to be an integer, got {self.dim!r}.")
         nn.Module.__init__(self)
 
     def forward(self, values: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -170,7 +170,7 @@ class DetMCD(_Function):
 
 @dataclass(eq=False, repr=False)
 class FastMCD(_Function):
-    """MCD of patches with random starts; with the settings of :func:`torchrg.robust.fit_fastmcd`.
+    """MCD of patches with random starts, with the settings of :func:`torchrg.robust.fit_fastmcd`.
 
     Example:
         >>> FastMCD()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
@@ -218,7 +218,7 @@ class MVE(_Function):
         mask: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> RobustFit:
-        """Return the fits; the generator draws the sets."""
+        """Return the fits; the generator draws the subsets."""
         return fit_mve(patches, mask, generator=generator, **asdict(self))
 
 
@@ -226,7 +226,7 @@ class MVE(_Function):
 class DetS(_Function):
     """Deterministic S-estimator of patches, with settings of :func:`torchrg.robust.fit_dets`.
 
-    Its gradients are those of the last step, with the weights of the points held fixed.
+    Gradients are those of the last step, with fixed weights of the points.
 
     Example:
         >>> DetS()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
@@ -248,7 +248,7 @@ class DetS(_Function):
 class DetMM(_Function):
     """Deterministic MM-estimator of patches, with settings of :func:`torchrg.robust.fit_detmm`.
 
-    Its gradients are those of the last step, with the weights of the points held fixed.
+    Gradients are those of the last step, with fixed weights of the points.
 
     Example:
         >>> DetMM()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
@@ -284,13 +284,13 @@ _ROBUST: dict[str, Callable[..., RobustFit]] = {
 
 
 class PatchNormals(nn.Module):
-    """Unit normals of patches by an estimator of single neighbourhoods.
+    """Unit normals of patches, by any estimator.
 
-    ``settings`` are keywords of the method, as in ``support_fraction=0.75``; ``irls`` needs
-    ``noise``, one number in the unit of the points.
+    ``settings`` are keyword arguments of the method, such as ``support_fraction=0.75``; ``irls``
+    needs ``noise``, a number in units of the points.
 
     Raises:
-        ConfigError: If there is no such estimator, or it has no such setting or value.
+        ConfigError: If the method, a setting or a value is invalid.
 
     Example:
         >>> corner = torch.eye(3)[[0, 1, 2, 0, 1, 2]]
@@ -305,7 +305,7 @@ class PatchNormals(nn.Module):
         if method == "irls" and not settings.get("noise", 0) > 0:
             raise ConfigError(
                 "PatchNormals: expected noise > 0 with method='irls', got none; pass noise=, in "
-                "the unit of the points."
+                "units of the points."
             )
         try:
             self.fit(torch.empty(0, 4, 3))

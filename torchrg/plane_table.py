@@ -1,6 +1,6 @@
-"""The plane table in files: arrays in ``.npz``, JSON in folders of arrays, CSV for other programs.
+"""Plane tables in files: ``.npz`` arrays, JSON and CSV.
 
-:func:`describe_planes` says what is known of a plane; the others are made of it.
+:func:`describe_planes` creates the JSON form, from which the CSV form is derived.
 """
 
 import csv
@@ -17,36 +17,36 @@ from torch import Tensor
 from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Array, PlaneAdjacency, Planes
 
 Arrays = dict[str, Array]
-"""Parts of the table by their names in ``.npz``."""
+"""Arrays of a plane table by their names in ``.npz``."""
 Json = dict[str, Any]
-"""Parts of the table as JSON can hold them, by name."""
+"""JSON-compatible values by name."""
 CSV_COLUMNS = (
     "id", "kind", "object", "normal", "offset", "centroid", "area", "count", "rms", "dip_deg",
     "dip_direction_deg", "curved", "outline",
 )  # fmt: skip
-"""Columns of CSV and of data frames, empty where nothing is known. Directions and places are three
-of them, as ``normal_x``; an outline is text, a WKT ``POLYGON Z``."""
+"""Columns of CSV files and data frames, empty if unknown. Directions and positions have three
+columns, such as ``normal_x``; a polygon is a WKT ``POLYGON Z``."""
 TABLE_SUFFIXES = (".csv", ".json")
-"""Suffixes of files of tables."""
+"""File extensions of plane tables."""
 
 
 def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
-    """Return a table as ``.npz`` holds it, by name; what it does not have is left out.
+    """Convert a table to ``.npz`` arrays by name; missing columns are omitted.
 
     Args:
         planes: The table.
-        origin: Where the origin of its coordinates is in those of the file, shape ``(3,)``. What is
-            moved by it, places and offsets, is in float64.
+        origin: Origin of its coordinates in file coordinates, shape ``(3,)``. Positions and offsets
+            are shifted by it, in float64.
 
     Returns:
-        ``plane_normal`` and so on, of M rows; ``plane_kind`` as words; ``adjacency_pairs``,
-        ``adjacency_boundary_length`` and ``adjacency_dihedral_deg``; outlines as
-        ``outline_points``, rings one after the other, ``outline_ring_sizes``, their lengths, and
-        ``outline_ring_planes``, the planes that they belong to.
+        ``plane_normal`` and so on, with M rows; ``plane_kind`` as text; ``adjacency_pairs``,
+        ``adjacency_boundary_length`` and ``adjacency_dihedral_deg``; polygons as ``outline_points``
+        (concatenated rings), ``outline_ring_sizes`` (their lengths) and ``outline_ring_planes``
+        (their plane IDs).
     """
 
-    def moved(places: Tensor) -> NDArray[np.float64]:
-        return places.numpy(force=True).astype(np.float64) + origin
+    def moved(positions: Tensor) -> NDArray[np.float64]:
+        return positions.numpy(force=True).astype(np.float64) + origin
 
     arrays: Arrays = {
         f"plane_{name}": getattr(planes, name).numpy(force=True) for name in PLANE_COLUMNS
@@ -72,11 +72,11 @@ def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
 def planes_from_arrays(
     arrays: Mapping[str, Array], origin: NDArray[np.float64], dtype: torch.dtype
 ) -> Planes:
-    """Return the table of :func:`planes_to_arrays`; ``dtype`` is that of its numbers.
+    """Convert the arrays of :func:`planes_to_arrays` to a table with numbers of ``dtype``.
 
     Raises:
-        LookupError: If an array is missing, or a number in it is that of no plane or kind.
-        ValueError: If an array is of another shape or type.
+        LookupError: If an array is missing, or a plane ID or class in it is out of range.
+        ValueError: If an array has another shape or type.
     """
 
     def read(name: str, dtype: str, shape: tuple[int, ...]) -> Array:
@@ -126,25 +126,25 @@ def planes_from_arrays(
 
 
 def _check_planes(numbers: Array, num_planes: int) -> None:
-    """Raise IndexError if a number is that of no plane."""
+    """Raise IndexError if a plane ID is out of range."""
     if numbers.size and not 0 <= numbers.min() <= numbers.max() < num_planes:
         raise IndexError(f"plane {numbers.max()} of {num_planes}")
 
 
 def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) -> Json:
-    """Return a plane table as JSON can hold it.
+    """Convert a plane table to JSON-compatible values.
 
     Args:
         planes: The table.
-        origin: Where the origin of its coordinates is in those of the data set, shape ``(3,)``.
-            Default: they are the same.
+        origin: Origin of its coordinates in the coordinates of the data set, shape ``(3,)``.
+            Default: the same origin.
 
     Returns:
-        ``planes``: for each plane its ``id``, the value in ``plane.npy``, and the columns of
-        :class:`torchrg.structures.Planes`; ``kind`` as a word, and ``outline`` as rings of points.
+        ``planes``: for each plane its ``id`` (the value in ``plane.npy``) and the columns of
+        :class:`torchrg.structures.Planes`; ``kind`` as text, and ``outline`` as rings of points.
         With z up and y north, ``dip_deg`` is the angle to the horizontal, in [0, 90], and
-        ``dip_direction_deg`` where the plane falls, clockwise from north, 0 if it is level.
-        ``adjacency`` where it is known: ``pair`` of ids, ``boundary_length``, ``dihedral_deg``.
+        ``dip_direction_deg`` the direction of steepest descent, clockwise from north, 0 if level.
+        ``adjacency``, if known: ``pair`` of IDs, ``boundary_length``, ``dihedral_deg``.
 
     Example:
         >>> from torchrg.pipeline import segment_planes
@@ -173,7 +173,7 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
 
 
 def tabulate_planes(described: Json) -> Json:
-    """Return what :func:`describe_planes` described as columns of single values by name.
+    """Convert the result of :func:`describe_planes` to scalar columns by name.
 
     Example:
         >>> plane = {"id": 0, "normal": [0.0, 0.6, 0.8], "centroid": [1.0, 2.0, 3.0], "area": 2.5}
@@ -197,14 +197,16 @@ def tabulate_planes(described: Json) -> Json:
 
 
 def encode_csv(described: Json) -> bytes:
-    """Return what :func:`describe_planes` described as CSV, with a line of names."""
+    """Convert the result of :func:`describe_planes` to CSV with a header line."""
     columns, text = tabulate_planes(described), io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
     return text.getvalue().encode()
 
 
 def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float]) -> str:
-    """Return rings as a WKT polygon, or several: outer ones run counter-clockwise, then holes.
+    """Convert rings to a WKT polygon or multipolygon.
+
+    Outer rings are counter-clockwise; each is followed by its holes.
 
     Example:
         >>> _to_wkt([[[0.0, 0.0, 7.5], [1.0, 0.0, 7.5], [0.0, 1.0, 7.5]]], [0, 0, 1])
@@ -212,10 +214,10 @@ def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float])
     """
     polygons: list[list[str]] = []
     for ring in rings:
-        places = np.array(ring) - ring[0]
-        if np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0) @ normal > 0:
+        positions = np.array(ring) - ring[0]
+        if np.cross(positions, np.roll(positions, -1, axis=0)).sum(axis=0) @ normal > 0:
             polygons.append([])
-        polygons[-1].append(", ".join(" ".join(map(repr, place)) for place in [*ring, ring[0]]))
+        polygons[-1].append(", ".join(" ".join(map(repr, point)) for point in [*ring, ring[0]]))
     texts = [f"(({'), ('.join(polygon)}))" for polygon in polygons]
     if len(texts) > 1:
         return f"MULTIPOLYGON Z ({', '.join(texts)})"
@@ -228,12 +230,12 @@ def _lists(arrays: Arrays, prefix: str) -> Json:
 
 
 def _rows(columns: Json) -> list[Json]:
-    """Turn a table of columns into a list of rows."""
+    """Convert a table of columns to a list of rows."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def arrays_of_description(described: Json) -> Arrays:
-    """Return what :func:`describe_planes` described as :func:`planes_to_arrays` gives it."""
+def described_to_arrays(described: Json) -> Arrays:
+    """Convert the result of :func:`describe_planes` to that of :func:`planes_to_arrays`."""
     rows, pairs = described["planes"], described.get("adjacency")
     arrays = {
         f"plane_{name}": np.array([row[name] for row in rows], dtype).reshape(len(rows), *shape)

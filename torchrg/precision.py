@@ -1,7 +1,7 @@
-"""Whether coordinates have steps that are coarse for the spacing of their points.
+"""Rounding step of coordinates relative to the spacing of their points.
 
-float32 has 24 bits: a northing of five million metres is a multiple of half a metre there, and so
-are the planes of a room. Nothing that comes later brings back what was lost.
+float32 has 24 bits: a northing of five million meters is a multiple of 0.5 m. Lost precision cannot
+be recovered.
 """
 
 import math
@@ -14,45 +14,44 @@ from torch import Tensor
 from torchrg.errors import PrecisionWarning
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
-"""Steps of the coordinates, in spacings of the points, from which on there is a note: those of
-float32, which nobody has chosen, and those of a grid that a file was written with."""
-_SURELY_FINE = 1e-3
-"""Step, in spacings of an even surface, up to which nothing is searched: half of the points would
-have to lie a hundred times as close for it to be too coarse."""
+"""Rounding steps, in spacings of the points, above which there is a note: for float32, and for the
+scale of a file."""
+_MAX_FINE_STEP = 1e-3
+"""Rounding step, in spacings of a uniform surface, up to which no search is needed: for it to be
+too coarse, half of the points would have to be a hundred times closer."""
 _QUARTILES = (0.25, 0.75)
-"""Quantiles of each coordinate about the middle half of a cloud: single points far off play no
-part."""
+"""Quantiles of each coordinate that bound the middle half of a cloud, robust to outliers."""
 _SAMPLE = 20_000
-"""About as many points tell the spacing."""
+"""Approximate number of points from which the spacing is measured."""
 _CELL = 32
-"""Side of the cells of the sample, in spacings of an even surface: seven of eight points are not at
-the border of their cell, where the nearest point may be outside."""
+"""Side of the cells of the sample, in spacings of a uniform surface. Seven of eight points are away
+from the boundary of their cell, outside of which the nearest point may be."""
 _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791])
-"""Factors of the hash of a cell: M. Teschner et al. Optimized spatial hashing for collision
-detection of deformable objects. VMV, 2003."""
+"""Factors of the cell hash: M. Teschner et al. Optimized spatial hashing for collision detection of
+deformable objects. VMV, 2003."""
 _MIXING = 0x9E3779B97F4A7C15
-"""Odd factor next to 2^64 over the golden ratio, which spreads such a hash over all 64 bits."""
+"""Odd factor next to 2^64 over the golden ratio, which spreads the hash over all 64 bits."""
 
 _ABOVE_DECORATORS = 5
-"""Frames from here to the caller of a function that has two decorators."""
+"""Number of stack frames from here to the caller of a function with two decorators."""
 
 
 def note_on_steps(
     points: NDArray[np.floating],
     *,
     scale: float = 0.0,
-    cure: str = "write float64, or subtract an offset before saving",
+    fix: str = "write float64, or subtract an offset before saving",
 ) -> str:
-    """Return a line for people where the steps of coordinates are coarse for the spacing.
+    """Return a note if the rounding step of coordinates is coarse for their spacing.
 
-    It is empty where they are not, and where that cannot be told: of fewer than three points, and
-    where half of them are in one place. It does not depend on the order of the points.
+    The note is empty if the step is fine, or cannot be judged: with fewer than three points, or if
+    half of them coincide. It does not depend on the order of the points.
 
     Args:
-        points: Coordinates as they came, shape ``(N, 3)``, float32 or float64; what is not finite
-            does not count, nor do the steps of float64.
-        scale: What the coordinates are multiples of in their file. Default: of nothing.
-        cure: What to do where it is the type that is too coarse, and not the scale.
+        points: Input coordinates, shape ``(N, 3)``, float32 or float64. Non-finite points and the
+            rounding step of float64 are ignored.
+        scale: Step of the coordinates in their file. Default: none.
+        fix: Fix if the type, not the scale, is too coarse.
 
     Example:
         >>> points = np.random.default_rng(0).random((1000, 3), dtype=np.float32)
@@ -70,7 +69,7 @@ def note_on_steps(
         return ""
     with np.errstate(over="ignore", invalid="ignore"):
         ranks = [int(fraction * (len(finite_points) - 1)) for fraction in _QUARTILES]
-        # One rank and one column at a time: a third of the time of np.quantile.
+        # One rank and one column at a time take a third of the time of np.quantile.
         low, high = np.array(
             [[np.partition(column, k)[k] for column in finite_points.T] for k in ranks],
             dtype=np.float64,
@@ -79,30 +78,30 @@ def note_on_steps(
         single = float(np.spacing(reach)) if is_single else 0.0
     step = max(single, scale)
     even = width / math.sqrt(len(finite_points))
-    if not 0 < width < math.inf or step <= _SURELY_FINE * even:
+    if not 0 < width < math.inf or step <= _MAX_FINE_STEP * even:
         return ""
     spacing = _spacing(finite_points, _CELL * even) if step < even else even
     is_grid = scale > _COARSE_GRID * spacing
     if not is_grid and single <= _COARSE * spacing:
         return ""
-    step, cure = (scale, "write it with a finer scale") if is_grid else (single, cure)
-    return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {cure}"
+    step, fix = (scale, "write it with a finer scale") if is_grid else (single, fix)
+    return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {fix}"
 
 
 def warn_of_steps(caller: str, points: Tensor) -> None:
-    """Warn the user, above a public function and its decorators, of :func:`note_on_steps`."""
+    """Warn about :func:`note_on_steps`, at the caller of a decorated public function."""
     coordinates = points.detach().cpu().numpy()
     note = note_on_steps(
-        coordinates, cure="pass float64, or subtract an offset before it is float32"
+        coordinates, fix="pass float64, or subtract an offset before it is float32"
     )
     if note:
         warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=_ABOVE_DECORATORS)
 
 
 def _spacing(points: NDArray[np.floating], side: float) -> float:
-    """Return the median distance to the nearest other place, of the points in some of all cells.
+    """Return the median distance to the nearest distinct point, in a sample of cells.
 
-    The place of a cell decides whether it is one of them, so that no order of the points does.
+    Cells are sampled by a hash of their position, so the order of the points does not matter.
     """
     from scipy.spatial import cKDTree
 
@@ -110,7 +109,7 @@ def _spacing(points: NDArray[np.floating], side: float) -> float:
     hashes = np.bitwise_xor.reduce(cells * _PRIMES, axis=1).view(np.uint64) * np.uint64(_MIXING)
     fraction = min(_SAMPLE / len(points), 1.0)
     chosen = points[hashes <= fraction * np.iinfo(np.uint64).max]
-    places = np.unique(chosen.astype(np.float64), axis=0)
-    if len(places) < 2:
+    positions = np.unique(chosen.astype(np.float64), axis=0)
+    if len(positions) < 2:
         return math.inf
-    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    return float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))

@@ -1,7 +1,7 @@
-"""A cloud and what was found about it: what files, folders, pages and notebooks hold.
+"""Segmentation results: a cloud with its labels, planes and superpoints.
 
-:func:`torchrg.write_cloud`, ``torchrg convert`` and ``torchrg depth`` write results, and
-:func:`read_result` reads them again.
+Written by :func:`torchrg.write_cloud`, ``torchrg convert`` and ``torchrg depth``; read by
+:func:`read_result`.
 """
 
 import json
@@ -27,7 +27,7 @@ from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.plane_table import (
     Arrays,
     Json,
-    arrays_of_description,
+    described_to_arrays,
     encode_csv,
     planes_from_arrays,
 )
@@ -46,8 +46,8 @@ from torchrg.structures import (
 )
 
 PLANES_FILE, RECORD = "planes.json", "provenance.json"
-"""Table of planes, and record of how they were made, in a folder of arrays. The record is written
-last, so that a scan without it is not done."""
+"""Files of the plane table and the provenance in a folder of arrays. The provenance is written
+last, so that a scan without it is incomplete."""
 _FOLDER_FIELDS = {
     "plane": "labels",
     "superpoint": "superpoint",
@@ -55,7 +55,7 @@ _FOLDER_FIELDS = {
     "curvature": "curvature",
     "color": "color",
 }
-"""Fields of a cloud by the arrays of a folder that hold them."""
+"""Fields of a cloud by the names of their arrays in a folder."""
 _KINDS = {
     "labels": ("iu", ()),
     "superpoint": ("iu", ()),
@@ -65,32 +65,32 @@ _KINDS = {
     "sharp": ("b", ()),
     "valid": ("b", ()),
 }
-"""NumPy's kinds of numbers of a field, and shape of a row."""
-_MAX_SEARCHED = 100_000
-"""Points of a random sample that tell which planes meet where no result says it."""
-_NEIGHBORS = 50
-"""As many neighbours as normals are estimated from by default: of a cloud that is not sampled the
-same planes meet as in its result."""
+"""NumPy's kind of numbers of a field, and shape of a row."""
+_MAX_SAMPLED_POINTS = 100_000
+"""Number of points of a random sample from which adjacent planes are found if unknown."""
+_NUM_NEIGHBORS = 50
+"""Number of neighbors, equal to the default for normals, so that a cloud that is not sampled gets
+the same adjacency as its result."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A cloud, what was found about each of its points, and the table of its planes.
+    """A cloud, its per-point results, and its plane table.
 
     Args:
-        cloud: The points. Among its fields are those of the result, as far as they are known:
-            ``labels``, ``normals``, ``curvature``, the masks ``sharp`` and ``valid``, and
-            ``superpoint``, with coarser levels as ``superpoint_1`` and so on.
-        table: The plane table that came with them, about :attr:`Cloud.origin`; its rows are the
-            labels, ascending. Default: there is none.
+        cloud: The points. Its fields include the known results: ``labels``, ``normals``,
+            ``curvature``, the masks ``sharp`` and ``valid``, and ``superpoint``, with coarser
+            levels as ``superpoint_1`` and so on.
+        table: Plane table relative to :attr:`Cloud.origin`; its rows are the labels, ascending.
+            Default: no table.
         plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
-        provenance: How the result was made.
+        provenance: Record of how the result was made.
         neighbors: See :attr:`torchrg.structures.Segmentation.neighbors`.
 
     Example:
         >>> points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2], [5, 5, 5]])
-        >>> labelled = Cloud(points, {"labels": np.array([7, 7, 7, 7, -1])})
-        >>> result = Result(labelled)
+        >>> labeled = Cloud(points, {"labels": np.array([7, 7, 7, 7, -1])})
+        >>> result = Result(labeled)
         >>> result.names.tolist(), result.planes.offset.tolist(), result.planes.count.tolist()
         ([7], [2.0], [4])
     """
@@ -105,12 +105,12 @@ class Result:
     def of(
         cls, cloud: Cloud, segmentation: Segmentation, superpoints: Superpoints | None = None
     ) -> "Result":
-        """Return the result of segmenting a cloud, or a depth image whose pixels are its points.
+        """Create the result of segmenting a cloud, or a depth image with its pixels as points.
 
-        Own fields of the cloud whose names it takes are put aside, as in files.
+        Input fields with the names of results are renamed, as in files.
 
         Raises:
-            ShapeError: If the segmentation is not of its points.
+            ShapeError: If the segmentation has another number of points.
         """
         if segmentation.labels.numel() != len(cloud):
             raise ShapeError(
@@ -125,16 +125,16 @@ class Result:
         }
         if superpoints is not None:
             results |= superpoints.by_level()
-        labelled = replace(cloud, fields=put_results(cloud.fields, results))
+        labeled = replace(cloud, fields=put_results(cloud.fields, results))
         plane_of_superpoint = None if superpoints is None else superpoints.plane
         neighbors = segmentation.neighbors
-        return cls(labelled, segmentation.planes, plane_of_superpoint, neighbors=neighbors)
+        return cls(labeled, segmentation.planes, plane_of_superpoint, neighbors=neighbors)
 
     @cached_property
     def fields(self) -> dict[str, Tensor]:
-        """Fields of the cloud that are what their names say: files from elsewhere may hold others.
+        """Result fields of the cloud with a valid type and shape, and ``color`` as uint8.
 
-        Those of a result, and ``color`` as uint8.
+        Other files may use these names for different data.
         """
         fields = {
             name: values
@@ -149,11 +149,11 @@ class Result:
         return {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in fields.items()}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what is known as a sample of loaders and transforms.
+        """Convert to a sample for data loaders and transforms.
 
-        ``coord`` ``(N, 3)``, float32, about ``origin`` ``(1, 3)``, float64, and as far as they are
-        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint``, and ``planes``, the
-        table.
+        Contains ``coord`` ``(N, 3)``, float32, relative to ``origin`` ``(1, 3)``, float64, and if
+        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint`` and the table
+        ``planes``.
 
         Example:
             >>> sample = Result(Cloud(np.zeros((2, 3)), {"labels": np.array([0, -1])})).to_dict()
@@ -168,7 +168,7 @@ class Result:
 
     @cached_property
     def _numbering(self) -> tuple[Tensor, Tensor]:
-        """Label of each plane, and the plane of each point."""
+        """Label of each plane, and plane of each point."""
         labels = self.fields.get("labels", torch.full((len(self.cloud),), UNLABELED)).long()
         if self.table is not None:
             return torch.arange(len(self.table)), labels
@@ -182,9 +182,9 @@ class Result:
 
     @property
     def labels(self) -> Tensor:
-        """Row of :attr:`planes` that each point is on, or -1, shape ``(N,)``, int64.
+        """Row of :attr:`planes` for each point, or -1, shape ``(N,)``, int64.
 
-        These are the labels of torchrg's own results; labels from elsewhere may have gaps.
+        Equal to the stored labels for results of torchrg; labels of other programs may have gaps.
         """
         return self._numbering[1]
 
@@ -192,8 +192,8 @@ class Result:
     def planes(self) -> Planes | None:
         """The plane table; None without labels.
 
-        Of a result it is ``table``. What that lacks, for labels from elsewhere all of it, for
-        images which planes meet, is found once, from the labels.
+        Missing data is computed once from the labels: the whole table for labels of other programs,
+        the adjacency for images.
         """
         table = self.table
         if "labels" not in self.fields or (table is not None and table.adjacency is not None):
@@ -204,9 +204,9 @@ class Result:
         if neighbors is not None and len(neighbors.indices) != len(rows):
             neighbors = None
         if neighbors is None and bool((self.labels[rows] >= 0).any()):
-            places = np.random.default_rng(0).permutation(len(rows))[:_MAX_SEARCHED]
-            sampled = rows[torch.from_numpy(places).sort().values]
-            k = min(_NEIGHBORS, len(sampled))
+            chosen = np.random.default_rng(0).permutation(len(rows))[:_MAX_SAMPLED_POINTS]
+            sampled = rows[torch.from_numpy(chosen).sort().values]
+            k = min(_NUM_NEIGHBORS, len(sampled))
             neighbors = search_knn(self.cloud.points[sampled], k, canonical=True)
         points, (present, labels) = self.cloud.points[sampled], number_labels(self.labels[sampled])
         if table is None:
@@ -227,16 +227,16 @@ class Result:
 
     @property
     def _normals(self) -> Tensor:
-        """Normals in the dtype of the points, zero where there are none."""
+        """Normals in the dtype of the points, zero if unknown."""
         points = self.cloud.points
         normals = self.fields.get("normals", torch.zeros_like(points))
         return normals.to(points.dtype).nan_to_num(0, 0, 0)
 
     @property
     def segmentation(self) -> Segmentation | None:
-        """What :func:`torchrg.segment_planes` said about ``cloud.points``; None without labels.
+        """Segmentation of ``cloud.points``; None without labels.
 
-        What a file does not hold is zero or False; points with a normal are ``valid``.
+        Missing values are zero or False; points with a normal are ``valid``.
         """
         planes = self.planes if self.table is None else self.table
         if planes is None:
@@ -256,9 +256,9 @@ class Result:
 
     @property
     def superpoints(self) -> Superpoints | None:
-        """What :func:`torchrg.make_superpoints` said about them; None where it was not asked.
+        """Superpoints of the cloud; None without superpoints.
 
-        Numbers that are not below that of points, as where some were left out since, are made anew.
+        Labels are renumbered if they exceed the number of points, as after removing points.
         """
         if "superpoint" not in self.fields:
             return None
@@ -274,28 +274,27 @@ class Result:
 
 
 def write_table(path: Path, described: Json) -> None:
-    """Write what :func:`describe_planes` described, as JSON or CSV by its suffix."""
+    """Write the result of :func:`describe_planes` as JSON or CSV, by file extension."""
     is_json = path.suffix.lower() == ".json"
     content = json.dumps(described, indent=1).encode() if is_json else encode_csv(described)
-    with atomic_path(path) as beside:
-        beside.write_bytes(content)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Result:
-    """Read what ``segment``, ``depth`` or ``convert`` wrote, or any other cloud.
+    """Read a saved result, or a plain point cloud.
 
     Args:
-        path: A file, or a folder of ``torchrg convert`` or in Pointcept's layout.
-        columns: As of :func:`torchrg.read_cloud`.
+        path: A file, or a folder written by ``torchrg convert`` or in Pointcept's layout.
+        columns: Column names, as in :func:`torchrg.read_cloud`.
 
     Returns:
-        The cloud and what is known about it. ``.npz`` files hold all of a result, folders all but
-        the masks, other files what :func:`torchrg.write_cloud` puts beside each point. A plane
-        table that is not of the labels, as somebody changed them since, is left out, and
-        ``notes`` of the cloud say so.
+        The cloud and its results. ``.npz`` files contain complete results, folders all but the
+        masks, other files the per-point results of :func:`torchrg.write_cloud`. A plane table that
+        does not match the labels is dropped, with a note in ``notes`` of the cloud.
 
     Raises:
-        FormatError: If there is no such file, or it is damaged; see :func:`torchrg.read_cloud`.
+        FormatError: If the file is missing or corrupt; see :func:`torchrg.read_cloud`.
         MissingDependencyError: If the format needs an optional package.
 
     Example:
@@ -310,41 +309,41 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
     """
     source = Path(path)
     if source.is_dir():
-        cloud, beside = _read_folder(source)
+        cloud, extras = _read_folder(source)
     else:
         cloud = read_cloud(source, columns=columns)
-        # Text has one kind of numbers for all.
+        # Text files have a single type for all columns.
         whole = {
             name: values.astype(np.int64)
             for name, values in cloud.fields.items()
             if name.startswith("superpoint") and values.dtype.kind == "f" and are_whole(values)
         }
         cloud = replace(cloud, fields={**cloud.fields, **whole})
-        beside = read_beside(source) if source.suffix.lower() == ".npz" else {}
-    planes = beside.get("plane_of_superpoint", np.zeros(()))
+        extras = read_beside(source) if source.suffix.lower() == ".npz" else {}
+    planes = extras.get("plane_of_superpoint", np.zeros(()))
     result = Result(
         cloud,
         plane_of_superpoint=torch.from_numpy(planes) if planes.dtype == np.int64 else None,
-        provenance=_record(str(beside.get("provenance", ""))),
+        provenance=_parse_record(str(extras.get("provenance", ""))),
     )
-    if "plane_count" not in beside:
+    if "plane_count" not in extras:
         return result
     try:
         normals = result.fields.get("normals", cloud.points)
-        table = planes_from_arrays(beside, cloud.origin, normals.dtype)
+        table = planes_from_arrays(extras, cloud.origin, normals.dtype)
         sizes = torch.bincount(result.labels + 1, minlength=1)[1:]
         named = torch.equal(result.names, torch.arange(len(sizes)))
         if named and torch.equal(sizes, table.count):
             return replace(result, table=table)
     except DAMAGES:
-        # A table of an older version, or of another program that has arrays of these names.
+        # A table of an older version, or unrelated arrays with these names.
         pass
-    note = "its table of planes left out, as it is not that of its labels"
+    note = "plane table left out, because it does not match the labels"
     return replace(result, cloud=replace(cloud, notes=(*cloud.notes, note)))
 
 
 def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
-    """Return the cloud of a folder of arrays, and what is beside them as ``.npz`` would hold it."""
+    """Return the cloud of a folder of arrays, and its other arrays as named in ``.npz``."""
     arrays = map_folder(folder, ("coord", *_FOLDER_FIELDS))
     fields = {
         _FOLDER_FIELDS[name]: values.reshape(-1, *_KINDS[_FOLDER_FIELDS[name]][1])
@@ -360,20 +359,20 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
     coord = arrays["coord"]
     grid = coord.shape[:2] if coord.ndim == 3 else None
     cloud = Cloud(coord.reshape(-1, 3), fields, grid, str(folder), notes=notes)
-    beside: Arrays = {}
+    extras: Arrays = {}
     if (folder / RECORD).is_file():
-        beside["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
+        extras["provenance"] = np.array((folder / RECORD).read_text("utf-8", "replace"))
     if (folder / PLANES_FILE).is_file():
         try:
             text = (folder / PLANES_FILE).read_text(encoding="utf-8")
-            beside |= arrays_of_description(json.loads(text))
+            extras |= described_to_arrays(json.loads(text))
         except DAMAGES:
-            beside["plane_count"] = np.zeros(0)
-    return cloud, beside
+            extras["plane_count"] = np.zeros(0)
+    return cloud, extras
 
 
-def _record(text: str) -> dict[str, Any]:
-    """Return the record that a text holds, empty if it holds none."""
+def _parse_record(text: str) -> dict[str, Any]:
+    """Parse a provenance record; return an empty one if invalid."""
     try:
         content = json.loads(text)
     except DAMAGES:

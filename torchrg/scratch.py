@@ -1,9 +1,8 @@
-"""Large arrays in a file without a name, for clouds that are larger than memory.
+"""Large arrays in unnamed scratch files, for clouds larger than memory.
 
-Of the memory that a point takes while its planes are found, most is in the lists of neighbours.
-Within :func:`on_disk` these are shared maps of temporary files that are unlinked as soon as they
-are open: they leave with the process, however it ends, and nothing can be left behind, be locked or
-be damaged. Whoever reads or writes such an array does not know.
+Most of the memory of a segmentation goes to the neighbor lists. Within :func:`on_disk` they are
+memory maps of temporary files that are unlinked once opened. The files are removed when the process
+exits, even on a crash. Memory mapping is transparent to callers.
 """
 
 import math
@@ -24,14 +23,14 @@ from numpy.typing import NDArray
 from torchrg.errors import FormatError
 
 _MIN_BYTES = 2**24
-"""Bytes of the smallest array that goes to the disk; all smaller ones together are few."""
+"""Minimum size of an array on disk, in bytes; all smaller arrays together take little memory."""
 BYTES_PER_NEIGHBOR = 9
-"""Bytes that a neighbour of a point takes at most: four in its list, and four and a mark in that of
-the neighbours of the same object."""
+"""Maximum bytes per neighbor of a point: four in the neighbor list, and five in the list of
+neighbors of the same object (index and mask)."""
 _RELEASE_SECONDS = 0.01
-"""How often pages go back to the system. In that time some 20 MB of an array are read."""
+"""Interval for releasing pages, in seconds. Meanwhile about 20 MB of an array are read."""
 _ZEROS = bytes(2**20)
-"""Bytes that reserve a disk where the system has no call for that, as on macOS."""
+"""Bytes that reserve disk space on systems without posix_fallocate, such as macOS."""
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -41,7 +40,7 @@ _lock = threading.Lock()
 
 
 def _renew_lock() -> None:
-    """Give a forked process a lock of its own; a thread that it lacks may hold the other."""
+    """Replace the lock in a forked process, where a thread of the parent may have held it."""
     global _lock
     _lock = threading.Lock()
 
@@ -52,16 +51,15 @@ if hasattr(os, "register_at_fork"):
 
 @contextmanager
 def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Keep large arrays on the disk of a folder: results are the same, and memory is bounded.
+    """Move large arrays to the disk of a folder, with identical results and bounded memory.
 
-    Segmenting a cloud then takes about 350 bytes of memory a point, with the pages of the files
-    that the system has not yet taken back, and up to nine bytes of disk for each neighbor of a
-    point.
-    Inside a result there is no such array, so it can be used afterwards. The folder should be on a
-    disk, as some ``/tmp`` is not.
+    Segmenting a cloud then takes about 350 bytes of memory per point, including file pages not yet
+    released by the system. It takes up to nine bytes of disk per neighbor of a point. Results
+    contain no such array and can be used afterwards. The folder should be on a disk; some systems
+    keep ``/tmp`` in memory.
 
     Raises:
-        FormatError: If the disk has no room, or the folder cannot be written; before the array is
+        FormatError: If the disk is too full, or the folder is not writable; before the array is
             used.
 
     Example:
@@ -84,12 +82,12 @@ def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def is_active() -> bool:
-    """Return whether large arrays go to a disk."""
+    """Return whether large arrays are moved to disk."""
     return _folder.get() is not None
 
 
 def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
-    """Return an array without values: ``numpy.empty``, but a large one on the disk if that is on.
+    """Return an uninitialized array: ``numpy.empty``, or a map on disk if large and active.
 
     Example:
         >>> with on_disk("."):
@@ -109,8 +107,8 @@ def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
             memory = mmap.mmap(file.fileno(), size)
     except OSError as error:
         raise FormatError(
-            f"{folder}: expected {size / 1e9:,.2f} GB of disk for the work, got: {error.strerror}; "
-            "make room, or set TMPDIR to a directory that has it."
+            f"{folder}: expected {size / 1e9:,.2f} GB of free disk space, got: {error.strerror}; "
+            "free space, or set TMPDIR to a directory on another disk."
         ) from error
     with _lock:
         _maps.add(memory)
@@ -118,16 +116,16 @@ def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
 
 
 def _release_until(is_done: threading.Event) -> None:
-    """Let the system take back the pages of all maps again and again; it can read them again."""
+    """Release the pages of all maps repeatedly; the system can read them again."""
     while not is_done.wait(_RELEASE_SECONDS):
         release()
 
 
 def release() -> None:
-    """Let the system take back the pages of all maps, which it can read again.
+    """Release the pages of all maps; the system can read them again.
 
-    What reads rows here and there should ask for it now and then: with each of them a system maps
-    the pages around it too, more in a hundredth of a second than a limit may leave room for.
+    Code with random row access should call this regularly. Each access also maps surrounding pages,
+    in a hundredth of a second more than a memory limit may allow.
     """
     with _lock:
         maps = list(_maps)

@@ -1,4 +1,4 @@
-"""Values that one step gives to the next: clouds, neighbours, fits, planes, segmentations."""
+"""Data structures passed between pipeline stages."""
 
 import operator
 import warnings
@@ -17,48 +17,47 @@ from torchrg.errors import PrecisionWarning, ShapeError
 from torchrg.precision import note_on_steps
 
 UNLABELED = -1
-"""Label of a point that belongs to no region."""
+"""Label of points without a region."""
 FARTHEST = 1e12
-"""Largest coordinate of a point. Programs write 1e20, 1e30 or the largest float32 for a missing
-one."""
+"""Maximum absolute coordinate of a point; files use 1e20, 1e30 or the largest float32 for missing
+points."""
 
 MAX_POINTS = 2**31 - 1
-"""Most points of a cloud, as lists of neighbors hold int32."""
+"""Maximum number of points of a cloud; neighbor lists are int32."""
 
 Array = NDArray[Any]
-"""An array of numbers or text, of any shape."""
+"""Array of numbers or text of any shape."""
 Rows = slice | Tensor
-"""A block of points, or the row numbers of some."""
+"""A block of points, or row indices."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A cloud as it was read: its coordinates untouched, and points fit for float32 arithmetic.
+    """A point cloud with its original coordinates, and a float32 copy shifted near the origin.
 
     Args:
-        coordinates: The input's own coordinates, shape ``(N, 3)``, float32 or float64, an array or
-            a tensor, which becomes an array. Non-finite rows are kept.
-        fields: Further values of each point by name, each of shape ``(N, ...)``: for example
+        coordinates: Input coordinates, shape ``(N, 3)``, float32 or float64, an array or a tensor
+            (converted to an array). Non-finite rows are kept.
+        fields: Further per-point values by name, each of shape ``(N, ...)``: for example
             ``labels``, ``normals``, ``intensity``, ``color`` (``(N, 3)`` uint8 or uint16).
-        grid_shape: ``(height, width)`` of an organised cloud (row-major), otherwise None.
-        source: The file it came from, for messages.
-        header: What the file says about the cloud as a whole: ``viewpoint`` of a PCD file (seven
-            numbers, position and quaternion w x y z) and ``las`` (the header of a LAS file), which
-            are written again, ``scans`` (names and poses) and ``coordinate_metadata`` of an E57
-            file.
-        notes: What reading took for granted or left out, a line each without a full stop, for
-            people.
-        front: Direction from each point to where its surface was seen from, of any length, zero
-            where unknown, shape ``(N, 3)``, float32; None where the file does not say. By the faces
-            of a mesh, or by where the scanners stood. It is not written with the cloud;
-            :func:`torchrg.normals.orient_normals` turns normals by it.
-        repairs: What reading put right, a line each.
+        grid_shape: ``(height, width)`` of an organized cloud (row-major), otherwise None.
+        source: Path of the input file, for messages.
+        header: File-level metadata: ``viewpoint`` of a PCD file (seven numbers, position and
+            quaternion w x y z) and ``las`` (the header of a LAS file), which are written again;
+            ``scans`` (names and poses) and ``coordinate_metadata`` of an E57 file.
+        notes: Human-readable notes on assumptions made and data skipped while reading, without a
+            period.
+        front: Direction from each point toward the front of its surface (not normalized), zero if
+            unknown, shape ``(N, 3)``, float32; None if the file has none. Computed from the faces
+            of a mesh, or from the scanner positions. It is not written with the cloud;
+            :func:`torchrg.normals.orient_normals` uses it.
+        repairs: Notes on data repaired while reading.
 
     Raises:
         ShapeError: If ``coordinates`` is neither array nor tensor, or ``front`` has another shape.
 
     Warns:
-        PrecisionWarning: Where :attr:`points` is taken and :attr:`precision_note` is not empty.
+        PrecisionWarning: On access to :attr:`points` if :attr:`precision_note` is not empty.
 
     Example:
         >>> cloud = Cloud(np.array([[500000.25, 4000000.5, 1.0], [500001.25, 4000000.5, 1.0]]))
@@ -85,7 +84,7 @@ class Cloud:
         if not isinstance(values["coordinates"], np.ndarray):
             raise ShapeError(
                 "Cloud: expected coordinates to be a tensor or a NumPy array, got "
-                f"{type(self.coordinates).__name__}; numpy.array makes one."
+                f"{type(self.coordinates).__name__}; use numpy.array."
             )
         if self.front is not None and self.front.shape != (len(self), 3):
             raise ShapeError(
@@ -106,15 +105,15 @@ class Cloud:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name):  # noqa: ANN001, ANN204
-            """Say where the values of points are, to who asks for them by name."""
+            """Raise an error that lists the fields."""
             names = ", ".join(f"fields[{field!r}]" for field in vars(self).get("fields", ()))
             raise AttributeError(f"Cloud has no attribute {name!r}; it has {names or 'no fields'}.")
 
     @cached_property
     def finite(self) -> NDArray[np.bool_]:
-        """Which points have three finite coordinates, none beyond 1e12, shape ``(N,)``.
+        """Mask of points with three finite coordinates of at most 1e12, shape ``(N,)``.
 
-        Those beyond are codes for a missing point.
+        Larger coordinates are codes for missing points.
         """
         with np.errstate(invalid="ignore"):
             finite: NDArray[np.bool_] = (np.abs(self.coordinates) <= FARTHEST).all(axis=1)
@@ -122,7 +121,7 @@ class Cloud:
 
     @cached_property
     def origin(self) -> NDArray[np.float64]:
-        """Origin of :attr:`points`, shape ``(3,)``: that of :func:`origin_of_box`."""
+        """Origin of :attr:`points`, shape ``(3,)``; see :func:`origin_of_box`."""
         finite = self.coordinates[self.finite]
         if len(finite) == 0:
             return np.zeros(3)
@@ -130,7 +129,7 @@ class Cloud:
 
     @cached_property
     def points(self) -> Tensor:
-        """Coordinates about :attr:`origin`, shape ``(N, 3)``, float32.
+        """Coordinates relative to :attr:`origin`, shape ``(N, 3)``, float32.
 
         Rows that are not :attr:`finite` are not finite here either.
         """
@@ -142,15 +141,15 @@ class Cloud:
 
     @cached_property
     def _local(self) -> Tensor:
-        """:attr:`points`, whatever their precision."""
+        """:attr:`points`, without the precision warning."""
         return self.about(self.origin)
 
     @cached_property
     def precision_note(self) -> str:
-        """What has cost the coordinates digits that the spacing of the points needs, or nothing.
+        """Note on lost precision, or an empty string.
 
-        A line for people, without a full stop: that they were written as float32 far from the
-        origin, or as LAS with too coarse a scale, or reach too far for float32 about any origin.
+        Set if the coordinates are float32 far from the origin, LAS with a coarse scale, or too
+        extended for float32. Without a period.
         """
         scale = float(max(getattr(self.header.get("las"), "scales", (0.0,))))
         finite = self.coordinates if self.finite.all() else self.coordinates[self.finite]
@@ -158,11 +157,11 @@ class Cloud:
             return note
         if finite.dtype == np.float32:
             return ""
-        cure = "leave out points that are far off, or cut the cloud into parts"
-        return note_on_steps(self._local.numpy(), cure=cure)
+        fix = "leave out points that are far off, or cut the cloud into parts"
+        return note_on_steps(self._local.numpy(), fix=fix)
 
     def about(self, origin: NDArray[np.float64]) -> Tensor:
-        """Return the coordinates about an origin of shape ``(3,)``, float32, shape ``(N, 3)``."""
+        """Return the coordinates relative to ``origin`` ``(3,)``, float32, shape ``(N, 3)``."""
         coordinates = self.coordinates
         if not self.finite.all() and (is_code := np.abs(coordinates) > FARTHEST).any():
             coordinates = np.where(is_code, coordinates.dtype.type(np.nan), coordinates)
@@ -172,16 +171,16 @@ class Cloud:
 
 
 def _as_array(values: Any) -> Any:  # noqa: ANN401
-    """Return a tensor as an array, and anything else as it is."""
+    """Convert a tensor to an array; return anything else unchanged."""
     return values.numpy(force=True) if isinstance(values, Tensor) else values
 
 
 def bounding_box(
     coordinates: NDArray[np.floating],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the least and the largest coordinates of points ``(N, 3)``, each ``(3,)``.
+    """Return the minimum and maximum coordinates of points ``(N, 3)``, each ``(3,)``.
 
-    Column by column: along the rows NumPy takes twenty times as long.
+    Reduced column by column, since NumPy takes twenty times as long along rows.
     """
     columns = coordinates.T
     low, high = [column.min() for column in columns], [column.max() for column in columns]
@@ -189,11 +188,11 @@ def bounding_box(
 
 
 def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return about what a cloud with this box is kept in float32: zero, or the middle if it is far.
+    """Return the origin of a cloud with this box: zero, or the center if the cloud is far away.
 
-    A cloud is far when moving it to its middle makes its largest coordinate less than a quarter as
-    large; a near cloud is left where it is, so that float32 files keep their coordinates bit for
-    bit. A box that is not finite, as that of no points, is near.
+    A cloud is far away if centering makes its largest coordinate less than a quarter as large. A
+    near cloud is not shifted, so that float32 coordinates stay bit-identical. A box that is not
+    finite counts as near.
 
     Example:
         >>> origin_of_box(np.array([10.0, 10.0, 0.0]), np.array([12.0, 12.0, 3.0])).tolist()
@@ -202,29 +201,30 @@ def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDAr
     low, high = low.astype(np.float64), high.astype(np.float64)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return np.zeros(3)
-    middle = low + (high - low) / 2
+    midpoint = low + (high - low) / 2
     reach, half_extent = np.abs([low, high]).max(), (high - low).max() / 2
-    return middle if half_extent * 4 < reach else np.zeros(3)
+    return midpoint if half_extent * 4 < reach else np.zeros(3)
 
 
 class Neighbors(NamedTuple):
-    """The nearest points of each point; see :func:`torchrg.search_knn`.
+    """Nearest neighbors of each point; see :func:`torchrg.search_knn`.
 
     Attributes:
-        indices: Rows of the neighbours, shape ``(N, K)``, int32. The first column is the point
-            itself, the rest is sorted by distance. Where ``valid`` is False: the point itself.
-        valid: Which entries are neighbours, shape ``(N, K)``, bool; None when all are.
+        indices: Rows of the neighbors, shape ``(N, K)``, int32. The first column is the point
+            itself, the other columns are sorted by distance. Invalid entries contain the point
+            itself.
+        valid: Mask of the valid entries, shape ``(N, K)``, bool; None if all are valid.
     """
 
     indices: Tensor
     valid: Tensor | None = None
 
     def at(self, rows: Rows) -> "Neighbors":
-        """Return the neighbours of some of the points."""
+        """Return the neighbors of the selected points."""
         return Neighbors(self.indices[rows], None if self.valid is None else self.valid[rows])
 
     def of(self, values: Tensor, rows: Rows = slice(None)) -> Tensor:
-        """Return the values ``(N,)`` of the neighbours of some points, shape ``(n, K)``.
+        """Gather the values ``(N,)`` of the neighbors of the selected points, shape ``(n, K)``.
 
         Example:
             >>> Neighbors(torch.tensor([[0, 1], [1, 0]])).of(torch.tensor([0.5, 2.5])).tolist()
@@ -234,7 +234,7 @@ class Neighbors(NamedTuple):
         return values.index_select(0, indices.reshape(-1)).view(indices.shape)
 
     def counted(self, rows: Rows = slice(None)) -> Tensor:
-        """Return which entries of some points are neighbours, shape ``(n, K)``, bool."""
+        """Return the mask of valid entries of the selected points, shape ``(n, K)``, bool."""
         if self.valid is not None:
             return self.valid[rows]
         first = self.indices[rows, :1]
@@ -243,18 +243,19 @@ class Neighbors(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """How a cloud samples its surfaces; see :func:`torchrg.neighbors.measure_sampling`.
+    """Sampling of the surfaces of a cloud; see :func:`torchrg.neighbors.measure_sampling`.
 
     Attributes:
-        whiteness: Deviation from a plane of 16 points by that of 100, in [0, 1]: 1 for noise that
-            is independent from point to point, near 0 for facets and bent surfaces.
-        variation: Standard deviation by mean of the distances to the nearest point: 0.25 to 0.35
-            for vertices of a mesh and for grids, about 0.5 for points drawn at random.
-        exactness: Share of points that lie with their 8 nearest in one plane, to a thousandth of
-            their distance: 0.3 to 0.7 for points drawn from the triangles of a mesh, else near 0.
-        density: Points in a square of side 1 on a surface, in the unit of the cloud.
-        height: Least extent along the principal axes of the cloud, in its unit: of a room mostly
-            its height.
+        whiteness: Ratio of the deviations from a plane of 16 and of 100 points, in [0, 1]: 1 for
+            noise that is independent between points, near 0 for facets and bent surfaces.
+        variation: Coefficient of variation of the distances to the nearest point: 0.25 to 0.35 for
+            mesh vertices and grids, about 0.5 for points sampled at random.
+        exactness: Fraction of points coplanar with their 8 nearest neighbors, within a thousandth
+            of their distance: 0.3 to 0.7 for points sampled from the triangles of a mesh, else near
+            0.
+        density: Number of points per unit of area on a surface.
+        height: Smallest extent along the principal axes, in units of the cloud; the height of most
+            rooms.
     """
 
     whiteness: float = 1.0
@@ -265,14 +266,14 @@ class Sampling(NamedTuple):
 
 
 class NormalFit(NamedTuple):
-    """Normals and what else the fit of a plane to each neighbourhood gives.
+    """Fit of a plane to each neighborhood.
 
     Attributes:
         normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero where not ``valid``.
         curvature: Surface variation in [0, 1/3], shape ``(*)``; 0 where not ``valid``.
         valid: Whether there is a plane, shape ``(*)``, bool.
-        residual_rms: Root mean square distance of the fitted points to the plane, shape ``(*)``,
-            in the unit of the cloud; 0 where not ``valid``.
+        residual_rms: RMS distance of the fitted points to the plane, shape ``(*)``, in units of the
+        cloud; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(*)``, bool; None for methods of one stage.
     """
 
@@ -283,7 +284,7 @@ class NormalFit(NamedTuple):
     sharp: Tensor | None = None
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
-        """Return a fit whose tensors are changed by one function, None left alone."""
+        """Apply a function to all tensors; None stays None."""
         sharp = None if self.sharp is None else change(self.sharp)
         normals, curvature, valid, residual_rms = (change(values) for values in self[:4])
         return NormalFit(normals, curvature, valid, residual_rms, sharp)
@@ -293,16 +294,16 @@ PlaneKind = Literal["other", "floor", "ceiling", "wall", "horizontal", "vertical
 """Class of a plane."""
 PLANE_KINDS: tuple[PlaneKind, ...] = get_args(PlaneKind)
 """Classes of planes; see :func:`torchrg.regions.classes.classify_planes`. Curved planes are
-"other", "horizontal" and "vertical" ones neither floor nor ceiling nor wall."""
+"other"; "horizontal" and "vertical" planes are neither floor nor ceiling nor wall."""
 
 
 class PlaneAdjacency(NamedTuple):
-    """Pairs of planes that meet.
+    """Pairs of adjacent planes.
 
     Attributes:
         pairs: Rows of the plane table, the smaller first, ascending, shape ``(E, 2)``, int64.
-        boundary_length: Length along which they meet, shape ``(E,)``, in the unit of the cloud.
-        dihedral_deg: Angle between the planes, in [0, 90], shape ``(E,)``.
+        boundary_length: Length of the common boundary, shape ``(E,)``, in units of the cloud.
+        dihedral_deg: Angle between the planes, in degrees, in [0, 90], shape ``(E,)``.
     """
 
     pairs: Tensor
@@ -312,16 +313,16 @@ class PlaneAdjacency(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """One plane of a table, as ``seg.planes[0]``: its row of :class:`Planes`, with the same names.
+    """One plane: a row of :class:`Planes`, with the same names, as returned by ``seg.planes[0]``.
 
     Attributes:
         id: Label of its points.
         normal: Shape ``(3,)``; so are ``centroid`` and ``center``. ``extent`` is ``(2,)``, and
             ``axes`` is ``(2, 3)``.
-        offset: A number of Python, as are ``area``, ``count``, ``rms`` and ``curved``.
-        kind: One of :data:`PLANE_KINDS`; None where the up direction was not given.
-        outline: Rings around it, of shape ``(V, 3)``; None where not asked for.
-        object: Number of its object; None where planes were not kept within objects.
+        offset: A Python number, as are ``area``, ``count``, ``rms`` and ``curved``.
+        kind: One of :data:`PLANE_KINDS`; None if the up axis is unknown.
+        outline: Rings of its polygon, of shape ``(V, 3)``; None if not requested.
+        object: Object ID; None without objects.
     """
 
     id: int
@@ -350,34 +351,32 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """The plane table: one row for each region, in the order of the labels.
+    """Plane table with one row per region, in the order of the labels.
 
-    Its planes are gone through as those of a list; its columns are tensors of all of them. Lengths
-    are in the unit of the cloud. Values are computed in float64 and given in the dtype of the
-    points. Copies of a point count once in all columns except ``count``.
+    Iterating yields :class:`Plane` objects; attributes are tensors with one row per plane. Lengths
+    are in units of the cloud. Values are computed in float64 and returned in the dtype of the
+    points. Duplicate points count once, except in ``count``.
 
     Attributes:
-        normal: Unit normals, shape ``(M, 3)``; the sign makes the first of z, y, x that is not
-            zero positive.
-        offset: Signed distance of the plane from the origin, shape ``(M,)``: a point x of the plane
-            has ``normal . x = offset``.
+        normal: Unit normals, shape ``(M, 3)``, with a positive first nonzero component of z, y, x.
+        offset: Signed distance of the plane from the origin, shape ``(M,)``: points x on the plane
+            have ``normal . x = offset``.
         centroid: Mean of the region's points, shape ``(M, 3)``.
-        area: Area that the points cover on the plane, shape ``(M,)``.
-        count: Number of points, copies included, shape ``(M,)``, int64.
-        rms: Root mean square distance of the points to the plane, shape ``(M,)``.
-        extent: Long and short side of the smallest rectangle in the plane that holds the points'
-            projections, shape ``(M, 2)``.
+        area: Area covered by the points on the plane, shape ``(M,)``.
+        count: Number of points, including duplicates, shape ``(M,)``, int64.
+        rms: RMS distance of the points to the plane, shape ``(M,)``.
+        extent: Long and short side of the minimum bounding rectangle of the projected points, shape
+            ``(M, 2)``.
         axes: Unit directions of those sides, shape ``(M, 2, 3)``.
         center: Center of that rectangle, shape ``(M, 3)``.
-        curved: Whether the region is one smooth surface but not a plane, shape ``(M,)``, bool: a
-            column, a bent wall. Its plane is the best there is, no more.
-        kind: Class of each plane as a place in :data:`PLANE_KINDS`, shape ``(M,)``, int64; None
-            where the up direction was not given.
-        outline: Rings around each region, of shape ``(V, 3)``: outer ones counter-clockwise seen
-            against the normal, holes clockwise; None where not asked for.
-        adjacency: Which planes meet; None where the neighbours were not given.
-        object: Object that each plane is of, shape ``(M,)``, int64; None where planes were not kept
-            within objects.
+        curved: Mask of smooth but nonplanar regions (a column, a bent wall), shape ``(M,)``, bool.
+            Their plane is only a best fit.
+        kind: Class of each plane as an index of :data:`PLANE_KINDS`, shape ``(M,)``, int64; None if
+            the up axis is unknown.
+        outline: Polygon of each region as rings of shape ``(V, 3)``: seen against the normal, outer
+            rings are counter-clockwise and holes clockwise; None if not requested.
+        adjacency: Adjacent planes; None without neighbors.
+        object: Object ID of each plane, shape ``(M,)``, int64; None without objects.
 
     Example:
         >>> from torchrg import segment_planes
@@ -417,16 +416,16 @@ class Planes:
         return map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, row: SupportsIndex) -> Plane:
-        """Return a plane by its number."""
+        """Return a plane by its row."""
         try:
             row = range(len(self))[operator.index(row)]
         except TypeError:
             raise TypeError(
-                f"Planes: expected the number of a plane, got {type(row).__name__}; columns take "
+                f"Planes: expected an integer row, got {type(row).__name__}; index columns with "
                 "slices and masks, as in planes.normal[planes.area > 1]."
             ) from None
         except IndexError:
-            raise IndexError(f"Planes: expected one of {len(self)} planes, got {row}.") from None
+            raise IndexError(f"Planes: expected a row below {len(self)}, got {row}.") from None
         columns = {name: getattr(self, name)[row] for name in PLANE_COLUMNS}
         values = {name: value if value.ndim else value.item() for name, value in columns.items()}
         kind = None if self.kind is None else PLANE_KINDS[int(self.kind[row])]
@@ -435,11 +434,11 @@ class Planes:
         return Plane(row, **values, kind=kind, outline=outline, object=within)
 
     def to(self, device: torch.device | str) -> "Planes":
-        """Return the table on a device."""
+        """Move the table to a device."""
         return replace(self, **{name: moved(value, device) for name, value in vars(self).items()})
 
     def to_pandas(self) -> Any:  # noqa: ANN401
-        """Return a ``pandas.DataFrame``, the columns of :data:`torchrg.plane_table.CSV_COLUMNS`.
+        """Convert to a ``pandas.DataFrame`` with :data:`torchrg.plane_table.CSV_COLUMNS`.
 
         Raises:
             MissingDependencyError: If pandas is not installed.
@@ -448,14 +447,14 @@ class Planes:
 
 
 def _count_points(labels: Tensor) -> str:
-    """Return the number of points, or the size of an image, in words."""
+    """Return the number of points, or the size of an image, as text."""
     if labels.ndim == 2:
         return f"{labels.shape[0]:,} x {labels.shape[1]:,} pixels"
     return f"{len(labels):,} points"
 
 
 def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401
-    """Return tensors, and tuples and tables of them, on a device; anything else as it is."""
+    """Move tensors, and tuples and tables of tensors, to a device; return others unchanged."""
     if isinstance(value, Tensor | Planes):
         return value.to(device)
     if isinstance(value, tuple):
@@ -476,12 +475,12 @@ PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "center": ("f8", (3,)),
     "curved": ("?", ()),
 }
-"""Columns that every plane table has, in files too: kind of numbers, and shape of a row."""
+"""Columns of every plane table, including files: kind of numbers, and shape of a row."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """What :func:`torchrg.segment_planes` returns: labels, normals, and the plane table.
+    """Plane segmentation: per-point labels and normals, and the plane table.
 
     Attributes:
         labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or
@@ -489,15 +488,14 @@ class Segmentation:
         normals: Unit normals, shape ``(N, 3)``; zero where not ``valid``.
         curvature: Surface variation in [0, 1/3], shape ``(N,)``; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(N,)``, bool.
-        valid: Points that are finite and have a normal, shape ``(N,)``, bool.
+        valid: Finite points with a normal, shape ``(N,)``, bool.
         planes: The plane table, M rows.
-        points: What was segmented, shape ``(N, 3)``, to show it; None where it is not known.
+        points: Input points for visualization, shape ``(N, 3)``; None if unknown.
         neighbors: Neighbors of the distinct finite points in canonical order, as
-            :func:`torchrg.search_knn` finds them there; None where they were not kept. See
+            :func:`torchrg.search_knn` returns them; None if not kept. See
             :func:`torchrg.neighbors.distinct_points`.
-        sampling: What was measured of the cloud, by which settings were chosen; None where it was
-            not.
-        num_copies: Number of points that repeat the coordinates of another point.
+        sampling: Measured sampling from which settings were chosen; None if not measured.
+        num_copies: Number of points that duplicate the coordinates of another point.
     """
 
     labels: Tensor
@@ -519,45 +517,45 @@ class Segmentation:
         )
 
     def to(self, device: torch.device | str) -> "Segmentation":
-        """Return the segmentation on a device."""
+        """Move the segmentation to a device."""
         return replace(self, **{name: moved(value, device) for name, value in vars(self).items()})
 
     def cpu(self) -> "Segmentation":
-        """Return the segmentation on the CPU."""
+        """Move the segmentation to the CPU."""
         return self.to("cpu")
 
     def show(self, **settings: Any) -> Any:  # noqa: ANN401
-        """Return the page of the browser, which a notebook shows; needs ``torchrg[view]``.
+        """Return an interactive viewer, displayed by notebooks; needs ``torchrg[view]``.
 
         Args:
-            settings: Those of :func:`torchrg.render.make_page`.
+            settings: Keyword arguments of :func:`torchrg.render.make_page`.
 
         Returns:
-            A :class:`torchrg.render.page.Page`; :func:`torchrg.render.write_page` keeps it.
+            A :class:`torchrg.render.page.Page`; save it with :func:`torchrg.render.write_page`.
 
         Raises:
             ConfigError: If ``points`` is None.
-            MissingDependencyError: If pages cannot be made.
+            MissingDependencyError: If the viewer cannot be created.
         """
         return _display.call("show", self, **settings)
 
     def _repr_html_(self) -> str:
-        """Return a picture and the table of planes, as a notebook shows them."""
+        """Return an image and the plane table, as displayed by notebooks."""
         text: str = _display.call("as_html", self)
         return text
 
 
 @dataclass(frozen=True, eq=False)
 class Superpoints:
-    """What :func:`torchrg.make_superpoints` returns: a partition of all points, and coarser ones.
+    """Partition of all points into superpoints, in levels from fine to coarse.
 
     Attributes:
-        labels: Superpoint of each point, shape ``(N,)``, int64: 0 to M-1 by descending size; -1 for
-            points that are not finite, and for no others.
-        plane: Plane that more than half of the points of each superpoint are on, shape ``(M,)``,
-            int64, or -1.
-        levels: Coarser partitions, numbered likewise, each shape ``(N,)``: each of their parts is
-            made of whole parts of the one before.
+        labels: Superpoint of each point, shape ``(N,)``, int64: 0 to M-1 by descending size; -1
+            only for points that are not finite.
+        plane: Plane with the majority of the points of each superpoint, shape ``(M,)``, int64, or
+            -1.
+        levels: Coarser partitions with the same numbering, each shape ``(N,)``; each superpoint is
+            a union of superpoints of the previous level.
     """
 
     labels: Tensor
@@ -572,7 +570,7 @@ class Superpoints:
         return f"Superpoints({_count_points(self.labels)}, {counts} superpoints)"
 
     def by_level(self) -> dict[str, NDArray[np.int32]]:
-        """Return all partitions by the names that they have in files.
+        """Return all partitions by their field names in files.
 
         Example:
             >>> one = torch.tensor([0, 0, 1])

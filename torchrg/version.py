@@ -1,3 +1,3 @@
-"""The version of torchrg, for whoever must know it without loading anything else."""
+"""Version of torchrg, without further imports."""
 
 __version__ = "0.1.0"

@@ -66,7 +66,7 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
 
 def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, convert):
     done = convert("folder", rooms, tmp_path / "out", "--workers", 1, "--limit-memory", 0.1)
-    assert done.err.count("may need more memory than 0.1 GB; it runs alone") == 2
+    assert done.err.count("may exceed the memory limit of 0.1 GB; it runs alone") == 2
     assert results_of(tmp_path / "out") == results_of(converted)
 
 
@@ -95,8 +95,8 @@ def test_a_dry_run_writes_nothing(rooms, tmp_path, convert):
     shown = convert("folder", rooms, tmp_path / "out", "--dry-run", "--only", "east/*").out
     assert "1 scans to convert" in shown
     assert "disk: about 0.000 GB of " in shown
-    assert "memory: about 0.4 GB for 1 at a time" in shown
-    assert "time: about 1 s, at 10 s of a core for a million points" in shown
+    assert "memory: about 0.4 GB, 1 at a time" in shown
+    assert "time: about 1 s, at 10 core seconds per million points" in shown
     assert not (tmp_path / "out").exists()
 
 
@@ -128,7 +128,7 @@ def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, con
         (["folder", "IN", "OUT", "--workers", "0"], "expected --workers >= 1, got 0"),
         (["folder", "IN", "OUT", "--limit-memory", "0"], "expected --limit-memory above 0"),
         (["folder", "IN", "OUT", "--chunk-size", "0"], "expected --chunk-size >= 1"),
-        (["folder", "IN", "OUT", "--ray-address", "auto"], "together with --engine ray"),
+        (["folder", "IN", "OUT", "--ray-address", "auto"], "with --engine ray"),
         (["folder", "IN", "OUT", "--engine", "spark"], "engine"),
         (["folder", "IN", "OUT", "--only", "west/*"], "they are east/office, hall"),
         (["folder", "IN", "IN/out"], "expected a directory outside"),

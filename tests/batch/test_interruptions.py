@@ -185,5 +185,5 @@ def test_an_interrupt_says_how_to_go_on(larger_rooms, tmp_path, number):
             break  # Else all rooms were done before the signal came.
     assert process.returncode == 130, told
     assert told.count("\n") == 1
-    assert "of 4 scans are complete. The same command goes on from here." in told
+    assert "of 4 scans are complete. Rerun the same command to resume." in told
     assert not list(out.rglob(".*.np?"))

@@ -83,7 +83,7 @@ def test_many_small_scans_take_room_and_time_of_their_own(faults, tmp_path):
     assert plan.num_bytes > 99 * 6 * 4096
     costs = format_costs(plan, 1, 10**10, 10**10, (10.0, "points"))
     assert "disk: about 0.003 GB" in costs
-    assert "time: about 3 s, at 10 s of a core" in costs
+    assert "time: about 3 s, at 10 core seconds" in costs
     assert "time: about 5 min" in format_costs(
         plan._replace(jobs=plan.jobs * 100), 1, 10**10, 10**10, (10.0, "points")
     )
@@ -95,7 +95,7 @@ def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):
     table = format_report(report)
     assert "8_b" in table
     assert "9_a" not in table
-    assert "1 scans have notes, which report.json holds" in table
+    assert "1 scans have notes; see report.json" in table
 
 
 def test_an_empty_table_is_its_head():

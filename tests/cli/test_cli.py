@@ -183,7 +183,7 @@ def test_no_result_takes_the_place_of_an_input(room_file, tmp_path, monkeypatch,
     for out in ("room é.npz", ".", "linked.npz"):
         done = run(*command, *several, "room é.npz", "--out", out)
         assert done.code == 2
-        assert "expected a place of its own for each result" in done.error
+        assert "would overwrite an input or another result" in done.error
     assert Path("room é.npz").read_bytes() == before
 
 
@@ -295,7 +295,7 @@ def test_names_of_columns_count_for_each_file_without_its_own(tmp_path, run):
     write_cloud(tmp_path / "b.ply", Cloud(flat[:100] + np.eye(3)[2], {"d": flat[:100, 0]}))
     inputs, out = (tmp_path / "a.npy", tmp_path / "b.ply"), tmp_path / "r.npz"
     shown = run("segment", *inputs, "--merge", *CLASSIC, "--out", out, "--columns", "x,y,z,d")
-    assert "(without its own d)" in shown.out
+    assert "(without the input fields d)" in shown.out
     assert shown.err == ""
     with np.load(out) as result:
         np.testing.assert_array_equal(result["points"][:2_000], flat)
@@ -306,7 +306,7 @@ def test_names_of_columns_count_for_each_file_without_its_own(tmp_path, run):
 def test_commands_that_read_truth_or_draw_take_names_too(leica, tmp_path, run):
     path, _ = leica
     assert "f1" in run("score", path, path, "--columns", "x,y,z,label,_,_,_").out
-    assert "shares neither labels nor normals" in run("score", path, path).err
+    assert "has neither labels nor normals in common" in run("score", path, path).err
     picture = ("--out", tmp_path / "a.png", "--width", "99")
     assert run("view", path, *picture, *NAMES, "--color", "color").code == 0
     convert = ("convert", "folder", path.parent, tmp_path / "out", *CLASSIC, "--workers", "1")
@@ -325,7 +325,7 @@ def test_names_for_files_that_have_their_own_are_wrong_use(room_file, tmp_path, 
         ("convert", "folder", room_file.parent, tmp_path / "out"),
     ):
         error = run(*command, "--columns", "x,y,z").error
-        assert "expected text or .npy for --columns, got files that name" in error
+        assert "expected text or .npy input for --columns, got files with" in error
 
 
 def test_what_gives_way_to_a_result_is_told(room_file, tmp_path, run):
@@ -339,7 +339,7 @@ def test_what_gives_way_to_a_result_is_told(room_file, tmp_path, run):
     # Archives hold the result alone, which the line about it says.
     shown = run("segment", room_file, *CLASSIC, "--out", tmp_path / "a.npz")
     assert shown.err == ""
-    assert shown.out.endswith("a.npz (without its own labels, normals)\n")
+    assert shown.out.endswith("a.npz (without the input fields labels, normals)\n")
 
 
 def test_codes_for_missing_points_are_no_points(room, tmp_path, run):

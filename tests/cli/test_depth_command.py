@@ -107,7 +107,7 @@ def test_segment_says_that_a_cloud_is_a_depth_image(tmp_path, run, depth):
         source = tmp_path / f"{name}.pcd"
         write_cloud(source, Cloud(coordinates, grid_shape=grid))
         done = run("segment", source, "--preset", "classic", "--out", tmp_path / "out.npz")
-        assert ("taken by a depth camera; torchrg depth" in done.err) == (name == "image")
+        assert ("from a depth camera; torchrg depth" in done.err) == (name == "image")
 
 
 def contents(folder):
@@ -126,7 +126,7 @@ def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_pa
     damaged, sums = told.err.splitlines()
     assert damaged.startswith(f"torchrg: {inputs[1]}: ")
     assert damaged.count("2.png") == 1
-    assert sums == "torchrg: 1 of 3 inputs failed, the others are written."
+    assert sums == "torchrg: 1 of 3 inputs failed, the remaining ones are written."
     assert told.out.count(" 2 planes, ") == 2
     assert sorted(path.name for path in out.iterdir()) == ["1", "3"]
     assert contents(out / "1") == contents(out / "3")
@@ -170,7 +170,7 @@ def test_images_in_a_directory_write_what_convert_writes(tmp_path, frame, depth,
 def test_a_folder_of_several_is_refused_with_the_command_for_it(tmp_path, frame, run):
     (tmp_path / "next.png").write_bytes(frame.read_bytes())
     error = run("depth", tmp_path, *CAMERA, "--out", tmp_path / "out").error
-    assert f"of one depth image, got 2; use: torchrg convert rgbd {tmp_path} OUT" in error
+    assert f"with one depth image, got 2; use torchrg convert rgbd {tmp_path} OUT" in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.png", "next.png"]
 
 
@@ -209,8 +209,8 @@ def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, run):
     other.write_bytes(frame.read_bytes())
     before = contents(tmp_path)
     for inputs, out, message in (
-        ([frame], frame, "frame.png: expected a place of its own for each result"),
-        ([other], frame, "frame_planes.png: expected a place of its own for each result"),
+        ([frame], frame, "frame.png: would overwrite an input or another result"),
+        ([other], frame, "frame_planes.png: would overwrite an input or another result"),
     ):
         assert message in run("depth", *inputs, *CAMERA, "--out", out).error
     assert contents(tmp_path) == before
@@ -230,19 +230,19 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
     twin = tmp_path / "more" / frame.name
     twin.write_bytes(frame.read_bytes())
     for arguments, message in (
-        ([frame], "frame.png: expected --intrinsics fx,fy,cx,cy, which depth images"),
-        ([frame, *CAMERA[:2]], "frame.png: expected --depth-scale, which depth images"),
-        ([frame, "--intrinsics", "1,2,3", *CAMERA[2:]], "four numbers without blanks"),
+        ([frame], "frame.png: missing --intrinsics fx,fy,cx,cy, required"),
+        ([frame, *CAMERA[:2]], "frame.png: missing --depth-scale, required"),
+        ([frame, "--intrinsics", "1,2,3", *CAMERA[2:]], "four numbers without spaces"),
         ([frame, frame, *CAMERA], "expected a directory for 2 inputs"),
         ([frame, *CAMERA[:4], "--threads", "0"], "expected --threads from 1 to 1,024, got 0"),
-        ([tmp_path / "list.pcd"], "expected an organised cloud"),
-        ([tmp_path / "turned.pcd"], "expected points of a pinhole camera"),
+        ([tmp_path / "list.pcd"], "not an organized point cloud"),
+        ([tmp_path / "turned.pcd"], "expected points in the coordinates of a pinhole camera"),
         ([tmp_path / "bad.npy", *CAMERA], "bad.npy: expected an array of numbers, got: "),
         (
             [tmp_path / "huge.png", *CAMERA],
-            "huge.png: expected an image that memory has room for, got 90,000,000,000 pix",
+            "huge.png: not enough memory for 90,000,000,000 pix",
         ),
-        ([frame, twin, *CAMERA, "--out", tmp_path / "out"], "another input has the same name"),
+        ([frame, twin, *CAMERA, "--out", tmp_path / "out"], "has the same name as"),
     ):
         assert message in run("depth", "--out", tmp_path / "a.png", *arguments).error
     assert not (tmp_path / "a.png").exists()
@@ -317,22 +317,22 @@ def test_a_cloud_is_checked_against_a_camera_that_is_given(tmp_path, depth, run)
     assert run("depth", source, *CAMERA[:2], *out).err == ""
     for camera in ("55,55,39.5,29.5", "50,50,36,29.5", "50,-50,39.5,29.5"):
         error = run("depth", source, "--intrinsics", camera, *out).err.splitlines()[-1]
-        assert "scan.pcd: expected --intrinsics of the camera that the points are of" in error
+        assert "scan.pcd: --intrinsics do not match the points" in error
     done = run("depth", source, "--depth-scale", "1000", *out)
-    assert "--depth-scale has no effect on a cloud" in done.err
+    assert "--depth-scale is ignored for point clouds" in done.err
 
 
 def test_segment_says_where_depth_images_went(tmp_path, frame, run):
     cloud, out = tmp_path / "scan.pcd", ["--out", tmp_path / "out.npz"]
     depth = "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
-    image = f"got the image {frame}; use: torchrg depth {frame} {depth}"
+    image = f"got the image {frame}; use torchrg depth {frame} {depth}"
     for arguments, message in (
         ([frame, *out], image),
         ([cloud, frame, *CAMERA, *out], image),
         ([*out, "--preset=classic", frame], image),
-        ([cloud, "--image", *out], f"got --image; use: torchrg depth IMAGES... {depth}"),
-        ([cloud, *CAMERA, *out], f"got --intrinsics; use: torchrg depth IMAGES... {depth}"),
-        ([cloud, "--depth-scale=1000", *out], "got --depth-scale=1000; use: torchrg depth IMAGES"),
+        ([cloud, "--image", *out], f"got --image; use torchrg depth IMAGES... {depth}"),
+        ([cloud, *CAMERA, *out], f"got --intrinsics; use torchrg depth IMAGES... {depth}"),
+        ([cloud, "--depth-scale=1000", *out], "got --depth-scale=1000; use torchrg depth IMAGES"),
     ):
         error = run("segment", *arguments).error
         assert error.startswith("torchrg: segment: expected point clouds, got ")

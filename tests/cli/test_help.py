@@ -117,7 +117,7 @@ def test_fields_become_what_is_written(line, changes):
         ("a --out", "expected a value for --out. See"),
         ("a --out b --part.size wide", "expected a number for --part.size, got 'wide'. See"),
         ("a --out b --place 1 2", "expected 3 values for --place, got 2. See"),
-        ("a --out b --part.counts 1 x", "expected a whole number for --part.counts, got 'x'. See"),
+        ("a --out b --part.counts 1 x", "expected an integer for --part.counts, got 'x'. See"),
         ("a --out b --kind none", "expected --kind to be one of one, other, got 'none'. See"),
         ("a --out b --part.is-on=yes", "expected no value for --part.is-on. See"),
         ("a b --out b", "unrecognized argument b. See"),
@@ -157,7 +157,7 @@ def test_examples_are_understood(prog, capsys):
     for line in examples:
         assert line.startswith(f"{prog} ")
         arguments = shlex.split(line)[len(prog.split()) :]
-        parse(kind, flags.spell_counts(arguments), prog=prog)
+        parse(kind, flags.expand_counts(arguments), prog=prog)
 
 
 @pytest.mark.parametrize("prog", KINDS)
@@ -166,7 +166,7 @@ def test_short_help_fits_a_screen_and_names_the_rest(prog, capsys, monkeypatch):
     text, flags = help_of(prog, capsys, "--help"), list(list_flags(KINDS[prog]))
     assert len(text.splitlines()) <= 60
     shown = [flag for flag in flags if f"\n  {flag.spelling}" in text]
-    assert all(flag in shown for flag in flags if flag.is_needed)
+    assert all(flag in shown for flag in flags if flag.is_required)
     more = f"{prog} --help-all explains these and {len(flags) - len(shown)} more."
     assert (more in text) == (len(shown) < len(flags))
     assert text.rstrip().endswith(example_lines(KINDS[prog])[-1])

@@ -81,7 +81,7 @@ import torchrg.__main__ as process
 def interrupted(*_, **__):
     os.kill(os.getpid(), signal.SIGINT)
 
-process.on_interrupts = lambda handler: signal.signal(signal.SIGINT, signal.default_int_handler)
+process.handle_interrupts = lambda handler: signal.signal(signal.SIGINT, signal.default_int_handler)
 process.cli._run = process.cli.fail = interrupted
 sys.exit(process.main())
 """

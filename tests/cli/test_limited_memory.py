@@ -42,7 +42,7 @@ def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, run, monkeypa
     for folder, limit, said in (("whole", "9", False), ("disk", LIMIT, True)):
         (tmp_path / folder).mkdir()
         done = run("segment", *files, "--out", tmp_path / folder / name, "--limit-memory", limit)
-        assert ("the largest arrays are on the disk" in done.out) == said
+        assert ("moving the largest arrays to disk" in done.out) == said
     whole, disk = (
         {path.relative_to(tmp_path / folder): path.read_bytes() for path in files}
         for folder in ("whole", "disk")

@@ -170,7 +170,7 @@ def test_inputs_whose_results_would_share_a_file_are_both_named(tmp_path, run, c
         path.parent.mkdir()
         path.touch()
     line = run(command, *inputs, "--out", tmp_path / "out").error
-    assert all(str(name) in line for name in (*inputs, "give them different directories"))
+    assert all(str(name) in line for name in (*inputs, "use different output directories"))
     assert not (tmp_path / "out").exists()
 
 
@@ -185,5 +185,5 @@ def test_no_page_takes_the_place_of_the_index(tmp_path, run, name):
         ("segment", inputs / f"{name}.npy", "--out", tmp_path, "--pages", "--picture", pages),
         ("convert", "folder", inputs, tmp_path / "out", "--pages", pages),
     ):
-        assert f"the page of {name} would take the place of the index" in run(*command).error
+        assert f"the viewer of {name} would overwrite the index" in run(*command).error
     assert not list(pages.iterdir())

@@ -49,7 +49,7 @@ def test_names_are_printed_with_escapes(cloud, tmp_path, shown_by):
     said = shown_by("segment", cloud, "--out", out, *flags)
     assert said.count("\n") == 1
     assert f"{SHOWN}.npz: 600 points" in said
-    assert f"without its own {SHOWN}" in said
+    assert f"without the input fields {SHOWN}" in said
     assert f"{SHOWN}.ply\n" in shown_by("normals", cloud, "--out", again, "--method", "pca")
     assert f"{SHOWN}.x: " in shown_by("info", f"{EVIL}.x", code=2)
     convert = ("convert", "folder", cloud.parent, tmp_path / "out", *flags)
@@ -64,7 +64,7 @@ def test_names_that_are_no_text_are_taken(cloud, tmp_path, shown_by):
     shown_by("normals", cloud, "--out", path, "--method", "pca")
     assert "lat\\udce9.ply -> " in shown_by("view", path, "--out", tmp_path / "o.html")
     assert "lat\\udce9" in (tmp_path / "o.html").read_text(encoding="utf-8")
-    with pytest.raises(FormatError, match="; rename it, as pictures need a name in UTF-8"):
+    with pytest.raises(FormatError, match="; rename it, image file names must be valid UTF-8"):
         write_png(path.with_suffix(".png"), torch.zeros(2, 2, 3, dtype=torch.uint8))
     assert sorted(place.name for place in tmp_path.iterdir()) == ["in", NOT_TEXT, "o.html"]
 

@@ -63,8 +63,10 @@ def test_another_order_is_refused_and_nearest_points_score_as_rows_do(
     shuffled = changed(folder, f"shuffled{suffix}", ORDER)
     line = refused(shuffled, folder / "truth.npz")
     num_moved = int((np.arange(SIZE) != ORDER).sum())
-    assert f"got others ({num_moved:,} of 3,000 rows, the first 0: " in line
-    assert line.endswith("; add --match-distance D to take the nearest points within D.\n")
+    assert f"got {num_moved:,} of 3,000 that differ (row 0: " in line
+    assert line.endswith(
+        "; to compare each point with the nearest one within D, pass --match-distance D.\n"
+    )
     flags = ["--superpoints"] if suffix == ".npz" else []
     expected = score(folder / "ours.npz", folder / "truth.npz", *flags)
     scores = score(shuffled, folder / "truth.npz", *NEAR, *flags)
@@ -78,8 +80,8 @@ def test_another_order_is_refused_and_nearest_points_score_as_rows_do(
 def test_another_place_is_refused(folder, refused, flags):
     moved = changed(folder, "moved.npz", shift=1.0)
     line = refused(moved, folder / "truth.npz", *flags)
-    assert "got others (3,000 of 3,000 rows, the first 0: " in line
-    assert "expected points near those of" in refused(moved, folder / "truth.npz", *NEAR)
+    assert "got 3,000 of 3,000 that differ (row 0: " in line
+    assert "no points within the distance of" in refused(moved, folder / "truth.npz", *NEAR)
 
 
 def test_one_wrong_row_is_named(folder, refused):
@@ -88,19 +90,19 @@ def test_one_wrong_row_is_named(folder, refused):
     points[17] = [1.5, 2.5, 0.25]
     write_cloud(folder / "one.npz", Cloud(points, cloud.fields))
     line = refused(folder / "one.npz", folder / "truth.npz")
-    assert "(1 of 3,000 rows, the first 17: 1.5 2.5 0.25 for" in line
+    assert "1 of 3,000 that differ (row 17: 1.5 2.5 0.25 for" in line
 
 
 def test_points_without_a_match_are_told_and_count_as_unlabelled(folder, run, refused):
     kept = np.sort(ORDER[: SIZE // 2])
     part = changed(folder, "part.npz", kept, shift=0.0004)
-    assert "expected as many points as" in refused(part, folder / "truth.npz")
+    assert "expected 3,000 points as in" in refused(part, folder / "truth.npz")
     flags = ["--match-distance", "0.001", "--superpoints", "--json"]
     done = run("score", part, folder / "truth.npz", *flags)
     lost = np.ones(SIZE, dtype=bool)
     lost[kept] = False
     told = f"{folder / 'truth.npz'}: 1,500 of 3,000 points have no match in {part} and count as"
-    assert done.err == f"torchrg: warning: {told} unlabelled.\n"
+    assert done.err == f"torchrg: warning: {told} unlabeled.\n"
     scores, truth = json.loads(done.out), read_cloud(folder / "truth.npz")
     assert scores["match"] == {"points": SIZE, "unmatched": SIZE // 2, "unused": 0}
     ours = {name: v.copy() for name, v in read_cloud(folder / "ours.npz").fields.items()}
@@ -139,7 +141,7 @@ def test_points_that_are_not_finite_agree_with_each_other(folder, score, refused
         write_cloud(folder / f"holes_{name}.npz", Cloud(points, cloud.fields))
     score(folder / "holes_ours.npz", folder / "holes_truth.npz")
     line = refused(folder / "holes_ours.npz", folder / "truth.npz")
-    assert "got others (2 of 3,000 rows, the first 3: nan nan nan for" in line
+    assert "got 2 of 3,000 that differ (row 3: nan nan nan for" in line
 
 
 def test_results_of_convert_are_scored_as_files_are(folder_of_clouds, tmp_path, score):

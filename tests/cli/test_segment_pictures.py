@@ -41,7 +41,7 @@ def test_several_pictures_go_to_a_directory_under_the_names_of_the_inputs(rooms,
 @pytest.mark.parametrize(
     ("inputs", "place", "message"),
     [
-        (["room1.npz"], "seg.jpg", "expected a file that ends in .png"),
+        (["room1.npz"], "seg.jpg", "expected a file ending in .png"),
         (["room1.npz"], "no/seg.png", "there is no folder"),
         (["room1.npz", "room2.npz"], "both.png", "expected a directory for 2 files"),
     ],
@@ -58,5 +58,5 @@ def test_equal_points_give_no_plane_a_warning_and_a_picture(tmp_path, segment):
     places = ("--out", tmp_path / "seg.npz", "--picture", tmp_path / "seg.png")
     done = segment(tmp_path / "one.npy", *places)
     assert (done.code, done.err.count("\n")) == (0, 1)
-    assert "no plane found: all points are equal" in done.err
+    assert "no plane found: all points are identical" in done.err
     assert (tmp_path / "seg.png").read_bytes().startswith(PNG)

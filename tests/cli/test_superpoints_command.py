@@ -68,7 +68,7 @@ def test_superpoints_are_scored_when_asked(folder, run):
     assert scores["superpoints"] == expected._asdict()
     assert set(json.loads(run("score", result, truth, "--json").out)) == {"labels", "normals"}
     error = run("score", truth, result, "--superpoints").error
-    assert "expected the field superpoint for --superpoints" in error
+    assert "missing superpoint, required by --superpoints" in error
 
 
 def test_superpoints_are_drawn(folder, tmp_path, run):

@@ -129,11 +129,11 @@ def test_convert_keeps_its_tables_and_never_replaces_those_of_others(scans, tmp_
     [
         (
             "planes.txt",
-            "planes.txt: expected a file that ends in .csv or .json, got '.txt'",
+            "planes.txt: expected a file ending in .csv or .json, got '.txt'",
         ),
         ("no/planes.csv", "there is no folder"),
-        ("out.npz", "expected a file that ends in .csv or .json, got '."),
-        ("room.xyz", "expected a file that ends in .csv or .json, got '."),
+        ("out.npz", "expected a file ending in .csv or .json, got '."),
+        ("room.xyz", "expected a file ending in .csv or .json, got '."),
     ],
 )
 def test_a_table_without_a_place_is_refused_before_the_work(scans, tmp_path, run, table, message):
@@ -148,7 +148,7 @@ def test_a_table_without_a_place_is_refused_before_the_work(scans, tmp_path, run
 )
 def test_convert_refuses_a_table_outside_the_folder_of_a_scan(scans, tmp_path, run, table):
     told = run("convert", "folder", scans[0], tmp_path / "out", "--table", table)
-    assert "expected --table to be the name of a .csv or .json file" in told.error
+    assert "expected --table to be a file name ending in .csv or .json" in told.error
     assert not (tmp_path / "out").exists()
 
 

@@ -18,9 +18,9 @@ def test_view_draws_a_picture(room_file, tmp_path, run):
     assert run("view", room_file, "--out", out, "--width", "200").code == 0
     assert out.read_bytes().startswith(b"\x89PNG")
     for flags, message in (
-        (["--color", "curvature"], "expected curvature for --color curvature"),
+        (["--color", "curvature"], "missing curvature, required by --color curvature"),
         (["--azimuth-deg", "nan"], "expected azimuth_deg to be finite, got nan"),
-        (["--out", "room.jpg"], "room.jpg: expected a file that ends in .png or .html"),
+        (["--out", "room.jpg"], "room.jpg: expected a file ending in .png or .html"),
     ):
         assert message in run("view", room_file, "--out", out, *flags).error
 

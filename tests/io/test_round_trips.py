@@ -401,5 +401,5 @@ def test_a_cloud_takes_tensors():
     values = cloud.coordinates, cloud.fields["labels"], cloud.front
     assert all(isinstance(value, np.ndarray) for value in values)
     assert torch.equal(cloud.points, torch.eye(3))
-    with pytest.raises(ShapeError, match=r"got list; numpy\.array makes"):
+    with pytest.raises(ShapeError, match=r"got list; use numpy\.array"):
         Cloud([[0.0, 0.0, 1.0]])

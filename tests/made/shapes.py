@@ -24,7 +24,7 @@ from torchrg.scenes import (
 )
 from torchrg.scenes.geometry import box_around
 from torchrg.scenes.scene import NoiseDirection
-from torchrg.scenes.surfaces import Plane, in_space
+from torchrg.scenes.surfaces import Plane, append_zero
 
 _HERE = Frame.upright(np.zeros(3))
 _QUARTER = np.pi / 2
@@ -64,9 +64,9 @@ class Fan(Flat):
 
     def _corners(self) -> Array:
         corner, first, second = self.cells.swapaxes(0, 1)
-        return in_space(np.concatenate([corner, corner + first, corner + second]))
+        return append_zero(np.concatenate([corner, corner + first, corner + second]))
 
-    def _shares(self, first: Array, second: Array) -> tuple[Array, Array]:
+    def _edge_fractions(self, first: Array, second: Array) -> tuple[Array, Array]:
         beyond = first + second > 1
         return np.where(beyond, 1 - first, first), np.where(beyond, 1 - second, second)
 
@@ -171,7 +171,7 @@ class Sheet(Surface):
         return np.broadcast_to(self.frame.axes[2], points.shape)
 
     def _corners(self) -> Array:
-        return in_space(self.outline.corners)
+        return append_zero(self.outline.corners)
 
     def _draw(self, rng: np.random.Generator, count: int) -> Array:
         low, high = box_around(self.outline.corners)
@@ -180,7 +180,7 @@ class Sheet(Surface):
             tried = low + (high - low) * rng.random((2 * missing + 16, 2))
             drawn.append(tried[self.outline.contains(*tried.T)][:missing])
             missing -= len(drawn[-1])
-        return in_space(np.concatenate(drawn))
+        return append_zero(np.concatenate(drawn))
 
 
 def extrude(outline: Outline, height: float) -> tuple[Surface, ...]:

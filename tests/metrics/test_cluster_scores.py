@@ -9,7 +9,7 @@ import torch
 from tests.metrics.sphere_clusters import indices_by_loops, scattered
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import score_clusters
-from torchrg.metrics.sphere import _rim
+from torchrg.metrics.sphere import _diameter_candidates
 
 INDICES = ("cp", "sp", "dbi", "dvi")
 
@@ -248,4 +248,4 @@ def test_settings_out_of_range_are_refused(setting, value, requirement):
 def test_only_the_rim_of_an_arc_can_hold_its_diameter():
     angles = torch.linspace(-0.1, 0.1, 101, dtype=torch.float64)
     arc = torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], dim=1)
-    assert len(_rim(arc, arc[50])) == 2
+    assert len(_diameter_candidates(arc, arc[50])) == 2

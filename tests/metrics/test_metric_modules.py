@@ -76,7 +76,7 @@ def test_all_indices_of_a_part_have_no_direction():
 def test_unknown_indices_and_those_of_several_parts_are_refused():
     with pytest.raises(ConfigError, match=r"expected index to be one of labels, .*, got 'f2'"):
         PlaneMetric("f2")
-    with pytest.raises(ConfigError, match=r"'invalid' of clusters and normals; take PlaneMetric"):
+    with pytest.raises(ConfigError, match=r"'invalid' of clusters and normals; use PlaneMetric"):
         PlaneMetric("invalid")
     with pytest.raises(ValueError, match="Unexpected keyword arguments: `min_points`"):
         PlaneMetric("f1", min_points=3)

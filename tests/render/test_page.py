@@ -239,8 +239,8 @@ def test_directions_survive_two_bytes():
         ({"up": (0, 0, 0)}, "expected up to be a direction"),
         ({"view": "inside"}, "expected view to be one of"),
         ({"color": "height"}, "expected one of plane"),
-        ({"color": "error"}, "expected labels for the colour 'error' and a truth"),
-        ({"truth": Cloud(np.eye(3))}, "expected a truth of 1,600 points, got 3"),
+        ({"color": "error"}, "expected labels and ground truth for color='error'"),
+        ({"truth": Cloud(np.eye(3))}, "expected ground truth for 1,600 points, got 3"),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(settings, message):
@@ -269,10 +269,13 @@ def test_view_writes_a_page(tmp_path, run):
     ("arguments", "message"),
     [
         (["--out", "no/page.html"], "there is no folder"),
-        (["--out", "page.pdf"], "expected a file that ends in .png or .html"),
-        (["--out", "page.png", "--truth", "room.npz"], "with a page"),
-        (["--out", "page.html", "--truth", "few.npz"], "expected a truth of 300 points, got 3"),
-        (["--out", "page.html", "--color", "sharp"], "expected sharp for the colour"),
+        (["--out", "page.pdf"], "expected a file ending in .png or .html"),
+        (["--out", "page.png", "--truth", "room.npz"], "with a viewer"),
+        (
+            ["--out", "page.html", "--truth", "few.npz"],
+            "expected ground truth for 300 points, got 3",
+        ),
+        (["--out", "page.html", "--color", "sharp"], "expected sharp for color="),
         (["--out", "page.html", "--beside", "gone.npz"], "no such file"),
         (["--out", "page.html", "--max-points", "0"], "expected max_points >= 1"),
     ],

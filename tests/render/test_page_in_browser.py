@@ -43,7 +43,7 @@ class Tab:
         self.page.goto(path.as_uri())
         self.wait_for(
             "globalThis.torchrg && (torchrg.page.ready || !message.hidden && "
-            "!message.textContent.startsWith('Unpacking'))"
+            "!message.textContent.startsWith('Decompressing'))"
         )
 
     def run(self, script):
@@ -207,7 +207,7 @@ def test_a_click_picks_and_the_panel_tells(tab, room):
     plane = tab.run(f"torchrg.page.clouds[0].planes[{number}]")
     text = tab.run("picked.innerText")
     assert f"{plane['count']:,}" in text
-    assert all(word in text for word in ("equation", "area", "rms", "meets"))
+    assert all(word in text for word in ("equation", "area", "rms", "adjacent"))
     assert "°" in text
     boxes = "(terms) => terms.filter((term) => term.scrollWidth > term.clientWidth).length"
     assert tab.page.locator("#picked dt").evaluate_all(boxes) == 0  # No term covers its value.

@@ -153,7 +153,7 @@ def test_a_least_dimension_that_points_do_not_have_is_refused(estimator, rng):
     patch = torch.rand(9, 3, generator=rng)
     assert estimator(patch, min_dimension=1).valid
     for wrong in (-1, 3, 10**23):
-        with pytest.raises(ConfigError, match="expected min_dimension from 0 to 2, of points of 3"):
+        with pytest.raises(ConfigError, match="expected min_dimension from 0 to 2 for points"):
             estimator(patch, min_dimension=wrong)
 
 

@@ -276,7 +276,7 @@ def test_refusals():
         fit_detmcd(patch, scaling="median")
     with pytest.raises(ConfigError, match="expected inliers to be one of raw, reweighted"):
         fit_detmcd(patch, inliers="final")
-    with pytest.raises(ConfigError, match="expected small_sample off with scaling='quantile'"):
+    with pytest.raises(ConfigError, match="expected small_sample=False with scaling='quantile'"):
         fit_detmcd(patch, small_sample=True, scaling="quantile")
-    with pytest.raises(ConfigError, match="expected points of 3 coordinates"):
+    with pytest.raises(ConfigError, match="expected points with 3 coordinates"):
         fit_detmcd(torch.randn(50, 2), small_sample=True)

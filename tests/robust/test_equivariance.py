@@ -103,10 +103,10 @@ def test_subsets_of_tied_distances_have_exactly_h_points(rng):
         assert (kept <= left).all()
         if size < 50:
             # Of the points at the limit the first ones are taken.
-            places = torch.arange(50)[:, None]
+            indices = torch.arange(50)[:, None]
             tied = distances == kept
-            last_in = torch.where(tied & (marked > 0), places, -1).amax(dim=0)
-            first_out = torch.where(tied & (marked == 0), places, 50).amin(dim=0)
+            last_in = torch.where(tied & (marked > 0), indices, -1).amax(dim=0)
+            first_out = torch.where(tied & (marked == 0), indices, 50).amin(dim=0)
             assert (last_in < first_out).all()
 
 

@@ -1,4 +1,4 @@
-"""Command line: ``torchrg COMMAND ...``; each command parses, calls, and prints."""
+"""Command line: ``torchrg COMMAND ...``."""
 
 import difflib
 import gc
@@ -27,24 +27,24 @@ from torchrg.errors import (
 )
 
 COMMANDS = {
-    "segment": "label the planes of scans",
-    "depth": "label the planes of depth images and of organised clouds",
+    "segment": "segment point clouds into planes",
+    "depth": "segment depth images and organized clouds into planes",
     "normals": "estimate normals and curvature of scans",
-    "align": "set scans upright, with their walls along x and y",
+    "align": "make scans upright, with walls along x and y",
     "convert": "segment every scan of a data set, on one machine or a cluster",
-    "score": "compare labels and normals with a truth",
-    "sample": "make a synthetic room with its truth",
-    "view": "draw a cloud or a result",
-    "info": "say what a file holds",
+    "score": "evaluate labels and normals against ground truth",
+    "sample": "generate a synthetic room with ground truth",
+    "view": "render a cloud or a result",
+    "info": "print a summary of a point cloud file",
 }
-"""Commands by name, each with a module of the same name, and what they do."""
+"""Purpose of each command by name; each command is a module with the same name."""
 _OVERVIEW = """usage: torchrg COMMAND ...
 
 Normals, curvature and plane labels for indoor point clouds.
 
 {}
 
-torchrg COMMAND --help says more. torchrg --version prints the version.""".format(
+torchrg COMMAND --help lists the options. torchrg --version prints the version.""".format(
     "\n".join(f"  {name:<9}{purpose}" for name, purpose in COMMANDS.items())
 )
 
@@ -53,10 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code.
 
     Args:
-        argv: Arguments after ``torchrg``. Default: those of the process.
+        argv: Arguments after ``torchrg``. Default: the arguments of the process.
 
     Returns:
-        0 done; 2 wrong use or bad input; 3 some items of a batch failed; 130 interrupted.
+        0 success; 2 usage error or invalid input; 3 some inputs of a batch failed; 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     name = next(iter(arguments), "")
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return _run(arguments)
         finally:
-            # Here, where an error of writing is told, and not when Python ends.
+            # Flush here, so that write errors are reported as errors of the command.
             print(end="", flush=True)
     except TorchrgError as error:
         return fail(str(error))
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return fail(f"{name}: {OUT_OF_MEMORY}")
     except OSError as error:
-        # What could not be printed Python would try again when it ends, and complain.
+        # Otherwise Python would flush stdout again at exit and print a traceback.
         with suppress(UnsupportedOperation, AttributeError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
@@ -84,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    """Run the command that the first argument names."""
+    """Run the command named by the first argument."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_OVERVIEW)
         return 0 if arguments else USAGE_ERROR
@@ -103,7 +103,7 @@ def _run(arguments: list[str]) -> int:
         gc.freeze()
         gc.enable()
     with raising_interrupts(), warnings.catch_warnings():
-        # Commands tell of the precision of each file as a line: see check_finite.
+        # Commands print the precision of each file themselves (check_finite).
         warnings.simplefilter("ignore", PrecisionWarning)
         warnings.showwarning = lambda message, *_, **__: warn(" ".join(str(message).split()))
         code: int = command.run(remaining)

@@ -1,4 +1,4 @@
-"""``torchrg align``: scans set upright, with their walls along x and y."""
+"""``torchrg align``: make scans upright, with walls along x and y."""
 
 import dataclasses
 import time
@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrg.batch.records import describe_run
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.ending import say, warn, warnings_as_lines
-from torchrg.cli.loop import STAGES, check_apart, note_input, output_paths, run_each, stage_bar
+from torchrg.cli.ending import print_lines, print_warnings, warn
+from torchrg.cli.loop import STAGES, check_distinct, note_input, output_paths, run_each, stage_bar
 from torchrg.clouds import check_finite
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
@@ -26,10 +26,10 @@ from torchrg.structures import Segmentation
 
 @dataclass(frozen=True)
 class Arguments:
-    """Set scans upright, with walls along x and y, the lowest floor at z = 0, the middle at 0, 0.
+    """Make scans upright, with walls along x and y.
 
-    The planes of the scan say where floors and walls are; settings are those of torchrg segment.
-    The axis of --up points up to within 30 degrees.
+    The lowest floor is moved to z = 0 and the center to x = y = 0. Floors and walls are detected
+    with the settings of torchrg segment. The axis --up may be off by up to 30 degrees.
 
     Examples:
         torchrg align scan.ply --out upright.ply
@@ -40,10 +40,10 @@ class Arguments:
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     matrix: Path | None = None
-    """File for the motion of the scan, of one input: .npy holds it as 4 x 4 numbers, .txt as the
-    line axisAlignment of ScanNet."""
+    """File for the rigid transform of a single input: .npy (4 x 4 array) or .txt (axisAlignment
+    line of ScanNet)."""
     segment: bool = False
-    """Write labels, normals, curvature and the table of planes too, as torchrg segment does."""
+    """Also write labels, normals, curvature and the plane table, as torchrg segment does."""
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
     settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
@@ -56,28 +56,28 @@ def run(argv: list[str]) -> int:
     flags.use_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
-    check_apart(outputs, arguments.inputs)
+    check_distinct(outputs, arguments.inputs)
     if arguments.matrix is not None:
         _check_matrix(arguments, arguments.matrix, outputs)
     return run_each(_align_file, arguments, arguments.inputs, outputs)
 
 
 def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None:
-    """Refuse a file for the motion that cannot be written, or stands for several."""
+    """Raise if the transform cannot be written, or there are several inputs."""
     if len(arguments.inputs) > 1:
         raise ConfigError(
             f"expected one input with --matrix, got {len(arguments.inputs)}; align them one by one."
         )
     if path.suffix.lower() not in (".npy", ".txt"):
         raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
-    check_apart([path], [*arguments.inputs, *outputs])
+    check_distinct([path], [*arguments.inputs, *outputs])
     check_place(path)
 
 
 def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Align one file."""
     begin = time.perf_counter()
-    cloud = read_cloud(source, columns=flags.columns_of(source, arguments.columns))
+    cloud = read_cloud(source, columns=flags.file_columns(source, arguments.columns))
     note_input(f"{source}", cloud, target, RESULT_FIELDS if arguments.segment else ())
     for note in check_finite(cloud):
         warn(f"{source}: {note}.")
@@ -86,30 +86,30 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     with stage_bar(source.name, STAGES) as advance:
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     try:
-        with warnings_as_lines():
+        with print_warnings():
             motion = align_axes(seg, up=settings.planes.up or "z")
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
-    # The motion of the coordinates in the file; points are about their origin.
-    whole = motion.clone()
-    whole[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
-    moved = move_cloud(cloud, whole)
+    # The transform in file coordinates; points are relative to the cloud's origin.
+    file_motion = motion.clone()
+    file_motion[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
+    moved = move_cloud(cloud, file_motion)
     moved_seg = _move(seg, motion, moved.origin) if arguments.segment else None
-    provenance = describe_run(source, settings) | {"motion": whole.tolist()}
+    provenance = describe_run(source, settings) | {"motion": file_motion.tolist()}
     write_cloud(target, moved, moved_seg, provenance=provenance)
     if arguments.matrix is not None:
-        _write_matrix(arguments.matrix, whole.numpy())
-    tilt = torch.rad2deg(whole[2, 2].clamp(-1, 1).acos())
-    turn = torch.rad2deg(torch.atan2(whole[1, 0], whole[0, 0]))
+        _write_matrix(arguments.matrix, file_motion.numpy())
+    tilt = torch.rad2deg(file_motion[2, 2].clamp(-1, 1).acos())
+    turn = torch.rad2deg(torch.atan2(file_motion[1, 0], file_motion[0, 0]))
     seconds = time.perf_counter() - begin
-    say(
+    print_lines(
         f"{source}: {len(cloud):,} points, tilted by {tilt:.2f} and turned by {turn:.2f} degrees, "
         f"{seconds:.1f} s -> {target}"
     )
 
 
 def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Segmentation:
-    """Return a segmentation after a rigid motion, about the origin of the moved cloud."""
+    """Transform a segmentation rigidly, relative to the origin of the moved cloud."""
     about = motion.clone()
     about[:3, 3] -= torch.from_numpy(origin)
     normals = (seg.normals.double() @ motion[:3, :3].T).to(seg.normals.dtype)
@@ -117,10 +117,10 @@ def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Seg
 
 
 def _write_matrix(path: Path, matrix: NDArray[np.float64]) -> None:
-    """Write a motion as an array, or as the line that ScanNet has in the text of a scan."""
-    with atomic_path(path) as beside:
+    """Write a transform as an array, or as the axisAlignment line of ScanNet."""
+    with atomic_path(path) as temporary:
         if path.suffix.lower() == ".npy":
-            np.save(beside, matrix)
+            np.save(temporary, matrix)
         else:
             numbers = " ".join(f"{value:.9f}" for value in matrix.reshape(-1))
-            beside.write_text(f"axisAlignment = {numbers}\n", encoding="utf-8")
+            temporary.write_text(f"axisAlignment = {numbers}\n", encoding="utf-8")

@@ -1,9 +1,8 @@
-"""Arguments of commands from the fields of dataclasses: their parser, and what ``--help`` prints.
+"""Command-line parser and help texts generated from dataclasses.
 
-A field is a flag, unless its metadata say otherwise (``torchrg.config.NO_FLAG``), and its docstring
-says what the flag does. A field that is a dataclass is a part, whose flags are called
-``--part.field``. ``--help`` tells what is needed, what is often wanted, the rest by part, and
-examples.
+Each field is a flag, unless its metadata is ``torchrg.config.NO_FLAG``; its docstring is the help
+text. The fields of a nested dataclass become ``--part.field`` flags. ``--help`` lists required and
+common flags; ``--help-all`` lists all flags by group.
 """
 
 import argparse
@@ -29,49 +28,49 @@ from torchrg.errors import ConfigError
 
 Command = TypeVar("Command")
 
-OFTEN = (
+COMMON = (
     *("--normals.method", "--normals.k"),
     *("--growing.max-angle-deg", "--growing.min-size", "--growing.max-distance", "--up"),
     *("--depth.noise", "--depth.max-depth", "--depth.min-size"),
 )
-"""Settings of parts that are often changed; ``--help-all`` has the others."""
+"""Common flags of nested parts; the others appear only in ``--help-all``."""
 ADVANCED = (
     *("--pages", "--level", "--layout", "--columns", "--viewpoint", "--within", "--merge"),
     *("--config", "--angle-deg", "--sort", "--chunk-size", "--engine", "--ray-address"),
     *("--growing.max-distance", "--ignore", "--boundary-distance", "--azimuth-deg"),
 )
-"""Flags of commands that ``--help`` leaves to ``--help-all``."""
+"""Command flags that appear only in ``--help-all``."""
 RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
-"""Flags that decide where and how fast a command runs, never what it finds."""
-ALSO = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
-"""Other spellings of flags, which are accepted and not shown."""
+"""Flags that set where and how fast a command runs, and do not change its result."""
+ALIASES = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
+"""Alternative spellings of flags, accepted but not listed."""
 NEEDED = "required"
-"""Title of the arguments that a command does not run without."""
-_RUNNING = "performance (does not change the result)"
+"""Title of the required arguments."""
+_PERFORMANCE = "performance (does not change the result)"
 _EXAMPLES = "\n\nExamples:\n"
-_WIDEST = 100
+_MAX_WIDTH = 100
 _COLUMN = 28
-"""Column of the terminal at which the texts of short help begin."""
-_SHORT = 40
-"""Characters of a default that short help names."""
-_WORDS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
-_NUMBERS = {int: "a whole number", float: "a number"}
+"""Terminal column at which the texts of the short help start."""
+_MAX_LENGTH = 40
+"""Maximum length of a default listed in the short help, in characters."""
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
+_NUMBERS = {int: "an integer", float: "a number"}
 _NONE = "None"
-"""How a value that is none is written."""
+"""Spelling of a None value."""
 _ROLE = re.compile(r":\w+:`~?([^`]+)`")
 
 
 @dataclass(frozen=True)
 class Argument:
-    """How the field of a command is written, where its name and type do not say it.
+    """Properties of a field that its name and type do not determine.
 
     Attributes:
-        metavar: What stands for its value.
-        text: What it does, where a type that several commands share says it.
-        is_positional: Whether it has no flag.
-        is_inline: Whether the fields of its dataclass are flags without the name of the part.
+        metavar: Placeholder for the value.
+        text: Help text, for types that several commands share.
+        is_positional: Whether the argument has no flag.
+        is_inline: Whether the fields of a dataclass become flags without the name of the part.
     """
 
     metavar: str | None = None
@@ -81,23 +80,23 @@ class Argument:
 
 
 class Flag(NamedTuple):
-    """An argument of a command."""
+    """A command-line argument."""
 
     path: str
-    """Fields that lead to its value, with dots between them."""
+    """Dotted path of the field."""
     name: str
-    """How it is called: ``--part.field``, or a word for what has no flag."""
+    """Name: ``--part.field``, or a word for a positional argument."""
     spelling: str
-    """How it is written, with what stands for its value."""
+    """Name with the placeholder for its value, as in the help."""
     text: str
     part: str
-    """Subject of the part that it belongs to, empty for the command itself."""
+    """Title of its part, empty for flags of the command itself."""
     hint: object
-    is_needed: bool
+    is_required: bool
 
     @property
     def is_positional(self) -> bool:
-        """Whether it has no flag."""
+        """Whether the argument has no flag."""
         return not self.name.startswith("-")
 
 
@@ -110,10 +109,10 @@ def parse(
 ) -> Command:
     """Parse arguments into a dataclass; ``--help`` and ``--help-all`` print and exit.
 
-    ``default`` has values of fields in place of those of the dataclass; ``prog`` is the command.
+    ``default`` overrides defaults of the dataclass by field name; ``prog`` is the command.
 
     Raises:
-        ConfigError: If an argument is wrong, as one line.
+        ConfigError: If an argument is invalid, with a one-line message.
 
     Example:
         >>> from torchrg.cli.sample import Arguments
@@ -122,19 +121,19 @@ def parse(
     """
     flags = list(list_flags(kind, default))
     if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
-        print(format_help(kind, flags, prog=prog, whole="--help-all" in arguments))
+        print(format_help(kind, flags, prog=prog, complete="--help-all" in arguments))
         raise SystemExit(0)
     try:
         example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
         values = _read(flags, arguments, prog, example)
         return typing.cast(Command, _build(kind, default, values))
     except ConfigError as error:
-        text = _named_as_flags(str(error), flags)
+        text = _use_flag_name(str(error), flags)
         raise ConfigError(f"{text} See {prog} --help.") from None
 
 
-def _named_as_flags(message: str, flags: Sequence[Flag]) -> str:
-    """Return a message on a setting that names its flag, where that has no part."""
+def _use_flag_name(message: str, flags: Sequence[Flag]) -> str:
+    """Replace the setting in a message by its flag, if the flag has no part."""
     named = re.fullmatch(r"\w+Config: expected (\w+) (.*)", message, re.DOTALL)
     name = f"--{named[1].replace('_', '-')}" if named else ""
     is_flag = any(flag.name == name for flag in flags)
@@ -142,10 +141,10 @@ def _named_as_flags(message: str, flags: Sequence[Flag]) -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Raises what it would print."""
+    """Parser that raises instead of printing."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise a message in the words of this program."""
+        """Raise the message, reworded."""
         for pattern, text in (
             (r"argument (--[^:/]*).*: expected .*", r"expected a value for \1"),
             (r"argument (--[^:/]*).*: ignored explicit .*", r"expected no value for \1"),
@@ -157,7 +156,7 @@ class _Parser(argparse.ArgumentParser):
 def _read(
     flags: Sequence[Flag], arguments: Sequence[str], prog: str, example: str
 ) -> dict[str, object]:
-    """Return the values that are given, by path."""
+    """Return the parsed values by field path."""
     parser = _Parser(prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
     for flag in flags:
         nargs = "*" if any(map(_is_list, _kinds(flag.hint))) else None
@@ -166,31 +165,31 @@ def _read(
             continue
         switches = zip(_switches(flag.name), (True, False), strict=True)
         for name, const in switches if flag.hint is bool else [(flag.name, None)]:
-            # Fields are written with underscores too.
+            # Underscores are accepted too.
             underscored = f"--{name[2:].replace('-', '_')}"
-            spellings = dict.fromkeys((name, underscored, *ALSO.get(name, ())))
+            spellings = dict.fromkeys((name, underscored, *ALIASES.get(name, ())))
             takes: dict[str, Any] = {"nargs": nargs}
             if const is not None:
                 takes = {"action": "store_const", "const": const}
             parser.add_argument(*spellings, dest=flag.path, **takes)
-    namespace, left = parser.parse_known_args(_joined(flags, arguments))
+    namespace, left = parser.parse_known_args(_join_dashed_values(flags, arguments))
     if left:
         raise ConfigError(_describe_unknown(left[0], flags, arguments))
     values = vars(namespace)
     missing = [
-        flag.name for flag in flags if flag.is_needed and values.get(flag.path) in (None, [])
+        flag.name for flag in flags if flag.is_required and values.get(flag.path) in (None, [])
     ]
     if missing:
         inputs = [values[flag.path] for flag in flags if flag.is_positional and flag.path in values]
         words = " ".join(" ".join(words) if isinstance(words, list) else words for words in inputs)
         given = f" for {words}" if words else ""
         raise ConfigError(f"missing required {' and '.join(missing)}{given}.{example}")
-    return {flag.path: _value_of(flag, values[flag.path]) for flag in flags if flag.path in values}
+    return {flag.path: _to_value(flag, values[flag.path]) for flag in flags if flag.path in values}
 
 
 def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]) -> str:
-    """Return a message on an argument that is neither a flag nor a value, with a repair."""
-    if os.path.lexists(word):  # A file whose name begins as a flag does.
+    """Return a message about an unknown flag or argument, with a fix."""
+    if os.path.lexists(word):  # A file name that starts like a flag.
         return f"unrecognized option {word}. Did you mean ./{word}?"
     if not word.startswith("-"):
         start = list(arguments).index(word)
@@ -208,7 +207,7 @@ def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]
         )
     asked = word.partition("=")[0].replace("_", "-")
     names = {flag.name: flag.name for flag in flags if not flag.is_positional}
-    # The first flag of a tail wins; settings of superpoints, which few people change, come last.
+    # The first flag of a tail wins; settings of superpoints, which are rarely changed, come last.
     ordered = sorted(names, key=lambda name: name.startswith("--partition."))
     tails = {f"--{name.lstrip('-').rpartition('.')[2]}": name for name in reversed(ordered)}
     near = difflib.get_close_matches(asked, [*tails, *names], n=1)
@@ -217,12 +216,12 @@ def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]
     return f"unrecognized option {asked}.{f' Did you mean {name}?' if name else ''}"
 
 
-def _joined(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:
-    """Return arguments in which a value that begins as a flag does is part of its flag.
+def _join_dashed_values(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:
+    """Join each flag with a value that starts with a dash.
 
     Example:
         >>> up = Flag("up", "--up", "--up {z,-z}", "", "", Literal["z", "-z"], False)
-        >>> _joined([up], ["--up", "-z", "--up", "z"])
+        >>> _join_dashed_values([up], ["--up", "-z", "--up", "z"])
         ['--up=-z', '--up', 'z']
     """
     choices = {
@@ -239,7 +238,7 @@ def _joined(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:
 
 
 def _switches(name: str) -> tuple[str, str]:
-    """Return the flags that turn something on and off.
+    """Return the flags that turn a setting on and off.
 
     Example:
         >>> _switches("--growing.absorb")
@@ -250,25 +249,25 @@ def _switches(name: str) -> tuple[str, str]:
 
 
 def _kinds(hint: object) -> list[Any]:
-    """Return the types that a value may have; None is not among them."""
+    """Return the types allowed for a value, without None."""
     kinds = typing.get_args(hint)
     is_union = typing.get_origin(hint) not in (None, tuple, Literal)
     return [kind for kind in kinds if kind is not NoneType] if is_union else [hint]
 
 
 def _is_list(kind: object) -> bool:
-    """Return whether a value is several arguments; words are one, with commas between them."""
+    """Return whether a value takes several arguments; choices are one, separated by commas."""
     return typing.get_origin(kind) is tuple and not _choices(kind)
 
 
 def _choices(kind: object) -> tuple[str, ...]:
-    """Return the words that the items of a tuple are chosen from; none of other types."""
+    """Return the choices for the items of a tuple; empty for other types."""
     items = typing.get_args(kind)[:1] if typing.get_origin(kind) is tuple else ()
     return typing.get_args(items[0]) if items and typing.get_origin(items[0]) is Literal else ()
 
 
-def _value_of(flag: Flag, typed: bool | str | list[str]) -> object:
-    """Return the value that is written for a flag."""
+def _to_value(flag: Flag, typed: bool | str | list[str]) -> object:
+    """Convert the text of a flag to its value."""
     if isinstance(typed, bool):
         return typed
     words = [typed] if isinstance(typed, str) else typed
@@ -301,7 +300,7 @@ def _value_of(flag: Flag, typed: bool | str | list[str]) -> object:
 
 
 def _build(kind: Any, default: Any, typed: Mapping[str, object], prefix: str = "") -> Any:  # noqa: ANN401
-    """Return a dataclass with the values that are given, and otherwise those that it has."""
+    """Build a dataclass from the parsed values and the defaults."""
     values, hints = {}, typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
         value, path = _default_of(field, default), f"{prefix}{field.name}"
@@ -311,21 +310,21 @@ def _build(kind: Any, default: Any, typed: Mapping[str, object], prefix: str = "
     return kind(**values)
 
 
-def format_help(kind: type, flags: Sequence[Flag], *, prog: str, whole: bool = True) -> str:
-    """Return the help of a command that is parsed into a dataclass, whole or on one screen.
+def format_help(kind: type, flags: Sequence[Flag], *, prog: str, complete: bool = True) -> str:
+    """Format the help of a command, complete or on one screen.
 
-    The docstring of the class is the description; the lines of its section "Examples" come last.
-    On one screen, each common option has its first sentence.
+    The class docstring is the description; its "Examples" section comes last. The short help shows
+    only the first sentence of each common option.
     """
-    common = [flag for flag in flags if whole or _is_common(flag)]
+    common = [flag for flag in flags if complete or _is_common(flag)]
     groups = group_flags(common)
     needed = (flag.spelling for flag in groups.get(NEEDED, ()))
     usage = " ".join(["usage:", prog, *needed, "[options]"])
     paragraphs = describe(kind).split("\n\n")
-    blocks = [usage, *map(_wrap, paragraphs if whole else paragraphs[:1])]
+    blocks = [usage, *map(_wrap, paragraphs if complete else paragraphs[:1])]
     for title, members in groups.items():
-        entries = [_whole_entry(flag) if whole else _short_entry(flag) for flag in members]
-        blocks.append("\n".join([f"{title}:", *entries]))
+        entries = [_long_entry(flag) if complete else _short_entry(flag) for flag in members]
+        blocks.append("\n".join([title if ":" in title else f"{title}:", *entries]))
     if len(common) < len(flags):
         blocks.append(f"{prog} --help-all explains these and {len(flags) - len(common)} more.")
     if examples := example_lines(kind):
@@ -334,50 +333,52 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str, whole: bool = T
 
 
 def _is_common(flag: Flag) -> bool:
-    """Return whether most users need a flag."""
-    return flag.is_needed or (flag.name not in ADVANCED and (not flag.part or flag.name in OFTEN))
+    """Return whether the short help lists a flag."""
+    return flag.is_required or (
+        flag.name not in ADVANCED and (not flag.part or flag.name in COMMON)
+    )
 
 
-def _whole_entry(flag: Flag) -> str:
-    """Return the lines on a flag: how it is written, and all of its text."""
+def _long_entry(flag: Flag) -> str:
+    """Format a flag with its complete help text."""
     return f"  {flag.spelling}\n{_wrap(flag.text, indent=6)}"
 
 
 def _short_entry(flag: Flag) -> str:
-    """Return the lines on a flag: how it is written, its first sentence and its default."""
+    """Format a flag with its first sentence and its default."""
     sentences = re.split(r"(?<=[.]) (?=[A-Z])", flag.text)
-    default = [s for s in sentences[1:] if s.startswith("Default:") and len(s) < _SHORT]
+    default = [s for s in sentences[1:] if s.startswith("Default:") and len(s) < _MAX_LENGTH]
     text = _wrap(" ".join([sentences[0], *default]), indent=_COLUMN)
     head = f"  {flag.spelling}"
     return f"{head:<{_COLUMN}}{text.lstrip()}" if len(head) < _COLUMN - 1 else f"{head}\n{text}"
 
 
 def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
-    """Return the arguments of a command by title: needed, often wanted, the rest by part."""
-    groups: dict[str, list[Flag]] = {title: [] for title in (NEEDED, "options", _RUNNING)}
+    """Group arguments by title: required, options, performance, then each part."""
+    groups: dict[str, list[Flag]] = {title: [] for title in (NEEDED, "options", _PERFORMANCE)}
     for flag in flags:
-        if flag.is_needed:
+        if flag.is_required:
             group = NEEDED
         elif flag.name in RESOURCES:
-            group = _RUNNING
-        elif not flag.part or flag.name in OFTEN:
+            group = _PERFORMANCE
+        elif not flag.part or flag.name in COMMON:
             group = "options"
         else:
             group = f"advanced: {flag.part}"
         groups.setdefault(group, []).append(flag)
-    # What has no flag comes first, in the order in which it is written.
+    # Positional arguments come first, in their order.
     groups[NEEDED].sort(key=lambda flag: not flag.is_positional)
-    groups[_RUNNING].sort(key=lambda flag: RESOURCES.index(flag.name))
+    groups[_PERFORMANCE].sort(key=lambda flag: RESOURCES.index(flag.name))
     return {title: members for title, members in groups.items() if members}
 
 
 def describe(kind: type) -> str:
-    """Return what the docstring of a command says, but for its examples."""
+    """Return the docstring of a command without its examples."""
     return plain((inspect.getdoc(kind) or "").partition(_EXAMPLES)[0])
 
 
 def example_lines(kind: type) -> list[str]:
-    """Return the lines of the section "Examples" of a docstring."""
+    """Return the lines of the "Examples" section of a docstring."""
     _, _, lines = (inspect.getdoc(kind) or "").partition(_EXAMPLES)
     return textwrap.dedent(lines).splitlines()
 
@@ -389,47 +390,47 @@ def list_flags(
     prefix: str = "--",
     part: str = "",
 ) -> Iterator[Flag]:
-    """Yield the arguments that the fields of a dataclass become, in their order.
+    """Yield the arguments defined by the fields of a dataclass, in order.
 
-    ``default`` is an instance, or values of fields by name, in place of the defaults of the class.
-    Fields that are dataclasses are parts: of these ``path`` leads to the part, ``prefix`` stands
-    before the names of its flags, and ``part`` says what they are about.
+    ``default`` is an instance, or a mapping of values by field name, that overrides the class
+    defaults. Nested dataclasses are parts: ``path`` is the path of the part, ``prefix`` the start
+    of its flags, and ``part`` its title.
     """
-    texts, hints = _texts(kind), typing.get_type_hints(kind, include_extras=True)
+    texts, hints = _field_docstrings(kind), typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         if not field.metadata.get("is_flag", True):
             continue
         hint, argument = hints[field.name], Argument()
         if typing.get_origin(hint) is typing.Annotated:
             hint, argument = typing.get_args(hint)
-        value, own = _default_of(field, default), f"{path}{field.name}"
+        value, field_path = _default_of(field, default), f"{path}{field.name}"
         front, subject = prefix, part
         if not field.metadata.get("has_part", True):
             front, subject = "--", ""
         if dataclasses.is_dataclass(hint):
             inner = (prefix, part)
             if not argument.is_inline:
-                inner = (f"{prefix}{field.name}.", _first_line(hint))
-            yield from list_flags(hint, value, f"{own}.", *inner)
+                inner = (f"{prefix}{field.name}.", _summary(hint))
+            yield from list_flags(hint, value, f"{field_path}.", *inner)
             continue
         text = plain(argument.text or texts.get(field.name, ""))
         if "Default:" not in text:
-            text = f"{text} {_said(value, is_setting=front != '--')}".strip()
+            text = f"{text} {_default_sentence(value, is_setting=front != '--')}".strip()
         name = f"{front}{field.name}".replace("_", "-")
         if argument.is_positional:
             name = argument.metavar or field.name.upper()
             spelling = name + "..." * (typing.get_origin(hint) is tuple)
         elif hint is bool:
-            # Only settings may be on from the start, and are turned off.
+            # Only settings can be on by default, and need a flag to turn them off.
             spelling = ", ".join(_switches(name)) if value or subject else name
         else:
-            spelling = f"{name} {argument.metavar or _words(hint)}"
+            spelling = f"{name} {argument.metavar or _metavar(hint)}"
         needed = argument.is_positional or value is dataclasses.MISSING
-        yield Flag(own, name, spelling, text, subject, hint, needed)
+        yield Flag(field_path, name, spelling, text, subject, hint, needed)
 
 
 def plain(text: str) -> str:
-    """Return a docstring without markup.
+    """Strip markup from a docstring.
 
     Example:
         >>> plain("With ``absorb``; see :func:`torchrg.segment_planes`.")
@@ -439,8 +440,8 @@ def plain(text: str) -> str:
 
 
 @functools.cache
-def _texts(kind: type) -> dict[str, str]:
-    """Return the docstrings below the fields of a dataclass and of its bases."""
+def _field_docstrings(kind: type) -> dict[str, str]:
+    """Return the docstrings of the fields of a dataclass and its bases."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         (node,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
@@ -453,17 +454,17 @@ def _texts(kind: type) -> dict[str, str]:
 
 
 def _default_of(field: "dataclasses.Field[Any]", default: object) -> object:
-    """Return what a field is where no flag says otherwise."""
+    """Return the value of a field if no flag sets it."""
     if isinstance(default, Mapping) and field.name in default:
         return default[field.name]
     if default is not None and not isinstance(default, Mapping):
         return getattr(default, field.name)
-    made = field.default_factory
-    return field.default if made is dataclasses.MISSING else made()
+    factory = field.default_factory
+    return field.default if factory is dataclasses.MISSING else factory()
 
 
-def _said(value: object, *, is_setting: bool) -> str:
-    """Return the sentence on a default; flags of the command have none for what is off."""
+def _default_sentence(value: object, *, is_setting: bool) -> str:
+    """Return the sentence about a default; empty for command flags that are off."""
     is_off = value is None or value is False or value == ()
     if value is dataclasses.MISSING or (is_off and not is_setting):
         return ""
@@ -473,27 +474,27 @@ def _said(value: object, *, is_setting: bool) -> str:
     return f"Default: {' '.join(words)}."
 
 
-def _words(hint: object) -> str:
-    """Return what stands for a value of a type; that None may be given is left to the text."""
+def _metavar(hint: object) -> str:
+    """Return the placeholder for a value of a type; None is left to the text."""
     choices = [choice for choice in typing.get_args(hint) if choice not in (NoneType, None)]
     if typing.get_origin(hint) is Literal:
         return "{" + ",".join(map(str, choices)) + "}"
     if typing.get_origin(hint) is tuple:
         if words := _choices(hint):
             return f"{{{','.join(words)}}},..."
-        return f"{_words(choices[0])}..." if ... in choices else " ".join(map(_words, choices))
-    return " or ".join(map(_words, choices)) if choices else _WORDS[typing.cast(type, hint)]
+        return f"{_metavar(choices[0])}..." if ... in choices else " ".join(map(_metavar, choices))
+    return " or ".join(map(_metavar, choices)) if choices else _METAVARS[typing.cast(type, hint)]
 
 
-def _first_line(kind: object) -> str:
-    """Return the first sentence of a docstring, to stand within one."""
+def _summary(kind: object) -> str:
+    """Return the first sentence of a docstring, in lower case."""
     first = re.split(r"[.;] |\.$", plain(inspect.getdoc(kind) or ""))[0].replace("\n", " ")
     return first[:1].lower() + first[1:]
 
 
 def _wrap(text: str, *, indent: int = 0) -> str:
-    """Return a paragraph in lines that fit the terminal."""
-    width = min(shutil.get_terminal_size().columns, _WIDEST)
+    """Wrap a paragraph to the width of the terminal."""
+    width = min(shutil.get_terminal_size().columns, _MAX_WIDTH)
     return textwrap.fill(
         " ".join(text.split()),
         width,

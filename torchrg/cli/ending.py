@@ -1,4 +1,4 @@
-"""Lines that commands print, and how they end: with one line and an exit code, interrupted too."""
+"""Printed lines, exit codes and interrupts of commands."""
 
 import contextlib
 import os
@@ -10,21 +10,21 @@ from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 USAGE_ERROR = 2
-"""Exit code where a command was used wrongly, or its input is bad."""
+"""Exit code of a usage error or an invalid input."""
 SOME_FAILED = 3
-"""Exit code where some inputs failed and the results of the others are complete."""
+"""Exit code if some inputs failed; the results of the remaining ones are complete."""
 INTERRUPTED = 130
-"""Exit code of shells for a program that Ctrl-C ended: 128, and the number of the signal."""
+"""Exit code after Ctrl-C by shell convention: 128 plus the signal number."""
 
 INTERRUPTED_LINE = "interrupted; every file written is complete."
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
-"""Ctrl-C, and what batch systems send."""
+"""Ctrl-C, and the termination signal of batch systems."""
 
 
 def printable(text: str) -> str:
-    r"""Return text in which what moves the cursor, or turns or hides text, is written as escapes.
+    r"""Escape characters that move the cursor, reverse or hide text.
 
-    Names of files and fields may hold such characters, and bytes that are no text.
+    File and field names may contain such characters, and undecodable bytes.
 
     Example:
         >>> printable("caf\u00e9 \x1b[31m\n\u202e\udce9")
@@ -33,25 +33,25 @@ def printable(text: str) -> str:
     return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def say(*lines: str) -> None:
-    """Print lines on stdout."""
+def print_lines(*lines: str) -> None:
+    """Print lines to stdout."""
     print(*map(printable, lines), sep="\n", flush=True)
 
 
 def fail(message: str, *, code: int = USAGE_ERROR) -> int:
-    """Print one line on stderr and return the exit code."""
+    """Print one line to stderr and return the exit code."""
     print(f"torchrg: {printable(message)}", file=sys.stderr)
     return code
 
 
 def warn(message: str) -> None:
-    """Print one warning line on stderr."""
+    """Print a one-line warning to stderr."""
     fail(f"warning: {message}")
 
 
 @contextlib.contextmanager
-def warnings_as_lines() -> Iterator[None]:
-    """Print warnings as single lines, each once."""
+def print_warnings() -> Iterator[None]:
+    """Print the warnings of a block as single lines, without duplicates."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         yield
@@ -59,17 +59,17 @@ def warnings_as_lines() -> Iterator[None]:
         warn(line)
 
 
-def end_at_once(*_: object) -> NoReturn:
-    """End the process by an interrupt, with its line and nothing else."""
+def exit_interrupted(*_: object) -> NoReturn:
+    """Exit immediately after an interrupt, with one line."""
     with contextlib.suppress(OSError):
         os.write(2, f"torchrg: {INTERRUPTED_LINE}\n".encode())
     os._exit(INTERRUPTED)
 
 
-def on_interrupts(handler: Callable[..., Any] | signal.Handlers) -> dict[signal.Signals, Any]:
-    """Let interrupts be handled, and return how they were.
+def handle_interrupts(handler: Callable[..., Any] | signal.Handlers) -> dict[signal.Signals, Any]:
+    """Set the handler of interrupts and return the previous handlers.
 
-    Those that are ignored, as in the background of a shell, stay so.
+    Ignored signals stay ignored, as for background jobs of a shell.
     """
     before = {number: signal.getsignal(number) for number in _INTERRUPTS}
     heard = {number: old for number, old in before.items() if old not in (signal.SIG_IGN, None)}
@@ -80,11 +80,11 @@ def on_interrupts(handler: Callable[..., Any] | signal.Handlers) -> dict[signal.
 
 @contextlib.contextmanager
 def raising_interrupts() -> Iterator[None]:
-    """Let interrupts raise KeyboardInterrupt, so that what is being written is taken back."""
+    """Raise KeyboardInterrupt on interrupts, so that partial files are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = on_interrupts(signal.default_int_handler)
+    before = handle_interrupts(signal.default_int_handler)
     try:
         yield
     finally:

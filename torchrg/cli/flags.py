@@ -1,4 +1,4 @@
-"""Flags that several commands share, and what their values mean."""
+"""Flags shared by several commands, and their values."""
 
 import dataclasses
 import os
@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal
 
 import torch
 
-from torchrg.cli.arguments import ALSO, Argument
-from torchrg.cli.ending import warn, warnings_as_lines
+from torchrg.cli.arguments import ALIASES, Argument
+from torchrg.cli.ending import print_warnings, warn
 from torchrg.config import (
     DEFAULT_PRESET,
     WHITENESS,
@@ -32,90 +32,94 @@ from torchrg.normals import Orientation
 from torchrg.structures import FARTHEST, Sampling
 
 _MAX_THREADS = 1024
-"""More than any machine has cores; many more cannot be started, and torch ends with the process."""
+"""Upper bound of --threads: more than any machine has cores, and few enough to start."""
 _MAX_GIGABYTES = 1_000_000
-"""A petabyte, more than any machine has memory."""
+"""Upper bound of --limit-memory: a petabyte, in GB."""
 
 CloudsFlag = Annotated[
     tuple[Path, ...],
     Argument(
         metavar="CLOUD",
         is_positional=True,
-        text=f"Clouds to read, files that end in {' '.join(FORMATS)}. For depth images, and for "
-        "organised clouds taken as images, there is torchrg depth.",
+        text=f"Input point clouds ({' '.join(FORMATS)}). For depth images and organized clouds, "
+        "use torchrg depth.",
     ),
 ]
 OutFlag = Annotated[
     Path,
-    Argument(text="File to write, its format by suffix; for several inputs a directory."),
+    Argument(
+        text="Output file; the extension selects the format. With several inputs, an output "
+        "directory.",
+    ),
 ]
 ColumnsFlag = Annotated[
     str | None,
     Argument(
         metavar="X,Y,Z,...",
-        text="Names of the columns of text and of bare .npy arrays, in their order, as "
-        f"x,y,z,intensity,r,g,b; _ leaves one out. {COLUMNS_RULE} What was taken is printed.",
+        text="Column names of text and plain .npy input, in order, as in x,y,z,intensity,r,g,b; "
+        f"use _ to skip a column. {COLUMNS_RULE} The guess is printed.",
     ),
 ]
 ThreadsFlag = Annotated[
     int | None,
-    Argument(text="Number of threads. Default: as torch decides, usually one for each core."),
+    Argument(text="Number of CPU threads. Default: chosen by PyTorch, usually one per core."),
 ]
 OrientFlag = Annotated[
     Orientation,
     Argument(
-        text="Side to which normals point. auto: the front of the faces of a mesh, else the "
-        "scanner if the file names its place, as E57 does, else interior. interior: the free space "
-        "of rooms. viewpoint: the scanner. consistent: as their neighbors. up, +x ... -z: along an "
-        "axis. none: as estimated, which is fastest.",
+        text="Orientation of the normals. auto: front side of the faces of a mesh, else toward the "
+        "scanner if the file stores its position (E57), else interior. interior: into the free "
+        "space of rooms. viewpoint: toward the scanner. consistent: the same side as adjacent "
+        "normals. up, +x ... -z: along an axis. none: not oriented, fastest.",
     ),
 ]
 ViewpointFlag = Annotated[
     tuple[float, float, float] | None,
     Argument(
-        text="Place of the scanner in the coordinates of the input, for --orient viewpoint. "
-        "Default: the places that the file names.",
+        text="Scanner position in input coordinates, for --orient viewpoint. Default: the "
+        "positions stored in the file.",
     ),
 ]
 IntrinsicsFlag = Annotated[
     str | None,
     Argument(
         metavar="CAMERA",
-        text="Camera, as fx,fy,cx,cy in pixels, where the middle of the first pixel is 0,0, or its "
-        "file: a matrix of 3 x 3 or 4 x 4 numbers, JSON, YAML, info.txt, COLMAP's cameras.txt. A "
-        "camera file that names a larger image size is scaled. Default: the camera file of the "
-        "folder.",
+        text="Camera as fx,fy,cx,cy in pixels, with 0,0 at the center of the first pixel, or a "
+        "camera file: a 3 x 3 or 4 x 4 matrix, JSON, YAML, info.txt or COLMAP's cameras.txt. "
+        "Intrinsics for a larger image size are scaled. Default: the camera file in the folder.",
     ),
 ]
 DepthScaleFlag = Annotated[
     float | None,
-    Argument(text="Stored value of one metre: 1000 for millimetres. Default: that of the folder."),
+    Argument(
+        text="Depth units per meter, such as 1000 for millimeters. Default: that of the folder."
+    ),
 ]
 ImageOrientFlag = Annotated[
     Orientation,
     Argument(
-        text="Side to which normals point. auto, viewpoint, none: the camera. interior: the free "
-        "space of rooms. consistent: as their neighbors. up, +x ... -z: along an axis, in camera "
-        "coordinates if the pose is unknown.",
+        text="Orientation of the normals. auto, viewpoint, none: toward the camera. interior: into "
+        "the free space of rooms. consistent: the same side as adjacent normals. up, +x ... -z: "
+        "along an axis, in camera coordinates if the pose is unknown.",
     ),
 ]
 TableFlag = Annotated[
     Path | None,
     Argument(
         metavar="PLANES.csv",
-        text="Table of the planes to write too, .csv or .json; for several inputs a directory. CSV "
-        "has a line for each plane, in the coordinates of the input: class, normal, offset, "
-        "centroid, area, dip, root mean square distance, outline as WKT POLYGON Z. Up is z. Of "
-        "clouds it asks for classes and outlines (pip install 'torchrg[outline]').",
+        text="Also write the plane table, as .csv or .json; with several inputs, a directory. CSV "
+        "has one row per plane in input coordinates: class, normal, offset, centroid, area, dip, "
+        "RMS distance and the polygon as WKT POLYGON Z. The up axis is z. For point clouds, also "
+        "traces polygons if shapely is installed (pip install 'torchrg[outline]').",
     ),
 ]
 WithinFlag = Annotated[
     str | None,
     Argument(
         metavar="FIELD",
-        text="Field with the object of each point, as instance or segment: no plane has points of "
-        "two of them, and the table of planes names the object of each. Points that have none, "
-        "-1, are an object too. Default: planes go across.",
+        text="Per-point field with object IDs, such as instance or segment. No plane crosses two "
+        "objects, and the plane table lists the object of each plane. Points with ID -1 count as "
+        "one more object. Default: no constraint.",
     ),
 ]
 Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "nag", "npy"]
@@ -123,27 +127,26 @@ Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3
 
 @dataclass(frozen=True)
 class PlaneSettings:
-    """How planes are found: what the preset or the file says, where no flag says otherwise."""
+    """Settings of the plane segmentation: preset or file, overridden by flags."""
 
     preset: str = DEFAULT_PRESET
-    """Settings to start from: consensus, which measures what kind of data it has, or those of
-    another method (classic, classic_increment, detmm, paper, algorithm2). Flags change them one by
-    one."""
+    """Preset to start from: consensus (adapts to the data), or classic, classic_increment, detmm,
+    paper, algorithm2 for comparison. Flags override it."""
     config: Path | None = None
-    """YAML file with settings, in place of a preset; what it does not name has its default."""
+    """YAML settings file, instead of a preset. Settings it omits keep their defaults."""
     angle_deg: float | None = None
-    """The one threshold of the paper, in degrees: that of sharp points and of growth. The flags
-    --normals.sharp-angle-deg and --growing.max-angle-deg win where they are given."""
+    """The paper's single threshold, in degrees: sets both --normals.sharp-angle-deg and
+    --growing.max-angle-deg, which take precedence."""
     resolved: Annotated[PipelineConfig, Argument(is_inline=True)] = dataclasses.field(
         default_factory=PipelineConfig
     )
 
     @classmethod
     def asked_for(cls, argv: list[str]) -> "PlaneSettings":
-        """Return the settings of the preset or the file in the arguments: defaults of the flags.
+        """Return the settings of the preset or file in the arguments, as defaults of the flags.
 
-        The axis z points up unless the file names another. A table of planes has outlines as far as
-        they can be known.
+        The up axis is z unless the file sets another. With --table, polygons are traced if shapely
+        is installed.
 
         Example:
             >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
@@ -163,16 +166,16 @@ class PlaneSettings:
         resolved = dataclasses.replace(resolved, planes=planes)
         try:
             angle = float(values["--angle-deg"])
-        except ValueError:  # It is not given, or a word that the parser refuses.
+        except ValueError:  # Missing, or invalid and rejected by the parser.
             return cls(resolved=resolved)
         return cls(resolved=resolved.at_angle(angle))
 
 
-def choice_of(sampling: Sampling, settings: Mapping[str, Any]) -> str:
-    """Return in words what was measured of a cloud, and the settings that it chose.
+def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
+    """Describe the measured sampling of a cloud and the settings selected by it.
 
     Example:
-        >>> choice_of(Sampling(0.06, 0.5, 0.6, 4000.0, 2.7), {"growing.min_size": 173})
+        >>> describe_sampling(Sampling(0.06, 0.5, 0.6, 4000.0, 2.7), {"growing.min_size": 173})
         'faces in facets or bent (whiteness 0.06): min_size 173'
     """
     low, high = WHITENESS
@@ -189,7 +192,7 @@ def choice_of(sampling: Sampling, settings: Mapping[str, Any]) -> str:
 
 
 def reason_for_no_plane(settings: SelectionConfig) -> str:
-    """Return why a result has no plane.
+    """Return the reason why a result has no plane.
 
     Example:
         >>> reason_for_no_plane(SelectionConfig(min_area=9.0))
@@ -200,11 +203,11 @@ def reason_for_no_plane(settings: SelectionConfig) -> str:
 
 
 SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]
-"""Type of an argument whose flags are ``--preset``, ``--config``, ``--normals.k`` and so on."""
+"""Argument type with the flags ``--preset``, ``--config``, ``--normals.k`` and so on."""
 
 
 def split_columns(columns: str | None) -> tuple[str, ...] | None:
-    """Return the names in the value of ``--columns``.
+    """Split the value of ``--columns`` into names.
 
     Example:
         >>> split_columns("x, y,z,_")
@@ -213,13 +216,13 @@ def split_columns(columns: str | None) -> tuple[str, ...] | None:
     return None if columns is None else tuple(name.strip() for name in columns.split(","))
 
 
-def columns_of(path: str | os.PathLike[str], columns: str | None) -> tuple[str, ...] | None:
-    """Return the names that ``--columns`` gives a file; None for one that names its own."""
+def file_columns(path: str | os.PathLike[str], columns: str | None) -> tuple[str, ...] | None:
+    """Return the column names for a file; None if the file stores its own."""
     return split_columns(columns) if takes_columns(path) else None
 
 
 def check_viewpoint(viewpoint: tuple[float, float, float] | None, orient: str) -> None:
-    """Refuse a viewpoint that normals do not point to."""
+    """Raise if a viewpoint is passed without --orient viewpoint."""
     if viewpoint is not None and orient != "viewpoint":
         raise ConfigError(
             f"expected --viewpoint X Y Z with --orient viewpoint, got --orient {orient}; add it."
@@ -227,21 +230,23 @@ def check_viewpoint(viewpoint: tuple[float, float, float] | None, orient: str) -
 
 
 def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) -> None:
-    """Refuse names of columns where every file names its own."""
+    """Raise if column names are passed but every file stores its own."""
     if columns is not None and not any(map(takes_columns, paths)):
-        raise ConfigError("expected text or .npy for --columns, got files that name their own.")
+        raise ConfigError(
+            "expected text or .npy input for --columns, got files with named columns."
+        )
 
 
-def spell_counts(argv: Sequence[str]) -> list[str]:
-    """Return arguments in which numbers after ``--superpoints`` have a flag of their own.
+def expand_counts(argv: Sequence[str]) -> list[str]:
+    """Move the numbers after ``--superpoints`` into a separate flag.
 
     Example:
-        >>> spell_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
+        >>> expand_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
         ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
     """
     spelled: list[str] = []
     for argument in argv:
-        names = ("--superpoints", *ALSO["--superpoints"])
+        names = ("--superpoints", *ALIASES["--superpoints"])
         is_after = spelled[-1:] and spelled[-1] in names
         name, _, numbers = argument.rpartition("=")
         if re.fullmatch(r"\d+(,\d+)*", numbers) and (name in names or (is_after and not name)):
@@ -252,14 +257,14 @@ def spell_counts(argv: Sequence[str]) -> list[str]:
 
 
 def check_level(level: int, config: SuperpointsConfig) -> None:
-    """Refuse a level that superpoints do not have."""
+    """Raise if the superpoints have no such level."""
     if not 0 <= level < config.num_levels:
-        most = config.num_levels - 1
-        raise ConfigError(f"expected --level from 0 to {most}, the levels there are, got {level}.")
+        max_level = config.num_levels - 1
+        raise ConfigError(f"expected --level from 0 to {max_level}, got {level}.")
 
 
 def parse_intrinsics(text: str | None) -> Pinhole | None:
-    """Return the camera of ``fx,fy,cx,cy`` or of a file; None where none is given."""
+    """Parse a camera from ``fx,fy,cx,cy`` or a file; None stays None."""
     if text is None:
         return None
     numbers: list[float] = []
@@ -269,28 +274,28 @@ def parse_intrinsics(text: str | None) -> Pinhole | None:
         fx, fy, cx, cy = numbers
         if 0 in (fx, fy) or not all(abs(number) <= FARTHEST for number in numbers):
             raise ConfigError(
-                f"expected finite --intrinsics with fx and fy not 0, got {text}; pass pixels."
+                f"expected finite --intrinsics with nonzero fx and fy, got {text}; pass pixels."
             )
         if min(fx, fy) < 0:
             warn(
-                f"--intrinsics {text}: a negative focal length turns the image over; leave out the "
-                "minus unless that is meant."
+                f"--intrinsics {text}: a negative focal length flips the image; leave out the "
+                "minus sign unless intended."
             )
         return Pinhole(fx, fy, cx, cy)
     is_file = False
     with suppress(OSError):
         is_file = Path(text).is_file()
     if is_file or text.lower().endswith(SUFFIXES[1:]):
-        with warnings_as_lines():
+        with print_warnings():
             return read_camera(Path(text))
     raise ConfigError(
-        "expected --intrinsics fx,fy,cx,cy, four numbers without blanks, or a camera file, got "
+        "expected --intrinsics fx,fy,cx,cy (four numbers without spaces) or a camera file, got "
         f"{text!r}."
     )
 
 
 def use_threads(threads: int | None) -> None:
-    """Let torch use so many threads; None leaves it to torch."""
+    """Set the number of threads of torch; None keeps its default."""
     if threads is None:
         return
     if not 1 <= threads <= _MAX_THREADS:
@@ -298,10 +303,10 @@ def use_threads(threads: int | None) -> None:
     torch.set_num_threads(threads)
 
 
-def bytes_of_limit(limit_memory: float | None, usual: int = 0) -> int:
-    """Return the limit of memory in bytes, the usual one where none is set; refuse a wrong one."""
+def limit_in_bytes(limit_memory: float | None, default: int = 0) -> int:
+    """Convert a memory limit to bytes; return ``default`` if unset, raise if out of range."""
     if limit_memory is None:
-        return usual
+        return default
     if not 0 < limit_memory <= _MAX_GIGABYTES:
         raise ConfigError(
             f"expected --limit-memory above 0 and at most {_MAX_GIGABYTES:,} GB, got "

@@ -1,4 +1,4 @@
-"""``torchrg info``: what a file holds."""
+"""``torchrg info``: summary of a point cloud file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,28 +9,30 @@ import torch
 
 from torchrg import kernels
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say
-from torchrg.cli.flags import ColumnsFlag, check_columns, choice_of, columns_of
+from torchrg.cli.ending import print_lines
+from torchrg.cli.flags import ColumnsFlag, check_columns, describe_sampling, file_columns
 from torchrg.config import load_config
 from torchrg.io import read_cloud
 from torchrg.neighbors import distinct_points, measure_sampling, prepare_search
 from torchrg.structures import Cloud
 
 _DIGITS = {4: 6, 8: 10}
-"""Digits of a coordinate that are shown, by its bytes. float32 holds no more than six, and ten are
-millimetres at a thousand kilometres."""
+"""Significant digits printed for a coordinate, by its size in bytes. float32 has at most six; ten
+resolve a millimeter at a thousand kilometers."""
 
 
 _NUM_NEIGHBORS = 50
-"""Neighbors by which surfaces are measured, as by the default settings."""
+"""Number of neighbors for measuring the surfaces, as in the default preset."""
 
 _NUM_FOR_SPACING = 10_000
-"""Points, evenly along the canonical order, whose nearest neighbors give the spacing."""
+"""Number of points, evenly along the canonical order, from which the spacing is measured."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Say what a file holds: points, extent, spacing, duplicates, fields; and what kernels run.
+    """Print a summary of a point cloud file and the compiled kernels.
+
+    Points, extent, spacing, duplicates and fields.
 
     Examples:
         torchrg info scan.ply
@@ -38,25 +40,25 @@ class Arguments:
     """
 
     file: Annotated[Path, Argument("FILE", is_positional=True)]
-    """Cloud to read."""
+    """Input point cloud."""
     columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
-    """Parse the arguments and print what the file holds."""
+    """Parse the arguments and print the summary."""
     arguments = parse(Arguments, argv, prog="torchrg info")
     check_columns(arguments.columns, [arguments.file])
-    cloud = read_cloud(arguments.file, columns=columns_of(arguments.file, arguments.columns))
+    cloud = read_cloud(arguments.file, columns=file_columns(arguments.file, arguments.columns))
     for name, value in describe_cloud(cloud).items():
-        say(f"{name:<12}{value}")
+        print_lines(f"{name:<12}{value}")
     for note in filter(None, (*cloud.notes, cloud.precision_note)):
-        say(f"{'note':<12}{note}")
-    say(f"{'kernels':<12}{kernels.name_of_library() or 'none: torchrg runs without, slower'}")
+        print_lines(f"{'note':<12}{note}")
+    print_lines(f"{'kernels':<12}{kernels.name_of_library() or 'none (several times slower)'}")
     return 0
 
 
 def describe_cloud(cloud: Cloud) -> dict[str, str]:
-    """Return the facts about a cloud, by name."""
+    """Return the properties of a cloud by name."""
     facts = {"points": f"{len(cloud):,} of {cloud.coordinates.dtype}"}
     if cloud.grid_shape:
         facts["grid"] = f"{cloud.grid_shape[0]} rows x {cloud.grid_shape[1]} columns"
@@ -70,18 +72,20 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         centered = finite - cloud.origin if cloud.origin.any() else finite
         distinct = distinct_points(torch.from_numpy(centered))
         facts["duplicates"] = f"{distinct.num_copies:,}"
-        places = distinct.points.numpy()
+        positions = distinct.points.numpy()
         facts["spacing"] = "none"
-        if len(places) > 1:
-            search = prepare_search(places, min(_NUM_NEIGHBORS, len(places)))
-            rows = np.arange(0, len(places), -(-len(places) // _NUM_FOR_SPACING))
-            spacing = np.median(np.linalg.norm(places[rows] - places[search(rows)[:, 1]], axis=1))
+        if len(positions) > 1:
+            search = prepare_search(positions, min(_NUM_NEIGHBORS, len(positions)))
+            rows = np.arange(0, len(positions), -(-len(positions) // _NUM_FOR_SPACING))
+            spacing = np.median(
+                np.linalg.norm(positions[rows] - positions[search(rows)[:, 1]], axis=1)
+            )
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
-            sampling = measure_sampling(torch.from_numpy(places), search)
+            sampling = measure_sampling(torch.from_numpy(positions), search)
             chosen = load_config().measured(sampling)["settings"]
-            facts["height"] = f"{sampling.height:g} (least extent along the principal axes)"
+            facts["height"] = f"{sampling.height:g} (smallest extent along the principal axes)"
             facts["density"] = f"{sampling.density:g} points on a square of side 1"
-            facts["surfaces"] = choice_of(sampling, chosen)
+            facts["surfaces"] = describe_sampling(sampling, chosen)
     for name, values in cloud.fields.items():
         shape = " x ".join(map(str, values.shape[1:])) or "1"
         facts[name] = f"{shape} {values.dtype}"

@@ -1,4 +1,4 @@
-"""What commands over several inputs share: places of results, the loop, progress, and exit code."""
+"""Commands with several inputs: output paths, loop, progress and exit code."""
 
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -18,24 +18,24 @@ from torchrg.io.npy import KEPT_FIELDS
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
 
-# Tqdm's own lock starts a process in Python 3.14, which would import from the folder of a command.
+# In Python 3.14 the default lock of tqdm starts a process that imports from the working directory.
 tqdm.set_lock(RLock())
 
-DRAWINGS = (".png", ".html")
-"""Suffixes of pictures and pages."""
+IMAGE_SUFFIXES = (".png", ".html")
+"""File extensions of images and viewers."""
 STAGES = ("neighbors", "normals", "regions", "planes", "orientation")
-"""Stages of the segmentation of a cloud, which progress bars show."""
+"""Stages of the segmentation of a cloud, as in progress bars."""
 
 
 def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> list[Path]:
-    """Return where the result of each input goes.
+    """Return the output path of each input.
 
-    One input goes to the file ``out``, a cloud or of the given suffix, or under its own name into
-    an existing directory; several need a directory, which is made. With an empty suffix each result
-    is a directory.
+    A single input is written to ``out``, a cloud or a file with the extension ``suffix``, or under
+    its own name into an existing directory. Several inputs need a directory, which is created. If
+    ``suffix`` is empty, each result is a directory.
 
     Raises:
-        FormatError: If there is no input, two results would share a name, or one cannot be
+        FormatError: If there is no input, two results have the same name, or a result cannot be
             written.
     """
     if not inputs:
@@ -46,8 +46,8 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         return [out]
     if ending and ending in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(
-            f"{out}: expected a directory for {len(inputs)} inputs, got a file name; "
-            "name a directory."
+            f"{out}: expected a directory for {len(inputs)} inputs, got a file name; pass a "
+            "directory."
         )
     results = [out / f"{path.stem}{suffix}" for path in inputs]
     first: dict[str, Path] = {}
@@ -55,8 +55,8 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         other = first.setdefault(folded_name(result.name), source)
         if other is not source:
             raise FormatError(
-                f"{source}: another input has the same name, {other}, and {out / result.name} is "
-                "one place; give them different directories."
+                f"{source}: has the same name as {other}, so that both would be written to "
+                f"{out / result.name}; use different output directories."
             )
     make_folder(out)
     for result in results if suffix else []:
@@ -64,22 +64,21 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
     return results
 
 
-def check_apart(results: Sequence[Path], inputs: Sequence[Path]) -> None:
-    """Raise FormatError if a result would take the place of an input or of another result."""
+def check_distinct(results: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Raise FormatError if a result would overwrite an input or another result."""
     taken = {str(path.resolve()) for path in inputs}
-    files = {_file_number(path) for path in inputs} - {None}
+    files = {_file_id(path) for path in inputs} - {None}
     for path in results:
-        place = str(path.resolve())
-        if not taken.isdisjoint((place, folded_name(place))) or _file_number(path) in files:
+        output = str(path.resolve())
+        if not taken.isdisjoint((output, folded_name(output))) or _file_id(path) in files:
             raise FormatError(
-                f"{path}: expected a place of its own for each result, got one of an input or of "
-                "another result; choose another."
+                f"{path}: would overwrite an input or another result; choose another output path."
             )
-        taken.add(folded_name(place))
+        taken.add(folded_name(output))
 
 
-def _file_number(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from others, whatever the case of its name; None without a file."""
+def _file_id(path: Path) -> tuple[int, int] | None:
+    """Return the device and inode of a file, which ignore case; None if it does not exist."""
     try:
         status = path.stat()
     except OSError:
@@ -87,54 +86,54 @@ def _file_number(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def paths_beside(
-    results: Sequence[Path], place: Path | None, *, suffixes: Sequence[str] = DRAWINGS
+def sidecar_paths(
+    results: Sequence[Path], output: Path | None, *, suffixes: Sequence[str] = IMAGE_SUFFIXES
 ) -> Sequence[Path | None]:
-    """Return where the picture or table of each result goes, as :func:`output_paths` does.
+    """Return the path of the image or table of each result, like :func:`output_paths`.
 
-    In a directory they end in the first of the suffixes.
+    Files in a directory get the first of the extensions.
     """
-    if place is None:
+    if output is None:
         return [None] * len(results)
-    if not place.is_dir():
-        if len(results) == 1 and place.suffix:
-            check_beside(place, suffixes=suffixes)
-            return [place]
-        if place.suffix.lower() in suffixes:
+    if not output.is_dir():
+        if len(results) == 1 and output.suffix:
+            check_sidecar(output, suffixes=suffixes)
+            return [output]
+        if output.suffix.lower() in suffixes:
             raise FormatError(
-                f"{place}: expected a directory for {len(results)} files, got a file name."
+                f"{output}: expected a directory for {len(results)} files, got a file name."
             )
-    make_folder(place)
-    paths = [place / f"{path.stem}{suffixes[0]}" for path in results]
+    make_folder(output)
+    paths = [output / f"{path.stem}{suffixes[0]}" for path in results]
     for path in paths:
         check_place(path)
     return paths
 
 
-def check_beside(path: Path, *, suffixes: Sequence[str] = DRAWINGS) -> None:
-    """Raise before long work if a picture, page or table has no place, or cannot be made."""
+def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> None:
+    """Raise if an image, viewer or table cannot be written; call before long computations."""
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
         raise FormatError(
-            f"{path}: expected a file that ends in {endings}, got {path.suffix!r}; name it so."
+            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; rename it."
         )
     check_place(path)
-    if is_page(path):
+    if is_viewer(path):
         check_library()
 
 
-def is_page(path: Path) -> bool:
-    """Return whether a drawing is a page."""
+def is_viewer(path: Path) -> bool:
+    """Return whether a path is a viewer."""
     return path.suffix.lower() == ".html"
 
 
 def is_archive(path: Path) -> bool:
-    """Return whether a result goes to the format that holds it alone, without a cloud's fields."""
+    """Return whether a result is written as .npz, without the fields of the cloud."""
     return path.suffix.lower() == ".npz"
 
 
-def name_of(source: Path | Sequence[Path]) -> str:
-    """Return what an input is called in messages: a file, or files that are one cloud."""
+def display_name(source: Path | Sequence[Path]) -> str:
+    """Return the name of an input in messages: a file, or several merged files."""
     first, *others = [source] if isinstance(source, Path) else source
     return f"{first} and {len(others)} more" if others else f"{first}"
 
@@ -147,8 +146,8 @@ def run_each(
 ) -> int:
     """Call ``write`` with the arguments and the values of each input; return the exit code.
 
-    One that fails stops no other and is told in one line; where it is the only one, its error is
-    that of the command. A full disk ends the loop, as every further input would fail.
+    A failure is printed on one line and the remaining inputs continue; the error of a single input
+    is raised. A full disk ends the loop.
     """
     rows = list(zip(inputs, *columns, strict=True))
     if len(rows) == 1:
@@ -159,23 +158,23 @@ def run_each(
 
         def work(begin: Begin, row: Sequence[Any] = row) -> TaskReport:
             write(arguments, *row)
-            return TaskReport(name_of(row[0]), "converted")
+            return TaskReport(display_name(row[0]), "converted")
 
-        report = report_on(name_of(row[0]), work)
-        tell_failure(report)
+        report = report_on(display_name(row[0]), work)
+        print_failure(report)
         num_failed += report.status == "failed"
         if report.disk_full:
             state = f"{number + 1 - num_failed:,} of {len(rows):,} inputs are complete"
-            told = f"the disk is full; {state}. Make room. The same command begins anew."
-            return fail(f"{arguments.out}: {told}", code=SOME_FAILED)
+            message = f"the disk is full; {state}. Free space and rerun the command."
+            return fail(f"{arguments.out}: {message}", code=SOME_FAILED)
     if num_failed:
-        told = f"{num_failed} of {len(rows)} inputs failed, the others are written."
-        return fail(told, code=SOME_FAILED)
+        message = f"{num_failed} of {len(rows)} inputs failed, the remaining ones are written."
+        return fail(message, code=SOME_FAILED)
     return 0
 
 
-def tell_failure(report: TaskReport) -> None:
-    """Print why a task failed, if it did."""
+def print_failure(report: TaskReport) -> None:
+    """Print the reason of a failed task."""
     if report.status == "failed":
         fail(f"{report.name}: {report.reason.removeprefix(f'{report.name}: ')}")
 
@@ -183,21 +182,21 @@ def tell_failure(report: TaskReport) -> None:
 def note_input(
     source: str, cloud: Cloud, target: Path, results: Collection[str] = RESULT_FIELDS
 ) -> None:
-    """Warn of what reading took for granted, and of fields of a cloud whose names results take."""
+    """Warn about assumptions made while reading, and about fields that results replace."""
     replaced = () if is_archive(target) else notes_on_results(cloud.fields, results)
     for note in (*cloud.notes, *replaced):
         warn(f"{source}: {note}.")
 
 
-def left_out(target: Path, fields: Collection[str]) -> str:
-    """Return the words for a report on which fields of a cloud its result does not hold."""
+def dropped_fields_note(target: Path, fields: Collection[str]) -> str:
+    """Describe the fields of a cloud that its result omits."""
     names = [name for name in fields if name not in KEPT_FIELDS and is_archive(target)]
-    return f" (without its own {', '.join(names)})" if names else ""
+    return f" (without the input fields {', '.join(names)})" if names else ""
 
 
 @contextlib.contextmanager
 def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar on a terminal; what is yielded is called as each stage begins."""
+    """Show a progress bar on a terminal; call the yielded function at the start of each stage."""
     with tqdm(
         total=len(stages), desc=printable(name), unit="stage", leave=False, disable=None
     ) as bar:
@@ -210,14 +209,14 @@ def stage_bar(name: str, stages: Sequence[str]) -> Iterator[Callable[[str], None
 
 
 class Progress:
-    """A progress bar that counts scans and moves by points, or by frames where those are scans."""
+    """Progress bar that counts scans, weighted by their points (or frames)."""
 
     def __init__(self, bar: "tqdm[NoReturn]", sizes: Mapping[str, int], *, unit: str) -> None:
         self.bar, self.sizes, self.unit = bar, sizes, unit
         self.num_done = self.num_failed = 0
 
     def __call__(self, report: TaskReport | None) -> None:
-        """Take a report, or only show that time passes."""
+        """Count a report, or only refresh the bar."""
         if report is not None:
             self.num_done += 1
             self.num_failed += report.status == "failed"

@@ -10,11 +10,11 @@ import torch
 from torchrg.batch.records import describe_run
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.ending import say, warn
+from torchrg.cli.ending import print_lines, warn
 from torchrg.cli.loop import (
-    check_apart,
+    check_distinct,
+    dropped_fields_note,
     is_archive,
-    left_out,
     note_input,
     output_paths,
     run_each,
@@ -31,12 +31,12 @@ from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import find_directions
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
-"""Fields of each point that are written."""
+"""Per-point output fields."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Estimate normals and curvature of scans, and tell sharp feature points.
+    """Estimate normals, curvature and sharp points of scans.
 
     Examples:
         torchrg normals scan.pcd --out normals.ply
@@ -49,14 +49,13 @@ class Arguments:
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     method: NormalMethod | None = None
-    """Estimator of the normals, a short form of --normals.method."""
+    """Normal estimator; short form of --normals.method."""
     orient: flags.OrientFlag = "auto"
     viewpoint: flags.ViewpointFlag = None
     normals: NormalsConfig = dataclasses.field(default_factory=lambda: load_config().normals)
-    """How normals and curvature are estimated."""
+    """Normals and curvature."""
     chunk_size: int = PipelineConfig.chunk_size
-    """Number of points that are handled at a time. It bounds the memory and never changes a
-    result."""
+    """Points processed at a time; bounds memory use."""
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
 
@@ -72,19 +71,19 @@ def run(argv: list[str]) -> int:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
-    check_apart(outputs, arguments.inputs)
+    check_distinct(outputs, arguments.inputs)
     return run_each(_estimate_file, arguments, arguments.inputs, outputs)
 
 
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Estimate the normals of one file."""
     begin = time.perf_counter()
-    cloud = read_cloud(source, columns=flags.columns_of(source, arguments.columns))
+    cloud = read_cloud(source, columns=flags.file_columns(source, arguments.columns))
     note_input(f"{source}", cloud, target, RESULTS)
     check_finite(cloud)
     if cloud.precision_note:
         warn(f"{source}: {cloud.precision_note}.")
-    # Before the work.
+    # Fail before the computation.
     find_directions("normals", cloud, arguments.orient, viewpoint=arguments.viewpoint)
     check_output(target, cloud)
     with stage_bar(source.name, ("normals", "orientation")) as advance:
@@ -99,14 +98,14 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
             cloud, fit.normals, orient=arguments.orient, viewpoint=arguments.viewpoint
         )
     for note in note_on_copies(distinct.num_copies, len(cloud)):
-        say(f"{source}: {note}")
+        print_lines(f"{source}: {note}")
     provenance = describe_run(source, arguments.normals)
     names = ("orient", "viewpoint", *["columns"] * (arguments.columns is not None))
     provenance |= {name: getattr(arguments, name) for name in names}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     results = zip(RESULTS, (turned, fit.curvature, sharp, fit.valid), strict=True)
-    every = not is_archive(target)
-    fields = {name: v for name, v in cloud.fields.items() if every or name in KEPT_FIELDS}
+    keeps_fields = not is_archive(target)
+    fields = {name: v for name, v in cloud.fields.items() if keeps_fields or name in KEPT_FIELDS}
     fields = put_results(fields, {name: values.numpy() for name, values in results})
     write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
     num_bad = len(cloud) - int(fit.valid.sum())
@@ -114,5 +113,5 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
-    place = f"{target}{left_out(target, cloud.fields)}"
-    say(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {place}")
+    destination = f"{target}{dropped_fields_note(target, cloud.fields)}"
+    print_lines(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {destination}")

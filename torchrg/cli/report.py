@@ -1,4 +1,4 @@
-"""What ``torchrg convert`` prints of a batch: its plan, what it will take, what became of it."""
+"""Console output of ``torchrg convert``: plan, cost estimate and report."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -8,15 +8,16 @@ from torchrg.batch.task import TaskReport
 from torchrg.cli.ending import printable
 
 _SECONDS_PER_SCAN = 0.03
-"""Time of one core of an AMD EPYC for a scan of 40 points: hashes, and files that are flushed."""
-_SHORT = 100
-"""Seconds or minutes from which on a duration is in the next unit."""
+"""Time for a scan of 40 points on one core of an AMD EPYC, in seconds: hashing and flushing
+files."""
+_MIN_NEXT_UNIT = 100
+"""Durations from this many seconds or minutes on are printed in the next larger unit."""
 MAX_ROWS = 300
-"""Most scans of a batch that is printed scan by scan."""
+"""Maximum number of scans in a report with one row per scan."""
 
 
 def format_plan(plan: Plan) -> str:
-    """Return what a plan would do: a row for each scan that is to be converted."""
+    """Format a plan: one row per scan to convert."""
     sums = f"{len(plan.to_convert):,} scans to convert, {len(plan.done):,} done"
     if not plan.to_convert:
         return sums
@@ -27,10 +28,10 @@ def format_plan(plan: Plan) -> str:
 
 
 def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[float, str]) -> str:
-    """Return what a plan would take, in words, or that there is nothing to do.
+    """Format the estimated costs of a plan.
 
-    ``limit`` is the memory of all workers and ``free`` the room on the disk, in bytes; ``rate`` is
-    the seconds of a core for a million points, and what these points are.
+    ``limit`` is the memory limit of all workers and ``free`` the free disk space, in bytes;
+    ``rate`` is the time per million points of one core, in seconds, and the name of the points.
     """
     jobs, (seconds, of_what) = plan.to_convert, rate
     if not jobs:
@@ -43,19 +44,18 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
     num_points = sum(job.scan.num_points for job in jobs)
     total = seconds * num_points / 1e6 + _SECONDS_PER_SCAN * len(jobs)
     return (
-        f"disk: about {plan.num_bytes / 1e9:,.3f} GB of "
-        f"{free / 1e9:,.1f} that are free\n"
-        f"memory: about {memory / 1e9:,.1f} GB for {at_once} at a time, within {limit / 1e9:,.1f}\n"
-        f"time: about {_format_time(total / at_once)}, at {seconds:g} s of a core for a million "
+        f"disk: about {plan.num_bytes / 1e9:,.3f} GB of {free / 1e9:,.1f} GB free\n"
+        f"memory: about {memory / 1e9:,.1f} GB, {at_once} at a time, limit {limit / 1e9:,.1f} GB\n"
+        f"time: about {_format_time(total / at_once)}, at {seconds:g} core seconds per million "
         f"{of_what}"
     )
 
 
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:
-    """Return a report as text: a row for each scan, notes below, then the sums.
+    """Format a report: one row per scan, notes, then the totals.
 
-    With more than :data:`MAX_ROWS` scans, only failures have a row. ``unit`` is what a scan is
-    called where its number in a second counts.
+    With more than :data:`MAX_ROWS` scans, only failures are listed. ``unit`` is the name of a scan
+    in the throughput.
     """
     stages = list(report.stage_seconds)
     shown = report.scans if len(report.scans) <= MAX_ROWS else report.with_status("failed")
@@ -71,10 +71,10 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     for scan in shown:
         if scan.status != "failed":
             again = [f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []
-            told = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
-            notes += [printable(f"{scan.name}: {note}") for note in told]
+            lines = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
+            notes += [printable(f"{scan.name}: {note}") for note in lines]
     if len(report.scans) > MAX_ROWS and (num_noted := sum(bool(s.warnings) for s in report.scans)):
-        notes.append(f"{num_noted:,} {unit}s have notes, which report.json holds")
+        notes.append(f"{num_noted:,} {unit}s have notes; see report.json")
     seconds = report.seconds or math.inf
     speed = (
         f"{report.num_points:,} points in {report.seconds:,.1f} s: "
@@ -84,20 +84,20 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
 
 
 def _format_time(seconds: float) -> str:
-    """Return a duration in the unit that suits it.
+    """Format a duration in a suitable unit.
 
     Example:
         >>> _format_time(8), _format_time(500), _format_time(9000)
         ('8 s', '8 min', '2.5 h')
     """
-    if seconds < _SHORT:
+    if seconds < _MIN_NEXT_UNIT:
         return f"{math.ceil(seconds)} s"
     minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < _SHORT else f"{minutes / 60:,.1f} h"
+    return f"{minutes:.0f} min" if minutes < _MIN_NEXT_UNIT else f"{minutes / 60:,.1f} h"
 
 
 def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:
-    """Return the cells of a scan."""
+    """Return the table row of a scan."""
     points = f"{scan.num_points:,}" if scan.num_points else ""
     return [
         scan.name,
@@ -110,7 +110,7 @@ def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return rows of text as aligned columns, numbers to the right.
+    """Format rows as aligned columns, with numbers right-aligned.
 
     Example:
         >>> print(format_table(["scan", "points"], [["hall", "1,000"], ["office", "20"]]))

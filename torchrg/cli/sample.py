@@ -1,11 +1,11 @@
-"""``torchrg sample``: a synthetic room with its truth."""
+"""``torchrg sample``: a synthetic room with ground truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say
+from torchrg.cli.ending import print_lines
 from torchrg.io import check_output, write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -13,7 +13,7 @@ from torchrg.structures import Cloud
 
 @dataclass(frozen=True)
 class Arguments:
-    """Make a furnished room with exact labels and normals; the same seed gives the same room.
+    """Generate a furnished room with exact labels and normals; deterministic for a seed.
 
     Examples:
         torchrg sample room.npz
@@ -21,13 +21,13 @@ class Arguments:
     """
 
     out: Annotated[Path, Argument("OUT", is_positional=True)]
-    """File to write, its format by suffix."""
+    """Output file; the extension selects the format."""
     num_points: int = 100_000
     """Number of points."""
     noise: float = 0.003
-    """Standard deviation of the sensor's noise, in metres."""
+    """Standard deviation of the sensor noise, in meters."""
     seed: int = 0
-    """Seed of the random numbers."""
+    """Random seed."""
 
 
 def run(argv: list[str]) -> int:
@@ -38,5 +38,5 @@ def run(argv: list[str]) -> int:
     fields = {"labels": room.labels.numpy(), "normals": room.normals.numpy()}
     write_cloud(arguments.out, Cloud(room.points.numpy(), fields))
     num_faces = int(room.labels.max()) + 1
-    say(f"{arguments.out}: {len(room.points):,} points, {num_faces} faces")
+    print_lines(f"{arguments.out}: {len(room.points):,} points, {num_faces} planes")
     return 0

@@ -1,4 +1,4 @@
-"""``torchrg score``: labels, normals, superpoints against a truth, of one scan or of folders."""
+"""``torchrg score``: evaluate results against ground truth, for a scan or for folders."""
 
 import json
 import math
@@ -11,8 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import warn, warnings_as_lines
-from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
+from torchrg.cli.ending import print_warnings, warn
+from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.metrics import (
@@ -28,18 +28,18 @@ from torchrg.result import read_result
 from torchrg.structures import UNLABELED, Cloud
 
 Scores: TypeAlias = dict[str, dict[str, float | None]]
-"""Indices by part (``labels``, ``normals``, ``superpoints``) and name."""
+"""Metrics by part (``labels``, ``normals``, ``superpoints``) and name."""
 
 _MAX_NAMED = 5
-"""Scans that an error names, so that it stays one line."""
+"""Maximum number of scans listed in an error."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Score labels and normals against a truth of the same points.
+    """Evaluate labels and normals against ground truth for the same points.
 
-    Two scans, or two folders: then scans of the same name are compared, and the mean over them is
-    printed. A scan is a file, or a folder as torchrg convert writes it.
+    Both arguments are scans, or both are folders. For folders, scans with the same name are
+    compared and the mean is printed. A scan is a file, or a folder written by torchrg convert.
 
     Examples:
         torchrg score planes.npz room.npz
@@ -48,43 +48,44 @@ class Arguments:
     """
 
     predicted: Annotated[Path, Argument("PREDICTED", is_positional=True)]
-    """Scan with labels or normals, as torchrg segment and convert write it, or a folder of
-    such."""
+    """Scan with labels or normals, as written by torchrg segment or convert, or a folder of
+    scans."""
     truth: Annotated[Path, Argument("TRUTH", is_positional=True)]
-    """File with the true labels or normals, or a folder with such a file for each result."""
+    """File with ground-truth labels or normals, or a folder with one such file per result."""
     match_distance: float | None = None
-    """Compare each point of the truth with the nearest one of the prediction, at most this far
-    away in the unit of the cloud. Every point of the truth counts once. One without a match counts
-    as unlabelled, and predicted points that are nearest to none count nowhere. Default: points of
-    one row are compared, and must be the same."""
+    """Match each ground-truth point to the nearest predicted point within this distance, in units
+    of the cloud. Every ground-truth point counts once; without a match it counts as unlabeled.
+    Unmatched predicted points are ignored. Default: points are compared row by row and must be the
+    same."""
     superpoints: bool = False
-    """Score superpoints against the true labels, as torchrg segment --superpoints writes them."""
+    """Also evaluate superpoints against the ground-truth labels."""
     ignore: int | None = None
-    """True label of points that are not of any part, for superpoints. -1 always is one."""
+    """Ground-truth label of points to ignore in the evaluation of superpoints, in addition to
+    -1."""
     boundary_distance: float | None = None
-    """How far apart borders of superpoints and true ones may be and still agree, in the unit of the
-    cloud. Default: the median distance to the 8th nearest neighbour."""
+    """Maximum distance between matching superpoint and ground-truth boundaries, in units of the
+    cloud. Default: the median distance to the 8th nearest neighbor."""
     json: bool = False
-    """Print one JSON object instead of lines; for folders with the keys "scans", which holds the
-    scores of each, and "mean"."""
+    """Print a JSON object instead of text; for folders with the keys "scans" (scores per scan) and
+    "mean"."""
     columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
-    """Parse the arguments, score what both sides have, and print it."""
+    """Parse the arguments, evaluate and print the scores."""
     arguments = parse(Arguments, argv, prog="torchrg score")
     if arguments.match_distance is not None and not arguments.match_distance > 0:
         raise ConfigError(f"expected --match-distance > 0, got {arguments.match_distance}.")
     predicted, truth = arguments.predicted, arguments.truth
     for path in (predicted, truth):
         if not path.exists():
-            raise FormatError(f"{path}: no such file; check the spelling.")
-    of_folders = _holds_scans(predicted)
-    if of_folders != _holds_scans(truth):
-        file, folder = (truth, predicted) if of_folders else (predicted, truth)
-        raise FormatError(f"{file}: expected a folder, as {folder} is one; or give two files.")
-    if of_folders:
-        with warnings_as_lines():
+            raise FormatError(f"{path}: file not found.")
+    are_folders = _is_data_set(predicted)
+    if are_folders != _is_data_set(truth):
+        file, folder = (truth, predicted) if are_folders else (predicted, truth)
+        raise FormatError(f"{file}: expected a folder like {folder}; or pass two files.")
+    if are_folders:
+        with print_warnings():
             pairs = _pair_scans(predicted, truth).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
         scans = {name: _score_files(arguments, *files) for name, files in bar}
@@ -92,9 +93,9 @@ def run(argv: list[str]) -> int:
     else:
         scans, scores = {}, _score_files(arguments, predicted, truth)
     if arguments.json:
-        print(json.dumps({"scans": scans, "mean": scores} if of_folders else scores))
+        print(json.dumps({"scans": scans, "mean": scores} if are_folders else scores))
         return 0
-    if of_folders:
+    if are_folders:
         print(f"mean of {len(scans):,} scans")
     for part, values in scores.items():
         print(part)
@@ -103,13 +104,13 @@ def run(argv: list[str]) -> int:
     return 0
 
 
-def _holds_scans(path: Path) -> bool:
-    """Return whether a path is a folder of scans, and not one scan."""
+def _is_data_set(path: Path) -> bool:
+    """Return whether a path is a folder of scans rather than a single scan."""
     return path.is_dir() and not is_scene(path)
 
 
 def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
-    """Return both places of each scan of two folders by name, in natural order."""
+    """Pair the scans of two folders by name, in natural order."""
     ours, theirs = (
         {scene.name: scene.path for scene in FolderOfClouds(folder).scenes}
         for folder in (predicted, truth)
@@ -118,17 +119,17 @@ def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
         if missing:
             first, more = sorted(missing, key=natural_key)[:_MAX_NAMED], len(missing) - _MAX_NAMED
             raise FormatError(
-                f"{folder}: expected a counterpart of every scan, got none of {', '.join(first)}"
+                f"{folder}: no scan found for {', '.join(first)}"
                 f"{f' and {more} more' if more > 0 else ''}."
             )
     return {name: (path, theirs[name]) for name, path in ours.items()}
 
 
 def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
-    """Return the scores of whatever two scans of the same points both have."""
+    """Evaluate all parts present in both scans."""
     check_columns(arguments.columns, (predicted, truth))
     ours, theirs = (
-        read_result(path, columns=columns_of(path, arguments.columns)).cloud
+        read_result(path, columns=file_columns(path, arguments.columns)).cloud
         for path in (predicted, truth)
     )
     for cloud in (ours, theirs):
@@ -138,16 +139,18 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
     if arguments.match_distance is None:
         _check_rows(predicted, truth, ours, theirs)
     else:
-        ours, scores["match"] = _nearest(arguments.match_distance, predicted, truth, ours, theirs)
+        ours, scores["match"] = _match_nearest(
+            arguments.match_distance, predicted, truth, ours, theirs
+        )
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
-            scores[part] = _known(score(ours.fields[part], theirs.fields[part])._asdict())
+            scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
         for path, cloud, field in ((predicted, ours, "superpoint"), (truth, theirs, "labels")):
             if field not in cloud.fields:
                 named = ", ".join(cloud.fields) or "points alone"
                 raise FormatError(
-                    f"{path}: expected the field {field} for --superpoints, got {named}."
+                    f"{path}: missing {field}, required by --superpoints; has {named}."
                 )
         indices = score_partition(
             ours.fields["superpoint"],
@@ -156,49 +159,49 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
             boundary_distance=arguments.boundary_distance,
             ignore=arguments.ignore,
         )
-        scores["superpoints"] = _known(indices._asdict())
+        scores["superpoints"] = _defined(indices._asdict())
     if not scores.keys() - {"match"}:
         raise FormatError(
-            f"{predicted}: shares neither labels nor normals with {truth}; give the result of "
-            "torchrg segment, and a truth with the fields label or normals."
+            f"{predicted}: has neither labels nor normals in common with {truth}; pass a result of "
+            "torchrg segment, and ground truth with the field label or normals."
         )
     return scores
 
 
 def _check_rows(predicted: Path, truth: Path, ours: Cloud, theirs: Cloud) -> None:
-    """Refuse two scans whose rows are not the same points, and say what would compare them."""
+    """Raise unless both scans have the same points in the same rows."""
     if len(ours) != len(theirs):
         raise FormatError(
-            f"{predicted}: expected as many points as {truth} ({len(theirs):,}), got "
-            f"{len(ours):,}; --match-distance D compares each point with the nearest within D."
+            f"{predicted}: expected {len(theirs):,} points as in {truth}, got {len(ours):,}; to "
+            "compare each point with the nearest one within D, pass --match-distance D."
         )
     rows = differing_rows(ours, theirs)
     if len(rows):
         points = (cloud.coordinates[rows[0]] for cloud in (ours, theirs))
         got, expected = (" ".join(f"{value:.9g}" for value in point) for point in points)
         raise FormatError(
-            f"{predicted}: expected the points of {truth}, each in its row, got others "
-            f"({len(rows):,} of {len(ours):,} rows, the first {rows[0]}: {got} for {expected}); "
-            "add --match-distance D to take the nearest points within D."
+            f"{predicted}: expected the same points as {truth} in every row, got "
+            f"{len(rows):,} of {len(ours):,} that differ (row {rows[0]}: {got} for {expected}); to "
+            "compare each point with the nearest one within D, pass --match-distance D."
         )
 
 
-def _nearest(
+def _match_nearest(
     distance: float, predicted: Path, truth: Path, ours: Cloud, theirs: Cloud
 ) -> tuple[Cloud, dict[str, float | None]]:
-    """Return the results of ours at their points, and how many of these have none."""
+    """Transfer the results to the nearest ground-truth points, and count unmatched points."""
     rows = match_points(ours, theirs, distance)
     is_matched = rows >= 0
     num_lost = int(np.count_nonzero(~is_matched))
     if num_lost == len(rows):
         raise FormatError(
-            f"{predicted}: expected points near those of {truth}, got none within the distance; "
-            "check place and unit of both, or raise --match-distance."
+            f"{predicted}: no points within the distance of {truth}; check position and unit of "
+            "both, or raise --match-distance."
         )
     if num_lost:
         warn(
             f"{truth}: {num_lost:,} of {len(rows):,} points have no match in {predicted} and count "
-            "as unlabelled."
+            "as unlabeled."
         )
     fields = {}
     for name in ("labels", "normals", "superpoint"):
@@ -211,8 +214,8 @@ def _nearest(
     return Cloud(theirs.coordinates, fields, source=ours.source), {**matched}
 
 
-def _known(values: Mapping[str, float | None]) -> dict[str, float | None]:
-    """Return the scores that were asked for; JSON knows null, but no NaN."""
+def _defined(values: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Drop scores that were not computed; replace NaN by None, as JSON has no NaN."""
     return {
         name: None if math.isnan(value) else value
         for name, value in values.items()
@@ -221,9 +224,9 @@ def _known(values: Mapping[str, float | None]) -> dict[str, float | None]:
 
 
 def _mean(scans: Mapping[str, Scores]) -> Scores:
-    """Return the mean of each index over the scans that it is defined for.
+    """Average each metric over the scans for which it is defined.
 
-    Each part also says over how many ``scans`` that have it.
+    The entry ``scans`` of a part is the number of scans that have the part.
     """
     means: Scores = {}
     for part in dict.fromkeys(part for scores in scans.values() for part in scores):
@@ -236,7 +239,7 @@ def _mean(scans: Mapping[str, Scores]) -> Scores:
 
 
 def _format(value: float | None, index: Index | None) -> str:
-    """Return a number with its unit; fractions are in percent, as precision and recall are."""
+    """Format a value with its unit; fractions are printed in percent."""
     unit = "" if index is None else index.unit
     if value is None:
         return "none"

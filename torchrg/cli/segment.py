@@ -1,4 +1,4 @@
-"""``torchrg segment``: plane labels of scans."""
+"""``torchrg segment``: segment point clouds into planes."""
 
 import contextlib
 import dataclasses
@@ -17,17 +17,17 @@ from torchrg.batch.records import Record, describe_run
 from torchrg.batch.run import REPORT, lock_folder
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
-from torchrg.cli.ending import say, warn
+from torchrg.cli.ending import print_lines, warn
 from torchrg.cli.loop import (
     STAGES,
-    check_apart,
-    is_page,
-    left_out,
-    name_of,
+    check_distinct,
+    display_name,
+    dropped_fields_note,
+    is_viewer,
     note_input,
     output_paths,
-    paths_beside,
     run_each,
+    sidecar_paths,
     stage_bar,
 )
 from torchrg.clouds import find_objects, note_on_copies, segment_cloud
@@ -48,22 +48,22 @@ from torchrg.io.files import check_space, mark_of
 from torchrg.merge import merge_clouds
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
-from torchrg.render.gallery import Entry, check_gallery, draw_entry, draw_planes, write_index
+from torchrg.render.gallery import Entry, check_gallery, write_entry, write_index, write_planes
 from torchrg.result import Result, write_table
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 _DATASET = "ScanNet"
-"""The data set as whose scans layouts take clouds without labels."""
+"""Data set whose file layout is used for clouds without labels."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
-"""Flags of depth images, which have a command of their own."""
+"""Flags of depth images, handled by torchrg depth."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Label the planes of scans, and write labels, normals, curvature and a table of planes.
+    """Segment point clouds into planes: plane label, normal, curvature, plane table.
 
-    Settings come from the preset or the file of --config, then from the flags given here. The
-    result holds a label for each point, -1 where it is on no plane.
+    Settings come from the preset (or the --config file) and are overridden by the flags below.
+    Points that lie on no plane get the label -1.
 
     Examples:
         torchrg segment scan.pcd --out planes.npz
@@ -76,25 +76,24 @@ class Arguments:
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     picture: Path | None = None
-    """Picture (.png) or page for the browser (.html) of the planes, to write too; for several
-    inputs a directory of pictures."""
+    """Also render the planes as an image (.png) or an interactive viewer (.html). With several
+    inputs, a directory of images."""
     table: flags.TableFlag = None
     pages: bool = False
-    """Write a page for the browser beside each picture, and index.html, in which each picture links
-    to its page; --picture is a directory then (pip install 'torchrg[view]')."""
+    """Also write an interactive viewer for each image, and an index.html linking to them. Requires
+    --picture DIRECTORY (pip install 'torchrg[view]')."""
     voxel: float | None = None
-    """Side of voxels, in the unit of the cloud: one point of each is segmented, and every point
-    has the result of its voxel. Default: all points are segmented."""
+    """Voxel size, in units of the cloud. Segments one point per voxel and copies the result to all
+    points of that voxel. Default: no downsampling."""
     superpoints: bool = False
-    """Add superpoints, a partition of all points, to the result: the finest as "superpoint", the
-    coarser ones as "superpoint_1" and so on. Numbers say how many there are in each, as in
-    --superpoints 1000,300. Colours of the cloud play a part, and a picture shows superpoints
-    instead of planes."""
+    """Also partition all points into superpoints, stored as "superpoint" (finest), "superpoint_1"
+    and so on. Optional numbers set how many per level, as in --superpoints 1000,300. Uses point
+    colors if the cloud has them. Images then show superpoints instead of planes."""
     level: int = 0
-    """Which level of the superpoints --layout takes, 0 the finest."""
+    """Superpoint level exported by --layout; 0 is the finest."""
     layout: flags.Layout | None = None
-    """Write the files of other programs into the directory OUT instead of one result, as torchrg
-    convert --layout does. Superpoints are added then."""
+    """Write the file layout of another project into the directory OUT instead of a single result,
+    as torchrg convert --layout does. Implies --superpoints."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
@@ -102,18 +101,17 @@ class Arguments:
     viewpoint: flags.ViewpointFlag = None
     within: flags.WithinFlag = None
     merge: bool = False
-    """Take all inputs as one cloud, one after the other, with the fields that all of them have."""
+    """Concatenate all inputs into one cloud, keeping the fields they share."""
     limit_memory: float | None = None
-    """Gigabytes of memory that a cloud may take. Of one that would take more the largest arrays are
-    kept on the disk of OUT while it is segmented, or of TMPDIR, some 450 bytes a point, with the
-    same result. Default: half of what is free."""
+    """Memory limit per cloud, in GB. Beyond it, the largest arrays go to disk (about 450 bytes per
+    point, next to OUT or in TMPDIR); the result is identical. Default: half of the free memory."""
     settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
-    _refuse_images(argv)
-    argv = flags.spell_counts(argv)
+    _reject_images(argv)
+    argv = flags.expand_counts(argv)
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
     if arguments.layout not in (None, "pointcept"):
@@ -127,11 +125,11 @@ def run(argv: list[str]) -> int:
         check_layout(arguments.layout, _DATASET, "clouds")
     if arguments.level and arguments.layout is None:
         raise ConfigError(
-            "expected --layout with --level, as other files hold all levels, got none; leave "
-            "--level out."
+            "expected --layout with --level, got none; leave --level out, since other files "
+            "contain all levels."
         )
     flags.use_threads(arguments.threads)
-    flags.bytes_of_limit(arguments.limit_memory)
+    flags.limit_in_bytes(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
     clouds = [arguments.inputs] if arguments.merge else [(path,) for path in arguments.inputs]
@@ -140,23 +138,23 @@ def run(argv: list[str]) -> int:
     firsts = tuple(sources[0] for sources in clouds if sources)
     suffix = ".npz" if arguments.layout is None else ""
     outputs = output_paths(firsts, arguments.out, suffix=suffix)
-    pictures = paths_beside(outputs, arguments.picture)
-    tables = paths_beside(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
-    check_apart([*outputs, *filter(None, tables)], arguments.inputs)
+    pictures = sidecar_paths(outputs, arguments.picture)
+    tables = sidecar_paths(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
+    check_distinct([*outputs, *filter(None, tables)], arguments.inputs)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    with _sharing(arguments, outputs):
+    with _layout_lock(arguments, outputs):
         code = run_each(_segment, arguments, clouds, outputs, tables, pictures)
     if arguments.pages and arguments.picture is not None:
         done = [path for path in pictures if path is not None and _page_of(path).is_file()]
         entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
-        say(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
+        print_lines(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
     return code
 
 
 @contextlib.contextmanager
-def _sharing(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
-    """Keep scans of a layout, whose files are in the same folders, from those of one another."""
+def _layout_lock(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
+    """Lock the output directory and update the lists of a layout that shares folders."""
     if arguments.layout in (None, "pointcept"):
         yield
         return
@@ -168,19 +166,19 @@ def _sharing(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
 
 
 def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
-    """Refuse pages without a directory for them, or without what they need."""
+    """Raise if viewers have no directory, or cannot be written."""
     if arguments.picture is None or not arguments.picture.is_dir():
         raise ConfigError("expected --pages together with --picture DIRECTORY.")
     check_gallery(arguments.picture, [path.stem for path in pictures if path is not None])
 
 
 def _page_of(picture: Path) -> Path:
-    """Return where the page of a picture is."""
+    """Return the path of the viewer of an image."""
     return picture.with_suffix(".html")
 
 
-def _refuse_images(argv: list[str]) -> None:
-    """Say where depth images went, if the arguments are about them."""
+def _reject_images(argv: list[str]) -> None:
+    """Raise an error that refers to torchrg depth if the arguments are depth images."""
     for last, argument in pairwise(("", *argv)):
         is_flag = argument.partition("=")[0] in IMAGE_FLAGS
         is_value = last.startswith("--") and "=" not in last
@@ -188,7 +186,7 @@ def _refuse_images(argv: list[str]) -> None:
         if is_flag or (is_input and argument.lower().endswith(".png")):
             what, name = ("", "IMAGES...") if is_flag else ("the image ", argument)
             raise ConfigError(
-                f"segment: expected point clouds, got {what}{argument}; use: torchrg depth {name} "
+                f"segment: expected point clouds, got {what}{argument}; use torchrg depth {name} "
                 "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
             )
 
@@ -200,15 +198,15 @@ def _segment(
     table: Path | None,
     picture: Path | None,
 ) -> None:
-    """Segment a cloud with a progress bar on a terminal, and one line about the result."""
-    begin, source = time.perf_counter(), name_of(sources)
-    limit = flags.bytes_of_limit(arguments.limit_memory, available_memory() // 2)
-    _check_limit(source, sum(map(estimate_points, sources)), limit)  # Before it is read.
+    """Segment a cloud with a progress bar, and print one line about the result."""
+    begin, source = time.perf_counter(), display_name(sources)
+    limit = flags.limit_in_bytes(arguments.limit_memory, available_memory() // 2)
+    _check_limit(source, sum(map(estimate_points, sources)), limit)  # Before reading.
     clouds = [
-        read_cloud(path, columns=flags.columns_of(path, arguments.columns)) for path in sources
+        read_cloud(path, columns=flags.file_columns(path, arguments.columns)) for path in sources
     ]
     cloud = merge_clouds(clouds)
-    where = _arrays_of(arguments, source, target, len(cloud), limit)
+    where = _array_storage(arguments, source, target, len(cloud), limit)
     find_objects(cloud, arguments.within)  # An unknown field fails before any warning.
     _check_points(arguments, source, cloud, target)
     stages = (*STAGES, *["superpoints"] * arguments.superpoints)
@@ -225,7 +223,7 @@ def _segment(
             warn=lambda note: warn(f"{source}: {note}."),
         )
     for note in note_on_copies(seg.num_copies, len(cloud)):
-        say(f"{source}: {note}")
+        print_lines(f"{source}: {note}")
     if arguments.layout is None:
         provenance = _describe(arguments, sources, seg)
         write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)
@@ -238,29 +236,29 @@ def _segment(
     if superpoints is not None:
         levels = superpoints.by_level().values()
         counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)
-        say(f"{source}: superpoints of each level: {counts}")
+        print_lines(f"{source}: superpoints of each level: {counts}")
     if seg.sampling is not None:
         settings = arguments.settings.resolved.measured(seg.sampling)["settings"]
-        say(f"{source}: {flags.choice_of(seg.sampling, settings)}")
-    place = f"{target}{left_out(target, cloud.fields)}"
+        print_lines(f"{source}: {flags.describe_sampling(seg.sampling, settings)}")
+    destination = f"{target}{dropped_fields_note(target, cloud.fields)}"
     reason = flags.reason_for_no_plane(arguments.settings.resolved)
-    _report(source, seg, cloud, place, reason, time.perf_counter() - begin)
+    _report(source, seg, cloud, destination, reason, time.perf_counter() - begin)
 
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
-    """Refuse a cloud that takes more memory than allowed even with its large arrays on a disk."""
-    least = memory_of_scan(num_points, on_disk=True)
-    if least > limit:
+    """Raise if a cloud exceeds the memory limit even with its large arrays on disk."""
+    minimum = memory_of_scan(num_points, on_disk=True)
+    if minimum > limit:
         raise ConfigError(
-            f"{source}: expected --limit-memory of at least {least / 1e9:.2f} GB for about "
+            f"{source}: expected --limit-memory of at least {minimum / 1e9:.2f} GB for about "
             f"{num_points:,} points, got {limit / 1e9:.2f} GB; raise it, or split the cloud."
         )
 
 
-def _arrays_of(
+def _array_storage(
     arguments: Arguments, source: str, target: Path, num_points: int, limit: int
 ) -> contextlib.AbstractContextManager[None]:
-    """Return where the large arrays of a cloud are: in memory, or on a disk that has the room."""
+    """Return the context for large arrays: memory, or disk if they exceed the limit."""
     _check_limit(source, num_points, limit)
     if (needed := memory_of_scan(num_points)) <= limit:
         return contextlib.nullcontext()
@@ -268,15 +266,15 @@ def _arrays_of(
     normals = arguments.settings.resolved.normals
     k = max(normals.k, normals.adaptive_k or 0)
     check_space(folder, num_points * k * scratch.BYTES_PER_NEIGHBOR, "the work")
-    say(
-        f"{source}: about {num_points:,} points take {needed / 1e9:.2f} GB of memory, the limit is "
-        f"{limit / 1e9:.2f}: the largest arrays are on the disk of {folder}"
+    print_lines(
+        f"{source}: about {num_points:,} points need {needed / 1e9:.2f} GB of memory, the limit "
+        f"is {limit / 1e9:.2f} GB: moving the largest arrays to disk in {folder}"
     )
     return scratch.on_disk(folder)
 
 
 def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path) -> None:
-    """Warn of what is not as it seems, before the work; refuse what cannot be written."""
+    """Warn about the input before the computation; raise if the output cannot be written."""
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
     parts = [f"superpoint_{i}" if i else "superpoint" for i in levels]
     written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
@@ -286,13 +284,11 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
     grid = cloud.grid_shape
     pixels = None if grid is None else torch.from_numpy(cloud.coordinates).view(*grid, 3)
     if pixels is not None and find_intrinsics(pixels) is not None:
-        warn(
-            f"{source}: taken by a depth camera; torchrg depth keeps the steps of its image apart."
-        )
+        warn(f"{source}: from a depth camera; torchrg depth also separates planes at depth steps.")
 
 
 def _describe(arguments: Arguments, sources: tuple[Path, ...], seg: Segmentation) -> Record:
-    """Return the provenance of a cloud of one file or of several."""
+    """Return the provenance of a cloud from one or several files."""
     settings = arguments.settings.resolved
     provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
     names = ("columns", "viewpoint", "voxel", "within")
@@ -314,7 +310,7 @@ def _write_layout(
     seg: Segmentation,
     superpoints: Superpoints | None,
 ) -> None:
-    """Write a result in a layout, its folder ``target``."""
+    """Write a result in a layout to the folder ``target``."""
     layout, level = arguments.layout or "pointcept", arguments.level
     for note in note_on_origin(layout, cloud):
         warn(f"{cloud.source}: {note}.")
@@ -323,26 +319,26 @@ def _write_layout(
 
 
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
-    """Write the picture of a result, or the page, or both."""
+    """Write the image or viewer of a result, or both."""
     if arguments.pages:
-        draw_entry(picture.parent, picture.stem, result)
-    elif is_page(picture):
+        write_entry(picture.parent, picture.stem, result)
+    elif is_viewer(picture):
         write_page(picture, make_page(result))
     else:
-        draw_planes(picture, result)
+        write_planes(picture, result)
 
 
 def _report(
     source: str, seg: Segmentation, cloud: Cloud, target: str, reason: str, seconds: float
 ) -> None:
-    """Print the line about a result, after a warning with a reason if there is no plane in it."""
+    """Print the summary line of a result, and a warning if it has no plane."""
     if len(seg.planes) == 0:
         finite = cloud.coordinates[cloud.finite]
-        is_place = (finite == finite[0]).all()
-        warn(f"{source}: no plane found: {'all points are equal' if is_place else reason}.")
+        are_equal = (finite == finite[0]).all()
+        warn(f"{source}: no plane found: {'all points are identical' if are_equal else reason}.")
     num_points, num_planes = len(seg.labels), len(seg.planes)
     percent = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
-    say(
+    print_lines(
         f"{source}: {num_points:,} points, {num_planes:,} planes, {percent:.1f} % of the points "
-        f"labelled, {seconds:.1f} s -> {target}"
+        f"labeled, {seconds:.1f} s -> {target}"
     )

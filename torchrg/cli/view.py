@@ -1,4 +1,4 @@
-"""``torchrg view``: a picture or a page of a cloud or of a result."""
+"""``torchrg view``: an image or interactive viewer of a cloud or result."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import say, warn
-from torchrg.cli.flags import ColumnsFlag, check_columns, columns_of
-from torchrg.cli.loop import check_beside, is_page
+from torchrg.cli.ending import print_lines, warn
+from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
+from torchrg.cli.loop import check_sidecar, is_viewer
 from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.io.colors import narrow_colors
@@ -38,10 +38,9 @@ Direction = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Arguments:
-    """Draw a cloud, coloured by its planes if it has labels.
+    """Render a cloud as an image or an interactive viewer, colored by its planes if it has labels.
 
-    A picture is a PNG file. A page for the browser lets one turn the cloud, point at planes, and
-    compare two results.
+    The viewer is an HTML page: rotate the cloud, select planes, compare two results.
 
     Examples:
         torchrg view planes.npz --out planes.png
@@ -52,64 +51,64 @@ class Arguments:
     """
 
     file: Annotated[Path, Argument("FILE", is_positional=True)]
-    """Cloud or result to read."""
+    """Point cloud or result."""
     out: Path
-    """Picture (.png) or page (.html; pip install 'torchrg[view]') to write. A page is one file that
-    opens without a network."""
+    """Output image (.png) or interactive viewer (.html; pip install 'torchrg[view]'). A viewer is a
+    single file that works offline."""
     color: PageColorBy | None = None
-    """Meaning of the colours, at first on a page, where they can be switched. Default: the planes,
-    or the first thing that the file has. Errors need --truth, and a page."""
+    """Quantity shown as color; in a viewer, the initial one. Default: the planes, or the first
+    quantity in the file. error and normal-error require --truth and a viewer."""
     view: Literal["cutaway", "above", "outside", "sensor"] = "cutaway"
-    """Where the picture is taken from: from outside without ceiling and near walls (cutaway), from
-    above without ceiling (above), from outside with everything (outside), or from the origin along
-    z as a depth camera sees it (sensor)."""
+    """Camera. cutaway: from outside, without ceiling and near walls. above: from above, without
+    ceiling. outside: from outside, with everything. sensor: from the origin along z, like a depth
+    camera."""
     up: Up | None = None
-    """Axis that points up. Default: z; -y with --view sensor."""
+    """Up axis. Default: z; -y with --view sensor."""
     azimuth_deg: float | None = None
-    """Angle about the up axis from which to look, in degrees. Default: the one that shows most."""
+    """Azimuth of the camera about the up axis, in degrees. Default: chosen to show the most."""
     width: int = 1600
-    """Width in pixels of a picture, both halves together."""
+    """Width of the image in pixels, including both halves."""
     beside: Path | None = None
-    """Another cloud or result, for the right half; on a page both are turned together."""
+    """Second cloud or result, shown in the right half; in a viewer both rotate together."""
     truth: Path | None = None
-    """Cloud of the same points with true labels or normals, to show errors on a page."""
+    """Ground truth for the same points, with labels or normals; shows errors in a viewer."""
     max_points: int = MAX_POINTS
-    """Most points that a page shows. Of a larger cloud it shows a random sample, and says so."""
+    """Maximum points in the viewer; larger clouds are randomly downsampled, with a note."""
     unit: str | None = None
-    """Name of the unit of the coordinates, such as m, for lengths and areas on a page. Default: m
-    if the cloud is 2 to 6 units high, as rooms are in meters."""
+    """Unit of the coordinates, such as m, for lengths and areas in a viewer. Default: m if the
+    cloud is 2 to 6 units high, like a room in meters."""
     columns: ColumnsFlag = None
 
 
 def run(argv: list[str]) -> int:
-    """Parse the arguments, draw the cloud and write the picture."""
+    """Parse the arguments, render the cloud and write the output."""
     arguments = parse(Arguments, argv, prog="torchrg view")
-    check_beside(arguments.out)
+    check_sidecar(arguments.out)
     files = (arguments.file, arguments.beside, arguments.truth)
     check_columns(arguments.columns, [path for path in files if path is not None])
-    write = _write_page if is_page(arguments.out) else _write_picture
-    said = write(arguments, _read(arguments.file, arguments))
-    say(f"{arguments.file} -> {arguments.out} ({said})")
+    write = _write_page if is_viewer(arguments.out) else _write_picture
+    summary = write(arguments, _read(arguments.file, arguments))
+    print_lines(f"{arguments.file} -> {arguments.out} ({summary})")
     return 0
 
 
 def _read(path: Path, arguments: Arguments) -> Result:
-    """Read a cloud or a result, and print its notes."""
-    result = read_result(path, columns=columns_of(path, arguments.columns))
+    """Read a cloud or result, and print its notes."""
+    result = read_result(path, columns=file_columns(path, arguments.columns))
     for note in result.cloud.notes:
         warn(f"{path}: {note}.")
     return result
 
 
 def _write_picture(arguments: Arguments, result: Result) -> str:
-    """Write a picture, or two side by side, and return what there is to say about it."""
+    """Write an image, or two side by side, and return its description."""
     if arguments.truth is not None:
         raise ConfigError(
-            f"expected --truth with a page, got {arguments.out}; take --out PAGE.html."
+            f"expected --truth with a viewer, got {arguments.out}; use --out PAGE.html."
         )
-    halves = [_draw(arguments, result)]
+    halves = [_render(arguments, result)]
     if arguments.beside is not None:
-        halves.append(_draw(arguments, _read(arguments.beside, arguments), result))
+        halves.append(_render(arguments, _read(arguments.beside, arguments), result))
     height = max(len(half) for half in halves)
     level = [
         functional.pad(half, (0, 0, 0, 0, 0, height - len(half)), value=255) for half in halves
@@ -118,8 +117,8 @@ def _write_picture(arguments: Arguments, result: Result) -> str:
     return f"{sum(half.shape[1] for half in halves)} x {height} pixels"
 
 
-def _draw(arguments: Arguments, result: Result, first: Result | None = None) -> Tensor:
-    """Draw a result; if the first has the same points, from the same place and in its colors."""
+def _render(arguments: Arguments, result: Result, first: Result | None = None) -> Tensor:
+    """Render a result; with the same points as the first, use its camera and colors."""
     cloud, normals = result.cloud, result.cloud.fields.get("normals")
     reference = None
     if first and np.array_equal(cloud.coordinates, first.cloud.coordinates, equal_nan=True):
@@ -138,7 +137,7 @@ def _draw(arguments: Arguments, result: Result, first: Result | None = None) -> 
 
 
 def _write_page(arguments: Arguments, result: Result) -> str:
-    """Write a page, and return what there is to say about it."""
+    """Write a viewer and return its description."""
     page = make_page(
         result,
         beside=None if arguments.beside is None else _read(arguments.beside, arguments),
@@ -158,15 +157,15 @@ def _write_page(arguments: Arguments, result: Result) -> str:
 def _colors(
     cloud: Cloud, color: PageColorBy | None, up: Direction, reference: Tensor | None
 ) -> Tensor:
-    """Return the colour of each point; raise ConfigError if the cloud has none of that kind."""
+    """Return the color of each point; raise ConfigError if the cloud lacks the quantity."""
     present = [name for name in get_args(ColorBy) if MODES[name][1] in cloud.fields]
     if color is None:
         color = present[0] if present else None
     elif color not in present:
         raise ConfigError(
-            f"{cloud.source}: expected {MODES[color][1]} for --color {color}, got a file with "
+            f"{cloud.source}: missing {MODES[color][1]}, required by --color {color}; has "
             f"{', '.join(cloud.fields) or 'points alone'}."
-            + (" Errors are for pages, with --truth." if color.endswith("error") else "")
+            + (" Errors require a viewer and --truth." if color.endswith("error") else "")
         )
     if color is None:
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)
@@ -183,7 +182,7 @@ def _colors(
 
 
 def _direction(axis: Up) -> Direction:
-    """Return an axis as a vector."""
+    """Return the unit vector of an axis."""
     sign = -1.0 if axis.startswith("-") else 1.0
     x, y, z = (sign * (letter == axis[-1]) for letter in "xyz")
     return x, y, z

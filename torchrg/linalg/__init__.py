@@ -1,8 +1,8 @@
-"""Linear algebra of many tiny matrices, and the tolerances that follow from a precision.
+"""Linear algebra of many tiny matrices, and precision-based tolerances.
 
-Everything that can decide a label is built from ``+ - * /`` and ``sqrt`` alone: these are exact to
-the last bit wherever an element stands in a tensor, so results do not depend on chunk size or on
-the number of threads. Vectorised ``acos`` or ``cos`` do not promise that.
+Values that can affect a label use only ``+ - * /`` and ``sqrt``. These are bit-identical at any
+position of a tensor, so results do not depend on chunk size or number of threads. Vectorized
+``acos`` and ``cos`` do not guarantee this.
 """
 
 from torchrg.linalg.angles import (

@@ -1,4 +1,4 @@
-"""Angles between directions that have no sign."""
+"""Angles between unsigned directions."""
 
 import math
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ _ASIN_DEGREE = 10
 
 
 def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
-    """Return an upward direction, three numbers or the name of an axis, as a unit vector, float64.
+    """Convert an up direction, three numbers or the name of an axis, to a unit vector, float64.
 
-    ``caller`` is the public function that messages begin with.
+    ``caller`` is the public function that starts the messages.
 
     Raises:
-        ConfigError: If it is no direction.
+        ConfigError: If the direction is invalid.
 
     Example:
         >>> unit_direction("f", "-y").tolist(), unit_direction("f", (0, 0, 1e-300)).tolist()
@@ -35,8 +35,8 @@ def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
     direction = torch.tensor(values, dtype=torch.float64, device="cpu")
     if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
         raise ConfigError(
-            f"{caller}: expected up to be a direction, as three numbers that are not all zero or "
-            f"the name of an axis, got {up!r}."
+            f"{caller}: expected up to be a direction (three numbers, not all zero, or the name of "
+            f"an axis), got {up!r}."
         )
     direction /= direction.abs().amax()
     direction /= direction.norm()
@@ -44,11 +44,11 @@ def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
 
 
 def unsigned_angle_deg(a: Tensor, b: Tensor) -> Tensor:
-    """Return the angle ``(*)`` between directions without sign, in [0, 90] degrees, eq. (8).
+    """Return the angle ``(*)`` between unsigned directions, in [0, 90] degrees, eq. (8).
 
-    From the chord, ``2 asin(min(|a - b|, |a + b|) / 2)``: accurate for small angles, where the
-    arc cosine of a float32 product is wrong by up to 0.02 degrees. Unit vectors ``a`` and ``b``,
-    ``(*, 3)``, are broadcast.
+    Computed from the chord as ``2 asin(min(|a - b|, |a + b|) / 2)``, accurate for small angles.
+    There, the arc cosine of a float32 product is wrong by up to 0.02 degrees. Unit vectors ``a``
+    and ``b``, ``(*, 3)``, are broadcast.
 
     Example:
         >>> a = torch.tensor([[1.0, 0, 0], [1, 0, 0]])
@@ -61,9 +61,9 @@ def unsigned_angle_deg(a: Tensor, b: Tensor) -> Tensor:
 
 
 def sq_chord_to_deg(sq_chord: Tensor) -> Tensor:
-    """Return the angle under which a chord of the unit sphere of squared length 0 to 2 is seen.
+    """Convert squared chords of the unit sphere, in [0, 2], to angles.
 
-    In [0, 90] degrees, right to 1e-7 (float32) or 1e-8 degrees (float64).
+    In [0, 90] degrees, accurate to 1e-7 (float32) or 1e-8 degrees (float64).
 
     Example:
         >>> sq_chord_to_deg(torch.tensor([0.0, 1.0, 2.0]))
@@ -78,7 +78,7 @@ def sq_chord_to_deg(sq_chord: Tensor) -> Tensor:
 
 
 def deg_to_sq_chord(angle_deg: float) -> float:
-    """Return the squared chord ``(2 sin(a / 2))^2`` of the unit sphere that an angle spans.
+    """Convert an angle to the squared chord ``(2 sin(a / 2))^2`` of the unit sphere.
 
     Example:
         >>> round(deg_to_sq_chord(60.0), 6)
@@ -90,12 +90,12 @@ def deg_to_sq_chord(angle_deg: float) -> float:
 def sq_chords(
     normals: Sequence[Tensor], neighbor_normals: Sequence[Tensor], *, signed: bool = False
 ) -> Tensor:
-    """Return the squared distance on the unit sphere between normals and those of the neighbours.
+    """Return the squared chords between normals and the normals of their neighbors.
 
-    Built from ``+ - *`` alone, hence the same to the last bit in every chunk; and exact where the
-    normals are equal, so that an angle limit of 0 accepts them. Without gradient. Three components
-    of shape ``(n, 1)`` and three of ``(n, K)`` give ``(n, K)``, in [0, 2]; with ``signed`` opposite
-    normals are not equal but far apart, in [0, 4].
+    Uses only ``+ - *``, so it is bit-identical in every chunk. It is exact for equal normals, so
+    that an angle limit of 0 accepts them. Without gradient. Three components of shape ``(n, 1)``
+    and three of ``(n, K)`` give ``(n, K)``, in [0, 2]. With ``signed``, opposite normals are far
+    apart, in [0, 4].
 
     Example:
         >>> a = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
@@ -129,7 +129,7 @@ _ASIN_SERIES = _asin_series(_ASIN_DEGREE)
 
 
 def above(values: Tensor, bounds: Tensor | float) -> Tensor:
-    """Return 1 where values exceed their bounds and 0 elsewhere, in their dtype, without gradient.
+    """Return 1 where values exceed their bounds, else 0, in their dtype, without gradient.
 
     Example:
         >>> above(torch.tensor([1.0, 2.0, 3.0]), 2.0)
@@ -139,7 +139,7 @@ def above(values: Tensor, bounds: Tensor | float) -> Tensor:
 
 
 def at_most(values: Tensor, bounds: Tensor | float) -> Tensor:
-    """Return 1 where values are at or below their bounds and 0 elsewhere; see :func:`above`.
+    """Return 1 where values are at most their bounds, else 0; see :func:`above`.
 
     Example:
         >>> at_most(torch.tensor([1.0, 2.0, 3.0]), 2.0)
@@ -149,7 +149,7 @@ def at_most(values: Tensor, bounds: Tensor | float) -> Tensor:
 
 
 def signs(values: Tensor) -> Tensor:
-    """Return 1 or -1, by the sign of the values; that of zero may be either.
+    """Return 1 or -1, by the sign of the values; either for zero.
 
     Example:
         >>> signs(torch.tensor([-0.5, 2.0]))

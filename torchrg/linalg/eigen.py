@@ -1,7 +1,7 @@
-"""Eigenvectors of many symmetric 3x3 matrices, and how little counts as nothing.
+"""Eigenvectors of many symmetric 3x3 matrices, and numerical tolerances.
 
-Every tolerance that follows from the precision of a dtype is a function here; other modules name
-multiples of them.
+All tolerances that follow from the precision of a dtype are functions of this module; other modules
+use multiples of them.
 """
 
 from typing import Any, NamedTuple
@@ -12,43 +12,43 @@ from torch import Tensor
 from torchrg._checks import check_floating, check_shapes, has_values, refuse_forward_mode
 
 _JACOBI_SWEEPS = 5
-"""Rotations of all three pairs, after which 3x3 matrices are diagonal to rounding in either
+"""Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either
 dtype."""
 
-_FIRST_STEPS, _MORE_STEPS = 4, 36
-"""Steps of Newton's method for a simple root, and the most for one that is nearly double, where
-each step halves the distance until the two are apart."""
+_FIRST_STEPS, _MAX_MORE_STEPS = 4, 36
+"""Number of Newton steps for a simple root, and maximum number of further steps for a nearly double
+one, where each step halves the distance until the two roots separate."""
 
 _CONVERGED = 1e-9
-"""A root has converged if the last step moves it by less than this share of the trace."""
+"""Maximum last step of a converged root, as a fraction of the trace."""
 
 _NEARLY_EQUAL = 1e-9
-"""Share of the squared largest eigenvalue below which the adjugate gives no direction."""
+"""Fraction of the squared largest eigenvalue below which the adjugate gives no direction."""
 
 _ROUNDED_STEPS = 8
-"""Rounding errors that add up in a distance to a plane, in units of the patch's own extent."""
+"""Number of accumulated rounding errors in a distance to a plane, relative to the patch extent."""
 
 
 def machine_epsilon(dtype: torch.dtype) -> float:
-    """Return the distance from 1 to the next number of a dtype: twice its relative rounding."""
+    """Return the spacing of numbers at 1: twice the relative rounding error of a dtype."""
     return torch.finfo(dtype).eps
 
 
 def smallest_normal(dtype: torch.dtype) -> float:
-    """Return the smallest positive number of a dtype that has all its digits."""
+    """Return the smallest positive normal number of a dtype."""
     return torch.finfo(dtype).tiny
 
 
 def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
-    """Return ``max(num_values, 3) * eps``, the tolerance of a matrix of so many points.
+    """Return ``max(num_values, 3) * eps``, the rank tolerance for ``num_values`` points.
 
-    Of a singular value relative to the largest, at which a direction counts as flat.
+    It is the ratio to the largest singular value below which a direction counts as flat.
     """
     return max(num_values, 3) * machine_epsilon(dtype)
 
 
 def coordinate_resolution(points: Tensor) -> Tensor:
-    """Return the rounding of differences of coordinates ``(*, P)`` at each point, shape ``(*)``.
+    """Return the rounding error of differences of coordinates ``(*, P)`` per point, shape ``(*)``.
 
     Example:
         >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
@@ -60,8 +60,8 @@ def coordinate_resolution(points: Tensor) -> Tensor:
 def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
     """Return how far from its plane rounding alone can move a point, shape ``(B,)``.
 
-    The points ``(B, K, P)`` are as they were given: their coordinates were rounded where they are,
-    however far from the origin. ``extent`` is the largest coordinate about the patch's own middle.
+    The points ``(B, K, P)`` are input coordinates, whose rounding depends on their distance from
+    the origin. ``extent`` is the largest coordinate relative to the center of the patch.
     """
     coordinates = 2 * patches.abs().amax(dim=(1, 2))
     return machine_epsilon(patches.dtype) * (coordinates + _ROUNDED_STEPS * extent)
@@ -70,19 +70,19 @@ def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Eigen-decompose symmetric 3x3 matrices ``(*, 3, 3)`` by a fixed number of Jacobi rotations.
 
-    Scale-free (each matrix is first divided by its largest entry), branch-free and elementwise, so
-    it runs at the speed of memory on any device, where ``torch.linalg.eigh`` on tiny matrices is
-    slow. Cyclic Jacobi [1] keeps eigenvectors orthogonal to rounding even for equal eigenvalues,
-    which closed formulas with ``acos`` do not. Only the upper triangle is read.
+    Scale-free (each matrix is first divided by its largest entry), branch-free and elementwise. It
+    is memory-bound on any device, whereas ``torch.linalg.eigh`` is slow on tiny matrices. Cyclic
+    Jacobi [1] keeps eigenvectors orthogonal to rounding even for equal eigenvalues, unlike closed
+    formulas with ``acos``. Only the upper triangle is read.
 
     Returns:
         Eigenvalues in ascending order ``(*, 3)`` and unit eigenvectors as columns ``(*, 3, 3)``.
-        Signs are arbitrary. Gradients are those of :func:`torch.linalg.eigh`, and finite where
-        eigenvalues are equal: the turn between their vectors, which nothing determines, is left
-        out, so that projectors and vectors of other eigenvalues have the right ones.
+        Signs are arbitrary. Gradients equal those of :func:`torch.linalg.eigh`, but are finite for
+        equal eigenvalues: the undetermined rotation between their vectors is ignored, so that
+        projectors and vectors of other eigenvalues have correct gradients.
 
     Raises:
-        ShapeError: If the shape or dtype is not as above.
+        ShapeError: If the shape or dtype is invalid.
 
     References:
         [1] G. Golub, C. Van Loan. Matrix Computations, 4th ed., section 8.5.
@@ -96,15 +96,15 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     check_floating("eigh3", matrices=matrices)
     if not matrices.requires_grad and has_values(matrices):
         return _jacobi(matrices)
-    operation = _Eigh3 if torch.compiler.is_compiling() else _Refusing
+    operation = _Eigh3 if torch.compiler.is_compiling() else _ReverseOnly
     values, vectors = operation.apply(matrices)  # type: ignore[no-untyped-call]
     return values, vectors
 
 
 class _Eigh3(torch.autograd.Function):
-    """Jacobi rotations, with the gradient of eigenvalues and eigenvectors [1].
+    """Jacobi rotations with the gradient of eigenvalues and eigenvectors [1].
 
-    With ``W = V^T dV`` off the diagonal divided by ``l_j - l_i``, ``dA = V (diag(dl) + W) V^T``.
+    With the off-diagonal ``W = V^T dV`` divided by ``l_j - l_i``, ``dA = V (diag(dl) + W) V^T``.
 
     References:
         [1] M. Giles. Collected matrix derivative results for forward and reverse mode algorithmic
@@ -129,13 +129,14 @@ class _Eigh3(torch.autograd.Function):
         distinct = gap.detach().abs() > rank_tolerance(3, values.dtype) * largest
         turn = (vectors.mT @ of_vectors) / torch.where(distinct, gap, 1.0)
         inner = torch.where(distinct, turn, 0.0) + torch.diag_embed(of_values)
-        whole: Tensor = vectors @ inner @ vectors.mT
-        # Only the upper triangle is read, but both stand for one number, as in torch.linalg.eigh.
-        return (whole + whole.mT) / 2
+        gradient: Tensor = vectors @ inner @ vectors.mT
+        # Only the upper triangle is read, but both halves share the gradient, as in
+        # torch.linalg.eigh.
+        return (gradient + gradient.mT) / 2
 
 
-class _Refusing(_Eigh3):
-    """The same outside of compilers, which take no operation with a rule for forward mode."""
+class _ReverseOnly(_Eigh3):
+    """The same outside of compilers, which reject operations with a rule for forward mode."""
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
@@ -143,11 +144,11 @@ class _Refusing(_Eigh3):
 
 
 def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Do as :func:`eigh3`, without gradient."""
+    """Implement :func:`eigh3` without gradient."""
     scale = matrices.abs().amax(dim=(-2, -1))
     safe = torch.where(scale > 0, scale, 1.0)[..., None, None]
     scaled = matrices / safe
-    # Adding the scale's tiny reciprocal would overflow for denormal input; division does not.
+    # Multiplying by the reciprocal of a tiny scale would overflow for denormal input.
     a = [[scaled[..., min(i, j), max(i, j)].contiguous() for j in range(3)] for i in range(3)]
     one, zero = torch.ones_like(a[0][0]), torch.zeros_like(a[0][0])
     v = [[one if i == j else zero for j in range(3)] for i in range(3)]
@@ -162,9 +163,9 @@ def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Do as :func:`eigh3`, one matrix at a time: the faster way for less than a thousand of them.
+    """Variant of :func:`eigh3` by LAPACK, faster for fewer than a thousand matrices.
 
-    A matrix that is not finite gives NaN.
+    Non-finite matrices give NaN.
     """
     finite = matrices.isfinite().all(dim=(-2, -1))[..., None]
     values, vectors = torch.linalg.eigh(torch.where(finite[..., None], matrices, 0.0), UPLO="U")
@@ -174,15 +175,15 @@ def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return eigenvalues and the first eigenvector of positive semi-definite 3x3 matrices.
+    r"""Return eigenvalues and the first eigenvector of positive semidefinite 3x3 matrices.
 
-    It takes a third of the time of :func:`eigh3` and is more accurate for thin neighbourhoods.
+    Takes a third of the time of :func:`eigh3`, and is more accurate for thin neighborhoods.
     Newton's method from 0 approaches the smallest root of the characteristic polynomial from one
-    side; a column of the adjugate of :math:`A - \lambda I` is the eigenvector. Both are found in
-    double precision. Where the first two eigenvalues are equal to rounding, it is any vector across
-    the third eigenvector.
+    side; a column of the adjugate of :math:`A - \lambda I` is the eigenvector. Both are computed in
+    double precision. If the first two eigenvalues are equal to rounding, it is any vector
+    orthogonal to the third eigenvector.
 
-    Returns ascending eigenvalues ``(*, 3)``, not negative, right to 1e-8 of the largest or to
+    Returns ascending nonnegative eigenvalues ``(*, 3)``, accurate to 1e-8 of the largest or to
     rounding, and unit eigenvectors of the first ``(*, 3)``, of arbitrary sign.
     """
     scale = matrices.abs().amax(dim=(-2, -1))
@@ -193,8 +194,8 @@ def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     minors = xx * yy - xy * xy + (xx * zz - xz * xz) + (yy * zz - yz * yz)
     determinant = zz * (xx * yy - xy * xy) - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
     root = _smallest_root(trace, minors, determinant)
-    u, v, w = _kernel((xx - root, yy - root, zz - root), (yz, xz, xy))
-    # Where Newton's steps were still on their way, the quotient is right to second order.
+    u, v, w = _null_vectors((xx - root, yy - root, zz - root), (yz, xz, xy))
+    # If Newton's method has not converged, the Rayleigh quotient is accurate to second order.
     smallest = u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz
     smallest = smallest.clamp(min=0)
     others = trace - smallest
@@ -208,10 +209,10 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     """Return the smallest root of a characteristic polynomial without negative roots."""
     coefficients = torch.stack([values.reshape(-1) for values in (trace, minors, determinant)])
     root, step = _newton(torch.zeros_like(coefficients[0]), coefficients, _FIRST_STEPS)
-    # Convergence is quadratic but near a double root: few need the other steps.
+    # Convergence is quadratic except near a double root, so few need more steps.
     moving = step.abs() > _CONVERGED * coefficients[0]
     rows = moving.nonzero().squeeze(1)
-    for _ in range(_MORE_STEPS):
+    for _ in range(_MAX_MORE_STEPS):
         if len(rows) == 0:
             break
         root[rows], step = _newton(root[rows], coefficients[:, rows], 1)
@@ -220,28 +221,28 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
 
 
 def _newton(root: Tensor, coefficients: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
-    """Return the root after steps, by trace, principal minors, determinant; and the last step."""
+    """Run Newton steps on trace, principal minors and determinant; return root and last step."""
     trace, minors, determinant = coefficients
     twice, step = 2 * trace, root
     for _ in range(num_steps):
         value = (root - trace).mul_(root).add_(minors).mul_(root).sub_(determinant)
         slope = (3 * root).sub_(twice).mul_(root).add_(minors)
-        # At a multiple root both may be nothing.
+        # At a multiple root both may be zero.
         step = value.div_(slope).nan_to_num_(0.0, 0.0, 0.0)
         root = root - step
     return root, step
 
 
-def _kernel(
-    diagonal: tuple[Tensor, Tensor, Tensor], beside: tuple[Tensor, Tensor, Tensor]
+def _null_vectors(
+    diagonal: tuple[Tensor, Tensor, Tensor], off_diagonal: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return unit vectors that singular semi-definite matrices take to zero.
+    """Return unit vectors in the kernel of singular semidefinite matrices.
 
-    Of the entries beside the diagonal the first misses coordinate 0, then 1, then 2.
+    ``off_diagonal`` are the off-diagonal entries without coordinate 0, 1 and 2, respectively.
     """
     x, y, z = diagonal
-    yz, xz, xy = beside
-    # Any column of the adjugate will do; that with the largest diagonal entry is the longest.
+    yz, xz, xy = off_diagonal
+    # Any column of the adjugate works; the one with the largest diagonal entry is the longest.
     a, b, c = y * z - yz * yz, x * z - xz * xz, x * y - xy * xy
     ab, ac, bc = xz * yz - xy * z, xy * yz - xz * y, xy * xz - x * yz
     use, best = b > a, torch.maximum(a, b)
@@ -252,15 +253,15 @@ def _kernel(
     u, v, w = u / length, v / length, w / length
     rank_one = best < _NEARLY_EQUAL
     if bool(rank_one.any()):
-        x, y, z, yz, xz, xy = (entry[rank_one] for entry in (*diagonal, *beside))
-        u[rank_one], v[rank_one], w[rank_one] = _across((x, xy, xz), (xy, y, yz), (xz, yz, z))
+        x, y, z, yz, xz, xy = (entry[rank_one] for entry in (*diagonal, *off_diagonal))
+        u[rank_one], v[rank_one], w[rank_one] = _orthogonal((x, xy, xz), (xy, y, yz), (xz, yz, z))
     return u, v, w
 
 
-def _across(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return unit vectors across the direction of matrices of rank one, given by their rows."""
+def _orthogonal(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return unit vectors orthogonal to the direction of rank-one matrices, given by their rows."""
     first, second, third = rows
-    # The row of the largest diagonal entry, and the axis that it is least along.
+    # The row of the largest diagonal entry, and the axis with its smallest component.
     use = second[1] > first[0]
     a, b, c = (torch.where(use, q, p) for p, q in zip(first, second, strict=True))
     use = third[2] > torch.maximum(first[0], second[1])
@@ -284,7 +285,7 @@ def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int
     apq = a[p][q]
     active = apq != 0
     tau = (a[q][q] - a[p][p]) / (2 * torch.where(active, apq, 1.0))
-    # tau may overflow to infinity for a negligible apq; then t = 0, as it should be.
+    # tau may overflow to infinity for a negligible apq; then t is correctly 0.
     t = torch.where(tau >= 0, 1.0, -1.0).to(tau.dtype) / (tau.abs() + (1 + tau * tau).sqrt())
     t = torch.where(active, t, 0.0)
     c = 1 / (1 + t * t).sqrt()
@@ -302,10 +303,11 @@ def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int
 
 
 class PrincipalFrame(NamedTuple):
-    """Eigenvalues and eigenvectors of covariances; gradients flow through the first two.
+    """Eigen-decomposition of covariances; gradients flow through the first two fields.
 
-    Unit eigenvectors ``(*, 3)`` of the smallest eigenvalues, these, not below zero, ``(*)``, all
-    eigenvalues ascending ``(*, 3)``, and their unit eigenvectors as columns ``(*, 3, 3)``.
+    Unit eigenvectors ``(*, 3)`` of the smallest eigenvalues; these eigenvalues clamped to
+    nonnegative ``(*)``; all eigenvalues ascending ``(*, 3)``; their unit eigenvectors as columns
+    ``(*, 3, 3)``.
     """
 
     normals: Tensor
@@ -315,22 +317,21 @@ class PrincipalFrame(NamedTuple):
 
 
 def principal_frame(matrices: Tensor) -> PrincipalFrame:
-    """Decompose symmetric 3x3 matrices, with gradients of normal and smallest value."""
+    """Decompose symmetric 3x3 matrices, with gradients of normal and smallest eigenvalue."""
     values, vectors = eigh3(matrices)
     smallest = values[..., 0].clamp(min=0)
     return PrincipalFrame(vectors[..., 0], smallest, values.detach(), vectors.detach())
 
 
 def square_root(values: Tensor) -> Tensor:
-    """Return square roots of float32, rounded as IEEE 754 asks and kernels do.
+    """Return square roots of float32 with correct IEEE 754 rounding, as in kernels.
 
-    Those of torch come from a library of vector functions, of which every fifth is the float beside
-    it.
+    torch uses a vector library, in which every fifth result is an adjacent float.
     """
     return values.double().sqrt().to(values.dtype)
 
 
 def root(squares: Tensor) -> Tensor:
-    """Return square roots whose gradient at zero is zero."""
+    """Return square roots with zero gradient at zero."""
     positive = squares > 0
     return square_root(torch.where(positive, squares, 1.0)) * positive

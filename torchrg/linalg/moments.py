@@ -1,9 +1,9 @@
-"""Means and covariances: of patches, of weighted neighbourhoods, of regions.
+"""Means and covariances of patches, weighted neighborhoods and regions.
 
 Points lie along the last axis in patches, along the first in the lanes of
-:mod:`torchrg.robust.lanes`, one region after the other in :class:`Segments`, and each layout adds
-them up in its own way, so that a sum does not depend on what stands beside it. All covariances are
-:func:`second_moments` about a mean, but for the robust fits, which need determinants of thin ones.
+:mod:`torchrg.robust.lanes`, and region by region in :class:`Segments`. Each layout has its own
+summation order, so that a sum does not depend on its position in a tensor. All covariances are
+:func:`second_moments` about a mean, except in robust fits, which need determinants of thin ones.
 """
 
 import bisect
@@ -19,24 +19,24 @@ from torchrg._parallel import allowed_threads
 from torchrg.linalg.eigen import smallest_eigenvector3
 
 _MIN_POINTS = 2**16
-"""Points that are worth a thread's start."""
+"""Minimum number of points per thread."""
 
 _SORTED_SIZE = 50
-"""Mean number of points of a region below which one sort of all values is faster than a search for
-the quantile of each region."""
+"""Mean number of points per region below which one sort of all values is faster than a selection
+per region."""
 
 
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return mean and covariance (denominator: the number of points) of each patch, eq. (1).
 
-    Two passes about the first point of each patch: accurate far from the origin. The points that
-    count by the mask ``(*, K)`` are those of patches ``(*, K, P)``; the others may hold anything.
+    Two passes about the first point of each patch, accurate far from the origin. ``mask`` ``(*,
+    K)`` selects points of patches ``(*, K, P)``; masked-out points may be arbitrary.
 
     Returns:
-        The mean ``(*, P)`` and the covariance ``(*, P, P)``. A patch without points has zeros.
+        The mean ``(*, P)`` and the covariance ``(*, P, P)``; zeros for patches without points.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is invalid.
 
     Example:
         >>> mean, matrix = covariance(torch.tensor([[0.0, 0, 1], [2, 0, 1], [0, 4, 1], [2, 4, 1]]))
@@ -51,11 +51,11 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
 def covariance_of_columns(
     columns: Sequence[Tensor], mask: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Do as :func:`covariance`, for points given by the columns ``(*, K)`` of their coordinates."""
+    """Variant of :func:`covariance` for points given as coordinate columns ``(*, K)``."""
     first = [column[..., :1] for column in columns]
     count: Tensor | int = columns[0].shape[-1]
     if mask is not None:
-        # Any counted point serves as the local origin: the one with the largest mask value.
+        # Any selected point can be the local origin: take the first one.
         anchor = mask.to(torch.uint8).argmax(dim=-1, keepdim=True)
         first = [column.gather(-1, anchor) for column in columns]
         count = mask.sum(dim=-1, keepdim=True).clamp(min=1)
@@ -82,9 +82,9 @@ def second_moments(
 ) -> Tensor:
     """Return the second moments of weighted points about zero, shape ``(*, P, P)``.
 
-    Of P columns, about their mean for a covariance, with weights of the same shape (1 by default).
-    ``add`` takes a column to its sums, shape ``(*)``, by default along the last axis; these are
-    divided by ``total``, for a covariance the sum of the weights.
+    For a covariance, pass P columns relative to their mean. Weights have the same shape (default:
+    1). ``add`` sums a column, by default along the last axis, to shape ``(*)``. Sums are divided by
+    ``total``, for a covariance the sum of the weights.
     """
     size = len(columns)
     weighted = columns if weights is None else [weights * column for column in columns]
@@ -99,11 +99,11 @@ def second_moments(
 
 
 class Segments:
-    """The points of each region side by side, in the order of their rows.
+    """Points grouped by region, in the order of their rows.
 
-    Sums run over one region after the other, never by atomic additions, so they do not depend on
-    threads or device scheduling. ``labels`` ``(N,)`` are 0 to M-1, each at least once, or negative;
-    ``most`` points of a region are taken, evenly along their rows, by default all. Regions have
+    Sums run sequentially per region, without atomic additions, so they do not depend on threads or
+    device scheduling. ``labels`` ``(N,)`` are 0 to M-1, none missing, or negative. At most ``most``
+    points per region are taken, evenly spaced along their rows (default: all). Regions have
     ``sizes`` ``(M,)`` points, of which ``counts`` are taken.
 
     Example:
@@ -136,14 +136,14 @@ class Segments:
     def _take_rows(self, labels: Tensor, most: int | None) -> None:
         num_regions = int(labels.max()) + 1 if len(labels) else 0
         self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
-        self.sizes, places = self.counts.new_empty(2, len(self.counts))
-        written = self.counts, self.sizes, places
+        self.sizes, indices = self.counts.new_empty(2, len(self.counts))
+        written = self.counts, self.sizes, indices
         (rows,) = kernels.call("segment_rows", labels.long(), most or len(labels) + 1, *written)
         self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
 
     def split(self, most: int) -> "list[Segments]":
-        """Return regions, renumbered from 0, in parts of up to so many points or of one region."""
+        """Split into parts of whole regions, renumbered from 0, of at most ``most`` points."""
         ends = self.counts.cumsum(0).tolist()
         parts: list[Segments] = []
         region = row = 0
@@ -158,12 +158,12 @@ class Segments:
         return parts
 
     def chunks(self, most: int) -> "list[Segments]":
-        """Return what :meth:`split` does, in about equally large parts for each thread."""
+        """Split as :meth:`split`, into parts of about equal size for the threads."""
         size = max(len(self.rows) // allowed_threads() + 1, _MIN_POINTS)
         return self.split(min(size, most))
 
     def take(self, values: Tensor) -> Tensor:
-        """Return the values of the points that have a region, region by region."""
+        """Gather the values of the points, region by region."""
         return values.index_select(0, self.rows)
 
     def first(self, values: Tensor) -> Tensor:
@@ -171,17 +171,17 @@ class Segments:
         return values[self.rows[self.counts.cumsum(0) - self.counts]]
 
     def spread(self, values: Tensor) -> Tensor:
-        """Return for each point, in the order of :meth:`take`, the value of its region."""
+        """Broadcast a value per region to its points, in the order of :meth:`take`."""
         return values.index_select(0, self.labels)
 
     def take_columns(self, vectors: Tensor) -> list[Tensor]:
-        """Return the three columns of :meth:`take` of vectors ``(N, 3)``, in float64."""
+        """Apply :meth:`take` to the columns of vectors ``(N, 3)``, in float64."""
         return [self.take(column).double() for column in vectors.unbind(dim=1)]
 
     def along(self, vectors: Tensor, centers: Tensor, axes: Tensor) -> list[Tensor]:
-        """Return coordinates of the points of vectors ``(N, 3)`` about a center ``(M, 3)``.
+        """Return coordinates relative to region centers ``(M, 3)`` along region axes.
 
-        Along the ``axes`` ``(M, A, 3)`` of their region, A columns ``(n,)`` of float64.
+        ``vectors`` are ``(N, 3)``, ``axes`` ``(M, A, 3)``; returns A columns ``(n,)``, float64.
         """
         if self.is_served(vectors) and centers.dtype == torch.float64:
             tables = self.rows, self.counts, centers, axes
@@ -189,14 +189,14 @@ class Segments:
         about, columns = self.take_about(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
-            # Products and sums apart: their rounding must not depend on where a block ends.
+            # Separate products and sums: their rounding must not depend on block boundaries.
             for column, component in zip(about, axis.unbind(dim=1), strict=True):
                 total += column * self.spread(component)
             columns.append(total)
         return columns
 
     def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
-        """Return the columns of :meth:`take` about a center ``(M, 3)`` for each region."""
+        """Apply :meth:`take` to vectors ``(N, 3)``, relative to region centers ``(M, 3)``."""
         if self.is_served(vectors) and centers.dtype == torch.float64:
             eye = torch.eye(3, dtype=torch.float64, device=centers.device)
             return self.along(vectors, centers, eye.expand(len(centers), 3, 3))
@@ -204,15 +204,15 @@ class Segments:
         return [self.take(column).double() - self.spread(center) for column, center in pairs]
 
     def spread_columns(self, vectors: Tensor) -> list[Tensor]:
-        """Return the three columns of :meth:`spread` of vectors ``(M, 3)``."""
+        """Apply :meth:`spread` to the columns of vectors ``(M, 3)``."""
         return [self.spread(column) for column in vectors.unbind(dim=1)]
 
     def sum(self, values: Tensor) -> Tensor:
-        """Return the sum of each region's values, given in the order of :meth:`take`."""
+        """Return the sum of the values of each region, given in the order of :meth:`take`."""
         return reduce_runs(values, self.counts, "sum")
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of each region's values."""
+        """Return the mean of the values of each region."""
         return self.sum(values) / self.counts
 
     def moments(
@@ -220,8 +220,7 @@ class Segments:
     ) -> tuple[Tensor, Tensor]:
         """Return the weighted mean ``(M, 3)`` and covariance ``(M, 3, 3)`` of each region.
 
-        The columns are as :meth:`take_columns` returns them; unless ``centered`` the mean is taken
-        for zero.
+        The columns are as returned by :meth:`take_columns`; if not ``centered``, the mean is zero.
         """
         if self.is_served(weights):
             numbers = self.counts, centered
@@ -240,11 +239,11 @@ class Segments:
         least: Tensor,
         factors: tuple[float, float],
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Weigh points by Tukey's bisquare of their residuals along an axis of each region.
+        """Return Tukey's bisquare weights of the residuals along an axis of each region.
 
-        A point weighs nothing at a number of standard deviations, the second of the factors, and
-        the first times the median of the residuals is one; at ``least`` ``(M,)``. Returns weights
-        ``(n,)``, medians of the residuals without their signs, and mean squares, ``(M,)``.
+        The scale is the first factor times the median absolute residual, at least ``least``
+        ``(M,)``. The weight is zero from the second factor times the scale. Returns weights
+        ``(n,)``, median absolute residuals ``(M,)`` and mean squares ``(M,)``.
         """
         if self.is_served(means):
             tables = self.counts, means, axes, least
@@ -253,27 +252,27 @@ class Segments:
             )
             return weights, medians, squares
         residuals = torch.zeros_like(columns[0])
-        # Products and sums apart: their rounding must not depend on where a block of memory ends.
+        # Separate products and sums: their rounding must not depend on memory block boundaries.
         for column, mean, component in zip(columns, means.T, axes.T, strict=True):
             residuals += (column - self.spread(mean)) * self.spread(component)
         medians = self.median(residuals.abs())
         cut = factors[1] * torch.maximum(factors[0] * medians, least)
-        # A region of one place at the origin has cut 0: its residuals are 0 too.
+        # A region with all points at the origin has cut 0, and residuals 0 too.
         ratio = residuals / self.spread(torch.where(cut > 0, cut, 1.0))
         weights = (1 - ratio * ratio).clamp(min=0).square()
         return weights, medians, self.mean(residuals * residuals)
 
     def is_served(self, values: Tensor) -> bool:
-        """Tell whether kernels work on values of float64 of these regions."""
+        """Return whether kernels support float64 values of these regions."""
         is_plain = values.device.type == "cpu" and values.dtype == torch.float64
         return is_plain and kernels.serve() and bool(self.counts.all())
 
     def median(self, values: Tensor) -> Tensor:
-        """Return the median of each region's values, the lower one of an even number."""
+        """Return the lower median of the values of each region."""
         return self.quantile(values, 0.5)
 
     def quantile(self, values: Tensor, fraction: float) -> Tensor:
-        """Return the lower quantile of each region's values, one of them."""
+        """Return the lower quantile of the values of each region, without interpolation."""
         are_small = len(values) < _SORTED_SIZE * len(self.counts) and bool(self.counts.all())
         if are_small and values.device.type == "cpu":
             order = np.lexsort((values.numpy(), self.labels.numpy()))
@@ -286,7 +285,7 @@ class Segments:
 
 
 def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
-    """Return the "sum", "min" or "max" ``(M,)`` of runs of so many values each.
+    """Return the "sum", "min" or "max" ``(M,)`` of runs with ``counts`` values each.
 
     Example:
         >>> reduce_runs(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([2, 1]), "min")
@@ -294,22 +293,22 @@ def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
     """
     if values.device.type != "cpu" or not bool(counts.all()):
         return torch.segment_reduce(values.contiguous(), how, lengths=counts)
-    # Five times faster than torch's, and sums are of halves of halves: more accurate.
+    # Five times faster than in torch; pairwise sums are also more accurate.
     reduction = {"sum": np.add, "min": np.minimum, "max": np.maximum}[how]
     starts = counts.cumsum(0) - counts
     return torch.from_numpy(reduction.reduceat(values.numpy(), starts.numpy()))
 
 
 def _ascending(labels: Tensor) -> Tensor:
-    """Return the rows by ascending label, those of one label in their order."""
+    """Return the rows by ascending label, with a stable sort."""
     if labels.device.type == "cpu" and bool((labels < 2**15).all()):
-        # Sorted by digits: five times faster than by comparisons.
+        # Radix sort: five times faster than by comparisons.
         return torch.from_numpy(labels.to(torch.int16).numpy().argsort(kind="stable"))
     return labels.argsort(stable=True)
 
 
 def kth_smallest(values: Tensor, k: int) -> Tensor:
-    """Return the one of values ``(n,)`` that k others precede, NaN last; NaN if there are none.
+    """Return the value with index k in sorted order of ``(n,)``, NaN last; NaN if empty.
 
     Example:
         >>> kth_smallest(torch.tensor([3.0, 1.0, 2.0]), 1)
@@ -318,31 +317,31 @@ def kth_smallest(values: Tensor, k: int) -> Tensor:
     if len(values) == 0:
         return values.new_tensor(torch.nan)
     if values.device.type == "cpu":
-        # Up to eight times faster than torch's.
+        # Up to eight times faster than in torch.
         return torch.from_numpy(np.partition(values.numpy(), k))[k]
     return values.kthvalue(k + 1).values
 
 
 _NUM_LANES = 8
-"""Values that kernels add side by side, ``LANES`` in ``plain.h``."""
+"""Number of parallel accumulators in kernels, ``LANES`` in ``plain.h``."""
 
 Columns = tuple[Tensor, Tensor, Tensor]
-"""Coordinates x, y and z of neighbourhoods, each ``(n, K)`` and contiguous. The lanes of
-:mod:`torchrg.robust.lanes` lie the other way, as robust fits sort every neighbourhood."""
+"""Coordinates x, y and z of neighborhoods, each ``(n, K)`` and contiguous. The lanes of
+:mod:`torchrg.robust.lanes` are transposed, since robust fits sort every neighborhood."""
 
 
 def split_columns(patches: Tensor) -> Columns:
-    """Return the coordinates of patches ``(n, K, 3)`` as contiguous columns ``(n, K)``."""
+    """Split patches ``(n, K, 3)`` into contiguous columns ``(n, K)``."""
     x, y, z = patches.unbind(dim=-1)
     return x.contiguous(), y.contiguous(), z.contiguous()
 
 
 def sum_neighbors(values: Tensor) -> Tensor:
-    """Return sums ``(*)`` over the neighbours ``(*, K)`` in the order in which kernels add up.
+    """Return sums ``(*)`` over the neighbors ``(*, K)`` in the summation order of the kernels.
 
-    Every eighth value goes to one of eight sums, as a vector register holds, and these are added in
-    halves. Where rounding decides between planes that explain a neighbourhood equally well, the
-    decision is the same with and without the library.
+    Every eighth value is added to one of eight accumulators, as in a vector register; these are
+    added pairwise. Rounding that decides between equally good planes is therefore the same with and
+    without the library.
 
     Example:
         >>> sum_neighbors(torch.arange(10.0))
@@ -361,29 +360,29 @@ def sum_neighbors(values: Tensor) -> Tensor:
 
 
 def sq_lengths(columns: Columns) -> Tensor:
-    """Return the squared distance of each neighbour, shape ``(n, K)``."""
+    """Return the squared distance of each neighbor, shape ``(n, K)``."""
     x, y, z = columns
     return x * x + y * y + z * z
 
 
 def residuals(columns: Columns, normals: Tensor, offsets: Tensor) -> Tensor:
-    """Return signed distances of the neighbours to planes ``normal . q = offset``, ``(n, K)``."""
+    """Return signed distances of the neighbors to planes ``normal . q = offset``, ``(n, K)``."""
     return along(columns, normals).sub_(offsets[:, None])
 
 
 def along(columns: Columns, axes: Tensor) -> Tensor:
-    """Return coordinates of the neighbours along axes ``(*, n, 3)``, shape ``(*, n, K)``."""
+    """Return coordinates of the neighbors along axes ``(*, n, 3)``, shape ``(*, n, K)``."""
     x, y, z = columns
     a, b, c = (component[..., None] for component in axes.unbind(dim=-1))
-    # Products and sums apart: a fused multiply-add may round differently at the end of a block.
+    # Separate products and sums: fused multiply-adds may round differently at the end of a block.
     return (x * a).add_(y * b).add_(z * c)
 
 
 def fit_weighted_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit a plane to each neighbourhood by least squares with weights ``(n, K)``, not negative.
+    """Fit a plane to each neighborhood by least squares with nonnegative weights ``(n, K)``.
 
     Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the planes ``normal . q = offset``, and the
-    eigenvalues of the weighted covariance ``(n, 3)``, ascending.
+    ascending eigenvalues ``(n, 3)`` of the weighted covariance.
     """
     means, covariance = weighted_moments(columns, weights)
     values, normals = smallest_eigenvector3(covariance)
@@ -391,7 +390,7 @@ def fit_weighted_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Fit a plane to the neighbours with each of the weights; see :func:`fit_weighted_planes`."""
+    """Fit a plane to the neighbors for each set of weights; see :func:`fit_weighted_planes`."""
     means, covariances = zip(
         *(weighted_moments(columns, weights) for weights in groups), strict=True
     )
@@ -403,10 +402,10 @@ def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple
 def fit_parallel_planes(
     columns: Columns, groups: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit planes of one normal to the neighbours with each of several weights, least squares.
+    """Fit parallel planes to the neighbors, one per set of weights, by least squares.
 
-    Returns unit normals ``(n, 3)``, an offset for each group ``(G, n)``, and the mean squared
-    residual of all ``(n,)``.
+    Returns unit normals ``(n, 3)``, offsets of the G planes ``(G, n)``, and the mean squared
+    residual over all sets ``(n,)``.
     """
     totals = torch.stack([weights.sum(dim=1) for weights in groups])
     means, covariances = zip(
@@ -420,9 +419,9 @@ def fit_parallel_planes(
 
 
 def weighted_moments(columns: Sequence[Tensor], weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean ``(*, 3)`` and covariance ``(*, 3, 3)`` of each neighbourhood.
+    """Return the weighted mean ``(*, 3)`` and covariance ``(*, 3, 3)`` of each neighborhood.
 
-    Its three columns and the weights are of shape ``(*, K)``.
+    Columns and weights have shape ``(*, K)``.
     """
     total = sum_neighbors(weights)
     inverse = 1 / torch.where(total > 0, total, 1.0)
@@ -433,6 +432,6 @@ def weighted_moments(columns: Sequence[Tensor], weights: Tensor) -> tuple[Tensor
 
 
 def dot(vectors: Tensor, others: Tensor) -> Tensor:
-    """Return the products ``(*)`` of vectors ``(*, 3)``, added from the first coordinate on."""
+    """Return dot products ``(*)`` of vectors ``(*, 3)``, summed in coordinate order."""
     x, y, z = (vectors * others).unbind(dim=-1)
     return x + y + z

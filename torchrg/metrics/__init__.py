@@ -1,7 +1,7 @@
-"""Scores of plane labels, of superpoints, of clusters on the Gaussian sphere, and of normals.
+"""Evaluation of plane labels, superpoints, normals, and clusters on the Gaussian sphere.
 
-``METRICS`` says of every index its unit and whether more is better. The forms for torchmetrics
-are in :mod:`torchrg.metrics.modules`, which needs the extra ``metrics``.
+``METRICS`` lists the unit of each metric and whether higher is better. Modules for torchmetrics are
+in :mod:`torchrg.metrics.modules`, which needs the extra ``metrics``.
 """
 
 from collections.abc import Mapping
@@ -43,11 +43,11 @@ __all__ = [
 
 
 class Index(NamedTuple):
-    """What a number means.
+    """Unit and direction of a metric.
 
     Attributes:
         unit: ``"%"``, ``"fraction"``, ``"deg"``, ``"deg^2"``, ``"rad"``, ``"count"``, or ``""``.
-        higher_is_better: None where neither direction is better.
+        higher_is_better: None if neither direction is better.
     """
 
     unit: str
@@ -86,7 +86,7 @@ _NORMALS = {
 
 
 def _by_name(fields: tuple[str, ...], meanings: dict[Index, str]) -> Mapping[str, Index]:
-    """Return the index of each field."""
+    """Return the unit and direction of each field."""
     index_of = {name: index for index, names in meanings.items() for name in names.split()}
     return MappingProxyType({name: index_of[name] for name in fields})
 
@@ -99,7 +99,7 @@ METRICS: Mapping[str, Mapping[str, Index]] = MappingProxyType(
         "normals": _by_name(NormalScore._fields, _NORMALS),
     }
 )
-"""The fields of the scores, by part and name.
+"""Fields of the scores by part and name.
 
 Example:
     >>> METRICS["labels"]["f1"]

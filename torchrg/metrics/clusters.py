@@ -1,4 +1,4 @@
-"""Internal indices: how compact and separate the clusters of normals are, without any truth."""
+"""Internal indices: compactness and separation of clusters of normals, without ground truth."""
 
 import math
 from typing import Any, NamedTuple
@@ -10,28 +10,28 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import check_labels, check_one_device, number_labels
+from torchrg.metrics.contingency import check_labels, check_same_device, number_labels
 from torchrg.metrics.sphere import (
     chord_table,
     chord_to_angle,
     chords_between,
+    chunk_rows,
     find_centers,
     measure_spreads,
     merge_directions,
-    rows_at_once,
     unit_vectors,
 )
 from torchrg.neighbors import canonical_order
 from torchrg.structures import UNLABELED
 
 _COINCIDENT = 1e-12
-"""Radians. Closer centres, or closer directions of two clusters, differ by rounding alone."""
+"""Angle in radians below which centers or directions of two clusters differ only by rounding."""
 _MAX_CELLS = 4096
-"""Most cells of a grid in which the closest pair is searched; of more, trees are faster."""
+"""Maximum number of grid cells in the search for the closest pair; beyond it, trees are faster."""
 _FINEST_LEVEL = 50
-"""Divisions after which cells are as small as the rounding of coordinates."""
+"""Number of subdivisions after which cells are as small as the rounding of coordinates."""
 _QUERIES = 65536
-"""Directions that are looked up in a tree at a time. What is found shortens the next search."""
+"""Number of directions per tree query. Each result shortens the next query."""
 
 
 class ClusterScore(NamedTuple):
@@ -42,11 +42,11 @@ class ClusterScore(NamedTuple):
         sp: Separation (eq. 13), radians, higher is better.
         dbi: Davies-Bouldin index (eq. 14), lower is better.
         dvi: Dunn validity index (eq. 15), higher is better.
-        clusters: Number of clusters, after merging if that was asked for.
-        points: Labelled points with a normal.
-        invalid: Labelled points without a normal; they are left out.
-        sampled_clusters: Clusters whose term of ``dbi`` comes from a subsample.
-        dvi_exact: Whether no subsample entered ``dvi``.
+        clusters: Number of clusters, after merging if requested.
+        points: Number of labeled points with a normal.
+        invalid: Number of labeled points without a normal, which are ignored.
+        sampled_clusters: Number of clusters whose term of ``dbi`` comes from a subsample.
+        dvi_exact: Whether ``dvi`` uses no subsample.
     """
 
     cp: float
@@ -70,39 +70,43 @@ def score_clusters(
     sample_size: int = 20_000,
     seed: int = 0,
 ) -> ClusterScore:
-    r"""Score clusters of normals on the Gaussian sphere: CP, SP, DBI and DVI [1].
+    r"""Evaluate clusters of normals on the Gaussian sphere: CP, SP, DBI and DVI [1].
 
-    The distance of two normals is ``arccos |n_i . n_j|`` (eq. 17), the centre of a cluster its
-    normalised mean normal (eq. 16) after aligning the signs along the principal axis. With M
-    clusters, ``c_i`` their centres and ``w_i`` their mean distance over all pairs of points:
+    The distance of two normals is ``arccos |n_i . n_j|`` (eq. 17). The center of a cluster is its
+    normalized mean normal (eq. 16) after aligning the signs along the principal axis. For M
+    clusters with centers ``c_i`` and mean pairwise distances ``w_i``:
 
-    * CP: mean over the clusters of the mean distance to the centre;
-    * SP: mean distance over all pairs of centres;
+    * CP: mean over the clusters of the mean distance to the center;
+    * SP: mean distance over all pairs of centers;
     * DBI: mean over the clusters of ``max_j (w_i + w_j) / d(c_i, c_j)``;
-    * DVI: smallest distance between points of two clusters, over the largest within one.
+    * DVI: minimum distance between points of two clusters, over the maximum within one.
 
     Convention:
-        Two parallel walls have the same centre on the sphere. In any real room DBI therefore tends
-        to infinity and DVI to 0: that is what the formulas give, and it is returned. (They bound
-        DVI by (pi/2) / CP, which the paper's printed 10.0 exceeds.) ``distinct_directions`` asks
-        instead whether the *directions* are compact and separate. Points labelled ``UNLABELED``
-        (-1), and labelled points whose normal is zero or not finite, are left out.
+        Two parallel walls have the same center on the sphere. In real rooms DBI therefore tends to
+        infinity and DVI to 0, and these values are returned. (The formulas bound DVI by (pi/2) /
+        CP, which the paper's printed 10.0 exceeds.) ``distinct_directions`` evaluates the
+        *directions* instead. Points labeled ``UNLABELED`` (-1), and labeled points with a zero or
+        non-finite normal, are ignored.
 
     Args:
         normals: Normals of any sign and length, shape ``(N, 3)``, floating point.
         labels: Cluster of each point, shape ``(N,)``, integers.
-        min_size: Clusters of fewer points count as unlabelled.
-        distinct_directions: Whether clusters of about one direction are merged first.
-        max_angle_deg: Centres at most this far apart are one direction then, chains included.
-        sample_size: Clusters up to this size are scored over all pairs of points, larger ones
-            over a subsample of this size: for ``w_i``, and for the diameter in DVI where more
-            points can be its ends, which are few on planes. All else is exact.
-        seed: Seed of the subsample. It does not depend on the order of the points.
+        min_size: Minimum number of points per cluster; smaller clusters count as unlabeled.
+        distinct_directions: Whether to merge clusters with similar directions first.
+        max_angle_deg: Maximum angle between centers of one direction, in degrees, transitively.
+        sample_size: Maximum cluster size for exact evaluation. Larger clusters are subsampled to
+            this size for ``w_i``, and for the diameter in DVI if it has more candidate end points
+            (few on planes). Everything else is exact.
+        seed: Seed of the subsample, which does not depend on the order of the points.
 
     Returns:
-        The indices. Without a cluster all are nan, and of one cluster all but CP. A cluster of one
-        point has spread 0. Coinciding centres: ``dbi`` is infinite. All diameters 0: ``dvi`` is
-        infinite, or 0 if two clusters share a direction.
+        The indices. Without clusters all are nan; for one cluster all except CP. A cluster of one
+        point has spread 0. If centers coincide, ``dbi`` is infinite. If all diameters are 0,
+        ``dvi`` is infinite, or 0 if two clusters share a direction.
+
+    Raises:
+        ShapeError: If a shape, dtype or device is invalid.
+        ConfigError: If a setting is out of range.
 
     Raises:
         ShapeError: If a shape, dtype or device does not fit.
@@ -122,10 +126,10 @@ def score_clusters(
     (labels,) = check_labels("score_clusters", labels=labels)
     check_shapes("score_clusters", normals=(normals, "N 3"), labels=(labels, "N"))
     check_floating("score_clusters", normals=normals)
-    check_one_device("score_clusters", normals=normals, labels=labels)
-    for name, value, least in (("min_size", min_size, 1), ("sample_size", sample_size, 2)):
-        if value < least:
-            raise ConfigError(f"score_clusters: expected {name} >= {least}, got {value!r}.")
+    check_same_device("score_clusters", normals=normals, labels=labels)
+    for name, value, minimum in (("min_size", min_size, 1), ("sample_size", sample_size, 2)):
+        if value < minimum:
+            raise ConfigError(f"score_clusters: expected {name} >= {minimum}, got {value!r}.")
     if not 0 <= max_angle_deg <= 90:
         raise ConfigError(
             f"score_clusters: expected max_angle_deg in [0, 90], got {max_angle_deg!r}."
@@ -159,7 +163,7 @@ def score_clusters(
 def _labeled_directions(
     normals: Tensor, labels: Tensor, min_size: int
 ) -> tuple[Tensor, Tensor, int]:
-    """Return the unit normals of labelled points, their clusters, and how many had none."""
+    """Return unit normals and clusters of labeled points, and how many have no normal."""
     sizes = torch.unique(labels, return_inverse=True, return_counts=True)[1:]
     labeled = (labels != UNLABELED) & (sizes[1] >= min_size)[sizes[0]]
     directions, exists = unit_vectors(normals[labeled])
@@ -168,7 +172,7 @@ def _labeled_directions(
 
 
 def _compactness(chords: Tensor, clusters: Tensor) -> float:
-    """Return the mean over the clusters of the mean angle to the centre (eq. 12)."""
+    """Return the mean over the clusters of the mean angle to the center (eq. 12)."""
     if not len(clusters):
         return math.nan
     angles = chord_to_angle(chords)
@@ -180,7 +184,7 @@ def _separation(centers: Tensor, spreads: Tensor) -> tuple[float, float]:
     count = len(centers)
     if count < 2:
         return math.nan, math.nan
-    total, worst, rows = 0.0, 0.0, rows_at_once(count)
+    total, worst, rows = 0.0, 0.0, chunk_rows(count)
     for start in range(0, count, rows):
         block = slice(start, start + rows)
         distances = chord_to_angle(chord_table(centers[block], centers))
@@ -194,7 +198,7 @@ def _separation(centers: Tensor, spreads: Tensor) -> tuple[float, float]:
 
 
 def _dunn(closest: float, diameters: Tensor) -> float:
-    """Return DVI (eq. 15) of the smallest distance between clusters and their diameters."""
+    """Return DVI (eq. 15) from the minimum distance between clusters and their diameters."""
     if len(diameters) < 2:
         return math.nan
     if closest <= _COINCIDENT:
@@ -204,19 +208,19 @@ def _dunn(closest: float, diameters: Tensor) -> float:
 
 
 def closest_between(directions: Tensor, clusters: Tensor) -> float:
-    """Return the smallest angle between directions of different clusters, for eq. (15).
+    """Return the minimum angle between directions of different clusters, for eq. (15).
 
-    Exact for clouds of any size, by two searches. A grid on the sphere, made finer step by step,
-    drops the cells that are farther from every other cluster than two points known to be close.
-    Clusters that stand apart need no more. What is left where many clusters overlap goes to
-    kd-trees: the numbers of different clusters differ in one binary digit at least, so for each
-    digit the directions are split by it and the closest pair across the split is found.
+    Exact for clouds of any size, in two steps. A grid on the sphere is refined step by step; cells
+    farther from all other clusters than a known close pair are dropped. This suffices for separated
+    clusters. The remaining points of many overlapping clusters go to kd-trees. Cluster indices
+    differ in at least one binary digit: for each digit, the directions are split by it, and the
+    closest pair across the split is found.
 
-    Of unit vectors ``(N, 3)``, float64; infinite for fewer than two clusters.
+    Unit vectors have shape ``(N, 3)``, float64; infinite for fewer than two clusters.
     """
     if len(clusters) == 0 or clusters.min() == clusters.max():
         return torch.inf
-    # Adding 0 turns -0 into 0, so that equal rows are equal bit by bit.
+    # Adding 0 turns -0 into 0, so that equal rows are bit-identical.
     points = torch.where(directions[:, 2:] < 0, -directions, directions) + 0.0
     order = canonical_order(points)
     points, clusters = points[order], clusters[order]
@@ -229,7 +233,7 @@ def closest_between(directions: Tensor, clusters: Tensor) -> float:
 
 
 def _closest_chord(points: Tensor, clusters: Tensor) -> float:
-    """Return the shortest chord between two clusters of distinct points of the upper half."""
+    """Return the shortest chord between two clusters of distinct points of the upper hemisphere."""
     best, cells = 2.0, clusters
     for level in range(_FINEST_LEVEL):
         cells, firsts = _refine(cells, points, level)
@@ -239,14 +243,14 @@ def _closest_chord(points: Tensor, clusters: Tensor) -> float:
         best = min(best, float(chords.min()))
         if len(firsts) == len(points):
             break
-        # Both ends of a chord are at most the cell's diagonal away from the first of their cell.
+        # Both ends of a chord are within a cell diagonal of the first point of their cell.
         near = (chords <= best + 2 * 3**0.5 * 0.5**level)[cells]
         points, clusters, cells = points[near], clusters[near], cells[near]
     return best
 
 
 def _refine(cells: Tensor, points: Tensor, level: int) -> tuple[Tensor, Tensor]:
-    """Return the cell, of half the side before, of each point, and a point of each cell."""
+    """Halve the cells; return the cell of each point, and one point of each cell."""
     keys = cells
     for column in points.unbind(dim=1):
         keys = keys * 2 + ((column + 1) * 2**level).long() % 2
@@ -257,8 +261,8 @@ def _refine(cells: Tensor, points: Tensor, level: int) -> tuple[Tensor, Tensor]:
 
 
 def _closest_others(points: Tensor, clusters: Tensor) -> Tensor:
-    """Return the chord from each point to the closest one of another cluster, shape ``(C,)``."""
-    rows = rows_at_once(len(points))
+    """Return the chord from each point to the closest point of another cluster, shape ``(C,)``."""
+    rows = chunk_rows(len(points))
     closest = []
     for chunk, owners in zip(torch.split(points, rows), torch.split(clusters, rows), strict=True):
         chords = chord_table(chunk, points)
@@ -268,7 +272,7 @@ def _closest_others(points: Tensor, clusters: Tensor) -> Tensor:
 
 
 def _closest_by_digits(points: Tensor, clusters: Tensor, best: float) -> float:
-    """Return the shortest chord across any split by a binary digit, at most ``best``."""
+    """Return the shortest chord across a split by any binary digit, at most ``best``."""
     from scipy.spatial import cKDTree
 
     coordinates, numbers = points.numpy(force=True), clusters.numpy(force=True)
@@ -277,7 +281,7 @@ def _closest_by_digits(points: Tensor, clusters: Tensor, best: float) -> float:
         if side.all() or not side.any():
             continue
         ones, others = coordinates[side], coordinates[~side]
-        # Opposite directions are one; across the equator that needs the antipodes.
+        # Opposite directions are equal; pairs across the equator need the antipodes.
         tree = cKDTree(np.concatenate([others, -others[others[:, 2] <= best]]))
         for start in range(0, len(ones), _QUERIES):
             queries = ones[start : start + _QUERIES]

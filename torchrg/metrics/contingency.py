@@ -1,4 +1,4 @@
-"""The sparse table of overlaps between predicted regions and true faces."""
+"""Sparse contingency table of predicted regions and ground-truth planes."""
 
 from typing import Any, NamedTuple
 
@@ -17,17 +17,17 @@ INTEGERS = (
 
 
 class ContingencyTable(NamedTuple):
-    """How many points each region and each face share; pairs that share none are left out.
+    """Sparse table of overlaps between regions and ground-truth planes (faces).
 
     Attributes:
-        region_labels: Labels of the regions in ascending order, shape ``(R,)``, int64.
-        face_labels: Labels of the faces in ascending order, shape ``(F,)``, int64.
-        region_sizes: Points of each region, those of no face included, shape ``(R,)``, int64.
-        face_sizes: Points of each face, those of no region included, shape ``(F,)``, int64.
-        regions: Region of each overlap, a row of ``region_labels``, shape ``(E,)``, int64.
-        faces: Face of each overlap, a row of ``face_labels``, shape ``(E,)``, int64.
-        overlaps: Points that the two share, at least 1, shape ``(E,)``, int64.
-        num_points: Points that were counted, the unlabelled ones included.
+        region_labels: Labels of the regions, ascending, shape ``(R,)``, int64.
+        face_labels: Labels of the faces, ascending, shape ``(F,)``, int64.
+        region_sizes: Points of each region, with or without a face, shape ``(R,)``, int64.
+        face_sizes: Points of each face, with or without a region, shape ``(F,)``, int64.
+        regions: Region of each overlap as a row of ``region_labels``, shape ``(E,)``, int64.
+        faces: Face of each overlap as a row of ``face_labels``, shape ``(E,)``, int64.
+        overlaps: Number of common points, at least 1, shape ``(E,)``, int64.
+        num_points: Number of evaluated points, including unlabeled ones.
     """
 
     region_labels: Tensor
@@ -53,22 +53,22 @@ def contingency_table(
     min_size: int = 1,
     ignore: int | None = None,
 ) -> ContingencyTable:
-    """Count the points that each predicted region shares with each true face.
+    """Count the common points of predicted regions and ground-truth planes.
 
     Convention:
-        Labels are integers of any value and order; ``UNLABELED`` (-1) means "of no region" in
-        ``labels`` and "of no face" in ``truth``. A point of no face still belongs to its region and
-        makes it larger, a point of no region still belongs to its face.
+        Labels are arbitrary integers; ``UNLABELED`` (-1) means no region in ``labels`` and no face
+        in ``truth``. Points without a face still count in the size of their region, points without
+        a region in that of their face.
 
     Args:
         labels: Predicted label of each point, shape ``(N,)``, integers.
-        truth: True label of each point, shape ``(N,)``, integers.
-        min_size: Regions of fewer points count as unlabelled; their size is taken before
-            ``ignore`` is applied. Faces of any size count.
-        ignore: Points with this true label are left out of everything. Default: none is.
+        truth: Ground-truth label of each point, shape ``(N,)``, integers.
+        min_size: Minimum number of points per region, before ``ignore`` is applied; smaller regions
+            count as unlabeled. Faces of any size count.
+        ignore: Ground-truth label of points to ignore. Default: none.
 
     Returns:
-        The table. Its rows follow the labels, not the order of the points.
+        The table, in the order of the labels.
 
     Raises:
         ShapeError: If the labels are not integers, or differ in length or device.
@@ -91,7 +91,7 @@ def count_overlaps(
     min_size: int,
     ignore: int | None,
 ) -> ContingencyTable:
-    """Return the table of :func:`contingency_table`; errors name the caller."""
+    """Compute the table of :func:`contingency_table`; errors start with the caller."""
     labels, truth = check_labels(caller, labels=labels, truth=truth)
     if min_size < 1:
         raise ConfigError(f"{caller}: expected min_size >= 1, got {min_size!r}.")
@@ -99,7 +99,7 @@ def count_overlaps(
         _, rows, sizes = torch.unique(labels, return_inverse=True, return_counts=True)
         labels = labels.masked_fill((sizes < min_size)[rows], UNLABELED)
     if ignore is not None:
-        scored = have_other_label(truth, ignore)
+        scored = is_not_ignored(truth, ignore)
         labels, truth = labels[scored], truth[scored]
     region_labels, regions = number_labels(labels)
     face_labels, faces = number_labels(truth)
@@ -119,14 +119,14 @@ def count_overlaps(
 
 
 def number_labels(labels: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the labels that occur, ascending, and each point's row there or -1 if unlabelled."""
+    """Return the existing labels, ascending, and each point's row there, -1 if unlabeled."""
     distinct, rows = torch.unique(labels, return_inverse=True)
     labeled = distinct != UNLABELED
     return distinct[labeled], (labeled.cumsum(0) - 1).where(labeled, -1)[rows]
 
 
 def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor]:
-    """Return label arrays as int64 tensors; a ShapeError if lengths or devices differ."""
+    """Convert label arrays to int64 tensors; raise ShapeError if lengths or devices differ."""
     tensors = {name: as_tensor(caller, name, values) for name, values in arguments.items()}
     for name, tensor in tensors.items():
         if tensor.dtype not in INTEGERS:
@@ -135,15 +135,15 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
                 f"{caller}: expected {name} of integers, got {dtype}; convert with .long()."
             )
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
-    check_one_device(caller, **tensors)
+    check_same_device(caller, **tensors)
     return [tensor.long() for tensor in tensors.values()]
 
 
-def have_other_label(truth: Tensor, ignore: int | None) -> Tensor:
-    """Return which points do not have the ignored label; no point has one beyond int64.
+def is_not_ignored(truth: Tensor, ignore: int | None) -> Tensor:
+    """Return the mask of points without the ignored label; labels beyond int64 never match.
 
     Example:
-        >>> have_other_label(torch.tensor([0, 1]), 1), have_other_label(torch.tensor([0]), 10**23)
+        >>> is_not_ignored(torch.tensor([0, 1]), 1), is_not_ignored(torch.tensor([0]), 10**23)
         (tensor([ True, False]), tensor([True]))
     """
     if ignore is None or not -(2**63) <= ignore < 2**63:
@@ -151,8 +151,8 @@ def have_other_label(truth: Tensor, ignore: int | None) -> Tensor:
     return truth != ignore
 
 
-def check_one_device(caller: str, **arguments: Tensor) -> None:
-    """Raise a ShapeError for tensors on several devices."""
+def check_same_device(caller: str, **arguments: Tensor) -> None:
+    """Raise ShapeError for tensors on different devices."""
     devices = [str(tensor.device) for tensor in arguments.values()]
     if len(set(devices)) > 1:
         names = " and ".join(arguments)
@@ -160,5 +160,5 @@ def check_one_device(caller: str, **arguments: Tensor) -> None:
 
 
 def fraction(count: float, whole: float) -> float:
-    """Return ``part / whole``, and 0 where the whole is 0."""
+    """Return ``count / whole``, or 0 if ``whole`` is 0."""
     return count / whole if whole else 0.0

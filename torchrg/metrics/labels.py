@@ -1,4 +1,4 @@
-"""External indices: predicted plane labels against true ones."""
+"""External indices: predicted plane labels against ground truth."""
 
 from typing import Any, NamedTuple
 
@@ -10,23 +10,23 @@ from torchrg.metrics.contingency import ContingencyTable, count_overlaps, fracti
 
 
 class LabelScore(NamedTuple):
-    """External indices of a labelling; see :func:`score_labels`.
+    """External indices of a segmentation; see :func:`score_labels`.
 
-    ``METRICS["labels"]`` says which are percentages, as in the paper, counts or shares in [0, 1].
+    ``METRICS["labels"]`` lists the units: percent as in the paper, counts, or fractions in [0, 1].
 
     Attributes:
         precision: Mean over the pairs of ``100 |C & G| / |C|`` (section III.B), percent.
         recall: Mean over the pairs of ``100 |C & G| / |G|`` (section III.B), percent.
         f1: Harmonic mean of precision and recall (section III.B), percent.
-        pairs: Regions and faces that are each other's largest overlap.
-        regions: Predicted regions with a scored point.
-        faces: True faces with a scored point.
-        points: Scored points: all but those of the ignored label.
+        pairs: Number of regions and faces that are each other's largest overlap.
+        regions: Number of predicted regions with an evaluated point.
+        faces: Number of ground-truth planes (faces) with an evaluated point.
+        points: Number of evaluated points: all except those with the ignored label.
         mean_best_iou: Mean over all faces of the largest IoU with a region.
-        precision_iou50: Regions with a face at IoU > 0.5, of all regions.
-        recall_iou50: Faces with a region at IoU > 0.5, of all faces.
+        precision_iou50: Fraction of regions with a face at IoU > 0.5.
+        recall_iou50: Fraction of faces with a region at IoU > 0.5.
         precision_iou80: The same at IoU > 0.8; so is ``recall_iou80``.
-        fraction_labeled: Scored points that lie in a region.
+        fraction_labeled: Fraction of evaluated points in a region.
         covering: See :func:`segmentation_covering`.
         ari: See :func:`adjusted_rand_index`.
     """
@@ -55,20 +55,20 @@ def score_labels(
     min_size: int = 1,
     ignore: int | None = None,
 ) -> LabelScore:
-    """Score predicted plane labels against true ones.
+    """Evaluate predicted plane labels against ground truth.
 
     Precision, recall and F1 are the paper's [1]: means over the one-to-one pairs of
-    :func:`match_regions`. They say nothing about regions and faces without a partner, so the counts
-    and the indices over all faces stand beside them.
+    :func:`match_regions`. They ignore regions and faces without a partner, so the counts and the
+    indices over all faces complement them.
 
-    Arguments, errors, and how unlabelled points count are as in
-    :func:`torchrg.metrics.contingency_table`: a point of no face lowers the precision of its
-    region, a point of no region the recall of its face. The paper draws regions of 50 points and
-    more.
+    Arguments, errors and the handling of unlabeled points are as in
+    :func:`torchrg.metrics.contingency_table`: a point without a face lowers the precision of its
+    region, a point without a region the recall of its face. The paper shows regions of at least 50
+    points.
 
     Returns:
-        The indices. A mean or share over nothing is 0 (no pair, no region, no face, no point);
-        the counts tell it from a real 0.
+        The indices. Means and fractions over nothing are 0; the counts distinguish this from an
+        actual 0.
 
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
@@ -105,10 +105,10 @@ def score_labels(
 
 
 def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
-    """Return mean precision and recall of the pairs, in percent, and how many pairs there are.
+    """Return mean precision and recall of the pairs, in percent, and the number of pairs.
 
-    ``P = 100 |C & G| / |C|`` and ``R = 100 |C & G| / |G|`` of each pair of :func:`match_regions`;
-    0 where there is no pair.
+    ``P = 100 |C & G| / |C|`` and ``R = 100 |C & G| / |G|`` for each pair of :func:`match_regions`;
+    0 without pairs.
 
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
@@ -125,12 +125,12 @@ def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]
 
 
 def match_regions(table: ContingencyTable) -> Tensor:
-    """Pair each region with the face that it overlaps most and that it is overlapped most by.
+    """Pair regions and faces that are each other's largest overlap.
 
-    So the paper pairs them, see :func:`score_labels`. Equal overlaps, in points, are decided by the
-    larger intersection over union, that is the smaller partner; then by the lower label. (It also
-    says "the maximum or second maximum overlap", and not how the second enters.) Returns the rows
-    of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64.
+    This is the paper's pairing, see :func:`score_labels`. Ties in overlap go to the larger
+    intersection over union, that is the smaller partner, then to the lower label. The paper also
+    mentions "the maximum or second maximum overlap", without defining the use of the second.
+    Returns the rows of the table's overlaps that are pairs, ascending, shape ``(P,)``, int64.
 
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
@@ -148,7 +148,7 @@ def match_regions(table: ContingencyTable) -> Tensor:
 
 
 def _is_first(groups: Tensor, *keys: Tensor) -> Tensor:
-    """Return whether each row is the first of its group, ordered by the keys, shape ``(E,)``."""
+    """Mark the first row of each group, ordered by the keys, shape ``(E,)``."""
     order = torch.arange(len(groups), device=groups.device)
     for key in (*reversed(keys), groups):
         order = order[key[order].argsort(stable=True)]
@@ -161,9 +161,9 @@ def _is_first(groups: Tensor, *keys: Tensor) -> Tensor:
 def adjusted_rand_index(table: ContingencyTable) -> float:
     """Return the Rand index corrected for chance [1].
 
-    The unlabelled points of a side are one more part of it: the value is that of scikit-learn's
-    ``adjusted_rand_score`` for the same labels, -1 included. At most 1 (equal partitions), about 0
-    for independent ones, negative for worse; 1 where there is no pair of points to judge.
+    Unlabeled points count as one part, so the value equals scikit-learn's ``adjusted_rand_score``
+    for the same labels, including -1. At most 1 (equal partitions), about 0 for independent
+    partitions, negative for worse; 1 without pairs of points.
 
     References:
         [1] L. Hubert, P. Arabie. Comparing partitions. Journal of Classification, 1985, eq. 5.
@@ -174,7 +174,7 @@ def adjusted_rand_index(table: ContingencyTable) -> float:
         >>> adjusted_rand_index(table)
         1.0
     """
-    # Python's integers: products of two counts of pairs exceed 64 bits beyond 50,000 points.
+    # Python integers: products of two pair counts exceed 64 bits beyond 50,000 points.
     together, predicted, true = (
         int((sizes * (sizes - 1) // 2).sum()) for sizes in _sizes_with_unlabeled(table)
     )
@@ -184,7 +184,7 @@ def adjusted_rand_index(table: ContingencyTable) -> float:
 
 
 def segmentation_covering(table: ContingencyTable) -> float:
-    r"""Return the covering of the faces by the regions [1], in [0, 1]; 0 where there is no face.
+    r"""Return the covering of the faces by the regions [1], in [0, 1]; 0 without faces.
 
     ``sum_j |G_j| max_i IoU(C_i, G_j) / sum_j |G_j|``: the mean best IoU weighted by size.
 
@@ -202,13 +202,13 @@ def segmentation_covering(table: ContingencyTable) -> float:
 
 
 def _best_iou(table: ContingencyTable) -> Tensor:
-    """Return the largest IoU of each face with a region, 0 where none overlaps, ``(F,)``."""
+    """Return the largest IoU of each face with a region, 0 without overlap, ``(F,)``."""
     best = table.iou.new_zeros(len(table.face_sizes))
     return best.scatter_reduce(0, table.faces, table.iou, "amax")
 
 
 def _sizes_with_unlabeled(table: ContingencyTable) -> tuple[Tensor, Tensor, Tensor]:
-    """Return sizes of overlaps, regions and faces; a side's unlabelled points are one more part."""
+    """Return the sizes of overlaps, regions and faces, with unlabeled points as another part."""
     in_faces = torch.zeros_like(table.region_sizes).index_add(0, table.regions, table.overlaps)
     in_regions = torch.zeros_like(table.face_sizes).index_add(0, table.faces, table.overlaps)
     bare_regions, bare_faces = table.region_sizes - in_faces, table.face_sizes - in_regions

@@ -1,4 +1,4 @@
-"""Which point of one file is which of another: that of the same row, or the nearest one."""
+"""Correspondence of the points of two clouds, by row or by distance."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,11 @@ from torchrg.structures import Cloud
 
 
 def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
-    """Return the rows, ascending, that hold another point in the other cloud of equal length.
+    """Return the rows with different points in two clouds of equal length, ascending.
 
-    Numbers are compared in the narrower type of both clouds, so that a copy in float32 holds the
-    points of an original in float64. Points that are not finite agree with each other. Points that
-    other rounding has moved differ; :func:`match_points` takes them within a distance.
+    Coordinates are compared in the narrower type of both clouds, so a float32 copy equals its
+    float64 original. Non-finite points are equal to each other. Points moved by other rounding
+    differ; use :func:`match_points` for them.
 
     Example:
         >>> exact = np.array([[0.1, 2.0, 3.0], [0.5, 0.25, 0.125]])
@@ -30,9 +30,10 @@ def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
 
 
 def match_points(ours: Cloud, theirs: Cloud, max_distance: float) -> NDArray[np.int64]:
-    """Return the nearest point of ours for each of theirs, rows of ours, shape ``(M,)``.
+    """Return the nearest point of ours for each of theirs, as rows of ours, shape ``(M,)``.
 
-    Points farther than ``max_distance``, in the unit of the clouds, or not finite, have none: -1.
+    The entry is -1 for points that are not finite, or farther than ``max_distance``, in units of
+    the clouds.
 
     Example:
         >>> room = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])

@@ -1,4 +1,4 @@
-"""Scores as a :class:`torchmetrics.Metric`: one ``update`` a scan, ``compute`` over a data set."""
+"""Evaluation as a :class:`torchmetrics.Metric`."""
 
 import inspect
 import math
@@ -33,27 +33,27 @@ _SCORES: dict[str, Callable[..., LabelScore | PartitionScore | ClusterScore | No
     "clusters": score_clusters,
     "normals": score_normals,
 }
-"""The function of each part of ``METRICS``."""
+"""Evaluation function of each part of ``METRICS``."""
 
 
 class PlaneMetric(Metric):
-    """Mean of an index over the scans that it is defined for, or of all indices of a part.
+    """Mean of a metric over the scans for which it is defined, or of all metrics of a part.
 
-    The states are sums of all indices of the part, so they reduce across workers and processes by
-    addition, and the metrics of one part in a ``MetricCollection`` score each scan once.
+    The states are sums of all metrics of the part, so they reduce across workers and processes by
+    addition. Metrics of one part in a ``MetricCollection`` evaluate each scan once.
 
     Args:
-        index: A part of :data:`torchrg.metrics.METRICS`, for a dict of all its indices; or an index
-            of one, as in ``"f1"``.
-        **settings: Settings of the function of the part, as in ``min_size=50``, and those of
-            :class:`torchmetrics.Metric`.
+        index: A part of :data:`torchrg.metrics.METRICS`, for a dict of all its metrics, or the name
+            of a metric, such as ``"f1"``.
+        **settings: Settings of the evaluation function, such as ``min_size=50``, and of
+        :class:`torchmetrics.Metric`.
 
     Attributes:
-        part: The part of ``METRICS`` that the index is of.
-        index: The index; None for all, and so are the others then.
+        part: The part of ``METRICS``.
+        index: The metric; None for all, in which case ``unit`` and ``higher_is_better`` are None.
 
     Raises:
-        ConfigError: If there is no such index, or several parts have one of that name.
+        ConfigError: If the metric does not exist, or its name is ambiguous.
 
     Example:
         >>> f1 = PlaneMetric("f1", min_size=2)
@@ -83,36 +83,36 @@ class PlaneMetric(Metric):
 
     @property
     def unit(self) -> str | None:
-        """Unit of the index, from the catalogue."""
+        """Unit of the metric, from ``METRICS``."""
         return None if self.index is None else METRICS[self.part][self.index].unit
 
     @property
     def higher_is_better(self) -> bool | None:  # type: ignore[override]
-        """Whether more of the index is better, from the catalogue."""
+        """Whether higher is better, from ``METRICS``."""
         return None if self.index is None else METRICS[self.part][self.index].higher_is_better
 
     def update(self, *tensors: Tensor, **named: Tensor) -> None:
-        """Add the score of one scan, given the tensors that the function of the part takes.
+        """Add a scan; the tensors are the arguments of the evaluation function.
 
-        Labels: predicted and true label of each point, both ``(N,)``. Superpoints: the same, then,
-        for borders, points ``(N, 3)``. Clusters: normals ``(N, 3)`` and the cluster of each,
-        ``(N,)``. Normals: estimated and true normals ``(N, 3)``, and ``valid=`` of ``(N,)``.
+        Labels: predicted and ground-truth label of each point, both ``(N,)``. Superpoints: the
+        same, and points ``(N, 3)`` for boundary metrics. Clusters: normals ``(N, 3)`` and clusters
+        ``(N,)``. Normals: estimated and ground-truth normals ``(N, 3)``, and ``valid=`` ``(N,)``.
         """
         score = _SCORES[self.part](*tensors, **named, **self.settings)._asdict()
         values = (math.nan if score[name] is None else score[name] for name in METRICS[self.part])
         indices = torch.tensor([*map(float, values)], dtype=torch.float64, device=self.total.device)
-        # An index that the scan does not define is nan, and left out.
+        # Metrics undefined for the scan are nan, and ignored.
         self.total += indices.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
         self.scans += ~indices.isnan()
 
     def compute(self) -> Tensor | dict[str, Tensor]:
-        """Return the mean over the scans, nan where no scan defines it; scalar float64 tensors."""
+        """Return the mean over the scans as scalar float64 tensors, nan if defined for no scan."""
         means = dict(zip(METRICS[self.part], (self.total / self.scans).unbind(), strict=True))
         return means if self.index is None else means[self.index]
 
 
 def _find_index(name: str) -> tuple[str, str | None]:
-    """Return the part of an index and its name, or a part and None for all of it."""
+    """Return the part and name of a metric, or a part and None for all its metrics."""
     if name in METRICS:
         return name, None
     parts = [part for part, indices in METRICS.items() if name in indices]
@@ -120,8 +120,8 @@ def _find_index(name: str) -> tuple[str, str | None]:
         return parts[0], name
     if parts:
         raise ConfigError(
-            f"PlaneMetric: expected an index of one part, got {name!r} of {' and '.join(parts)}; "
-            f"take PlaneMetric({parts[0]!r}) and its {name!r}."
+            f"PlaneMetric: expected an unambiguous index, got {name!r} of {' and '.join(parts)}; "
+            f"use PlaneMetric({parts[0]!r}) and its {name!r}."
         )
     listed = ", ".join([*METRICS, *dict.fromkeys(n for part in METRICS.values() for n in part)])
     raise ConfigError(f"PlaneMetric: expected index to be one of {listed}, got {name!r}.")

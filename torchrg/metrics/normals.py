@@ -1,4 +1,4 @@
-"""Angle errors of normals against true ones."""
+"""Angle errors of normals against ground truth."""
 
 import math
 from typing import Any, NamedTuple
@@ -10,26 +10,26 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.metrics.contingency import check_one_device
+from torchrg.metrics.contingency import check_same_device
 from torchrg.metrics.sphere import unit_vectors
 
 _CHUNK = 2**20
-"""Points that are scored at a time, which bounds the memory."""
+"""Number of points evaluated at a time; bounds the memory."""
 _LIMITS_DEG = (5, 10, 20)
-"""Bounds of the shares of small errors, in degrees."""
+"""Limits of the fractions of small errors, in degrees."""
 
 
 class NormalScore(NamedTuple):
-    """Errors of normals; see :func:`score_normals`. ``METRICS["normals"]`` holds the units.
+    """Errors of normals; see :func:`score_normals`. ``METRICS["normals"]`` lists the units.
 
     Attributes:
         msae: Mean squared angle error, degrees^2.
-        rms: Root mean square angle error, degrees.
+        rms: RMS angle error, degrees.
         mean: Mean angle error, degrees.
         median: Median angle error, degrees.
-        under_5_deg: Share of points with an error below 5 degrees, in [0, 1]; and so on.
-        points: Points that were scored.
-        invalid: Points with a true normal and no estimated one; in none of the indices.
+        under_5_deg: Fraction of points with an error below 5 degrees, in [0, 1]; and so on.
+        points: Number of evaluated points.
+        invalid: Number of points with ground truth but no estimated normal; not evaluated.
     """
 
     msae: float
@@ -49,26 +49,26 @@ def score_normals(
     *,
     valid: Tensor | NDArray[Any] | None = None,
 ) -> NormalScore:
-    """Score normals by their angle to the true ones, signs ignored.
+    """Evaluate normals by their angle to ground truth, ignoring signs.
 
     The error of a point is ``arccos |n . t|`` in [0, 90] degrees; MSAE is the mean of its square
-    (the measure of the paper's Figure 4), RMS the root of that.
+    (Figure 4 of the paper), RMS the root of MSAE.
 
     Convention:
-        A point without an estimated normal (zero, not finite, or not ``valid``) is in no index and
-        counted in ``invalid``: look at that count before comparing estimators that may abstain. A
-        point without a true normal counts nowhere.
+        Points without an estimated normal (zero, non-finite, or not ``valid``) are not evaluated
+        but counted in ``invalid``: check that count before comparing estimators that may abstain.
+        Points without a ground-truth normal are ignored.
 
     Args:
         normals: Estimated normals of any length, shape ``(*, 3)``, floating point.
-        truth: True normals, likewise.
-        valid: Points whose normal counts as estimated, shape ``(*)``, bool. Default: all.
+        truth: Ground-truth normals, in the same form.
+        valid: Mask of points with an estimated normal, shape ``(*)``, bool. Default: all.
 
     Returns:
-        The errors. Over no point at all the errors and shares are nan.
+        The errors; nan without evaluated points.
 
     Raises:
-        ShapeError: If a shape, dtype or device does not fit.
+        ShapeError: If a shape, dtype or device is invalid.
 
     Example:
         >>> truth = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])
@@ -86,7 +86,7 @@ def score_normals(
     if mask.dtype != torch.bool:
         dtype = str(mask.dtype).removeprefix("torch.")
         raise ShapeError(f"score_normals: expected valid of bool, got {dtype}.")
-    check_one_device("score_normals", normals=normals, truth=truth, valid=mask)
+    check_same_device("score_normals", normals=normals, truth=truth, valid=mask)
     errors, scored, has_truth = _angle_errors(normals.reshape(-1, 3), truth.reshape(-1, 3))
     scored &= mask.reshape(-1)
     invalid, errors = int((has_truth & ~scored).sum()), errors[scored]
@@ -108,7 +108,7 @@ def score_normals(
 
 
 def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return errors in degrees, which points have both normals, and which a true one, ``(N,)``."""
+    """Return errors in degrees, and masks of evaluated points and of ground truth, ``(N,)``."""
     blocks = []
     for estimates, truths in zip(
         torch.split(normals, _CHUNK), torch.split(truth, _CHUNK), strict=True

@@ -1,4 +1,4 @@
-"""Scores of superpoints: how well a partition of all points keeps to the objects of a truth."""
+"""Evaluation of superpoints against ground-truth objects."""
 
 from typing import Any, NamedTuple
 
@@ -13,29 +13,29 @@ from torchrg.metrics.contingency import (
     check_labels,
     contingency_table,
     fraction,
-    have_other_label,
+    is_not_ignored,
 )
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.structures import UNLABELED
 
 _NUM_NEIGHBORS = 8
-"""Neighbours that surround a point of a surface. A border runs between it and one of them."""
+"""Number of neighbors of a surface point; a boundary separates it from at least one of them."""
 
 
 class PartitionScore(NamedTuple):
     """Quality of superpoints; see :func:`score_partition`.
 
     Attributes:
-        asa: Achievable segmentation accuracy: share of the points that are right when every
-            superpoint takes its most frequent part.
-        oracle_miou: Mean IoU over the parts of that labelling.
-        boundary_recall: Share of the points at a true border that have one at a border of
-            superpoints within ``boundary_distance``. Without coordinates all three are None.
-        boundary_precision: The same share the other way round.
-        boundary_distance: That distance, in the unit of the cloud.
-        count: Superpoints, those without a scored point included.
-        points_per_superpoint: Mean number of points of a superpoint, all points counted.
-        points: Scored points.
+        asa: Achievable segmentation accuracy: fraction of points that are correct if every
+        superpoint takes its most frequent object.
+        oracle_miou: Mean IoU over the objects of that labeling.
+        boundary_recall: Fraction of ground-truth boundary points with a superpoint boundary point
+        within ``boundary_distance``. None without coordinates, as the next two.
+        boundary_precision: The same fraction with the roles exchanged.
+        boundary_distance: Maximum distance of matching boundaries, in units of the cloud.
+        count: Number of superpoints, including those without an evaluated point.
+        points_per_superpoint: Mean number of points of a superpoint, over all points.
+        points: Number of evaluated points.
     """
 
     asa: float
@@ -56,32 +56,33 @@ def score_partition(
     boundary_distance: float | None = None,
     ignore: int | None = None,
 ) -> PartitionScore:
-    """Score a partition of a cloud by what a perfect classifier of its parts would reach.
+    """Evaluate a partition by the accuracy of a perfect classifier of its superpoints.
 
-    Achievable segmentation accuracy and boundary recall are those of superpixels [1, 2]; the
-    labelling by the most frequent part is the oracle of superpoint graphs [3]. More superpoints
-    are never worse, so compare partitions of equally many.
+    Achievable segmentation accuracy and boundary recall are metrics of superpixels [1, 2]; the
+    labeling by the most frequent object is the oracle of superpoint graphs [3]. More superpoints
+    are never worse, so compare partitions with the same count.
 
     Convention:
-        Points whose true label is :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not scored. A
-        point whose superpoint is -1 belongs to none, and is wrong. Of equally frequent parts a
-        superpoint takes that of the lowest label. A point is at a border when one of its 8 nearest
-        scored points has another label. Copies of a point with the same labels count once there.
+        Points with the ground-truth label :data:`torchrg.UNLABELED` (-1) or ``ignore`` are not
+        evaluated. Points with superpoint -1 belong to none, and are wrong. Ties between frequent
+        objects go to the lowest label. Boundary points have a point with another label among their
+        8 nearest evaluated points. Duplicate points with the same labels count once for boundaries.
 
     Args:
         superpoints: Superpoint of each point, shape ``(N,)``, integers.
-        truth: True part or object of each point, shape ``(N,)``, integers.
-        points: Points, shape ``(N, 3)``, for the scores of borders; those that are not finite
-            count for no border. Default: these scores are None.
-        boundary_distance: How far apart two borders may be and still agree, in the unit of the
-            cloud. Default: the median distance to the 8th nearest neighbour.
-        ignore: Another true label that is not scored.
+        truth: Ground-truth object of each point, shape ``(N,)``, integers.
+        points: Points, shape ``(N, 3)``, for the boundary metrics, which ignore non-finite points.
+            Default: boundary metrics are None.
+        boundary_distance: Maximum distance of matching boundaries, in units of the cloud. Default:
+            the median distance to the 8th nearest neighbor.
+        ignore: Another ground-truth label that is not evaluated.
 
     Returns:
-        The scores. A share of nothing is 0.
+        The metrics. Fractions of nothing are 0.
 
     Raises:
-        ShapeError: If the labels are not integers, the points not floating, or lengths differ.
+        ShapeError: If the labels are not integers, the points not floating point, or lengths
+            differ.
         ConfigError: If ``boundary_distance`` is not positive.
 
     References:
@@ -104,14 +105,14 @@ def score_partition(
         points = as_tensor("score_partition", "points", points)
         check_shapes("score_partition", points=(points, "N 3"), truth=(truth, "N"))
         check_floating("score_partition", points=points)
-    scored = (truth != UNLABELED) & have_other_label(truth, ignore)
+    scored = (truth != UNLABELED) & is_not_ignored(truth, ignore)
     has_one = superpoints != UNLABELED
     count = len(torch.unique(superpoints[has_one]))
     num_right, miou = _score_oracle(superpoints[scored], truth[scored])
     recall = precision = None
     if points is not None:
         used = scored & points.isfinite().all(dim=1)
-        recall, precision, boundary_distance = _score_borders(
+        recall, precision, boundary_distance = _score_boundaries(
             superpoints[used], truth[used], points[used].detach(), boundary_distance
         )
     num_scored = int(scored.sum())
@@ -128,30 +129,30 @@ def score_partition(
 
 
 def _score_oracle(superpoints: Tensor, truth: Tensor) -> tuple[int, float]:
-    """Return how many points the most frequent parts get right, and their mean IoU."""
+    """Return the number of points with the most frequent object, and the mean IoU."""
     table = contingency_table(superpoints, truth)
     num_parts = len(table.face_sizes)
-    # Overlaps are sorted by superpoint, then by part: the first largest is of the lowest label.
-    most = torch.zeros_like(table.region_sizes).scatter_reduce(
+    # Overlaps are sorted by superpoint, then by object, so ties go to the lowest label.
+    max_overlaps = torch.zeros_like(table.region_sizes).scatter_reduce(
         0, table.regions, table.overlaps, "amax"
     )
-    largest = table.overlaps == most[table.regions]
+    largest = table.overlaps == max_overlaps[table.regions]
     most_frequent = torch.full_like(table.region_sizes, num_parts).scatter_reduce(
         0, table.regions[largest], table.faces[largest], "amin"
     )
-    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, most)
+    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, max_overlaps)
     sizes = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, table.region_sizes)
     iou = right.double() / (sizes + table.face_sizes - right)
     return int(right.sum()), fraction(float(iou.sum()), num_parts)
 
 
-def _score_borders(
+def _score_boundaries(
     superpoints: Tensor, truth: Tensor, points: Tensor, distance: float | None
 ) -> tuple[float, float, float]:
-    """Return recall and precision of the borders of superpoints, and the distance they are at."""
+    """Return recall and precision of superpoint boundaries, and the distance used."""
     from scipy.spatial import cKDTree
 
-    # Copies of a point with the same labels count once.
+    # Duplicate points with the same labels count once.
     rows = distinct_rows(points, superpoints, truth)
     superpoints, truth, points = superpoints[rows], truth[rows], points[rows]
     if len(points) < 2:
@@ -169,7 +170,7 @@ def _score_borders(
         return 0.0, 0.0, distance
     fractions = []
     for of, near in ((theirs, ours), (ours, theirs)):
-        # The bound of the search excludes the distance itself.
+        # The search bound is exclusive.
         limit = np.nextafter(distance, np.inf)
         distances = cKDTree(near).query(of, distance_upper_bound=limit)[0]
         fractions.append(float(np.isfinite(distances).mean()))

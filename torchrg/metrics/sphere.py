@@ -1,7 +1,7 @@
-"""Directions without sign: points of the Gaussian sphere on which opposite points are one.
+"""Unsigned directions: points of the Gaussian sphere with opposite points identified.
 
-Directions are unit vectors in float64; their distance is the chord ``min(|a - b|, |a + b|)``, or
-its angle ``arccos |a . b|`` (eq. 17), which chords give without loss where it is small.
+Directions are unit vectors in float64. Their distance is the chord ``min(|a - b|, |a + b|)``, or
+its angle ``arccos |a . b|`` (eq. 17), which chords give accurately even if small.
 """
 
 import math
@@ -13,16 +13,16 @@ from torch import Tensor
 from torchrg.neighbors import canonical_order
 
 _MAX_PAIRS = 2**17
-"""Distances that are computed at a time, about as many as stay in a cache."""
+"""Number of distances computed at a time, about as many as fit into a cache."""
 
 _ROUNDING = 1e-12
-"""Relative error by which an angle may come out too large."""
+"""Maximum relative error by which an angle may be too large."""
 
 
 def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """Normalise vectors ``(*, 3)`` in float64, and say which could be, ``(*)``.
+    """Normalize vectors ``(*, 3)`` in float64; return also the mask ``(*)`` of valid ones.
 
-    A zero vector, or one that is not finite, has no direction, and is zero.
+    Zero and non-finite vectors have no direction and become zero.
 
     Example:
         >>> unit, exists = unit_vectors(torch.tensor([[0.0, 3, 4], [0, 0, 0], [torch.nan, 0, 0]]))
@@ -38,40 +38,39 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(exists[..., None], unit / length, 0), exists
 
 
-def rows_at_once(length: int) -> int:
-    """Return how many rows of distances of a length are in memory at a time."""
+def chunk_rows(length: int) -> int:
+    """Return how many rows of distances of this length to compute at a time."""
     return max(1, _MAX_PAIRS // max(1, length))
 
 
 def chord_table(a: Tensor, b: Tensor, *, aligned: bool = False) -> Tensor:
-    """Return the chord between all directions of two sets, shape ``(A, B)``, in [0, sqrt(2)].
+    """Return the chords between all directions of two sets, shape ``(A, B)``, in [0, sqrt(2)].
 
-    If they are ``aligned``, no two more than 90 degrees apart, that is half of the work.
+    ``aligned`` sets, with all angles at most 90 degrees, take half of the time.
     """
-    # A matrix product would be faster, and turn equal directions into chords of 1e-8.
+    # A matrix product would be faster, but turn equal directions into chords of 1e-8.
     direct = "donot_use_mm_for_euclid_dist"
     chords = torch.cdist(a, b, compute_mode=direct)
     return chords if aligned else torch.minimum(chords, torch.cdist(a, -b, compute_mode=direct))
 
 
 def chords_between(a: Tensor, b: Tensor) -> Tensor:
-    """Return the chord between directions row by row, in [0, sqrt(2)]."""
+    """Return the chords between directions row by row, in [0, sqrt(2)]."""
     return torch.minimum((a - b).square().sum(dim=-1), (a + b).square().sum(dim=-1)).sqrt()
 
 
 def chord_to_angle(chords: Tensor) -> Tensor:
-    """Return the angles of chords, in radians, in place."""
+    """Convert chords to angles in radians, in place."""
     return chords.div_(2).asin_().mul_(2)
 
 
 def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> tuple[Tensor, Tensor]:
-    """Return the normalised mean direction of each cluster (eq. 16), after aligning the signs.
+    """Return the normalized mean direction of each cluster (eq. 16), after aligning the signs.
 
-    Normals have no sign, so each is first turned to the side of the cluster's principal axis, the
-    direction that the sum of ``(n . axis)^2`` is largest for. The mean of the turned vectors
-    cannot vanish. The sign of a centre makes its largest entry positive. Each cluster of
-    ``clusters`` ``(N,)``, 0 to M-1, has one direction at least. Centres are ``(M, 3)``; the turned
-    directions ``(N, 3)`` are the second result.
+    Normals have no sign, so each is first flipped to the side of the cluster's principal axis,
+    which maximizes the sum of ``(n . axis)^2``. The mean of the aligned vectors cannot vanish. The
+    largest entry of a center is positive. Clusters ``(N,)`` are 0 to M-1, none empty. Returns
+    centers ``(M, 3)`` and aligned directions ``(N, 3)``.
 
     Example:
         >>> directions = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]], dtype=torch.float64)
@@ -95,16 +94,16 @@ def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> tup
 
 
 def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
-    """Number the groups of centres ``(M, 3)`` that are joined by steps of at most an angle.
+    """Group centers ``(M, 3)`` connected by steps of at most an angle.
 
-    Groups are 0, 1, ... in the order of their first members, shape ``(M,)``, int64.
+    Groups are numbered by their first members, shape ``(M,)``, int64.
 
     Example:
         >>> axes = torch.eye(3, dtype=torch.float64)
         >>> merge_directions(torch.stack([axes[0], axes[1], -axes[0]])).tolist()
         [0, 1, 0]
     """
-    longest = 2 * math.sin(math.radians(max_angle_deg) / 2)
+    max_chord = 2 * math.sin(math.radians(max_angle_deg) / 2)
     groups = torch.full((len(centers),), -1, device=centers.device)
     group = 0
     while len(free := (groups < 0).nonzero().squeeze(1)):
@@ -113,8 +112,8 @@ def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
             groups[newest] = group
             free = free[groups[free] < 0]
             near = torch.zeros_like(free, dtype=torch.bool)
-            for chunk in torch.split(newest, rows_at_once(len(free))):
-                near |= (chord_table(centers[chunk], centers[free]) <= longest).any(dim=0)
+            for chunk in torch.split(newest, chunk_rows(len(free))):
+                near |= (chord_table(centers[chunk], centers[free]) <= max_chord).any(dim=0)
             newest = free[near]
         group += 1
     return groups
@@ -123,15 +122,14 @@ def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
 def measure_spreads(
     parts: Sequence[Tensor], centers: Tensor, *, sample_size: int = 20_000, seed: int = 0
 ) -> tuple[Tensor, Tensor, int, bool]:
-    """Return mean angle over all pairs, and diameter, of the directions of each cluster, ``(M,)``.
+    """Return mean pairwise angle and diameter of the directions of each cluster, ``(M,)``.
 
-    Larger clusters, and larger sets of possible ends of a diameter, are subsampled to
-    ``sample_size``; third and fourth are the clusters whose mean is of a subsample, and whether no
-    diameter is.
+    Larger clusters, and larger sets of diameter end points, are subsampled to ``sample_size``. Also
+    returns the number of clusters with a subsampled mean, and whether all diameters are exact.
     """
     means, diameters, num_sampled, exact = [], [], 0, True
     for directions, center in zip(parts, centers, strict=True):
-        ends = _rim(directions, center)
+        ends = _diameter_candidates(directions, center)
         means.append(_mean_pairwise_angle(_subsample(directions, sample_size, seed)))
         angles = _upper_angles(_subsample(ends, sample_size, seed))
         diameters.append(max((float(block.max()) for block in angles), default=0.0))
@@ -145,30 +143,30 @@ def _mean_pairwise_angle(directions: Tensor) -> float:
     count, total = len(directions), 0.0
     for angles in _upper_angles(directions):
         rows = len(angles)
-        # The square at the diagonal holds each of its pairs twice.
+        # The diagonal block contains each of its pairs twice.
         total += float(angles[:, rows:].sum() + angles[:, :rows].sum() / 2)
     return 2 * total / (count * (count - 1)) if count > 1 else 0.0
 
 
 def _upper_angles(directions: Tensor) -> Iterator[Tensor]:
-    """Yield the angles of some directions to themselves and to all later ones, ``(r, n)``."""
+    """Yield the angles of blocks of directions to themselves and all later ones, ``(r, n)``."""
     count = len(directions)
-    # Within 45 degrees of one of them no two are more than 90 degrees apart.
+    # Directions within 45 degrees of one direction are at most 90 degrees apart.
     aligned = bool(count) and float((directions @ directions[0]).min()) > 0.5**0.5
     start = 0
     while start < count:
-        rows = rows_at_once(count - start)
+        rows = chunk_rows(count - start)
         chords = chord_table(directions[start : start + rows], directions[start:], aligned=aligned)
         yield chord_to_angle(chords)
         start += rows
 
 
-def _rim(directions: Tensor, center: Tensor) -> Tensor:
+def _diameter_candidates(directions: Tensor, center: Tensor) -> Tensor:
     """Return the directions of a cluster that can be an end of its diameter.
 
-    A pair at least as far apart as ``d`` has both ends at least ``d - r`` from the centre, with
-    ``r`` the largest distance from it (triangle inequality). ``d`` is a distance that
-    occurs: from the farthest direction to the one farthest from that.
+    A pair at distance ``d`` or more has both ends at least ``d - r`` from the center, where ``r``
+    is the radius of the cluster (triangle inequality). ``d`` is an existing distance: from the
+    farthest direction to the one farthest from it.
     """
     radii = chord_to_angle(chords_between(directions, center))
     from_first = chord_to_angle(chords_between(directions, directions[radii.argmax()]))
@@ -178,7 +176,7 @@ def _rim(directions: Tensor, center: Tensor) -> Tensor:
 
 
 def _subsample(directions: Tensor, size: int, seed: int) -> Tensor:
-    """Return a random subset of at most a size that does not depend on the order."""
+    """Return a random subset of at most ``size``, independent of the order."""
     if len(directions) <= size:
         return directions
     order = canonical_order(torch.where(directions[:, 2:] < 0, -directions, directions))

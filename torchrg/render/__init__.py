@@ -1,4 +1,4 @@
-"""Pictures and pages of clouds and their segmentation, without a desktop."""
+"""Rendering of clouds and segmentations as images and viewers, without a display."""
 
 from torchrg.render.cameras import make_camera
 from torchrg.render.colors import color_curvature, color_normals, color_planes, color_sharp

@@ -1,4 +1,4 @@
-"""Pinhole cameras that show a whole cloud; kornia holds them and projects."""
+"""Pinhole cameras that show a whole cloud, based on kornia."""
 
 import math
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,26 +9,26 @@ from torch import Tensor
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_MARGIN = 0.03
-"""Share of the picture that stays free on each side."""
-_NEAREST = 0.25
-"""Least distance from the camera to the nearest point, in depths of the cloud. A nearer camera
-would show what is in front much larger than what is behind."""
-_FLATTEST = 0.25
-"""Least ratio of height to width of a picture whose height is not given."""
+_MARGIN_FRACTION = 0.03
+"""Margin on each side of the image, as a fraction of its size."""
+_MIN_DISTANCE_FRACTION = 0.25
+"""Minimum distance from the camera to the nearest point, as a fraction of the depth of the cloud. A
+nearer camera would exaggerate the foreground."""
+_MIN_ASPECT_RATIO = 0.25
+"""Minimum aspect ratio (height to width) of an image without a given height."""
 
 
 def make_camera(
     world_to_camera: Tensor, focal: float, center: tuple[float, float], width: int, height: int
 ) -> "PinholeCamera":
-    """Return a camera of square pixels.
+    """Create a camera with square pixels.
 
     Args:
         world_to_camera: Rigid transform to x right, y down, z forward, shape ``(4, 4)``.
-        focal: Focal length in pixels.
-        center: Column and row of the principal point; whole numbers are pixel centres.
-        width: Width of the picture, in pixels.
-        height: Height of the picture, in pixels.
+        focal: Focal length, in pixels.
+        center: Column and row of the principal point; integers are pixel centers.
+        width: Width of the image, in pixels.
+        height: Height of the image, in pixels.
 
     Returns:
         A batch of one camera, float64.
@@ -48,11 +48,11 @@ def make_camera(
 
 
 def view_axes(toward: Tensor, up: Tensor) -> Tensor:
-    """Return the axes right, down, forward of a camera.
+    """Return the right, down and forward axes of a camera.
 
     Args:
         toward: Direction from the scene to the camera, shape ``(3,)``.
-        up: Direction that is up in the picture, not parallel to ``toward``, shape ``(3,)``.
+        up: Up direction of the image, not parallel to ``toward``, shape ``(3,)``.
 
     Returns:
         Unit vectors as rows, shape ``(3, 3)``, float64.
@@ -74,54 +74,54 @@ def fit_camera(
     height: int | None = None,
     field_of_view_deg: float = 30.0,
 ) -> "PinholeCamera":
-    """Return the nearest camera of given axes that has all points in its picture.
+    """Return the nearest camera with the given axes that has all points in its image.
 
-    A point at ``(x, y, z)`` along the axes is in the picture of a camera at ``(a, b, -d)`` if
-    ``|x - a| <= t (d + z)`` with t the tangent of half the angle of view: the largest ``x - t z``
-    and the smallest ``x + t z`` give a and d in closed form.
+    A point at ``(x, y, z)`` along the axes is in the image of a camera at ``(a, b, -d)`` if ``|x -
+    a| <= t (d + z)``, where t is the tangent of half the field of view. The maximum of ``x - t z``
+    and the minimum of ``x + t z`` determine a and d in closed form.
 
     Args:
-        points: What to show, shape ``(N, 3)``, finite.
+        points: Points to show, shape ``(N, 3)``, finite.
         axes: Right, down and forward, shape ``(3, 3)``.
-        width: Width of the picture, in pixels.
-        height: Height of the picture. Default: what the points need, from a quarter of the width
-            to all of it.
-        field_of_view_deg: Angle over the width; or over the height, if that is larger.
+        width: Width of the image, in pixels.
+        height: Height of the image. Default: fitted to the points, from a quarter of the width to
+            the width.
+        field_of_view_deg: Field of view over the larger of width and height, in degrees.
 
     Returns:
-        The camera. If all points are in one place, it looks at it from a distance of 1.
+        The camera. If all points coincide, it is at a distance of 1.
     """
     across = points.double() @ axes.to(points.device).T
     nearest, farthest = _bounds(across[:, 2])
     forward = across[:, 2] - nearest
     longer = max(width, height or width)
     half = math.tan(math.radians(field_of_view_deg) / 2)
-    distance = _NEAREST * (farthest - nearest)
-    middle = across.new_zeros(2)
+    distance = _MIN_DISTANCE_FRACTION * (farthest - nearest)
+    midpoint = across.new_zeros(2)
     for axis, size in enumerate((width, height or width)):
-        tangent = half * (1 - 2 * _MARGIN) * size / longer
+        tangent = half * (1 - 2 * _MARGIN_FRACTION) * size / longer
         _, high = _bounds(across[:, axis] - tangent * forward)
         low, _ = _bounds(across[:, axis] + tangent * forward)
-        middle[axis] = (low + high) / 2
+        midpoint[axis] = (low + high) / 2
         distance = max(distance, (high - low) / (2 * tangent))
     if bool((across == across[:1]).all()):
         distance = 1.0
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = axes
-    matrix[:2, 3], matrix[2, 3] = -middle, distance - nearest
+    matrix[:2, 3], matrix[2, 3] = -midpoint, distance - nearest
     focal = longer / 2 / half
-    rays = (across[:, :2] - middle) / (forward + distance)[:, None]
+    rays = (across[:, :2] - midpoint) / (forward + distance)[:, None]
     return _frame(matrix, focal, rays, width, height)
 
 
 def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "PinholeCamera":
-    """Return a camera in the origin that looks along z, x to the right and y down.
+    """Return a camera at the origin that looks along z, with x to the right and y down.
 
     Args:
-        points: What to show, shape ``(N, 3)``, finite; points behind the camera do not count.
-        width: Width of the picture, in pixels.
-        height: Height of the picture. Default: what the points need, from a quarter of the width
-            to all of it.
+        points: Points to show, shape ``(N, 3)``, finite; points behind the camera are ignored.
+        width: Width of the image, in pixels.
+        height: Height of the image. Default: fitted to the points, from a quarter of the width to
+            the width.
 
     Returns:
         The camera.
@@ -129,10 +129,10 @@ def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "
     ahead = points[points[:, 2] > 0].double()
     rays = ahead[:, :2] / ahead[:, 2:]
     (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
-    room = (1 - 2 * _MARGIN) * width, (1 - 2 * _MARGIN) * (height or width)
+    available = (1 - 2 * _MARGIN_FRACTION) * width, (1 - 2 * _MARGIN_FRACTION) * (height or width)
     scales = [
         size / span
-        for size, span in zip(room, (right - left, bottom - top), strict=True)
+        for size, span in zip(available, (right - left, bottom - top), strict=True)
         if span > 0
     ]
     return _frame(torch.eye(4), min(scales, default=float(width)), rays, width, height)
@@ -141,11 +141,11 @@ def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "
 def _frame(
     world_to_camera: Tensor, focal: float, rays: Tensor, width: int, height: int | None
 ) -> "PinholeCamera":
-    """Return the camera that has rays ``(N, 2)`` in the middle, of the height that they need."""
+    """Center the camera on rays ``(N, 2)``, and fit the height if None."""
     (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
     if height is None:
-        needed = focal * (bottom - top) / (1 - 2 * _MARGIN)
-        height = max(1, round(min(max(needed, _FLATTEST * width), width)))
+        needed = focal * (bottom - top) / (1 - 2 * _MARGIN_FRACTION)
+        height = max(1, round(min(max(needed, _MIN_ASPECT_RATIO * width), width)))
     center = (
         (width - 1) / 2 - focal * (left + right) / 2,
         (height - 1) / 2 - focal * (top + bottom) / 2,
@@ -154,10 +154,10 @@ def _frame(
 
 
 class Projection(NamedTuple):
-    """How a camera maps points about an origin to pixels.
+    """Projection of points relative to an origin to pixels.
 
     Attributes:
-        local_to_camera: Shape ``(1, 4, 4)``.
+        local_to_camera: Transform, shape ``(1, 4, 4)``.
         intrinsics: Shape ``(3, 3)``.
     """
 
@@ -166,11 +166,11 @@ class Projection(NamedTuple):
 
     @property
     def focal(self) -> float:
-        """Focal length in pixels."""
+        """Focal length, in pixels."""
         return float(self.intrinsics[0, 0])
 
     def __call__(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions ``(N, 3)`` in the camera's axes, and pixels ``(N, 2)``."""
+        """Return positions ``(N, 3)`` in camera axes, and pixels ``(N, 2)``."""
         from kornia.geometry.camera import project_points
         from kornia.geometry.linalg import transform_points
 
@@ -179,13 +179,13 @@ class Projection(NamedTuple):
 
 
 def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Projection:
-    """Return the projection of a camera onto a picture of ``finer`` times as many pixels a side.
+    """Return the projection of a camera, supersampled ``finer`` times per axis.
 
     Args:
         camera: A batch of one.
-        origin: Origin of the points that will be projected, shape ``(3,)``; taken in float64, so
-            that clouds far from zero keep their precision.
-        finer: Pixels along the side of each pixel of the camera.
+        origin: Origin of the points, shape ``(3,)``; applied in float64, so that clouds far from
+            zero keep their precision.
+        finer: Subpixels per pixel and axis.
 
     Returns:
         The projection, float32.
@@ -199,7 +199,7 @@ def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Pro
 
 
 def _bounds(values: Tensor) -> tuple[float, float]:
-    """Return the smallest and the largest value, or zeros if there are none."""
+    """Return the minimum and maximum, or zeros if empty."""
     if len(values) == 0:
         return 0.0, 0.0
     low, high = values.aminmax()

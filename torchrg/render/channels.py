@@ -1,4 +1,4 @@
-"""What the colours of a page can mean: numbers of each point, and the colour of each number."""
+"""Color channels of a viewer: values per point, and their colors."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -23,47 +23,47 @@ from torchrg.structures import UNLABELED
 MODES = {
     "plane": ("planes", "labels"),
     "superpoint": ("superpoints", "superpoint"),
-    "color": ("own colours", "color"),
+    "color": ("point colors", "color"),
     "normal": ("normals", "normals"),
     "curvature": ("curvature", "curvature"),
     "sharp": ("sharp feature points", "sharp"),
-    "error": ("errors of planes", "labels"),
-    "normal-error": ("errors of normals", "normals"),
+    "error": ("plane errors", "labels"),
+    "normal-error": ("normal errors", "normals"),
 }
-"""Meanings of colours: what a page calls them, and the field that they need."""
+"""Color modes: their name in the viewer, and the required field."""
 
 OUTCOMES = {
-    "right": ((214, 224, 214), "in the region of their face"),
-    "part": ((245, 170, 40), "in a second region of their face"),
-    "other": ((205, 45, 60), "in the region of another face"),
-    "none": ((50, 95, 190), "in no region"),
+    "right": ((214, 224, 214), "in the matching region"),
+    "part": ((245, 170, 40), "in a second region of its plane"),
+    "other": ((205, 45, 60), "in the region of another plane"),
+    "none": ((50, 95, 190), "unlabeled"),
 }
-"""Fates of a point against the truth: colour, and what it means."""
+"""Outcomes of a point against ground truth: color and meaning."""
 
 _OCTAHEDRON_STEPS = 254
-"""Steps along the sides of the square onto which directions are mapped: about one degree. An even
-number, so that the axes are mapped exactly."""
+"""Steps along the sides of the octahedral map: about one degree. Even, so that the axes are
+exact."""
 _DIRECTION_BITS = 6
-"""Bits of each coordinate of that square that tell a colour."""
+"""Bits per coordinate of the octahedral map that select a color."""
 _CURVATURE_END = 0.1
-"""Curvature at the end of its scale of colours."""
+"""Curvature at the end of the color scale."""
 _WORST_ANGLE_DEG = 45.0
-"""Error of a normal at the end of its scale of colours."""
+"""Normal error at the end of the color scale, in degrees."""
 _LEVELS = 255
-"""Steps of a scale of colours."""
+"""Number of steps of a color scale."""
 
 Legend = list[tuple[list[int], str]]
 
 
 class Channel(NamedTuple):
-    """One meaning of the colours.
+    """Values of one color mode.
 
     Attributes:
         mode: A key of :data:`MODES`.
-        values: Row of each point in ``colors``, shape ``(n,)``, unsigned; or, without ``colors``,
-            its colour, shape ``(n, 3)``, uint8.
+        values: Row of ``colors`` for each point, shape ``(n,)``, unsigned; if ``colors`` is None,
+            color of each point, shape ``(n, 3)``, uint8.
         colors: Shape ``(C, 3)``, uint8.
-        legend: Colours and what they mean.
+        legend: Colors and their meaning.
     """
 
     mode: str
@@ -72,30 +72,30 @@ class Channel(NamedTuple):
     legend: Legend
 
 
-def channels_of(
+def make_channels(
     fields: Mapping[str, Tensor],
     truth: Mapping[str, Tensor],
     palettes: Mapping[str, tuple[Tensor, Tensor]],
 ) -> Iterator[Channel]:
-    """Yield all that the fields of points can be coloured by, in the order of :data:`MODES`.
+    """Yield the available color channels, in the order of :data:`MODES`.
 
     Args:
         fields: Fields of n points; see :class:`torchrg.structures.Cloud`. Labels and superpoints
-            are numbered without gaps.
-        truth: ``labels`` or ``normals`` of the same points.
-        palettes: Of the modes ``plane`` and ``superpoint``, where there are such fields: what
-            :func:`torchrg.render.colors.palette_of_planes` returns, its first part for the points.
+            are consecutive.
+        truth: Ground-truth ``labels`` or ``normals`` of the same points.
+        palettes: Results of :func:`torchrg.render.colors.palette_of_planes` for the available modes
+            of ``plane`` and ``superpoint``, with rows of the n points.
     """
     if "labels" in fields:
-        yield _of_regions("plane", fields["labels"], *palettes["plane"])
+        yield _region_channel("plane", fields["labels"], *palettes["plane"])
     if "superpoint" in fields:
-        yield _of_regions("superpoint", fields["superpoint"], *palettes["superpoint"])
+        yield _region_channel("superpoint", fields["superpoint"], *palettes["superpoint"])
     if "color" in fields:
         yield Channel("color", fields["color"].numpy(), None, [])
     if "normals" in fields:
-        yield _of_normals(fields["normals"])
+        yield _normal_channel(fields["normals"])
     if "curvature" in fields:
-        yield _of_curvature(fields["curvature"])
+        yield _curvature_channel(fields["curvature"])
     if "sharp" in fields:
         colors = color_sharp(torch.tensor([False, True])).numpy()
         legend = [(colors[0].tolist(), "smooth"), (colors[1].tolist(), "sharp")]
@@ -106,24 +106,24 @@ def channels_of(
         colors = np.array([color for color, _ in meanings], dtype=np.uint8)
         yield Channel("error", values, colors, meanings)
     if "normals" in fields and "normals" in truth:
-        yield _of_angles(unsigned_angle_deg(fields["normals"], truth["normals"]))
+        yield _angle_channel(unsigned_angle_deg(fields["normals"], truth["normals"]))
 
 
-def _of_regions(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Channel:
-    """Return the colours of regions by their number; the last colour is that of points in none."""
+def _region_channel(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Channel:
+    """Return the colors of regions by label; the last color is for unlabeled points."""
     none = int(labels.max()) + 1 if len(labels) else 0
     values = torch.where(labels < 0, none, labels)
     colors = palette[-1:].repeat(none + 1, 1)
     colors[values] = palette[rows]
-    legend = [([UNLABELED_GRAY] * 3, f"in no {mode}")] if bool((rows < 0).any()) else []
+    legend = [([UNLABELED_GRAY] * 3, "unlabeled")] if bool((rows < 0).any()) else []
     return Channel(mode, values.numpy().astype(np.min_scalar_type(none)), colors.numpy(), legend)
 
 
-def _of_normals(normals: Tensor) -> Channel:
-    """Return the colours of directions, by their place on the octahedron."""
-    places = encode_directions(normals)
+def _normal_channel(normals: Tensor) -> Channel:
+    """Return the colors of directions, by their octahedral coordinates."""
+    codes = encode_directions(normals)
     shift = 8 - _DIRECTION_BITS
-    values = (places[:, 0].astype(np.uint16) >> shift << _DIRECTION_BITS) | (places[:, 1] >> shift)
+    values = (codes[:, 0].astype(np.uint16) >> shift << _DIRECTION_BITS) | (codes[:, 1] >> shift)
     values[(normals == 0).all(dim=1).numpy()] = 1 << 2 * _DIRECTION_BITS
     steps = (np.arange(1 << _DIRECTION_BITS) << shift) + (1 << shift - 1)
     square = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -134,8 +134,8 @@ def _of_normals(normals: Tensor) -> Channel:
     return Channel("normal", values, colors, legend)
 
 
-def _on_scale(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Channel:
-    """Return the colours of shares of a scale, and of those whose meaning is shown."""
+def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Channel:
+    """Return the colors of fractions of a scale, with a legend for selected values."""
     steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
     colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
     legend = [
@@ -145,35 +145,35 @@ def _on_scale(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Chann
     return Channel(mode, values, colors, legend)
 
 
-def _of_curvature(curvature: Tensor) -> Channel:
-    """Return the colours of curvature; they go with its root, as the numbers do."""
+def _curvature_channel(curvature: Tensor) -> Channel:
+    """Return the colors of curvature, on a square-root scale."""
     shown = {math.sqrt(value / _CURVATURE_END): f"{value:g}" for value in (0.0, 0.01, 0.03)}
     shown[1.0] = f"{_CURVATURE_END:g} and more"
-    return _on_scale("curvature", (curvature / _CURVATURE_END).clamp(min=0).sqrt(), shown)
+    return _scale_channel("curvature", (curvature / _CURVATURE_END).clamp(min=0).sqrt(), shown)
 
 
-def _of_angles(angles_deg: Tensor) -> Channel:
-    """Return the colours of angles between normals and their truth."""
+def _angle_channel(angles_deg: Tensor) -> Channel:
+    """Return the colors of the angles between normals and ground truth."""
     shown = {angle / _WORST_ANGLE_DEG: f"{angle:g} degrees" for angle in (0, 5, 20, 45)}
-    return _on_scale("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
+    return _scale_channel("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
 
 
 def outcomes_of(
     labels: Tensor | NDArray[np.integer], truth: Tensor | NDArray[np.integer]
 ) -> Tensor:
-    """Return what became of each point, as a place in :data:`OUTCOMES`.
+    """Return the outcome of each point as an index of :data:`OUTCOMES`.
 
     Args:
         labels: Regions, shape ``(N,)``.
-        truth: Faces, shape ``(N,)``.
+        truth: Ground-truth planes, shape ``(N,)``.
 
     Returns:
-        Shape ``(N,)``, int64: 0 where the region of the point is the partner of its face, 1 where
-        it is another one whose largest part is that face, 2 where it is mostly of other faces, 3
-        where the point is in no region.
+        Shape ``(N,)``, int64: 0 if the region matches the point's plane, 1 if it is another region
+        with that plane as its largest part, 2 if it consists mostly of other planes, 3 if the point
+        is unlabeled.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is invalid.
 
     Example:
         >>> outcomes_of(torch.tensor([0, 0, 0, 1, 2, -1]), torch.tensor([5, 5, 5, 5, 6, 6]))
@@ -184,23 +184,23 @@ def outcomes_of(
     pairs = match_regions(table)
     partner = torch.full_like(table.region_labels, UNLABELED - 1)
     partner[table.regions[pairs]] = table.face_labels[table.faces[pairs]]
-    # Overlaps by region, the largest first; the first of each region is that with its main face.
+    # Overlaps sorted by region, largest first; the first of each region is its main plane.
     order = np.lexsort((-table.overlaps.numpy(), table.regions.numpy()))
     rows, first = np.unique(table.regions.numpy()[order], return_index=True)
     main = torch.full_like(table.region_labels, UNLABELED - 1)
     main[rows] = table.face_labels[table.faces[order[first]]]
     outcome = torch.full_like(regions, 3)
     labeled = regions != UNLABELED
-    places = torch.searchsorted(table.region_labels, regions[labeled])
+    indices = torch.searchsorted(table.region_labels, regions[labeled])
     face = faces[labeled]
     outcome[labeled] = torch.where(
-        partner[places] == face, 0, torch.where(main[places] == face, 1, 2)
+        partner[indices] == face, 0, torch.where(main[indices] == face, 1, 2)
     )
     return outcome
 
 
 def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
-    """Map unit vectors ``(n, 3)`` to an octahedron, unfolded to a square [1]: two bytes each.
+    """Encode unit vectors ``(n, 3)`` by an octahedral map [1] as two bytes each.
 
     References:
         [1] Z. Cigolle et al. A survey of efficient representations for independent unit vectors.
@@ -221,14 +221,14 @@ def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
     return steps.numpy().astype(np.uint8)
 
 
-def decode_directions(places: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the unit vectors ``(n, 3)`` of :func:`encode_directions`.
+def decode_directions(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Decode the unit vectors ``(n, 3)`` of :func:`encode_directions`.
 
     Example:
         >>> decode_directions(np.array([[254, 127]], dtype=np.uint8)).tolist()
         [[1.0, 0.0, 0.0]]
     """
-    x, y = (places.astype(np.float32) / _OCTAHEDRON_STEPS * 2 - 1).T
+    x, y = (codes.astype(np.float32) / _OCTAHEDRON_STEPS * 2 - 1).T
     z = 1 - np.abs(x) - np.abs(y)
     fold = np.maximum(-z, 0)
     directions = np.stack([x - np.copysign(fold, x), y - np.copysign(fold, y), z], axis=1)

@@ -1,4 +1,4 @@
-"""Colours for planes, normals, curvature and sharp points, chosen by how different they look."""
+"""Perceptually distinct colors for planes, normals, curvature and sharp points."""
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torchrg.regions.adjacency import NUM_CONTACTS, NearestPoints
 
 
 def rgb_to_lab(colors: Tensor) -> Tensor:
-    """Convert sRGB in [0, 1], shape ``(*, 3)``, to CIE Lab, whose distances tell how much differs.
+    """Convert sRGB in [0, 1], shape ``(*, 3)``, to CIE Lab, where distances are perceptual.
 
     Example:
         >>> rgb_to_lab(torch.tensor([1.0, 1.0, 1.0])).round().abs()
@@ -29,7 +29,7 @@ def rgb_to_lab(colors: Tensor) -> Tensor:
 
 
 def _lab_to_rgb(colors: Tensor) -> Tensor:
-    """Convert CIE Lab to sRGB; values outside [0, 1] are colours no screen shows."""
+    """Convert CIE Lab to sRGB; values outside [0, 1] are out of gamut."""
     from kornia.color import lab_to_rgb as of_image
 
     rgb: Tensor = of_image(_as_image(colors), clip=False)[0, :, :, 0].T.reshape(colors.shape)
@@ -37,61 +37,59 @@ def _lab_to_rgb(colors: Tensor) -> Tensor:
 
 
 def _as_image(colors: Tensor) -> Tensor:
-    """Return colours ``(*, 3)`` as an image of one column ``(1, 3, N, 1)``."""
+    """Reshape colors ``(*, 3)`` to an image of one column ``(1, 3, N, 1)``."""
     return colors.reshape(-1, 3).T[None, :, :, None]
 
 
 def _to_bytes(colors: Tensor) -> Tensor:
-    """Return sRGB colours in [0, 1] as uint8, what is outside cut off."""
+    """Convert sRGB colors in [0, 1] to uint8, clipping values outside."""
     return (colors.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 UNLABELED_GRAY = 176
-"""Red, green and blue of points that belong to no plane."""
+"""Red, green and blue of unlabeled points."""
 
 _CALM = (
     "f0a7bc f1aa9c deb487 bebf86 98c79a 74cbba 66c9db 81c3ef b0b8f0 daaddc "
     "fdd3d4 ffd4bf f0dbab cfe4b4 aeeacd 99ebeb abe5fe cadeff e6d6ff ffcfea"
 )
-"""Colours of large planes: 10 hues of chroma 30 and 26 in CIE Lab, lightness 76 and 88."""
+"""Colors of large planes: 10 hues of chroma 30 and 26 in CIE Lab, lightness 76 and 88."""
 _VIVID = (
     "b6396a b53f41 a4511c 856303 606f00 297727 077758 077472 107284 0c7098 026abb 7159b2 a04592 "
     "e26077 d96c4f bf7d30 9a8d25 6d9838 269f5d 029d8a 079aa5 0297bd 1392db 7385e4 b372cb d663a3 "
     "fe8eb2 fe928c f99960 d7aa4b abb850 76c26d 16c897 14c4c1 13c1df 13bdfe 84b1fe bea1ff f08fdf"
 )
-"""Colours of small planes, which are easier to see: 13 hues of chroma up to 54, lightness 44, 58
-and 72."""
-_LARGE = 0.03
-"""Share of all points from which on a plane is large."""
-_ALIKE = 120.0
-"""Squared distance in CIE Lab of two colours that look about the same."""
-_WITHOUT_CONE = 0.5
-"""Weight of what the colour-blind see. With less, planes side by side look alike to them; with
-more, to all others."""
-_AXES_WITHOUT_CONE = ((0.0, 1.0), (1.07, 0.56))
-"""Directions in the axes a and b of CIE Lab that eyes without one kind of cones see: blue against
-yellow without the long or the middle ones, red against cyan without the short ones. Fitted to the
-palette seen by the model of Machado et al., A physiologically-based model for simulation of color
-vision deficiency, 2009."""
-_ELSEWHERE = 0.005
-"""Least weight of a plane that is not beside the one that gets a colour; a neighbour has 1."""
+"""Colors of small planes, more visible: 13 hues of chroma up to 54, lightness 44, 58 and 72."""
+_MIN_LARGE_FRACTION = 0.03
+"""Minimum fraction of all points in a large plane."""
+_SIMILAR = 120.0
+"""Squared distance in CIE Lab of two colors that look about the same."""
+_DICHROMACY_WEIGHT = 0.5
+"""Weight of color vision deficiency. With less, adjacent planes look alike to color-blind viewers;
+with more, to all other viewers."""
+_DICHROMACY_AXES = ((0.0, 1.0), (1.07, 0.56))
+"""Directions in the a-b plane of CIE Lab visible without one kind of cones: blue-yellow without the
+long or middle ones, red-cyan without the short ones. Fitted to the palette under the model of
+Machado et al., A physiologically-based model for simulation of color vision deficiency, 2009."""
+_MIN_WEIGHT = 0.005
+"""Minimum weight of a plane that is not adjacent; adjacent planes have weight 1."""
 _GRAY_WEIGHT = 0.05
-"""Weight of the gray of points in no plane, which are nearly everywhere."""
+"""Weight of the gray of unlabeled points, which occur nearly everywhere."""
 PALETTE = torch.tensor([list(bytes.fromhex(row)) for row in f"{_CALM} {_VIVID}".split()]).byte()
-"""Colours of planes, the calm ones first, shape ``(59, 3)``, uint8."""
+"""Colors of planes, calm ones first, shape ``(59, 3)``, uint8."""
 
 
-def _likeness() -> Tensor:
-    """Return how alike each colour of the palette looks to each, and to gray, ``(59, 60)``.
+def _similarity() -> Tensor:
+    """Return the similarity of palette colors to each other and to gray, ``(59, 60)``.
 
-    That is to eyes with three kinds of cones, and with a weight to those of the worst dichromacy.
+    Combines normal color vision with the weighted worst dichromacy.
     """
     gray = PALETTE.new_full((1, 3), UNLABELED_GRAY)
     labs = rgb_to_lab(torch.cat([PALETTE, gray]).double() / 255)
     light, a, b = (labs[: len(PALETTE), None] - labs).unbind(dim=2)
-    worst = torch.stack([(a * x + b * y).square() for x, y in _AXES_WITHOUT_CONE]).amin(dim=0)
-    usual, worst = light**2 + a**2 + b**2, light**2 + worst
-    return 1 / (usual + _ALIKE) + _WITHOUT_CONE / (worst + _ALIKE)
+    worst = torch.stack([(a * x + b * y).square() for x, y in _DICHROMACY_AXES]).amin(dim=0)
+    trichromatic, worst = light**2 + a**2 + b**2, light**2 + worst
+    return 1 / (trichromatic + _SIMILAR) + _DICHROMACY_WEIGHT / (worst + _SIMILAR)
 
 
 def choose_colors(
@@ -101,20 +99,20 @@ def choose_colors(
     *,
     fixed: Tensor | None = None,
 ) -> Tensor:
-    """Choose a row of the palette for each plane, the largest first, far from those before.
+    """Choose a palette row for each plane greedily, the largest plane first.
 
-    Each chosen colour repels with the inverse square of its distance in Lab: that of a neighbour,
-    in ``pairs`` ``(E, 2)``, with its weight, any other with a little. Where ``fixed`` is not
-    negative it is the choice.
+    Each chosen color repels later ones with the inverse square of its distance in Lab: the color of
+    an adjacent plane, in ``pairs`` ``(E, 2)``, with its weight, others weakly. Nonnegative entries
+    of ``fixed`` are kept.
 
     Example:
         >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))
         >>> len(choices.unique())
         2
     """
-    repulsion = _likeness().T
+    repulsion = _similarity().T
     fraction = sizes / sizes.sum()
-    strength = (8 * fraction).clamp(_ELSEWHERE, 1).double()
+    strength = (8 * fraction).clamp(_MIN_WEIGHT, 1).double()
     choices = torch.full_like(sizes, -1) if fixed is None else fixed.clone()
     done = choices >= 0
     field = strength[done] @ repulsion[choices[done]] + _GRAY_WEIGHT * repulsion[-1]
@@ -129,7 +127,7 @@ def choose_colors(
         near = slice(starts[plane], starts[plane + 1])
         placed = choices[others[near]]
         cost = field + (pull[near] * (placed >= 0)) @ repulsion[placed]
-        calm = bool(fraction[plane] > _LARGE)
+        calm = bool(fraction[plane] > _MIN_LARGE_FRACTION)
         pick = cost[:num_calm].argmin() if calm else num_calm + cost[num_calm:].argmin()
         choices[plane] = pick
         field += strength[plane] * repulsion[pick]
@@ -137,9 +135,9 @@ def choose_colors(
 
 
 _HORIZONTAL_LIGHTNESS, _UPRIGHT_LIGHTNESS = 84.0, 60.5
-"""Lightness in CIE Lab of horizontal and of upright surfaces: floors are lighter than walls."""
+"""Lightness in CIE Lab of horizontal and vertical surfaces: floors are lighter than walls."""
 _CHROMA = 42.0
-"""Chroma in CIE Lab of upright surfaces, which tells their hues apart."""
+"""Chroma in CIE Lab of vertical surfaces, which distinguishes their hues."""
 _RAMP = (
     (88.4, 0.0, 0.0),
     (84.6, 6.8, 41.2),
@@ -147,29 +145,29 @@ _RAMP = (
     (45.1, 60.6, 25.3),
     (19.0, 44.1, -21.7),
 )
-"""Scale of the curvature in CIE Lab: light gray, yellow, orange, red, violet, darker all the way,
-so that it is a scale in print as well."""
+"""Curvature scale in CIE Lab: light gray, yellow, orange, red, violet, with decreasing lightness,
+so that it also works in print."""
 _REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
-"""Red, green and blue of regular points, light gray, and of sharp ones, red."""
+"""Red, green and blue of regular points (light gray) and of sharp ones (red)."""
 
 
 def color_normals(
     normals: Tensor | NDArray[np.floating], *, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 ) -> Tensor:
-    """Colour normals by direction; a normal and its opposite get the same colour.
+    """Color normals by direction; opposite normals get the same color.
 
-    Horizontal surfaces are light gray. Upright ones are coloured by the direction they face, with
-    perpendicular walls in opposite hues. Slanted ones are between.
+    Horizontal surfaces are light gray. Vertical surfaces are colored by the direction they face,
+    with perpendicular walls in opposite hues. Slanted surfaces are in between.
 
     Args:
-        normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero where there is none.
-        up: Upward direction.
+        normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero if unknown.
+        up: Up direction.
 
     Returns:
-        Shape ``(*, 3)``, uint8; gray where there is no normal.
+        Shape ``(*, 3)``, uint8; gray for unknown normals.
 
     Raises:
-        ShapeError: If the shape or dtype is not as above.
+        ShapeError: If the shape or dtype is invalid.
         ConfigError: If ``up`` is zero.
 
     Example:
@@ -194,19 +192,19 @@ def color_normals(
 def color_curvature(
     curvature: Tensor | NDArray[np.floating], *, max_curvature: float = 0.1
 ) -> Tensor:
-    """Colour curvature from light gray over yellow and red to dark violet.
+    """Color curvature from light gray through yellow and red to dark violet.
 
-    The scale goes with the root of the curvature, and is the same for every cloud.
+    The scale is proportional to the square root of the curvature, and the same for every cloud.
 
     Args:
         curvature: Surface variation in [0, 1/3], shape ``(*)``.
-        max_curvature: Where the scale ends.
+        max_curvature: End of the scale.
 
     Returns:
         Shape ``(*, 3)``, uint8.
 
     Raises:
-        ShapeError: If the dtype is not as above.
+        ShapeError: If the dtype is invalid.
         ConfigError: If ``max_curvature`` is not positive.
 
     Example:
@@ -219,15 +217,15 @@ def color_curvature(
         raise ConfigError(
             f"color_curvature: expected max_curvature to be positive, got {max_curvature!r}."
         )
-    place = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
-    before = place.long().clamp(max=len(_RAMP) - 2)
+    position = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
+    before = position.long().clamp(max=len(_RAMP) - 2)
     ramp = tensor.new_tensor(_RAMP)
-    lab = torch.lerp(ramp[before], ramp[before + 1], (place - before)[..., None])
+    lab = torch.lerp(ramp[before], ramp[before + 1], (position - before)[..., None])
     return _to_bytes(_lab_to_rgb(lab))
 
 
 def color_sharp(sharp: Tensor | NDArray[np.generic]) -> Tensor:
-    """Colour sharp feature points red and all others light gray.
+    """Color sharp feature points red and all others light gray.
 
     Args:
         sharp: Shape ``(*)``, bool.
@@ -251,7 +249,7 @@ def color_sharp(sharp: Tensor | NDArray[np.generic]) -> Tensor:
 
 
 _NEIGHBORHOODS = ((256, 1.0), (48, 0.2))
-"""Voxels along the longest side of the cloud whose neighbours touch, and how much they count."""
+"""Number of voxels along the longest side of the cloud, and weight of planes in adjacent voxels."""
 
 
 def color_planes(
@@ -260,27 +258,27 @@ def color_planes(
     *,
     reference: Tensor | NDArray[np.generic] | None = None,
 ) -> Tensor:
-    """Colour the points of each plane.
+    """Color the points of each plane.
 
-    Planes get their colours one by one, the largest first: each the colour of a fixed palette that
-    is farthest from those of the planes next to it and, less so, from all others. Large planes get
-    calm colours, small ones vivid colours.
+    Planes are colored greedily, the largest first: each gets the color of a fixed palette that is
+    most distinct from adjacent planes and, with less weight, from all others. Large planes get calm
+    colors, small ones vivid colors.
 
     Convention:
-        The colours do not depend on the order of the points.
+        The colors do not depend on the order of the points.
 
     Args:
         labels: Plane of each point, shape ``(*)``, integers; ``UNLABELED`` for none.
-        points: Points, shape ``(*, 3)``, which tell what lies next to what. Default: nothing does.
+        points: Points, shape ``(*, 3)``, which define adjacency. Default: no adjacency.
         reference: Other labels of the same points, shape ``(*)``. A plane of ``labels`` and one of
-            ``reference`` that are each other's largest overlap get one colour, that of
-            ``color_planes(reference, points)``. For pictures side by side.
+            ``reference`` that are each other's largest overlap share the color of
+            ``color_planes(reference, points)``. For images side by side.
 
     Returns:
-        Shape ``(*, 3)``, uint8; points of no plane are gray.
+        Shape ``(*, 3)``, uint8; unlabeled points are gray.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is invalid.
 
     Example:
         >>> colors = color_planes(torch.tensor([0, 0, 1, -1]))
@@ -306,10 +304,10 @@ def palette_of_planes(
     *,
     reference: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return each point's row in a palette ``(N,)``, and the palette ``(M + 1, 3)``, uint8.
+    """Return each point's palette row ``(N,)``, and the palette ``(M + 1, 3)``, uint8.
 
-    Its rows are the labels that occur, ascending, and gray, which row -1 is as well. The arguments
-    are those of :func:`color_planes`, with one axis.
+    Palette rows are the existing labels, ascending, and gray, also for row -1. The arguments are
+    those of :func:`color_planes`, with one axis.
     """
     fixed = None
     if reference is not None:
@@ -328,14 +326,14 @@ def _choose(
     points: Tensor | None,
     fixed: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return each point's row among the labels that occur, and the palette's row of each label."""
+    """Return each point's index among the existing labels, and the palette row of each label."""
     rows = number_labels(labels)[1]
     sizes = torch.bincount(rows[rows >= 0])
     pairs, weights = [sizes.new_zeros((0, 2))], [torch.zeros(0, dtype=torch.float64)]
     if points is not None:
         counted = (rows >= 0) & points.isfinite().all(dim=-1)
         for num_voxels, weight in _NEIGHBORHOODS:
-            pairs.append(_touching_planes(points[counted], rows[counted], num_voxels))
+            pairs.append(_adjacent_planes(points[counted], rows[counted], num_voxels))
             weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
     choices = choose_colors(
         sizes.cpu(),
@@ -346,8 +344,8 @@ def _choose(
     return rows, choices.to(labels.device)
 
 
-def _touching_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
-    """Return the pairs of planes in neighbouring voxels, shape ``(E, 2)``."""
+def _adjacent_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
+    """Return the pairs of planes in adjacent voxels, shape ``(E, 2)``."""
     extent = float((points.amax(dim=0) - points.amin(dim=0)).amax()) if len(points) else 0.0
     if extent == 0:
         return labels.new_zeros((0, 2))

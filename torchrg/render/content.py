@@ -1,4 +1,4 @@
-"""What a page says about a cloud: its axes, the points it shows, its planes, what closes it."""
+"""Content of a viewer: axes, displayed points, planes and outer sides."""
 
 from dataclasses import replace
 from importlib.util import find_spec
@@ -23,52 +23,51 @@ from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
 NUM_STRATA = 8
-"""Random parts of the points, each along a Morton curve. While the page moves on a slow machine it
-draws the first ones; along a curve, positions compress to two thirds."""
+"""Number of random strata of the points, each sorted along a Morton curve. While the camera moves,
+slow machines draw only the first strata; sorting compresses positions to two thirds."""
 PAGE_EXTENT = 10.0
-"""The longest side of a cloud on a page: pages do not depend on the unit."""
+"""Longest side of a cloud in a viewer; independent of the unit."""
 _OUTLINE_POINTS = 200_000
-"""Points through which outlines are traced: enough for a picture."""
-_NOT_SHOWN = ("id", "centroid", "axes", "center", "outline")
-"""Columns of the plane table that a page draws or does not need."""
-_USUAL_RADIUS = 128
-"""Byte of a point with the usual radius, in the middle of what a byte holds."""
-_STEPS_OF_OCTAVE = 16
-"""Steps of the byte in which the radius of a point doubles: one step is 4 percent."""
-_LARGEST_SPACING = 3.0
-"""Largest ratio of a point's radius to the usual one, and of the usual one to it."""
+"""Number of points from which polygons are traced; enough for display."""
+_OMITTED_COLUMNS = ("id", "centroid", "axes", "center", "outline")
+"""Columns of the plane table that a viewer draws or omits."""
+_MEDIAN_RADIUS = 128
+"""Encoded median radius, in the middle of the byte range."""
+_STEPS_PER_OCTAVE = 16
+"""Steps of the encoded radius per factor of two: one step is 4 percent."""
+_MAX_SPACING_RATIO = 3.0
+"""Maximum ratio of a point's radius to the median, in either direction."""
 
 
-class Frame(NamedTuple):
-    """Where a page's axes are: z up, the middle of the first cloud in the origin.
+class PageFrame(NamedTuple):
+    """Axes of a viewer: z up, the center of the first cloud at the origin.
 
     Attributes:
-        origin: In the coordinates of the files, shape ``(3,)``, float64.
-        rotation: Rows are the axes of the page, shape ``(3, 3)``, float64.
-        scale: Length of a unit of the page, in the unit of the cloud.
+        origin: Origin in file coordinates, shape ``(3,)``, float64.
+        rotation: Axes of the viewer as rows, shape ``(3, 3)``, float64.
+        scale: Length of a viewer unit, in units of the cloud.
     """
 
     origin: Tensor
     rotation: Tensor
     scale: float
 
-    def place(self, points: Tensor, origin: NDArray[np.float64]) -> Tensor:
-        """Return points about an origin in the axes of the page, float32."""
+    def transform(self, points: Tensor, origin: NDArray[np.float64]) -> Tensor:
+        """Transform points relative to an origin to viewer axes, float32."""
         moved = points.double() + (torch.from_numpy(origin) - self.origin)
         return (moved @ self.rotation.T / self.scale).float()
 
 
-class Shown(NamedTuple):
-    """The points of a cloud that a page shows.
+class PointSample(NamedTuple):
+    """Points of a cloud displayed in a viewer.
 
     Attributes:
-        rows: Those that are shown, by strata, shape ``(n,)``.
-        levels: Number of points in the first stratum, in the first two, and so on.
-        points: In the axes of the page, shape ``(n, 3)``, float32.
-        fields: Fields of those points; normals are in the axes of the page, and labels numbered
-            without gaps.
-        surface: The surface through those points, in the axes of the page.
-        sides: Its outer sides.
+        rows: Displayed rows, by strata, shape ``(n,)``.
+        levels: Cumulative number of points of the strata.
+        points: Points in viewer axes, shape ``(n, 3)``, float32.
+        fields: Fields of those points; normals are in viewer axes, labels are consecutive.
+        surface: Surface of those points, in viewer axes.
+        sides: Outer sides of the surface.
     """
 
     rows: Tensor
@@ -79,30 +78,30 @@ class Shown(NamedTuple):
     sides: Sides
 
 
-def frame_of(cloud: Cloud, up: tuple[float, float, float]) -> Frame:
-    """Return the axes of a page for its first cloud."""
+def make_frame(cloud: Cloud, up: tuple[float, float, float]) -> PageFrame:
+    """Return the axes of a viewer for its first cloud."""
     third = unit_direction("make_page", up)
-    # With z up, x stays x; else the axis least along the upward one, so that x is never up.
+    # With z up, x stays x; otherwise use the axis most perpendicular to the up direction.
     start = torch.zeros(3, dtype=torch.float64)
     start[int(third.abs().argmin())] = 1
     first = functional.normalize(start - (start @ third) * third, dim=0)
     rotation = torch.stack([first, torch.linalg.cross(third, first), third])
     finite = cloud.coordinates[cloud.finite]
     if len(finite) == 0:
-        return Frame(torch.zeros(3, dtype=torch.float64), rotation, 1.0)
+        return PageFrame(torch.zeros(3, dtype=torch.float64), rotation, 1.0)
     low, high = (
         torch.from_numpy(end(axis=0).astype(np.float64)) for end in (finite.min, finite.max)
     )
     extent = float((high - low).amax())
-    return Frame(low + (high - low) / 2, rotation, extent / PAGE_EXTENT if extent > 0 else 1.0)
+    return PageFrame(low + (high - low) / 2, rotation, extent / PAGE_EXTENT if extent > 0 else 1.0)
 
 
-def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
-    """Choose the points to show: the same whatever their order, and in random strata."""
+def choose_points(result: Result, frame: PageFrame, max_points: int) -> PointSample:
+    """Sample the points to display, in random strata, independent of their order."""
     cloud = result.cloud
     finite = finite_rows(cloud.points)
-    mixed = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
-    strata = [stratum.sort().values for stratum in mixed.tensor_split(NUM_STRATA)]
+    shuffled = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
+    strata = [stratum.sort().values for stratum in shuffled.tensor_split(NUM_STRATA)]
     levels = torch.tensor([len(stratum) for stratum in strata]).cumsum(0).tolist()
     rows = finite[torch.cat(strata)]
     fields = {
@@ -118,34 +117,33 @@ def choose_points(result: Result, frame: Frame, max_points: int) -> Shown:
     if "superpoint" in fields:
         parts = result.fields["superpoint"].long()
         fields["superpoint"] = number_labels(parts.clamp(min=-1))[1][rows]
-    points = frame.place(cloud.points[rows], cloud.origin)
+    points = frame.transform(cloud.points[rows], cloud.origin)
     surface = sample_surface(points)
     labels = fields["labels"][surface.rows] if "labels" in fields else None
     sides = find_sides(surface, labels, torch.tensor([0.0, 0.0, 1.0]))
-    return Shown(rows, levels, points, fields, surface, sides)
+    return PointSample(rows, levels, points, fields, surface, sides)
 
 
-def radii_of(shown: Shown) -> Tensor:
-    """Return the radius of each point as a byte, 16 steps to an octave, 128 the usual one."""
+def encode_radii(shown: PointSample) -> Tensor:
+    """Return the encoded radius of each point: 16 steps per factor of two, 128 is the median."""
     surface, labels = shown.surface, shown.fields.get("labels")
-    usual = float(surface.spacing.median()) if len(surface.spacing) else 0.0
-    if usual == 0:
-        return torch.full((len(surface.rows),), _USUAL_RADIUS, dtype=torch.uint8)
+    median_spacing = float(surface.spacing.median()) if len(surface.spacing) else 0.0
+    if median_spacing == 0:
+        return torch.full((len(surface.rows),), _MEDIAN_RADIUS, dtype=torch.uint8)
     labels = None if labels is None else labels[surface.rows]
-    ratio = surface.disc_spacing(_LARGEST_SPACING, labels) / usual
-    octaves = ratio.clamp(min=1 / _LARGEST_SPACING).log2()
-    return (octaves * _STEPS_OF_OCTAVE + _USUAL_RADIUS).round().to(torch.uint8)
+    ratio = surface.disc_spacing(_MAX_SPACING_RATIO, labels) / median_spacing
+    octaves = ratio.clamp(min=1 / _MAX_SPACING_RATIO).log2()
+    return (octaves * _STEPS_PER_OCTAVE + _MEDIAN_RADIUS).round().to(torch.uint8)
 
 
-def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str, object]]:
-    """Return what a page says about each plane, by the number that its points have there.
+def page_planes(result: Result, shown: PointSample, frame: PageFrame) -> list[dict[str, object]]:
+    """Return the plane entries of a viewer, by viewer label.
 
-    It is the table of the result: the columns of :func:`torchrg.result.describe_planes` but for
-    those that are drawn, ``rings`` in the axes of the page, and which planes it ``meets``, at which
-    angle and along which length. Kinds go by the upward direction of the page where the result has
-    none.
+    Entries have the columns of :func:`torchrg.result.describe_planes` that are not drawn, ``rings``
+    in viewer axes, and ``meets``: adjacent planes with angle and boundary length. Planes without
+    classes are classified by the up axis of the viewer.
     """
-    planes, origin, table = result.planes, result.cloud.origin, describe_shown(result, frame)
+    planes, origin, table = result.planes, result.cloud.origin, displayed_table(result, frame)
     if not planes:
         return []
     meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
@@ -157,19 +155,19 @@ def planes_of_page(result: Result, shown: Shown, frame: Frame) -> list[dict[str,
     rings = planes.outline or _trace(planes, shown.rows, result)
     corners = _rectangles(planes)
     return [
-        {name: value for name, value in row.items() if name not in _NOT_SHOWN}
+        {name: value for name, value in row.items() if name not in _OMITTED_COLUMNS}
         | {
             "name": row["id"],
             "kind": PLANE_KINDS.index(row["kind"]),
-            "rings": [rounded(frame.place(ring, origin)) for ring in outline or (rectangle,)],
+            "rings": [rounded(frame.transform(ring, origin)) for ring in outline or (rectangle,)],
             "meets": met,
         }
         for row, outline, rectangle, met in zip(table["planes"], rings, corners, meets, strict=True)
     ]
 
 
-def describe_shown(result: Result, frame: Frame) -> Json:
-    """Return the table of a result as a page has it, its ids the labels of the file."""
+def displayed_table(result: Result, frame: PageFrame) -> Json:
+    """Return the plane table of a viewer, with the labels of the file as IDs."""
     planes = result.planes
     if not planes:
         return {"planes": []}
@@ -183,7 +181,7 @@ def describe_shown(result: Result, frame: Frame) -> Json:
 
 
 def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:
-    """Trace the outlines of planes through a sample of their points; none without shapely."""
+    """Trace polygons of planes from a sample of their points; empty without shapely."""
     outlines: list[tuple[Tensor, ...]] = [() for _ in planes.count]
     if find_spec("shapely") is None:
         return outlines
@@ -198,13 +196,13 @@ def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, .
 
 
 def _rectangles(planes: Planes) -> Tensor:
-    """Return the corners of the rectangle around each plane, shape ``(M, 4, 3)``."""
+    """Return the corners of the bounding rectangle of each plane, shape ``(M, 4, 3)``."""
     half = (planes.axes * planes.extent[:, :, None] / 2).double()
     signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
     return planes.center.double()[:, None] + signs @ half
 
 
 def rounded(values: Tensor) -> object:
-    """Return numbers of a page as JSON needs them: a step is a hundred-thousandth of the cloud."""
+    """Round numbers for JSON, to a hundred-thousandth of the cloud."""
     numbers: object = np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
     return numbers

@@ -1,7 +1,7 @@
-"""From where to look at a cloud, and which walls and ceilings to leave out to see into its rooms.
+"""Viewpoints, and the walls and ceilings to hide for a view into rooms.
 
-Walls and ceilings are those of the plane table. Where a cloud has no labels, its voxels are
-segmented. The shader and the picking of ``page.js`` cut by the bits that each point has here.
+Walls and ceilings come from the plane table, or from a segmentation of voxels if a cloud has no
+labels. The shader and the picking of ``page.js`` use the same bits per point.
 """
 
 import math
@@ -24,40 +24,43 @@ from torchrg.structures import PLANE_KINDS, UNLABELED, Planes
 View = Literal["cutaway", "above", "outside", "sensor"]
 
 MIN_FACING = {"cutaway": 0.1, "above": 0.7}
-"""Least cosine between the direction of an outer side and that toward the viewer for it to be cut
-away, by the view. From above only what lies nearly flat is in the way."""
+"""Minimum cosine between the outward direction of a side and the direction to the viewer for the
+side to be hidden, by view. From above only nearly horizontal sides obstruct the view."""
 MAX_SIDES = 7
-"""Outer sides of a cloud: bits of a byte, the last of which hides planes on a page."""
+"""Maximum number of outer sides: bits of a byte, without the last one, which hides planes in a
+viewer."""
 _MAX_WALLS = 60
-"""So many of the largest walls and ceilings may be outer ones, which bounds the memory."""
+"""Maximum number of candidate walls and ceilings, the largest ones; bounds the memory."""
 _ANGLE_DEG = 4.0
-"""Angle of growth on voxels, which have little noise: with more, ceilings grow into walls."""
-_ALIKE = 0.9
-"""Least cosine between the directions of walls that are cut away together."""
-_MAX_BEYOND = 0.03
-"""Largest share of the cloud beyond an outer wall: scanners see through doors and windows."""
-_MIN_INSIDE = 0.05
-"""Least share of the cloud on the inner side of an outer wall."""
+"""Maximum angle for region growing on voxels, in degrees. Voxels have little noise; with more,
+ceilings grow into walls."""
+_MIN_SIDE_COSINE = 0.9
+"""Minimum cosine between the directions of walls that are hidden together."""
+_MAX_BEYOND_FRACTION = 0.03
+"""Maximum fraction of the cloud beyond an outer wall: scanners see through doors and windows."""
+_MIN_INSIDE_FRACTION = 0.05
+"""Minimum fraction of the cloud on the inner side of an outer wall."""
 _THICKNESS = 1.5
-"""Voxels nearer to a wall than this many of their edges, and twice its own noise, are in it."""
-_BELOW_CEILING = 0.15
-"""Share of the cloud's height below a ceiling that goes with it: lamps and beams hang there."""
+"""Distance to a wall, in voxel edges plus twice its noise, up to which voxels belong to it."""
+_CEILING_DEPTH = 0.15
+"""Depth below a ceiling that is hidden with it, as a fraction of the cloud height, for lamps and
+beams."""
 _MAX_PIXELS = 500
-"""Side of the picture that tells how much a view shows."""
+"""Maximum side of the image for measuring how much a view shows, in pixels."""
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
-"""Azimuths that are tried, in degrees. None looks straight at a wall, so that two walls of a corner
-are always seen."""
+"""Candidate azimuths, in degrees. None is perpendicular to a wall, so both walls of a corner are
+visible."""
 
 
 class Sides(NamedTuple):
-    """The outer sides of a cloud: walls, by the direction that they face, and ceilings.
+    """Outer sides of a cloud: ceilings, and walls grouped by direction.
 
     Attributes:
-        directions: Unit vectors from the inside to the outside, shape ``(S, 3)``.
-        of_voxels: Bits of the sides that each voxel is in, shape ``(V,)``, uint8.
-        of_points: The same of each point, shape ``(n,)``: where it has a label, of its plane, so
-            that what stands against a wall, and the floor along it, is not part of the wall.
-        heading: Horizontal direction from which azimuths are measured, shape ``(3,)``.
+        directions: Outward unit vectors, shape ``(S, 3)``.
+        of_voxels: Bits of the sides of each voxel, shape ``(V,)``, uint8.
+        of_points: The same for each point, shape ``(n,)``. Labeled points have the bits of their
+            plane, so that furniture and the floor along a wall do not belong to the wall.
+        heading: Horizontal reference direction of azimuths, shape ``(3,)``.
     """
 
     directions: Tensor
@@ -66,23 +69,23 @@ class Sides(NamedTuple):
     heading: Tensor
 
     def bits_toward(self, toward: Tensor, view: View) -> int:
-        """Return the bits of the sides that a view from a direction leaves out."""
+        """Return the bits of the sides hidden in a view from a direction."""
         facing = self.directions @ toward > MIN_FACING.get(view, math.inf)
-        return sum(1 << place for place, cut in enumerate(facing.tolist()) if cut)
+        return sum(1 << side for side, cut in enumerate(facing.tolist()) if cut)
 
 
 def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
-    """Find the walls and ceilings that close a cloud.
+    """Find the walls and ceilings that enclose a cloud.
 
-    A wall is outer if next to nothing lies beyond the rectangle around it. What is in the rectangle
-    and not on the inner side of the wall belongs to it, as windows and handles do; and so do planes
-    that are mostly there.
+    A wall is outer if almost nothing lies beyond its bounding rectangle. Points in the rectangle
+    that are not on the inner side belong to the wall, such as windows and handles; so do planes
+    that mostly consist of such points.
 
     Args:
-        surface: The cloud, of at least one finite point.
-        labels: Plane of each of its n points, shape ``(n,)``, or negative. Default: those of the
-            voxels' own segmentation.
-        up: Upward unit vector, shape ``(3,)``.
+        surface: Surface of at least one finite point.
+        labels: Plane of each of its n points, shape ``(n,)``, or negative. Default: from a
+            segmentation of the voxels.
+        up: Up direction, a unit vector of shape ``(3,)``.
     """
     centers = surface.centers
     if len(centers) == 0:
@@ -90,7 +93,7 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
         return Sides(centers, nothing, nothing, _heading(centers, nothing, up))
     if labels is None:
         config = load_config("classic").at_angle(_ANGLE_DEG)
-        # Else a few voxels at a corner join two walls, which as one are none.
+        # Otherwise a few voxels at a corner join two walls to a region that is no wall.
         config = replace(config, growing=replace(config.growing, cut_bridges=True))
         labels = segment_planes(centers, config).labels[surface.voxel_of]
     present, of_points = number_labels(labels.clamp(min=UNLABELED))
@@ -101,53 +104,53 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
     low, high = altitude.quantile(altitude.new_tensor([0.02, 0.98])).tolist()
     kind = classify_planes(planes, centers, numbers, up)
     walls, ceilings = (kind == PLANE_KINDS.index(name) for name in ("wall", "ceiling"))
-    directions, covered = _outer(surface, planes, walls, ceilings, up, high - low)
+    directions, covered = _find_outer_sides(surface, planes, walls, ceilings, up, high - low)
     powers = 1 << torch.arange(MAX_SIDES, device=centers.device)
-    by_place = (covered * powers).sum(dim=1)
+    bits_by_position = (covered * powers).sum(dim=1)
     is_labeled = of_points >= 0
     inside = torch.zeros(len(present) + 1, MAX_SIDES, device=centers.device)
     inside.index_add_(0, of_points[is_labeled], covered[surface.voxel_of[is_labeled]].float())
     counts = torch.bincount(of_points[is_labeled], minlength=len(inside))
     of_planes = ((2 * inside > counts[:, None]) * powers).sum(dim=1)
-    voxels = torch.where(of_voxels < 0, by_place, of_planes[of_voxels])
-    points = torch.where(of_points < 0, by_place[surface.voxel_of], of_planes[of_points])
+    voxels = torch.where(of_voxels < 0, bits_by_position, of_planes[of_voxels])
+    points = torch.where(of_points < 0, bits_by_position[surface.voxel_of], of_planes[of_points])
     heading = _heading(planes.normal[walls], planes.area[walls], up)
     return Sides(directions, voxels.to(torch.uint8), points.to(torch.uint8), heading)
 
 
-def _outer(
+def _find_outer_sides(
     surface: Surface, planes: Planes, walls: Tensor, ceilings: Tensor, up: Tensor, height: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the directions of outer sides, and which voxels are in each ``(V, MAX_SIDES)``."""
+    """Return the directions of outer sides, and the mask of voxels in each, ``(V, MAX_SIDES)``."""
     rows = (walls | ceilings).nonzero().squeeze(1)
     rows = rows[planes.area[rows].argsort(descending=True, stable=True)][:_MAX_WALLS]
     local = surface.centers[:, None] - planes.center[rows]
     across = torch.einsum("vmi,mji->vmj", local, planes.axes[rows]).abs()
     thickness = _THICKNESS * surface.size + 2 * planes.rms[rows]
-    depth = torch.where(ceilings[rows], thickness.clamp(min=_BELOW_CEILING * height), thickness)
-    beside = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
+    depth = torch.where(ceilings[rows], thickness.clamp(min=_CEILING_DEPTH * height), thickness)
+    in_rectangle = (across <= (planes.extent[rows] / 2 + thickness[:, None])).all(dim=2)
     heights = (local * planes.normal[rows]).sum(dim=2)
     directions: list[Tensor] = []
     covered = torch.zeros(len(local), MAX_SIDES, dtype=torch.bool, device=local.device)
-    for place, row in enumerate(rows.tolist()):
+    for column, row in enumerate(rows.tolist()):
         for sign in (1, -1):
-            outward, above = sign * planes.normal[row], sign * heights[:, place]
-            beyond = (beside[:, place] & (above > thickness[place])).float().mean()
-            inside = (above < -thickness[place]).float().mean()
-            is_outer = bool((beyond <= _MAX_BEYOND) & (inside >= _MIN_INSIDE))
+            outward, above = sign * planes.normal[row], sign * heights[:, column]
+            beyond = (in_rectangle[:, column] & (above > thickness[column])).float().mean()
+            inside = (above < -thickness[column]).float().mean()
+            is_outer = bool((beyond <= _MAX_BEYOND_FRACTION) & (inside >= _MIN_INSIDE_FRACTION))
             if not is_outer or (ceilings[row] and outward @ up < 0):
                 continue
-            alike = [n for n, each in enumerate(directions) if each @ outward > _ALIKE]
-            if not alike and len(directions) < MAX_SIDES:
-                alike = [len(directions)]
+            similar = [n for n, each in enumerate(directions) if each @ outward > _MIN_SIDE_COSINE]
+            if not similar and len(directions) < MAX_SIDES:
+                similar = [len(directions)]
                 directions.append(outward)
-            for side in alike[:1]:
-                covered[:, side] |= beside[:, place] & (above > -depth[place])
+            for side in similar[:1]:
+                covered[:, side] |= in_rectangle[:, column] & (above > -depth[column])
     return torch.stack([up.new_zeros(3), *directions])[1:], covered
 
 
 def _heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor:
-    """Return the horizontal direction nearest to an axis along or across the largest wall."""
+    """Return the horizontal direction, along or across the largest wall, nearest to an axis."""
     east = torch.zeros_like(up)
     east[up.abs().argmin()] = 1
     east = functional.normalize(east - (east @ up) * up, dim=0)
@@ -161,12 +164,12 @@ def _heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor:
 
 
 class Viewpoint(NamedTuple):
-    """A direction to look from.
+    """Direction of a camera.
 
     Attributes:
-        toward: From the cloud to the viewer, shape ``(3,)``.
-        up: Up in the picture, shape ``(3,)``.
-        cut: Bits of the sides that are left out.
+        toward: Direction from the cloud to the viewer, shape ``(3,)``.
+        up: Up direction of the image, shape ``(3,)``.
+        cut: Bits of the hidden sides.
     """
 
     toward: Tensor
@@ -183,12 +186,12 @@ def choose_viewpoint(
     azimuth_deg: float | None = None,
     elevation_deg: float | None = None,
 ) -> Viewpoint:
-    """Choose the direction from which most surface is seen.
+    """Choose the direction from which most surface is visible.
 
-    The azimuth is the angle about ``up`` from the direction, along or across the largest wall, that
-    is nearest to x: by default the best of eight, equal ones decided by the angle, and from above
-    the one that lays the cloud across the picture. The elevation is the angle over the horizon: by
-    default 35, from above 90.
+    The azimuth is measured about ``up``, from the direction along or across the largest wall that
+    is nearest to x. Default: the best of eight, ties broken by angle; from above, the longer side
+    of the cloud is horizontal. The elevation is the angle above the horizon. Default: 35, from
+    above 90.
     """
     for name, angle in (("azimuth_deg", azimuth_deg), ("elevation_deg", elevation_deg)):
         if angle is not None and not math.isfinite(angle):
@@ -211,11 +214,11 @@ def choose_viewpoint(
         viewpoints.append(Viewpoint(toward, picture_up, sides.bits_toward(toward, view)))
     if len(viewpoints) == 1:
         return viewpoints[0]
-    return max(viewpoints, key=lambda viewpoint: _count_seen(surface, sides, viewpoint))
+    return max(viewpoints, key=lambda viewpoint: _count_visible(surface, sides, viewpoint))
 
 
 def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: float) -> Tensor:
-    """Return the direction at angles about the upward axis and over the horizon."""
+    """Return the direction with the given azimuth and elevation."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     across = torch.linalg.cross(up, heading)
     horizontal = math.cos(azimuth) * heading + math.sin(azimuth) * across
@@ -223,16 +226,16 @@ def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: floa
     return turned
 
 
-def _count_seen(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
-    """Return how many of the voxels that stay nothing hides from far away."""
+def _count_visible(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
+    """Return the number of visible voxels, in an orthographic view without the hidden sides."""
     centers = surface.centers[(sides.of_voxels & viewpoint.cut) == 0]
     if len(centers) == 0 or surface.size == 0:
         return 0
     right = torch.linalg.cross(viewpoint.up, viewpoint.toward)
-    places = centers @ torch.stack([right, viewpoint.up], dim=1)
-    places -= places.amin(dim=0)
-    pitch = max(1.5 * surface.size, float(places.amax()) / _MAX_PIXELS)
-    column, row = (places / pitch).long().unbind(dim=1)
+    positions = centers @ torch.stack([right, viewpoint.up], dim=1)
+    positions -= positions.amin(dim=0)
+    pitch = max(1.5 * surface.size, float(positions.amax()) / _MAX_PIXELS)
+    column, row = (positions / pitch).long().unbind(dim=1)
     pixels, height = column * (int(row.amax()) + 1) + row, centers @ viewpoint.toward
     front = height.new_full((int(pixels.amax()) + 1,), -torch.inf)
     front.scatter_reduce_(0, pixels, height, "amax")

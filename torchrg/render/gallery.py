@@ -1,4 +1,4 @@
-"""A picture of each of many scans that links to its page, and an index of them."""
+"""Images and viewers of many scans, with an index."""
 
 import os
 from collections.abc import Sequence
@@ -8,24 +8,24 @@ from typing import NamedTuple
 from torchrg.errors import FormatError
 from torchrg.io.files import atomic_path, check_place
 from torchrg.render.colors import color_planes
-from torchrg.render.page import check_library, make_page, template_of, write_page
+from torchrg.render.page import check_library, load_template, make_page, write_page
 from torchrg.render.pictures import render_cloud, write_png
 from torchrg.result import Result
 
 INDEX = "index.html"
-"""Name of the index in its folder."""
+"""File name of the index."""
 _IMAGE_BYTES, _BYTES_PER_POINT = 200_000_000, 200
-"""Memory that the pixels of a picture take, and each of its points; a page takes no more."""
+"""Memory for the pixels of an image, and per point, in bytes; a viewer takes no more."""
 
 
 class Entry(NamedTuple):
-    """A scan of an index.
+    """Entry of an index.
 
     Attributes:
         name: Name of the scan.
-        picture: A file below the folder of the index, with forward slashes.
-        page: Its page, another such file.
-        words: What else there is to say.
+        picture: Path of the image relative to the index, with forward slashes.
+        page: Path of the viewer, in the same form.
+        words: Caption.
     """
 
     name: str
@@ -34,8 +34,8 @@ class Entry(NamedTuple):
     words: str = ""
 
 
-def draw_planes(path: str | os.PathLike[str], result: Result) -> None:
-    """Write a picture of the superpoints of a result or, without any, of its planes."""
+def write_planes(path: str | os.PathLike[str], result: Result) -> None:
+    """Write an image of the superpoints of a result, or of its planes without superpoints."""
     fields, points = result.fields, result.cloud.points
     normals = fields.get("normals")
     picture = render_cloud(
@@ -48,7 +48,7 @@ def draw_planes(path: str | os.PathLike[str], result: Result) -> None:
 
 
 def memory_of_picture(num_points: int) -> int:
-    """Return the bytes that a picture or a page of a result takes.
+    """Return the memory for an image or viewer of a result, in bytes.
 
     Example:
         >>> memory_of_picture(1_000_000)
@@ -58,11 +58,11 @@ def memory_of_picture(num_points: int) -> int:
 
 
 def check_gallery(folder: Path, names: Sequence[str]) -> None:
-    """Raise before long work if pages of scans, or their index, have no place or cannot be made.
+    """Raise if viewers or their index cannot be written; call before long computations.
 
     Raises:
         FormatError: If a file cannot be written, or a scan has the name of the index.
-        MissingDependencyError: If pages cannot be made.
+        MissingDependencyError: If viewers cannot be created.
     """
     check_library()
     check_place(folder / INDEX)
@@ -70,34 +70,34 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
         page = folder / f"{name}.html"
         if page.parent == folder and page.name.lower() == INDEX:
             raise FormatError(
-                f"{page}: the page of {name} would take the place of the index; rename the scan."
+                f"{page}: the viewer of {name} would overwrite the index; rename the scan."
             )
         if page.parent.is_dir():
             check_place(page)
 
 
-def draw_entry(folder: Path, name: str, result: Result, *, words: str = "") -> Entry:
-    """Write picture and page of a result under its name, and return its entry of the index.
+def write_entry(folder: Path, name: str, result: Result, *, words: str = "") -> Entry:
+    """Write the image and viewer of a result, and return its index entry.
 
     Raises:
         FormatError: If a file cannot be written.
-        MissingDependencyError: If pages cannot be made.
+        MissingDependencyError: If viewers cannot be created.
     """
     entry = Entry(name, f"{name}.png", f"{name}.html", words)
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    draw_planes(folder / entry.picture, result)
+    write_planes(folder / entry.picture, result)
     write_page(folder / entry.page, make_page(result, title=name))
     return entry
 
 
 def write_index(folder: Path, title: str, entries: Sequence[Entry]) -> Path:
-    """Write the index of the entries of a folder, and return where it is.
+    """Write the index of the entries of a folder, and return its path.
 
     Raises:
         FormatError: If it cannot be written.
-        MissingDependencyError: If pages cannot be made.
+        MissingDependencyError: If viewers cannot be created.
     """
-    text = template_of("gallery.html.jinja").render(title=title, entries=entries)
-    with atomic_path(folder / INDEX) as beside:
-        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
+    text = load_template("gallery.html.jinja").render(title=title, entries=entries)
+    with atomic_path(folder / INDEX) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
     return folder / INDEX

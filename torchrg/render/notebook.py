@@ -1,4 +1,4 @@
-"""How a segmentation shows itself in a notebook: a picture, and a table of its planes."""
+"""Display of segmentations in notebooks."""
 
 import base64
 import tempfile
@@ -8,48 +8,48 @@ from typing import Any
 from torchrg._optional import require
 from torchrg.errors import ConfigError
 from torchrg.plane_table import describe_planes, tabulate_planes
-from torchrg.render.gallery import draw_planes
+from torchrg.render.gallery import write_planes
 from torchrg.render.page import Page, make_page
 from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
 
 MAX_ROWS = 12
-"""Planes in the table, the largest ones."""
+"""Maximum number of planes in the table, the largest ones."""
 
 
 def show(segmentation: Segmentation, **settings: Any) -> Page:  # noqa: ANN401
-    """Return the page of a segmentation; ``settings`` are those of :func:`make_page`.
+    """Return the viewer of a segmentation; ``settings`` are passed to :func:`make_page`.
 
     Raises:
-        ConfigError: If it does not know its points.
+        ConfigError: If the segmentation has no points.
     """
     return make_page(_result_of(segmentation), **settings)
 
 
 def _result_of(segmentation: Segmentation) -> Result:
-    """Return a segmentation with its points."""
+    """Return the result of a segmentation with its points."""
     if segmentation.points is None:
         raise ConfigError(
-            "Segmentation: expected its points to show them, got none; "
-            "use dataclasses.replace(seg, points=points)."
+            "Segmentation: expected points to display, got None; use "
+            "dataclasses.replace(seg, points=points)."
         )
     points = segmentation.points.numpy(force=True).reshape(-1, 3)
     return Result.of(Cloud(points, source="segmentation"), segmentation)
 
 
 def as_frame(planes: Planes) -> Any:  # noqa: ANN401
-    """Return a table of planes as a ``pandas.DataFrame``."""
-    pandas = require("pandas", extra="report", purpose="make data frames")
+    """Convert a plane table to a ``pandas.DataFrame``."""
+    pandas = require("pandas", extra="report", purpose="create data frames")
     return pandas.DataFrame(tabulate_planes(describe_planes(planes)))
 
 
 def as_html(segmentation: Segmentation) -> str:
-    """Return a picture, where the points are known, and a table of the largest planes."""
+    """Return an image, if the points are known, and a table of the largest planes, as HTML."""
     picture = ""
     if segmentation.points is not None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "planes.png"
-            draw_planes(path, _result_of(segmentation))
+            write_planes(path, _result_of(segmentation))
             content = base64.b64encode(path.read_bytes()).decode("ascii")
         picture = f'<img src="data:image/png;base64,{content}" style="max-width: 640px" alt="">'
     planes, labels = describe_planes(segmentation.planes)["planes"], segmentation.labels
@@ -72,4 +72,4 @@ def as_html(segmentation: Segmentation) -> str:
     lines = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
     more = f"<p>and {len(planes) - MAX_ROWS:,} more</p>" if len(planes) > MAX_ROWS else ""
     table = f"<table><tr>{cells}</tr>{lines}</table>{more}" if rows else ""
-    return f"<div><p>{counts}, {percent:.1f} % of the points labelled</p>{picture}{table}</div>"
+    return f"<div><p>{counts}, {percent:.1f} % of the points labeled</p>{picture}{table}</div>"

@@ -1,22 +1,22 @@
-// The page of torchrg.render.page: deck.gl draws and picks; this file unpacks, chooses and tells.
+// Viewer of torchrg.render.page, based on deck.gl.
 "use strict";
 
 const $ = (id) => document.getElementById(id);
-const say = (text) => { $("message").textContent = text; $("message").hidden = !text; };
+const showMessage = (text) => { $("message").textContent = text; $("message").hidden = !text; };
 const TYPES = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
-const HIDDEN = 128; // The bit of a point's cover that says that its plane is hidden.
-const FIELD_OF_VIEW = 50; // Degrees over the height, as deck.gl's view has it.
-const MOST_NORMALS = 15000; // Lines that still tell a surface from a fur coat.
-const MOST_ROWS = 300; // Of the table of planes.
-const SLOW_MS = 45, FAST_MS = 22; // Frames between these times keep the number of points.
-// Radii by which the rim of a disc is farther than its middle: of discs that reach past an edge from
-// either side, that with the nearer middle is in front. With more, one sees through thin plates.
+const HIDDEN = 128; // Bit of a point's mask: its plane is hidden.
+const FIELD_OF_VIEW = 50; // Vertical, in degrees, as in deck.gl's view.
+const MAX_NORMALS = 15000; // More lines obscure the surface.
+const MAX_ROWS = 300; // Rows of the plane table.
+const SLOW_MS = 45, FAST_MS = 22; // Frame times between which the number of points stays the same.
+// Depth of the rim of a disc behind its center, in radii: where discs extend beyond an edge from both
+// sides, the one with the nearer center is in front. Larger values make thin plates transparent.
 const DOME = "1.0";
-// Radius of a disc in units of the spacing: smaller ones leave gaps between random points.
+// Radius of a disc, in spacings; smaller ones leave gaps between random points.
 const RADIUS = 1.75;
-const STILL_MS = 250; // After so long without a turn all points are drawn again.
+const STILL_MS = 250; // Time without motion after which all points are drawn again.
 
-// ---- What the file holds ---------------------------------------------------------------------
+// ---- Data ------------------------------------------------------------------------------------
 
 async function bytesOf(id) {
   const text = atob($(id).textContent);
@@ -64,14 +64,14 @@ function preparePoints(cloud, bytes) {
   cloud.values = arrays;
   cloud.positions = new Float32Array(3 * n);
   for (let i = 0; i < 3 * n; i++) cloud.positions[i] = arrays.positions[i] * cloud.step + cloud.low[i % 3];
-  const none = 4096; // The number of the colour of points without a normal.
+  const none = 4096; // Color index of points without a normal.
   cloud.normals = arrays.normals
     ? directionsOf(arrays.normals, (i) => arrays.normal[i] === none) : new Float32Array(3 * n);
   cloud.colors = new Uint8Array(4 * n).fill(255);
   cloud.mask = arrays.covered.slice();
   cloud.hidden = new Set();
-  cloud.changes = 0; // How often another set of planes was hidden.
-  cloud.lines = {}; // Outlines and normals as they were drawn last.
+  cloud.changes = 0; // Number of changes to the set of hidden planes.
+  cloud.lines = {}; // Cached polygons and normals.
   cloud.order = cloud.planes.map((_, i) => i).sort((a, b) => cloud.planes[b].count - cloud.planes[a].count);
   cloud.high = [0, 1, 2].map((axis) => {
     let high = -Infinity;
@@ -105,8 +105,8 @@ const state = {
   sort: { by: "points", down: true }, minArea: 0,
   camera: { target: [0, 0, 0], rotationOrbit: 0, rotationX: 30, zoom: 5 },
 };
-let drawing = null, CloudLayer = null; // deck.gl's Deck, and our kind of its layers.
-const frames = []; // Milliseconds between the last frames.
+let drawing = null, CloudLayer = null; // deck.gl's Deck, and the point layer.
+const frames = []; // Times of the last frames, in milliseconds.
 
 function axesOfView() {
   const { rotationX, rotationOrbit } = state.camera;
@@ -129,7 +129,7 @@ function sizeOfView() {
 
 const focalLength = () => sizeOfView()[1] / 2 / Math.tan((FIELD_OF_VIEW / 2) * RADIANS);
 
-// The camera sees the points that are shown, but for the outermost ones.
+// Fit the camera to the visible points, without outliers.
 function showWhole() {
   const { right, up, toward } = axesOfView();
   const reach = [right, up, toward].map((axis) => {
@@ -140,35 +140,35 @@ function showWhole() {
       for (let i = 0; i < cloud.shown; i += step) if (!isCut(i)) places.push(dot(at(cloud.positions, i), axis));
     }
     places.sort((a, b) => a - b);
-    const [low, high] = [0.002, 0.998].map((share) => places[Math.floor(share * (places.length - 1))] ?? 0);
+    const [low, high] = [0.002, 0.998].map((fraction) => places[Math.floor(fraction * (places.length - 1))] ?? 0);
     return [(low + high) / 2, Math.max(high - low, 1e-3)];
   });
   state.camera.target = [0, 1, 2].map((i) =>
     right[i] * reach[0][0] + up[i] * reach[1][0] + toward[i] * reach[2][0]);
   const [width, height] = sizeOfView();
   const pixels = 0.9 * Math.min(width / reach[0][1], height / reach[1][1]);
-  // What is in front of the target looks larger: step back by half of the depth.
+  // The foreground looks larger: step back by half of the depth.
   const distance = focalLength() / pixels;
   state.camera.zoom = Math.log2(pixels * distance / (distance + reach[2][1] * 0.35));
 }
 
 const at = (array, i) => [array[3 * i], array[3 * i + 1], array[3 * i + 2]];
 
-// ---- What is drawn ---------------------------------------------------------------------------
+// ---- Layers ----------------------------------------------------------------------------------
 
-// The same decisions as the shader's: which bits are cut away, and from where on.
+// The same tests as in the shader: hidden bits and clipping planes.
 function limits(cloud) {
   const { toward } = axesOfView();
   const ahead = unit([toward[0], toward[1], 0]);
   const bits = HIDDEN | (state.cut ? cloud.surfaces.reduce((sum, direction, place) =>
-    sum | (dot(direction, toward) > page.leastFacing ? 1 << place : 0), 0) : 0);
+    sum | (dot(direction, toward) > page.minFacing ? 1 << place : 0), 0) : 0);
   const first = page.clouds[0];
   const range = (axis) => {
     const ends = axis.map((a, i) => [a * first.low[i], a * first.high[i]]);
     const low = ends.reduce((sum, pair) => sum + Math.min(...pair), 0);
     return [low, ends.reduce((sum, pair) => sum + Math.max(...pair), 0)];
   };
-  const limit = (share, [low, high]) => (share ? high - (share / 100) * (high - low) : 1e9);
+  const limit = (percent, [low, high]) => (percent ? high - (percent / 100) * (high - low) : 1e9);
   return { bits, ahead, top: limit(state.top, range([0, 0, 1])), near: limit(state.near, range(ahead)) };
 }
 
@@ -183,7 +183,7 @@ function paint(cloud) {
   const values = channel && cloud.values[state.mode];
   const table = channel && !channel.direct ? cloud.values[`${state.mode} colors`] : null;
   const own = page.clouds[state.picked?.cloud] === cloud ? state.picked.plane : -1;
-  const colors = cloud.colors = new Uint8Array(cloud.colors); // deck.gl looks at the identity.
+  const colors = cloud.colors = new Uint8Array(cloud.colors); // deck.gl compares by identity.
   for (let i = 0; i < cloud.shown; i++) {
     const dim = own >= 0 && planeOf(cloud, i) !== own ? 0.65 : 0;
     const from = table ? 3 * values[i] : 3 * i;
@@ -205,15 +205,15 @@ function hide(cloud) {
   }
 }
 
-// A layer of deck.gl that draws a point as one vertex; its own draws an instanced triangle for each.
+// A deck.gl layer with one vertex per point; the built-in layer draws an instanced triangle for each.
 function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
   const names = ["eye", "ahead", "light", "size", "limits"];
   const block = `layout(std140) uniform cutUniforms {
     ${names.map((name) => `vec4 ${name};`).join("\n    ")}
   } cut;`;
-  // eye: the viewer's place; ahead: level direction to the viewer, and where it is cut; light:
-  // toward the light; size: radius in space, focal length, smallest and largest radius in pixels;
-  // limits: bits that are hidden, and the height of the cut.
+  // eye: position of the viewer; ahead: horizontal direction to the viewer, and its clipping distance;
+  // light: toward the light; size: radius in space, focal length, minimum and maximum radius in pixels;
+  // limits: hidden bits, and clipping height.
   const module = {
     name: "cut", vs: block,
     uniformTypes: Object.fromEntries(names.map((name) => [name, "vec4<f32>"])),
@@ -228,7 +228,7 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
     out vec3 vDepth;
     void main(void) {
       geometry.worldPosition = places;
-      int number = gl_VertexID + 1; // As deck.gl counts what is picked: 0 is nothing.
+      int number = gl_VertexID + 1; // deck.gl's picking index: 0 is nothing.
       geometry.pickingColor = vec3(number & 255, number >> 8 & 255, number >> 16 & 255);
       gl_Position = project_position_to_clipspace(places, vec3(0.0), vec3(0.0), geometry.position);
       bool gone = (int(covers * 255.0 + 0.5) & int(cut.limits.x)) != 0;
@@ -238,7 +238,7 @@ function makeCloudLayer({ Layer, picking, project32 }, { Model }) {
       float space = cut.size.x * exp2((radii * 255.0 - 128.0) / 16.0);
       float radius = clamp(space * cut.size.y / length(sight), cut.size.z, cut.size.w);
       gl_PointSize = 2.0 * radius * project.devicePixelRatio;
-      // Depth on the screen is linear in the inverse distance: that infinitely far, and from it here.
+      // Screen depth is linear in the inverse distance: its value at infinity, and the difference here.
       mat4 rows = transpose(project.viewProjectionMatrix);
       float farthest = dot(rows[2].xyz, rows[3].xyz) / dot(rows[3].xyz, rows[3].xyz);
       vDepth = vec3(farthest, gl_Position.z / gl_Position.w - farthest, radius / cut.size.y);
@@ -299,23 +299,23 @@ function layersOf({ PathLayer, LineLayer }) {
     const light = unit(plus(plus(scaled(right, -0.45), scaled(up, 0.7)), scaled(toward, 0.55)));
     const level = Math.max(1, Math.round(state.share * cloud.levels.length));
     const length = cloud.levels[level - 1] ?? 0;
-    // Fewer points are larger, but do not close surfaces: without a GPU it is pixels that take time.
+    // Fewer points are larger, but leave gaps: without a GPU, the time goes to pixels.
     const growth = (cloud.shown / Math.max(length, 1)) ** 0.25;
     const radius = RADIUS * cloud.spacing * 1.15 ** state.size * growth;
     const eye = plus(state.camera.target, scaled(toward, focalLength() / 2 ** state.camera.zoom));
     const isCut = cutOf(cloud);
     const inView = ({ sides, rings }, plane) => !cloud.hidden.has(plane) && !(sides & bits)
       && rings[0].every((p) => p[2] <= top && dot(p, ahead) <= near);
-    // What is hidden has no outline; what is cut away has one, which tells where it is.
+    // Hidden planes have no polygon; cut-away planes have one, which shows their position.
     const picked = state.picked?.cloud === c && !cloud.hidden.has(state.picked.plane) ? state.picked.plane : -1;
     const rings = (chosen) => cloud.planes.flatMap((plane, number) =>
       chosen(plane, number) ? plane.rings.map((ring) => ({ ring: [...ring, ring[0]] })) : []);
-    // deck.gl builds lines anew when their data is another object: only when they may differ.
+    // deck.gl rebuilds lines if their data is a new object, so reuse it unless it may differ.
     const cuts = [cloud.changes, bits, top, near === 1e9 ? 0 : [near, ...ahead]].join();
     const side = Math.round(state.camera.rotationOrbit / 45);
-    const outlines = () => remembered(cloud, "outlines", cuts, () => rings(inView));
-    const ofPicked = () => remembered(cloud, "picked", picked, () => rings((_, n) => n === picked));
-    const normals = () => remembered(cloud, "normals", `${cuts} ${side}`, () => normalLines(cloud, isCut));
+    const outlines = () => cached(cloud, "outlines", cuts, () => rings(inView));
+    const ofPicked = () => cached(cloud, "picked", picked, () => rings((_, n) => n === picked));
+    const normals = () => cached(cloud, "normals", `${cuts} ${side}`, () => normalLines(cloud, isCut));
     const lines = (id, data, color, width) => new PathLayer({
       id: `${id}-${c}`, data, getPath: (row) => row.ring, getColor: color, getWidth: width,
       widthUnits: "pixels", jointRounded: true, capRounded: true,
@@ -350,14 +350,14 @@ function layersOf({ PathLayer, LineLayer }) {
   });
 }
 
-function remembered(cloud, name, key, make) {
+function cached(cloud, name, key, make) {
   if (cloud.lines[name]?.key !== key) cloud.lines[name] = { key, data: make() };
   return cloud.lines[name].data;
 }
 
 function normalLines(cloud, isCut) {
   const { toward } = axesOfView();
-  const lines = [], step = Math.max(1, Math.floor(cloud.shown / MOST_NORMALS));
+  const lines = [], step = Math.max(1, Math.floor(cloud.shown / MAX_NORMALS));
   const length = Math.min(0.25, Math.max(0.05, 4 * cloud.spacing));
   for (let i = 0; i < cloud.shown; i += step) {
     const [foot, normal] = [at(cloud.positions, i), at(cloud.normals, i)];
@@ -372,7 +372,7 @@ function draw() {
   showScale();
 }
 
-// ---- Turning ---------------------------------------------------------------------------------
+// ---- Camera motion ---------------------------------------------------------------------------
 
 let stillTimer = 0, lastFrame = 0;
 function moved() {
@@ -386,7 +386,7 @@ function moved() {
   draw();
 }
 
-// A slow machine draws fewer strata while it turns, as many as it can at about 30 frames a second.
+// Slow machines draw fewer strata during motion, to reach about 30 frames per second.
 function afterFrame() {
   const now = performance.now();
   if (lastFrame && state.moving) {
@@ -421,7 +421,7 @@ function home(toward) {
 }
 
 function showScale() {
-  const perUnit = 2 ** state.camera.zoom / page.frame.scale; // Pixels of a unit of the cloud.
+  const perUnit = 2 ** state.camera.zoom / page.frame.scale; // Pixels per unit of the cloud.
   const power = 10 ** Math.floor(Math.log10(160 / perUnit));
   const length = [5, 2, 1].find((digit) => digit * power * perUnit <= 160) * power;
   $("scale").hidden = false;
@@ -433,7 +433,7 @@ function showScale() {
 
 const number = (value, digits = 4) => (value !== 0 && Math.abs(value) < 1e-4 ? value.toExponential(1)
   : Number(value.toPrecision(digits)).toLocaleString("en", { maximumSignificantDigits: digits }));
-// Places of a point to a ten-thousandth of the cloud or better.
+// Coordinates to a ten-thousandth of the cloud or better.
 const decimals = Math.max(0, 4 - Math.floor(Math.log10(page.frame.scale * 10)));
 const place = (value) => (Math.round(value * 10 ** decimals) / 10 ** decimals + 0)
   .toLocaleString("en", { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
@@ -479,8 +479,8 @@ function element(tag, text, properties = {}) {
   return made;
 }
 
-// What is said of a plane in words of its own, or drawn; other columns of the table go by their names.
-const SAID = ["name", "kind", "curved", "normal", "offset", "area", "extent", "rms", "count", "rings", "meets", "sides"];
+// Columns with a special representation; the remaining ones are listed by name.
+const SPECIAL = ["name", "kind", "curved", "normal", "offset", "area", "extent", "rms", "count", "rings", "meets", "sides"];
 
 function describePicked() {
   const box = $("picked");
@@ -506,7 +506,7 @@ function describePicked() {
     add("rms", `${number(plane.rms, 3)} ${page.unit}`);
     add("points", plane.count.toLocaleString("en"));
     for (const [name, value] of Object.entries(plane)) {
-      if (SAID.includes(name)) continue;
+      if (SPECIAL.includes(name)) continue;
       const text = typeof value === "number" ? number(value) : `${value}`;
       add(name.replace(/_deg$/, "").replaceAll("_", " "), name.endsWith("_deg") ? `${text}°` : text);
     }
@@ -514,10 +514,10 @@ function describePicked() {
       element("button", `${cloud.planes[other].name}: ${angle}°`, {
         title: `plane ${cloud.planes[other].name}, at ${angle} degrees`,
         onclick: () => choose({ cloud: c, plane: other }) }));
-    if (met.length) add("meets", ...met);
+    if (met.length) add("adjacent", ...met);
   } else add("plane", "unlabeled");
   if (point !== undefined) {
-    add("at", inFile(at(cloud.positions, point)).map(place).join("  "));
+    add("position", inFile(at(cloud.positions, point)).map(place).join("  "));
     const normal = at(cloud.normals, point);
     if (dot(normal, normal) > 0) add("normal", inFileDirection(normal).map((v) => v.toFixed(2)).join("  "));
     if (cloud.values.curvature) add("curvature", number(0.1 * (cloud.values.curvature[point] / 255) ** 2, 2));
@@ -525,7 +525,7 @@ function describePicked() {
     if (cloud.values.superpoint) add("superpoint", String(cloud.values.superpoint[point]));
     for (const mode of ["error", "normal-error"]) {
       const values = cloud.values[mode];
-      if (values) add(mode === "error" ? "error" : "off by", mode === "error"
+      if (values) add(mode === "error" ? "outcome" : "normal error", mode === "error"
         ? cloud.channels.error.legend[values[point]][1] : `${number((values[point] / 255) * 45, 2)}°`);
     }
   }
@@ -571,7 +571,7 @@ function only(c, own) {
   setHidden(c, others, true);
 }
 
-// ---- The panel -------------------------------------------------------------------------------
+// ---- Panel -----------------------------------------------------------------------------------
 
 function chip(color) {
   const made = element("i", null, { className: "chip" });
@@ -602,7 +602,7 @@ function listKinds(c, cloud) {
   }));
 }
 
-// The columns of the table by which planes are sorted, with their keys.
+// Sort keys of the columns of the plane table.
 const COLUMNS = {
   plane: (plane) => Number(plane.name), class: (plane) => page.kinds[plane.kind],
   area: (plane) => plane.area, points: (plane) => plane.count,
@@ -628,7 +628,7 @@ function limitArea(area) {
   });
 }
 
-// The lines of a table, its head and those of the planes that are shown.
+// The header and the rows of visible planes of a CSV table.
 function shownTable(cloud) {
   const lines = new TextDecoder().decode(cloud.values.table).split(/(?<=\n)/);
   return lines.filter((_, i) => i === 0 || !cloud.hidden.has(i - 1)).join("");
@@ -651,7 +651,7 @@ function listPlanes() {
     if (isSorted) cell.setAttribute("aria-sort", state.sort.down ? "descending" : "ascending");
     return cell;
   }), element("th", "shown", { scope: "col" }));
-  table.append(head, ...listed.slice(0, MOST_ROWS).map((own) => {
+  table.append(head, ...listed.slice(0, MAX_ROWS).map((own) => {
     const plane = cloud.planes[own], row = element("tr", null);
     row.dataset.plane = own;
     const colors = cloud.values["plane colors"];
@@ -665,8 +665,8 @@ function listPlanes() {
     return row;
   }));
   $("planes").replaceChildren(table);
-  if (listed.length > MOST_ROWS)
-    $("planes").append(element("p", `The first ${MOST_ROWS} of ${listed.length.toLocaleString("en")}.`, { className: "soft" }));
+  if (listed.length > MAX_ROWS)
+    $("planes").append(element("p", `The first ${MAX_ROWS} of ${listed.length.toLocaleString("en")}.`, { className: "soft" }));
   if (focused?.startsWith("show ")) document.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
   markRow();
 }
@@ -693,7 +693,7 @@ function setMode(mode) {
 function fillPanel() {
   for (const [mode, name] of page.modes) $("mode").append(element("option", name, { value: mode }));
   $("mode").disabled = !page.modes.length;
-  if (!page.modes.length) $("mode").append(element("option", "nothing: the file has only points"));
+  if (!page.modes.length) $("mode").append(element("option", "none: the file has only points"));
   $("mode").value = page.mode;
   $("mode").onchange = (event) => setMode(event.target.value);
   for (const name of ["cut", "outlines", "normals", "loose"]) {
@@ -728,8 +728,8 @@ function fillPanel() {
     title.style.left = `calc(${(100 * c) / page.clouds.length}% + 12px)`;
     if (page.clouds.length > 1) document.querySelector("main").append(title);
     const lines = [`${cloud.count.toLocaleString("en")} points, ${cloud.planes.length.toLocaleString("en")} planes`];
-    if (cloud.finite < cloud.count) lines.push(`${(cloud.count - cloud.finite).toLocaleString("en")} points are not finite, and not shown`);
-    if (cloud.shown < cloud.finite) lines.push(`a random sample of ${cloud.shown.toLocaleString("en")} points is shown`);
+    if (cloud.finite < cloud.count) lines.push(`${(cloud.count - cloud.finite).toLocaleString("en")} points are not finite and not shown`);
+    if (cloud.shown < cloud.finite) lines.push(`showing a random sample of ${cloud.shown.toLocaleString("en")} points`);
     $("facts").append(...lines.map((line) => element("p", page.clouds.length > 1 ? `${cloud.name}: ${line}` : line)));
   });
   $("cloud").onchange = listPlanes;
@@ -780,27 +780,27 @@ function listen() {
   box.addEventListener("contextmenu", (event) => event.preventDefault());
 }
 
-// ---- Beginning -------------------------------------------------------------------------------
+// ---- Start -----------------------------------------------------------------------------------
 
 async function begin() {
-  if (!globalThis.DecompressionStream) throw new Error("This browser is too old: it cannot unpack the page.");
+  if (!globalThis.DecompressionStream) throw new Error("This browser is too old to decompress the page.");
   const library = element("script", new TextDecoder().decode(await bytesOf("blob0")));
   for (const [c, cloud] of page.clouds.entries()) preparePoints(cloud, await bytesOf(`blob${c + 1}`));
   fillPanel();
-  if (page.clouds.every((cloud) => !cloud.shown)) return say("There is no finite point to show.");
+  if (page.clouds.every((cloud) => !cloud.shown)) return showMessage("The cloud has no finite points.");
   if (!document.createElement("canvas").getContext("webgl2"))
-    throw new Error("This browser offers no WebGL 2, which drawing needs.");
-  document.head.append(library); // Runs at once: the page's policy knows it by its hash.
+    throw new Error("This browser does not support WebGL 2.");
+  document.head.append(library); // Runs at once: the content security policy allows its hash.
   const { Deck, OrbitView } = globalThis.deck;
   CloudLayer = makeCloudLayer(globalThis.deck, globalThis.luma);
   page.clouds.forEach(paint);
   lookFrom(page.toward);
   showWhole();
-  const share = 100 / page.clouds.length;
+  const percent = 100 / page.clouds.length;
   drawing = new Deck({
     parent: $("view"), width: "100%", height: "100%", useDevicePixels: true,
     views: page.clouds.map((_, c) => new OrbitView({
-      id: String(c), x: `${c * share}%`, width: `${share}%`, orbitAxis: "Z", fovy: FIELD_OF_VIEW,
+      id: String(c), x: `${c * percent}%`, width: `${percent}%`, orbitAxis: "Z", fovy: FIELD_OF_VIEW,
       controller: { keyboard: false, doubleClickZoom: false },
     })),
     layerFilter: ({ layer, viewport }) => layer.id.split("-")[1] === viewport.id,
@@ -812,8 +812,8 @@ async function begin() {
     },
     onAfterRender: afterFrame,
     onError: fail,
-    onLoad: () => { say(""); page.ready = true; },
-    _pickable: false, // Until one clicks: looking for what is under the mouse costs a frame each time.
+    onLoad: () => { showMessage(""); page.ready = true; },
+    _pickable: false, // Enabled on click: picking on hover costs a frame each time.
     layers: layersOf(globalThis.deck),
   });
   listen();
@@ -821,8 +821,8 @@ async function begin() {
 }
 
 let failed = false;
-function fail(error) { // The first error tells the reason; others follow from it.
-  if (!failed) say(`This page cannot be drawn: ${error.message}`);
+function fail(error) { // The first error is the cause; later ones follow from it.
+  if (!failed) showMessage(`This page cannot be displayed: ${error.message}`);
   failed = true;
   console.error(error.message);
 }

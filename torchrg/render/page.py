@@ -1,10 +1,10 @@
-"""A page for the browser: one file that opens offline, to turn a cloud, point at planes, compare.
+"""Interactive viewer: a single HTML file for rotating clouds and selecting planes, offline.
 
-:func:`write_page` puts together what ``page.js`` beside this file shows. deck.gl draws and picks;
-its JavaScript comes out of the installed package pydeck, so that the page needs no network. The
-rows of points are packed as byte planes, compressed, and written as base64; names that come from
-files are written as JSON with every character escaped that HTML could take for its own, and the
-page's policy allows only the scripts that torchrg put there, and no connection.
+:func:`write_page` combines data with ``page.js``, which uses deck.gl for drawing and picking. The
+JavaScript of deck.gl comes from the installed package pydeck, so the viewer needs no network.
+Points are packed as byte planes, compressed, and stored as base64. Names from files are stored as
+JSON with all characters special to HTML escaped. The content security policy allows only the
+scripts of torchrg and no connections.
 """
 
 import base64
@@ -32,17 +32,17 @@ from torchrg.io.files import atomic_path
 from torchrg.linalg import unit_direction
 from torchrg.neighbors.order import restore_rows
 from torchrg.plane_table import encode_csv
-from torchrg.render.channels import MODES, channels_of, encode_directions
+from torchrg.render.channels import MODES, encode_directions, make_channels
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
     PAGE_EXTENT,
-    Frame,
-    Shown,
+    PageFrame,
+    PointSample,
     choose_points,
-    describe_shown,
-    frame_of,
-    planes_of_page,
-    radii_of,
+    displayed_table,
+    encode_radii,
+    make_frame,
+    page_planes,
     rounded,
 )
 from torchrg.render.cutaway import MIN_FACING, View, choose_viewpoint
@@ -53,29 +53,29 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 MAX_POINTS = 1_000_000
-"""Most points of a page by default: as many as a laptop turns fluently."""
+"""Default maximum number of points in a viewer; laptops display this many smoothly."""
 _ROOM_HEIGHTS = 2.0, 6.0
-"""Heights of rooms and halls in meters."""
+"""Range of heights of rooms and halls, in meters."""
 _STEPS = 65535
-"""Steps of a position along the longest side of a cloud: two bytes a coordinate."""
+"""Steps of a position along the longest side of a cloud: two bytes per coordinate."""
 _ASSETS = Path(__file__).parent
 _LIBRARY = "nbextension/static/index.js"
-"""Where pydeck keeps deck.gl, which it writes itself into pages for use offline."""
+"""File of deck.gl in pydeck, which pydeck itself embeds in offline pages."""
 
 
 class Page(NamedTuple):
-    """A page, and what it shows.
+    """A viewer.
 
     Attributes:
-        html: The text of the file.
-        num_points: Points that are shown, of each cloud.
+        html: Content of the HTML file.
+        num_points: Number of displayed points of each cloud.
     """
 
     html: str
     num_points: tuple[int, ...]
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame of its own, as a notebook shows it."""
+        """Return the viewer in an iframe, as displayed by notebooks."""
         frame = 'width="100%" height="620" style="border: 1px solid #d9dee5"'
         return f'<iframe {frame} srcdoc="{html.escape(self.html)}"></iframe>'
 
@@ -93,39 +93,39 @@ def make_page(
     max_points: int = MAX_POINTS,
     unit: str | None = None,
 ) -> Page:
-    """Make a page that shows a result, or two of them with one camera.
+    """Create a viewer of a result, or of two results with a shared camera.
 
-    What can be seen depends on the fields of its cloud: ``labels`` (planes, with the table of the
-    result), ``superpoint``, ``color``, ``normals``, ``curvature``, ``sharp``. The page holds no
-    time and no path: equal input gives equal bytes.
+    Available color modes depend on the fields of the cloud: ``labels`` (planes, with the plane
+    table), ``superpoint``, ``color``, ``normals``, ``curvature``, ``sharp``. The output contains
+    no time and no path: identical inputs produce identical bytes.
 
     Args:
-        result: What to show. Points with NaN or Inf are left out, and counted.
-        beside: Another result in the same coordinates, for the right half. If it has the same
-            points, planes that are the same in both have the same colour.
-        truth: A cloud of the same points, with the true ``labels`` or ``normals``, to show errors.
-        title: Title of the page. Default: the names of the files.
-        color: A key of :data:`torchrg.render.channels.MODES` to begin with. Default: the first
-            that there is.
-        view: From where to look at first, see :func:`torchrg.render.render_cloud`.
-        up: Upward direction. Default: z, for the view of a sensor -y.
+        result: Result to show. Points with NaN or Inf are omitted and counted.
+        beside: Another result in the same coordinates, for the right half. With the same points,
+            matching planes have the same color.
+        truth: Ground truth for the same points, with ``labels`` or ``normals``, to show errors.
+        title: Title. Default: the names of the files.
+        color: Initial color mode, a key of :data:`torchrg.render.channels.MODES`. Default: the
+            first available one.
+        view: Initial camera, see :func:`torchrg.render.render_cloud`.
+        up: Up direction. Default: z; -y for the view ``"sensor"``.
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
-        max_points: Most points of a cloud that are shown; of a larger one it is a random sample,
-            and the page says so.
-        unit: Name of the unit of the coordinates, for lengths and areas. Default: "m" if the cloud
-            is as high as a room in meters, else "units".
+        max_points: Maximum number of points per cloud; larger clouds are randomly downsampled, with
+            a note in the viewer.
+        unit: Unit of the coordinates, for lengths and areas. Default: "m" if the cloud is as high
+            as a room in meters, else "units".
 
     Returns:
-        The page.
+        The viewer.
 
     Raises:
-        ConfigError: If a setting is not as above, or the cloud lacks what the colours shall show.
+        ConfigError: If a setting is invalid, or the cloud lacks the fields of the color mode.
         MissingDependencyError: If pydeck is not installed.
     """
     cloud = result.cloud
     up = _check_settings(cloud, truth, up, view, max_points)
     library = _read_library()
-    frame = frame_of(cloud, up)
+    frame = make_frame(cloud, up)
     true_fields = {} if truth is None else Result(truth).fields
     shown = choose_points(result, frame, max_points)
     described = [_describe_cloud(result, shown, true_fields, None, frame)]
@@ -139,19 +139,19 @@ def make_page(
     scenes, blobs = [scene for scene, _ in described], [blob for _, blob in described]
     modes = [mode for mode in MODES if any(mode in scene["channels"] for scene in scenes)]
     if color is not None and color not in modes:
-        needed = f"{MODES[color][1]} for" if color in MODES else f"one of {', '.join(MODES)} as"
-        beyond = " and a truth" if color.endswith("error") else ""
+        required = MODES[color][1] if color in MODES else f"one of {', '.join(MODES)}"
+        truth_hint = " and ground truth" if color.endswith("error") else ""
         raise ConfigError(
-            f"{cloud.source or 'make_page'}: expected {needed} the colour {color!r}{beyond}, got "
-            f"{', '.join(cloud.fields) or 'points alone'}."
+            f"{cloud.source or 'make_page'}: expected {required}{truth_hint} for color={color!r}, "
+            f"got {', '.join(cloud.fields) or 'points alone'}."
         )
     description = {
         "title": title or " and ".join(scene["name"] for scene in scenes),
         "modes": [(mode, MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
-        "toward": rounded(_direction_of_view(shown, view, frame, azimuth_deg)),
+        "toward": rounded(_initial_direction(shown, view, frame, azimuth_deg)),
         "cut": view in MIN_FACING,
-        "leastFacing": MIN_FACING["above" if view == "above" else "cutaway"],
+        "minFacing": MIN_FACING["above" if view == "above" else "cutaway"],
         "frame": {
             "origin": frame.origin.tolist(),
             "rotation": frame.rotation.tolist(),
@@ -166,7 +166,7 @@ def make_page(
 
 
 def _guess_unit(cloud: Cloud, up: tuple[float, float, float]) -> str:
-    """Return the unit of a cloud, by its height."""
+    """Return the unit of a cloud, estimated from its height."""
     heights = cloud.coordinates[cloud.finite].astype(float) @ np.array(up) / np.linalg.norm(up)
     height = np.ptp(heights) if len(heights) else 0.0
     return "m" if _ROOM_HEIGHTS[0] <= height <= _ROOM_HEIGHTS[1] else "units"
@@ -179,7 +179,7 @@ def _check_settings(
     view: View,
     max_points: int,
 ) -> tuple[float, float, float]:
-    """Return the upward direction, or say what is wrong with a setting."""
+    """Return the up direction; raise if a setting is invalid."""
     check_choices("make_page", view=(view, View))
     if max_points < 1:
         raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
@@ -187,34 +187,34 @@ def _check_settings(
         unit_direction("make_page", up)
     if truth is not None and len(truth) != len(cloud):
         raise ConfigError(
-            f"{truth.source or 'make_page'}: expected a truth of {len(cloud):,} points, got "
-            f"{len(truth):,}; it has to be of the same points in the same order."
+            f"{truth.source or 'make_page'}: expected ground truth for {len(cloud):,} points, got "
+            f"{len(truth):,}; pass the same points in the same order."
         )
     return up or ((0.0, -1.0, 0.0) if view == "sensor" else (0.0, 0.0, 1.0))
 
 
 def write_page(path: str | os.PathLike[str], page: Page) -> None:
-    """Write a page; the file appears whole or not at all.
+    """Write a viewer atomically.
 
     Raises:
         FormatError: If the file cannot be written.
     """
-    with atomic_path(path) as beside:
-        beside.write_text(page.html, encoding="utf-8", errors="backslashreplace")
+    with atomic_path(path) as temporary:
+        temporary.write_text(page.html, encoding="utf-8", errors="backslashreplace")
 
 
 def check_library() -> None:
-    """Raise MissingDependencyError before long work if no page can be made."""
+    """Raise MissingDependencyError if viewers cannot be created; call before long computations."""
     _read_library()
 
 
 def _read_library() -> str:
-    """Return the JavaScript of deck.gl."""
-    module = require("pydeck", extra="view", purpose="write pages")
+    """Read the JavaScript of deck.gl."""
+    module = require("pydeck", extra="view", purpose="create viewers")
     source = Path(str(module.__file__)).parent / _LIBRARY
     if not source.is_file():
         raise MissingDependencyError(
-            f"pydeck with {_LIBRARY} is needed to write pages; install it with: "
+            f"pydeck with {_LIBRARY} is needed to create viewers; install it with: "
             "pip install --upgrade 'torchrg[view]'"
         )
     return source.read_text(encoding="utf-8")
@@ -222,19 +222,19 @@ def _read_library() -> str:
 
 def _describe_cloud(
     result: Result,
-    shown: Shown,
+    shown: PointSample,
     truth: Mapping[str, Tensor],
     reference: Tensor | None,
-    frame: Frame,
+    frame: PageFrame,
 ) -> tuple[dict[str, Any], str]:
-    """Return what a page says about a result, and the packed arrays of its points."""
+    """Return the entry of a result in the description, and the packed arrays of its points."""
     cloud = result.cloud
     true_fields = {name: truth[name][shown.rows] for name in ("labels", "normals") if name in truth}
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     palettes = _palettes(result, shown, reference)
-    channels = list(channels_of(shown.fields, true_fields, palettes))
-    planes = planes_of_page(result, shown, frame)
+    channels = list(make_channels(shown.fields, true_fields, palettes))
+    planes = page_planes(result, shown, frame)
     covered = restore_rows(shown.sides.of_points, shown.surface.rows, len(shown.rows))
     if planes:
         labels = shown.fields["labels"]
@@ -247,10 +247,10 @@ def _describe_cloud(
     steps = ((shown.points - low) * (_STEPS / PAGE_EXTENT)).round().clamp(0, _STEPS)
     arrays: dict[str, NDArray[np.generic]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
-    radii = radii_of(shown)
+    radii = encode_radii(shown)
     arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
     if planes:
-        arrays["table"] = np.frombuffer(encode_csv(describe_shown(result, frame)), np.uint8)
+        arrays["table"] = np.frombuffer(encode_csv(displayed_table(result, frame)), np.uint8)
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:
@@ -279,9 +279,9 @@ def _describe_cloud(
 
 
 def _palettes(
-    result: Result, shown: Shown, reference: Tensor | None
+    result: Result, shown: PointSample, reference: Tensor | None
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return the colours of planes and superpoints, those that pictures of the cloud have too."""
+    """Return the colors of planes and superpoints, the same as in images of the cloud."""
     regions = {}
     if "labels" in result.fields:
         regions["plane"] = result.labels, reference
@@ -294,8 +294,10 @@ def _palettes(
     return palettes
 
 
-def _direction_of_view(shown: Shown, view: View, frame: Frame, azimuth_deg: float | None) -> Tensor:
-    """Return the direction toward the viewer at first, in the axes of the page, shape ``(3,)``."""
+def _initial_direction(
+    shown: PointSample, view: View, frame: PageFrame, azimuth_deg: float | None
+) -> Tensor:
+    """Return the initial direction toward the viewer, in viewer axes, shape ``(3,)``."""
     if view == "sensor":
         return frame.rotation[:, 2].float().neg()
     if len(shown.rows) == 0:
@@ -305,10 +307,10 @@ def _direction_of_view(shown: Shown, view: View, frame: Frame, azimuth_deg: floa
 
 
 def _pack(arrays: Mapping[str, NDArray[np.generic]]) -> tuple[list[dict[str, object]], str]:
-    """Return name, type and shape of arrays, and all of them as one text.
+    """Return the layout of arrays, and all arrays as one text; see ``unpack`` in ``page.js``.
 
-    Each column is split into its bytes, the low ones first. Of positions, which lie along a curve,
-    it is the differences. Read again by ``unpack`` in ``page.js``.
+    Columns are split into byte planes, low bytes first. Positions, which lie along a curve, are
+    stored as differences.
     """
     manifest, planes = [], []
     for name, array in arrays.items():
@@ -334,39 +336,39 @@ def _pack(arrays: Mapping[str, NDArray[np.generic]]) -> tuple[list[dict[str, obj
 
 @functools.cache
 def _encode_library(library: str) -> str:
-    """Return the library as pages hold it."""
+    """Encode the library for embedding."""
     return _encode(library.encode())
 
 
 def _encode(content: bytes) -> str:
-    """Return bytes compressed, as base64."""
-    # Of zlib's levels 6 is where the time grows faster than the page shrinks.
-    squeezer = zlib.compressobj(6, wbits=zlib.MAX_WBITS | 16)
-    return base64.b64encode(squeezer.compress(content) + squeezer.flush()).decode("ascii")
+    """Compress bytes and encode them as base64."""
+    # Above level 6 the time grows faster than the size shrinks.
+    compressor = zlib.compressobj(6, wbits=zlib.MAX_WBITS | 16)
+    return base64.b64encode(compressor.compress(content) + compressor.flush()).decode("ascii")
 
 
 def _fill_template(description: Mapping[str, object], blobs: Iterable[str], library: str) -> str:
-    """Return the text of a page."""
+    """Render the HTML of a viewer."""
     from markupsafe import Markup
 
     script = (_ASSETS / "page.js").read_text(encoding="utf-8")
-    text: str = template_of("page.html.jinja").render(
+    text: str = load_template("page.html.jinja").render(
         title=description["title"],
         description=Markup(_json_for_html(description)),  # noqa: S704 Escaped there.
         blobs=[Markup(blob) for blob in blobs],  # noqa: S704 Base64.
-        script=Markup(script),  # noqa: S704 Our own.
+        script=Markup(script),  # noqa: S704 Trusted.
         hashes=[_script_hash(script), _script_hash(library)],
     )
     return text
 
 
-def template_of(name: str) -> "Template":
-    """Return one of the templates beside this file; what is put into it is escaped.
+def load_template(name: str) -> "Template":
+    """Load a template of this folder, with autoescaping.
 
     Raises:
         MissingDependencyError: If jinja2 is not installed.
     """
-    jinja2 = require("jinja2", extra="view", purpose="write pages")
+    jinja2 = require("jinja2", extra="view", purpose="create viewers")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
     )
@@ -375,7 +377,7 @@ def template_of(name: str) -> "Template":
 
 
 def _json_for_html(value: object) -> str:
-    r"""Return JSON in which no character means anything to HTML.
+    r"""Encode as JSON without characters special to HTML.
 
     Example:
         >>> _json_for_html({"name": "</script>&"})
@@ -388,6 +390,6 @@ def _json_for_html(value: object) -> str:
 
 
 def _script_hash(script: str) -> str:
-    """Return the hash by which a page's policy allows one script and no other."""
+    """Return the hash of a script for the content security policy."""
     digest = hashlib.sha256(script.encode()).digest()
     return f"sha256-{base64.b64encode(digest).decode('ascii')}"

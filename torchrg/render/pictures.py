@@ -1,4 +1,4 @@
-"""Pictures of clouds, and the PNG files that hold them."""
+"""Images of clouds, and PNG files."""
 
 import functools
 import os
@@ -30,26 +30,27 @@ from torchrg.render.surface import Surface, sample_surface
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_POINTS_AT_ONCE = 131_072
-"""Points that are drawn together, which bounds the memory."""
+_CHUNK_POINTS = 131_072
+"""Number of points drawn at a time; bounds the memory."""
 _RADIUS = 1.3
-"""Radius of a disc in units of the local spacing. Such discs close a surface but for a few gaps."""
-_LARGEST = 4
-"""Largest radius of a disc in a plane in units of the usual one, which elsewhere is the largest."""
-_WIDEST = 0.02
-"""Largest radius of a disc in widths of the picture, which bounds the time of drawing it."""
-_ALWAYS, _MAX_RADIUS = 8.0, 64.0
-"""Radii in pixels of the picture: one that a disc may always have, however small the picture is,
-and the largest, however wide it is, as time grows with the square."""
+"""Radius of a disc, in local spacings; leaves only a few gaps in a surface."""
+_MAX_RADIUS_RATIO = 4
+"""Maximum radius of a disc in a plane, in median radii; elsewhere the median is the maximum."""
+_RADIUS_FRACTION = 0.02
+"""Maximum radius of a disc, as a fraction of the image width; bounds the drawing time."""
+_SMALL_RADIUS, _MAX_RADIUS = 8.0, 64.0
+"""Maximum radii of a disc in pixels: for small images, and for any image, since the time grows with
+the square of the radius."""
 _MAX_SIDE, _MAX_SUPERSAMPLING = 2**13, 16
-"""Most pixels along a side, those of a screen of 8K, and within a pixel: memory holds them."""
-_GAP = 0.6
+"""Maximum number of pixels per side (an 8K screen), and of subpixels per pixel and axis; bounds the
+memory."""
+_GAP_RADIUS = 0.6
 """Half the width of the gaps that are closed, in radii of a disc."""
-_STEEPEST = 0.05
-"""Least cosine of the angle under which a disc is seen: 87 degrees. Beyond, slopes get infinite."""
-_FAR_APART = 6
-"""Units of the usual spacing. Points farther from their neighbours are stray ones, and do not
-decide what the picture shows."""
+_MIN_COSINE = 0.05
+"""Minimum cosine of the viewing angle of a disc (87 degrees), beyond which slopes diverge."""
+_OUTLIER_SPACING = 6
+"""Distance to the neighbors, in median spacings, beyond which points are outliers that do not
+affect the image section."""
 
 
 def draw_picture(
@@ -62,43 +63,43 @@ def draw_picture(
     labels: Tensor | None = None,
     supersampling: int,
 ) -> Tensor:
-    """Draw points of a cloud as discs, close gaps, shade, and average pixels.
+    """Draw points as discs, close gaps, shade, and average subpixels.
 
     Args:
-        camera: A batch of one, with the size of the picture.
-        surface: The cloud, of at least one finite point.
-        is_shown: Which of its n points to draw, shape ``(n,)``, bool.
-        colors: Colours of all points, shape ``(N, 3)``, uint8.
-        normals: Normals of all points, shape ``(N, 3)``. Default: those of the voxels.
+        camera: A batch of one, with the size of the image.
+        surface: Surface of at least one finite point.
+        is_shown: Mask of its n points to draw, shape ``(n,)``, bool.
+        colors: Colors of all points, shape ``(N, 3)``, uint8.
+        normals: Normals of all points, shape ``(N, 3)``. Default: voxel normals.
         labels: Plane of each of the n points, shape ``(n,)``, or negative.
-        supersampling: Pixels along the side of each pixel of the picture.
+        supersampling: Subpixels per pixel and axis.
 
     Returns:
         Shape ``(H, W, 3)``, uint8.
     """
     width, height = int(camera.width), int(camera.height)
     project = projection_of(camera, surface.origin, finer=supersampling)
-    lengths = _RADIUS * surface.disc_spacing(_LARGEST, labels)
-    places = is_shown.nonzero().squeeze(-1)
-    radius, length = _usual_radius(project, surface.points, lengths, places)
-    widest = supersampling * min(max(_ALWAYS, _WIDEST * width), _MAX_RADIUS)
+    lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)
+    indices = is_shown.nonzero().squeeze(-1)
+    radius, length = _median_radius(project, surface.points, lengths, indices)
+    widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
     buffer = DepthBuffer(
-        width * supersampling, height * supersampling, max_radius=widest, device=places.device
+        width * supersampling, height * supersampling, max_radius=widest, device=indices.device
     )
 
     def discs_of(chunk: Tensor) -> Discs:
         rows = surface.rows[chunk]
         slant = surface.normals_at(chunk) if normals is None else normals[rows]
-        place, least = surface.points[chunk], supersampling / 2
-        return _discs(project, place, colors[rows], slant.float(), lengths[chunk], least=least)
+        position, floor = surface.points[chunk], supersampling / 2
+        return _discs(project, position, colors[rows], slant.float(), lengths[chunk], floor=floor)
 
-    parts = torch.split(places, _POINTS_AT_ONCE)
+    parts = torch.split(indices, _CHUNK_POINTS)
     for chunk in parts:
         buffer.draw(discs_of(chunk))
     buffer.end_drawing()
     for chunk in parts:
         buffer.paint(discs_of(chunk))
-    reach = max(1, round(_GAP * min(radius, widest)))
+    reach = max(1, round(_GAP_RADIUS * min(radius, widest)))
     depth, paint = depth_and_colors(close_gaps(buffer.keys(), reach=reach, thickness=length))
     brightness = shade_hollows(
         _reduce(depth, supersampling, torch.maximum),
@@ -109,11 +110,11 @@ def draw_picture(
     return (total * (brightness / supersampling**2)[..., None]).round_().to(torch.uint8)
 
 
-def _usual_radius(
-    project: Projection, points: Tensor, lengths: Tensor, places: Tensor
+def _median_radius(
+    project: Projection, points: Tensor, lengths: Tensor, indices: Tensor
 ) -> tuple[float, float]:
-    """Return the median radius of the discs, in pixels and in the unit of the cloud."""
-    sample = places[:: max(1, len(places) // _POINTS_AT_ONCE)]
+    """Return the median radius of the discs, in pixels and in units of the cloud."""
+    sample = indices[:: max(1, len(indices) // _CHUNK_POINTS)]
     depth = project(points[sample])[0][:, 2]
     sample, depth = sample[depth > 0], depth[depth > 0]
     if len(sample) == 0:
@@ -130,11 +131,11 @@ def _discs(
     normals: Tensor,
     lengths: Tensor,
     *,
-    least: float,
+    floor: float,
 ) -> Discs:
-    """Return lit discs of radii ``lengths`` in the unit of the cloud, at least ``least`` in pixels.
+    """Return shaded discs of radii ``lengths``, in units of the cloud, at least ``floor`` pixels.
 
-    Points behind the camera do not show.
+    Points behind the camera are dropped.
     """
     positions, pixels = project(points)
     ahead = positions[:, 2] > 0
@@ -145,21 +146,23 @@ def _discs(
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
     along = torch.where(
-        along.abs() < _STEEPEST, torch.where(along < 0, -_STEEPEST, _STEEPEST), along
+        along.abs() < _MIN_COSINE,
+        torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE),
+        along,
     )
     return Discs(
         pixels,
         inverse,
         light_colors(colors, normals, positions),
-        (lengths * inverse * project.focal).clamp(min=least),
-        # n . X = const gives 1 / z = n . ray / const, whose gradient in pixels is n_xy / focal.
+        (lengths * inverse * project.focal).clamp(min=floor),
+        # n . X = const gives 1 / z = n . ray / const, with the gradient n_xy / focal in pixels.
         slopes=normals[:, :2] * (inverse / (along * project.focal))[:, None],
         max_change=lengths * inverse * inverse,
     )
 
 
 def _reduce(image: Tensor, size: int, combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Combine the pixels of each square of ``size`` a side."""
+    """Combine the pixels of each square with sides ``size``."""
     parts = [image[row::size, column::size] for row in range(size) for column in range(size)]
     return functools.reduce(combine, parts)
 
@@ -178,40 +181,41 @@ def render_cloud(
     height: int | None = None,
     supersampling: int = 2,
 ) -> Tensor:
-    """Draw a cloud so that one sees at once what it is.
+    """Render a cloud from an automatically chosen camera.
 
-    ``"cutaway"`` looks from outside and leaves out the ceiling and the walls that face the viewer;
-    ``"above"`` looks down and leaves out the ceiling; ``"outside"`` leaves out nothing;
-    ``"sensor"`` looks from the origin along z, x to the right and y down, as a depth camera does.
+    ``"cutaway"`` looks from outside, without the ceiling and the walls that face the viewer;
+    ``"above"`` looks down, without the ceiling; ``"outside"`` shows everything; ``"sensor"`` looks
+    from the origin along z, with x to the right and y down, like a depth camera.
 
     Convention:
-        Points are drawn as discs as large as their distances, tilted by their normals. The picture
-        does not depend on the order of the points nor, but for rounding, on unit and origin.
+        Points are drawn as discs with the radius of the local spacing, tilted by their normals. The
+        image does not depend on the order of the points nor, except for rounding, on unit and
+        origin.
 
     Args:
-        points: Points, shape ``(N, 3)``; those with NaN or Inf are left out.
+        points: Points, shape ``(N, 3)``; points with NaN or Inf are omitted.
         colors: Shape ``(N, 3)``, uint8.
-        normals: For tilt and light, of arbitrary sign, shape ``(N, 3)``; zero where unknown.
-            Default: those of voxels of the cloud.
-        labels: Plane of each point, shape ``(N,)``, integers, negative for none, to tell walls and
-            ceilings. Default: the voxels of the cloud are segmented.
+        normals: Normals for tilt and shading, of arbitrary sign, shape ``(N, 3)``; zero if unknown.
+            Default: voxel normals.
+        labels: Plane of each point, shape ``(N,)``, integers, negative for none, from which walls
+            and ceilings are found. Default: the voxels are segmented.
         view: See above.
-        up: Upward direction; not used from the sensor.
-        azimuth_deg: Angle of the viewer about ``up``, from the direction along or across the
-            largest wall that is nearest to x; clouds of one room are seen from one place.
-            Default: of eight, the one from which most surface is seen.
-        elevation_deg: Angle of the viewer over the horizon. Default: 35, from above 90.
-        width: In pixels, at most 8,192.
-        height: In pixels, at most 8,192. Default: what the cloud needs, from a quarter of the width
-            to all of it.
-        supersampling: Each pixel is the mean of the square of this many pixels a side.
+        up: Up direction; ignored for ``"sensor"``.
+        azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction along or
+            across the largest wall that is nearest to x, so that clouds of one room share a camera.
+            Default: the one of eight with the most visible surface.
+        elevation_deg: Elevation of the camera, in degrees. Default: 35, from above 90.
+        width: Width in pixels, at most 8,192.
+        height: Height in pixels, at most 8,192. Default: fitted to the cloud, from a quarter of the
+            width to the width.
+        supersampling: Subpixels per pixel and axis, which are averaged.
 
     Returns:
-        The picture, shape ``(height, width, 3)``, uint8. White if no point is finite.
+        The image, shape ``(height, width, 3)``, uint8. White if no point is finite.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
-        ConfigError: If a setting is not as above.
+        ShapeError: If a shape or dtype is invalid.
+        ConfigError: If a setting is invalid.
 
     Example:
         >>> plane = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.zeros(1))
@@ -232,7 +236,7 @@ def render_cloud(
     if len(surface.rows) == 0:
         return _white(height or round(0.75 * width), width, cloud.device)
     planes = None if planes is None else planes[surface.rows]
-    near = surface.spacing <= _FAR_APART * surface.spacing.median()
+    near = surface.spacing <= _OUTLIER_SPACING * surface.spacing.median()
     is_shown = torch.ones_like(near)
     if view == "sensor":
         camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
@@ -259,21 +263,21 @@ def render_points(
     normals: Tensor | NDArray[np.floating] | None = None,
     supersampling: int = 2,
 ) -> Tensor:
-    """Draw a cloud as a given camera sees it; see :func:`render_cloud`.
+    """Render a cloud from a given camera; see :func:`render_cloud`.
 
     Args:
-        points: Points, shape ``(N, 3)``; those with NaN or Inf, or behind the camera, do not show.
+        points: Points, shape ``(N, 3)``; points with NaN or Inf, or behind the camera, are omitted.
         colors: Shape ``(N, 3)``, uint8.
-        camera: A batch of one camera of kornia, with the size of the picture; for example from
+        camera: A batch of one kornia camera, with the size of the image; for example from
             :func:`torchrg.render.make_camera`.
         normals: See :func:`render_cloud`.
         supersampling: See :func:`render_cloud`.
 
     Returns:
-        The picture, shape ``(height, width, 3)``, uint8.
+        The image, shape ``(height, width, 3)``, uint8.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is invalid.
         ConfigError: If ``supersampling`` is not from 1 to 16.
 
     Example:
@@ -294,20 +298,20 @@ def render_points(
 
 
 def _white(height: int, width: int, device: torch.device) -> Tensor:
-    """Return a picture of nothing."""
+    """Return a white image."""
     return torch.full((height, width, 3), 255, dtype=torch.uint8, device=device)
 
 
 def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:
-    """Write a picture, or an image of labels, as a PNG file.
+    """Write an RGB or label image as a PNG file.
 
     Args:
-        path: Where; the file appears whole or not at all.
-        image: A picture of shape ``(H, W, 3)``, uint8, for 8 bits a channel; or whole numbers from
-            0 to 65535 of shape ``(H, W)``, for 16 bits of gray.
+        path: Output path, written atomically.
+        image: An RGB image of shape ``(H, W, 3)``, uint8, for 8 bits per channel; or integers from
+            0 to 65535 of shape ``(H, W)``, for 16-bit grayscale.
 
     Raises:
-        ShapeError: If the image is neither.
+        ShapeError: If the image has another shape or dtype.
         FormatError: If the file cannot be written.
 
     Example:
@@ -334,12 +338,12 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic])
         )
     from kornia_rs import io
 
-    repair = "; rename it, as pictures need a name in UTF-8"
-    with atomic_path(path) as beside, refusing(f"{path}: ", UnicodeEncodeError, repair=repair):
+    repair = "; rename it, image file names must be valid UTF-8"
+    with atomic_path(path) as temporary, refusing(f"{path}: ", UnicodeEncodeError, repair=repair):
         if is_picture:
-            io.write_image_png_u8(str(beside), np.ascontiguousarray(values), "rgb")
+            io.write_image_png_u8(str(temporary), np.ascontiguousarray(values), "rgb")
         else:
-            io.write_image_png_u16(str(beside), values.astype(np.uint16)[..., None], "mono")
+            io.write_image_png_u16(str(temporary), values.astype(np.uint16)[..., None], "mono")
 
 
 def _check_cloud(
@@ -348,7 +352,7 @@ def _check_cloud(
     colors: Tensor | NDArray[np.uint8],
     normals: Tensor | NDArray[np.floating] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the arguments as tensors of agreeing shapes and right dtypes."""
+    """Return the arguments as tensors, after checking shapes and dtypes."""
     cloud, paint = as_tensor(caller, "points", points), as_tensor(caller, "colors", colors)
     slant = None if normals is None else as_tensor(caller, "normals", normals)
     check_shapes(caller, points=(cloud, "N 3"), colors=(paint, "N 3"), normals=(slant, "N 3"))
@@ -360,8 +364,8 @@ def _check_cloud(
     return cloud, paint, None if slant is None else slant.detach()
 
 
-def _check_sizes(caller: str, most: int, **settings: int | None) -> None:
-    """Raise ConfigError unless numbers of pixels are from 1 to ``most``."""
+def _check_sizes(caller: str, limit: int, **settings: int | None) -> None:
+    """Raise ConfigError unless numbers of pixels are from 1 to ``limit``."""
     for name, value in settings.items():
-        if value is not None and not 1 <= value <= most:
-            raise ConfigError(f"{caller}: expected {name} from 1 to {most:,}, got {value!r}.")
+        if value is not None and not 1 <= value <= limit:
+            raise ConfigError(f"{caller}: expected {name} from 1 to {limit:,}, got {value!r}.")

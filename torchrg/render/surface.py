@@ -1,4 +1,4 @@
-"""How dense a cloud is and where its surface faces, by voxels that hold a few points each."""
+"""Density and normals of a cloud, from voxels with a few points each."""
 
 from typing import NamedTuple
 
@@ -10,32 +10,32 @@ from torchrg.neighbors import gather_patches, search_knn
 from torchrg.neighbors.order import spread_bits
 
 _BITS = 20
-"""The longest side of a cloud is ``2**_BITS`` steps; points of one step are duplicates."""
+"""The longest side of a cloud has ``2**_BITS`` steps; points of one step are duplicates."""
 _MAX_VOXELS = 60_000
-"""Most voxels of a cloud: a room of 6 m has them every 5 cm."""
-_ALL_BELOW = 1000
-"""A cloud of fewer points has a voxel for each of them."""
+"""Maximum number of voxels of a cloud: every 5 cm in a room of 6 m."""
+_MAX_SINGLE_VOXELS = 1000
+"""Number of points up to which each point has its own voxel."""
 _NEIGHBORS = 16
-"""Voxels around each that tell how dense the surface is and where it faces."""
+"""Number of neighboring voxels for density and normals."""
 _FLAT = 0.15
-"""Largest ratio of the two smallest eigenvalues of voxels on a plane."""
+"""Maximum ratio of the two smallest eigenvalues of coplanar voxels."""
 
 
 class Surface(NamedTuple):
-    """The finite points of a cloud along a Morton curve, and the n points' V voxels.
+    """The n finite points of a cloud along a Morton curve, in V voxels.
 
     Attributes:
         rows: Row of each point in the cloud, shape ``(n,)``, int64.
-        points: Coordinates about ``origin``, shape ``(n, 3)``, float32.
-        origin: Lowest corner of the bounding box, shape ``(3,)``, float64.
-        spacing: Distance of each point from its neighbours on the surface, shape ``(n,)``; 0 if all
-            points are in one place.
+        points: Coordinates relative to ``origin``, shape ``(n, 3)``, float32.
+        origin: Lower corner of the bounding box, shape ``(3,)``, float64.
+        spacing: Distance of each point to its neighbors on the surface, shape ``(n,)``; 0 if all
+            points coincide.
         voxel_of: Voxel of each point, shape ``(n,)``.
-        first: The first point of each voxel, shape ``(V,)``.
-        centers: Means of the points, shape ``(V, 3)``, float32, about ``origin``.
-        normals: Unit normals of arbitrary sign, shape ``(V, 3)``; zero where there is no plane.
-        near: The nearest voxels of each, itself first, shape ``(V, K)``.
-        size: Edge of a voxel, or the usual spacing if that is larger.
+        first: First point of each voxel, shape ``(V,)``.
+        centers: Means of the points, shape ``(V, 3)``, float32, relative to ``origin``.
+        normals: Unit normals of arbitrary sign, shape ``(V, 3)``; zero without a plane.
+        near: Nearest voxels, including itself first, shape ``(V, K)``.
+        size: Edge of a voxel, or the median spacing if larger.
     """
 
     rows: Tensor
@@ -49,44 +49,44 @@ class Surface(NamedTuple):
     near: Tensor
     size: float
 
-    def normals_at(self, places: Tensor) -> Tensor:
-        """Return unit normals of some of the n points, ``(*, 3)``; zero where there is no plane.
+    def normals_at(self, rows: Tensor) -> Tensor:
+        """Return unit normals of the selected points, ``(*, 3)``; zero without a plane.
 
-        In a voxel at an edge a point has that of the plane around that passes nearest to it.
+        In a voxel at an edge, a point gets the normal of the nearest plane of a neighboring voxel.
         """
-        voxel = self.voxel_of[places]
+        voxel = self.voxel_of[rows]
         normals = self.normals[voxel]
         at_edge = (normals == 0).all(dim=1).nonzero().squeeze(1)
         near = self.near[voxel[at_edge]]
         around = self.normals[near]
-        away = self.points[places[at_edge], None] - self.centers[near]
+        away = self.points[rows[at_edge], None] - self.centers[near]
         heights = (away * around).sum(dim=2).abs()
         heights.masked_fill_((around == 0).all(dim=2), torch.inf)
         best = heights.argmin(dim=1)
         return normals.index_copy(0, at_edge, around[torch.arange(len(best)), best])
 
-    def disc_spacing(self, most: float, labels: Tensor | None = None) -> Tensor:
-        """Return the spacing that a disc at each of the n points closes, shape ``(n,)``.
+    def disc_spacing(self, cap: float, labels: Tensor | None = None) -> Tensor:
+        """Return the spacing that the disc of each of the n points must cover, shape ``(n,)``.
 
-        It is at most ``most`` times the usual one in a plane, and at most the usual one elsewhere,
-        so that stray points stay small.
+        It is at most ``cap`` times the median for points in a plane, and at most the median
+        elsewhere, so that outliers stay small.
 
         Args:
-            most: Largest ratio to the usual spacing.
-            labels: Plane of each of the n points, shape ``(n,)``, or negative. Default: points are
-                in a plane where their voxels are.
+            cap: Maximum ratio to the median spacing.
+            labels: Plane of each of the n points, shape ``(n,)``, or negative. Default: points of
+                planar voxels are in a plane.
         """
         in_plane = (self.normals != 0).any(dim=1)[self.voxel_of]
         if labels is not None:
             in_plane = in_plane & (labels >= 0)
-        return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, most, 1.0))
+        return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, cap, 1.0))
 
 
 def sample_surface(points: Tensor) -> Surface:
-    """Sort the finite points of a cloud into voxels, and measure the surface around each voxel.
+    """Sort the finite points of a cloud into voxels, and measure density and normals.
 
-    Nothing depends on the order of the points: means are of whole numbers of steps, which add up
-    exactly.
+    The result does not depend on the order of the points: means are computed from integer steps,
+    which add up exactly.
 
     Example:
         >>> surface = sample_surface(torch.tensor([[8.0, 0, 0], [torch.nan, 0, 0], [4, 1, 0]]))
@@ -127,19 +127,19 @@ def sample_surface(points: Tensor) -> Surface:
 
 
 def _level_of_voxels(codes: Tensor) -> int:
-    """Return how often steps are doubled until voxels hold two on average, and are few enough."""
-    most = min(_MAX_VOXELS, max(_ALL_BELOW, len(codes) // 2))
+    """Return how often steps are doubled until voxels have two points on average, within limits."""
+    cap = min(_MAX_VOXELS, max(_MAX_SINGLE_VOXELS, len(codes) // 2))
     level = 0
-    while int((codes >> 3 * level).diff().count_nonzero()) >= most:
+    while int((codes >> 3 * level).diff().count_nonzero()) >= cap:
         level += 1
     return level
 
 
 def _measure(centers: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the distance between points ``(V,)``, the normal and the nearest of each voxel.
+    """Return the spacing of points ``(V,)``, the normals and the nearest voxels.
 
-    Voxels with eigenvalues ``a <= b <= c`` of their covariance cover about ``12 sqrt(b c)`` of a
-    plane, ``sqrt(12 c)`` of a line.
+    Voxels with covariance eigenvalues ``a <= b <= c`` cover about ``12 sqrt(b c)`` of a plane,
+    ``sqrt(12 c)`` of a line.
     """
     if len(centers) < 2:
         nothing = torch.zeros_like(centers)

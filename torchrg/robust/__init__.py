@@ -1,10 +1,10 @@
-"""Robust scale, location and scatter of many small point sets at once.
+"""Robust scale, location and scatter of many small point sets.
 
-Where they break down is measured by ``python scripts/bench.py breakdown``. All withstand points far
-away and in a shell around the patch, up to 45 % but for DetMM. A compact cluster of 30 % draws
-DetMCD, DetS and DetMM, whose published starts look along the coordinate axes; FastMCD withstands
-it, and :func:`fit_detmcd` with ``starts="planes"`` even 45 %, where FastMCD finds a
-smaller determinant than that of the plane: 22 points in one place and five others.
+Breakdown points are measured by ``python scripts/bench.py breakdown``. All estimators tolerate
+distant outliers, and outliers in a shell around the patch, up to 45 % except DetMM. A compact
+cluster of 30 % breaks DetMCD, DetS and DetMM, whose published starts use the coordinate axes.
+FastMCD tolerates it, and :func:`fit_detmcd` with ``starts="planes"`` even 45 %, where FastMCD finds
+a determinant smaller than that of the plane: 22 coinciding points and five others.
 """
 
 from torchrg.robust.mcd import fit_detmcd, fit_fastmcd

@@ -1,4 +1,4 @@
-"""Planes, lines and places that hold a majority of a patch's points exactly."""
+"""Exact fits: planes, lines and points that contain a majority of a patch."""
 
 import random
 from functools import lru_cache
@@ -13,30 +13,29 @@ from torchrg.robust.lanes import covariance_entries, dot, eigenvectors, sum_squa
 from torchrg.robust.scale import sum_points
 
 _NUM_SIMPLICES = 128
-"""Sets of P + 1 points that are tried. If 27 of 50 points lie on a plane, all miss it once in
-25,000."""
+"""Number of tested simplices of P + 1 points. If 27 of 50 points lie on a plane, all simplices miss
+it once in 25,000."""
 
 _MAX_CANDIDATES = 16
-"""Flats of a patch whose points are counted. On exact planes nearly every simplex gives one."""
+"""Maximum number of candidate flats per patch. On exact planes nearly every simplex gives one."""
 
 _LANES = 1024
-"""Patches that are looked at together, so that what they need fits the cache."""
+"""Number of patches processed at a time, so that their data fits into the cache."""
 
 _MIN_EDGE = 0.01
-"""An edge shorter than this share of the extent of its patch does not span another dimension."""
+"""Minimum length of an edge that spans another dimension, as a fraction of the patch extent."""
 
 
 def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Look for the flat of lowest dimension that holds at least ``size`` points of each lane.
+    """Find the flat of lowest dimension that contains at least ``size`` points of each lane.
 
-    Each of a fixed list of simplices spans a flat of every dimension. Where the next vertex of a
-    simplex lies on the flat of those before it, which in general position never happens, the
-    flat is a candidate; the points on it are counted, and the flat is fitted to them again.
-    Columns ``(K, M)`` are about the middle of each lane; ``tolerance`` ``(M,)`` is the largest
-    distance that counts as on the flat.
+    Each simplex of a fixed list spans a flat of every dimension. If the next vertex of a simplex
+    lies on the flat of the previous ones, which never happens in general position, the flat is a
+    candidate: its points are counted, and it is fitted to them again. Columns ``(K, M)`` are
+    relative to the center of each lane; ``tolerance`` ``(M,)`` is the maximum distance to the flat.
 
-    Returns its dimension ``(M,)``, 0 a place, 1 a line, ..., P - 1 a hyperplane, P none, and the
-    points on it ``(K, M)``, bool, all False where there is none.
+    Returns its dimension ``(M,)`` (0 for a point, 1 for a line, ..., P - 1 for a hyperplane, P for
+    none), and the mask of its points ``(K, M)``, all False for none.
     """
     parts = [
         _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)
@@ -47,7 +46,7 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Ten
 
 
 def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Do as :func:`find_flats` for few enough lanes to fit the cache."""
+    """Implement :func:`find_flats` for lanes that fit into the cache."""
     num_coordinates, (num_points, num_lanes) = len(columns), columns[0].shape
     dimension = torch.full((num_lanes,), num_coordinates, device=tolerance.device)
     members = torch.zeros((num_points, num_lanes), dtype=torch.bool, device=tolerance.device)
@@ -64,14 +63,14 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Te
         across = _reject(edge, axes)
         height = sum_squares(across).sqrt()
         candidates = steep & (height <= reach) & (dimension == num_coordinates)
-        lanes, near = _majorities(columns, origins, axes, candidates, reach, size)
+        lanes, near = _find_majorities(columns, origins, axes, candidates, reach, size)
         if len(lanes):
             on_flat = refine_flat(take_lanes(columns, lanes), near, tolerance[lanes], len(axes))
             is_full = on_flat.sum(dim=0) >= size
             dimension[lanes[is_full]] = len(axes)
             members[:, lanes[is_full]] = on_flat[:, is_full]
         steep = steep & (height > _MIN_EDGE * extent)
-        # A short edge is a poor ruler: what rounding moves at its ends grows with the distance.
+        # A short edge is inaccurate: the error from rounding its ends grows with the distance.
         reach = torch.maximum(reach, 2 * tolerance * (1 + 2 * extent / height))
         axes.append([component / height for component in across])
     if num_points <= num_coordinates:
@@ -81,7 +80,7 @@ def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Te
     return dimension, members
 
 
-def _majorities(
+def _find_majorities(
     columns: list[Tensor],
     origins: list[Tensor],
     axes: list[list[Tensor]],
@@ -89,30 +88,30 @@ def _majorities(
     reach: Tensor,
     size: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return the lanes ``(F,)`` where a candidate is full, and its points ``(K, F)``."""
+    """Return the lanes ``(F,)`` with enough points on a candidate, and these points ``(K, F)``."""
     open_lanes = torch.nonzero(candidates.any(dim=0)).squeeze(1)
     first = candidates[:, open_lanes]
-    simplex, place = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
-    lane = open_lanes[place]
+    simplex, index = torch.nonzero(first & (first.cumsum(dim=0) <= _MAX_CANDIDATES), as_tuple=True)
+    lane = open_lanes[index]
     offsets = [
         points - origin[simplex, lane]
         for points, origin in zip(take_lanes(columns, lane), origins, strict=True)
     ]
     across = _reject(offsets, [[component[simplex, lane] for component in axis] for axis in axes])
     near = sum_squares(across) <= reach[simplex, lane] ** 2
-    # The best ruler among the full ones: a poor one may collect points beside the flat as well.
-    ruler = torch.where(near.sum(dim=0) >= size, reach[simplex, lane], torch.inf)
+    # Prefer the most accurate candidate; an inaccurate one may include points off the flat.
+    accuracy = torch.where(near.sum(dim=0) >= size, reach[simplex, lane], torch.inf)
     best = reach.new_full((len(open_lanes),), torch.inf)
-    best.scatter_reduce_(0, place, ruler, "amin")
-    order = torch.arange(len(place), device=place.device)
-    order = order.masked_fill((ruler > best[place]) | ruler.isinf(), len(place))
-    winner = torch.full_like(open_lanes, len(place)).scatter_reduce_(0, place, order, "amin")
-    winner = winner[winner < len(place)]
+    best.scatter_reduce_(0, index, accuracy, "amin")
+    order = torch.arange(len(index), device=index.device)
+    order = order.masked_fill((accuracy > best[index]) | accuracy.isinf(), len(index))
+    winner = torch.full_like(open_lanes, len(index)).scatter_reduce_(0, index, order, "amin")
+    winner = winner[winner < len(index)]
     return lane[winner], near[:, winner]
 
 
 def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimension: int) -> Tensor:
-    """Fit a flat to the chosen points of each lane, and mark those ``(K, M)`` that lie on it."""
+    """Fit a flat to the chosen points of each lane, and mark its points ``(K, M)``."""
     columns = [column.double() for column in columns]
     weights = chosen.double()
     count = sum_points(weights)
@@ -125,7 +124,7 @@ def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimens
 
 
 def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tensor]:
-    """Part of vectors, given by their coordinates, across orthonormal directions."""
+    """Component of vectors orthogonal to the given orthonormal directions."""
     for direction in directions:
         along = dot(vectors, direction)
         vectors = [
@@ -136,10 +135,10 @@ def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tenso
 
 @lru_cache(maxsize=256)
 def _simplices(num_points: int, num_edges: int) -> list[list[int]]:
-    """Vertices of the simplices looked at: ``num_edges + 1`` lists of point indices."""
+    """Vertices of the tested simplices: ``num_edges + 1`` lists of point indices."""
     corners = num_edges + 1
     if comb(num_points, corners) <= _NUM_SIMPLICES:
-        # In every cyclic order: where the first vertices coincide, they span nothing.
+        # All cyclic orders: if the first vertices coincide, they span nothing.
         chosen = [
             (*vertices[turn:], *vertices[:turn])
             for turn in range(corners)

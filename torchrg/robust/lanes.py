@@ -1,8 +1,7 @@
-"""Arithmetic on many patches side by side: axis 0 holds the points, axis 1 the patches.
+"""Arithmetic on many patches in parallel: axis 0 holds the points, axis 1 the patches (lanes).
 
-Patches laid out so are called lanes, as of a vector unit. Every lane is computed by the same
-operations in the same order wherever it stands, so a result does not depend, to the last bit, on
-the chunk it was computed in.
+Every lane is computed by the same operations in the same order at any position, so results are
+bit-identical for any chunk size.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +22,7 @@ def columns_of_points(patches: Tensor) -> list[Tensor]:
 
 
 def take_lanes(columns: list[Tensor], lanes: Tensor) -> list[Tensor]:
-    """Take the given lanes of each ``(K, M)``; much faster than ``column[:, lanes]``."""
+    """Select lanes of each ``(K, M)``; much faster than ``column[:, lanes]``."""
     return [column.index_select(1, lanes) for column in columns]
 
 
@@ -38,9 +37,9 @@ def median_points(values: Tensor) -> Tensor:
 
 
 def smallest_points(distances: Tensor, size: int) -> Tensor:
-    """Mark exactly ``size`` smallest values of each lane; of equal ones the first points win.
+    """Mark exactly ``size`` smallest values of each lane; ties go to the first points.
 
-    The values ``(K, M)`` hold no NaN. Returns 1 for a marked point and 0 for another.
+    The values ``(K, M)`` contain no NaN. Returns 1 for marked points and 0 for others.
     """
     num_points = len(distances)
     if size == num_points:
@@ -59,7 +58,7 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
 
 
 def dot(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:
-    """Sum of the products of P tensors and P others that fit them."""
+    """Sum of the products of P tensors and P matching tensors."""
     total = parts[0] * factors[0]
     for column, factor in zip(parts[1:], factors[1:], strict=True):
         total += column * factor
@@ -81,22 +80,22 @@ def eigenvectors(matrices: Tensor) -> Tensor:
 
 def map_values(
     on_cpu: Callable[..., NDArray[np.floating]],
-    elsewhere: Callable[..., Tensor],
+    in_torch: Callable[..., Tensor],
     values: Tensor,
     *more: float,
 ) -> Tensor:
-    """Apply NumPy's function on a CPU: the same for a value wherever it stands; torch's is not."""
+    """Apply NumPy's function on a CPU, which is independent of the position, unlike torch's."""
     if values.device.type == "cpu":
         return torch.from_numpy(on_cpu(values.numpy(), *more))
-    return elsewhere(values, *more)
+    return in_torch(values, *more)
 
 
 class Ellipsoid(NamedTuple):
     """Weighted mean and scatter of each lane, in a factored form.
 
-    P means ``(M,)``; P columns ``(K, M)`` of residuals, each centered coordinate less its
-    regression on those before it; P weighted sums of their squares ``(M,)``, at least the floor;
-    and whether the floor was needed, ``(M,)``, bool.
+    P means ``(M,)``; P columns ``(K, M)`` of residuals, each centered coordinate minus its
+    regression on the previous ones; P weighted sums of their squares ``(M,)``, at least the floor;
+    and a mask ``(M,)`` of lanes where the floor was applied.
     """
 
     means: list[Tensor]
@@ -110,23 +109,23 @@ def fit_ellipsoid(
 ) -> Ellipsoid:
     """Factor the weighted scatter of each lane by modified Gram-Schmidt.
 
-    The squares are those of a Cholesky factor of the scatter matrix, but each is a sum of squares
-    of residuals instead of a difference of large numbers: the error in a thin direction grows
-    with the ratio of extent to thickness, not with its square, which float32 could not bear.
+    The squares equal those of a Cholesky factor of the scatter matrix, but each is a sum of squared
+    residuals instead of a difference of large numbers. The error in a thin direction grows with the
+    ratio of extent to thickness, not with its square, which float32 could not represent.
 
-    ``total`` is the sum of the weights ``(K, M)``. ``floor`` is the least variance in any
-    direction, shape ``(M,)``, above 0: what rounding leaves of an exact plane.
+    ``total`` is the sum of the weights ``(K, M)``. ``floor`` is the minimum variance in any
+    direction, shape ``(M,)``, above 0: the rounding error of an exact plane.
     """
     means = [sum_points(weights * column) / total for column in columns]
     residuals = [column - mean for column, mean in zip(columns, means, strict=True)]
-    least = floor * total
+    min_square = floor * total
     squares: list[Tensor] = []
     singular = torch.zeros_like(floor, dtype=torch.bool)
     for j, pivot in enumerate(residuals):
         weighted = weights * pivot
         square = sum_points(weighted * pivot)
-        singular = singular | (square <= least)
-        squares.append(torch.maximum(square, least))
+        singular = singular | (square <= min_square)
+        squares.append(torch.maximum(square, min_square))
         for k in range(j + 1, len(residuals)):
             slope = sum_points(weighted * residuals[k]) / squares[j]
             residuals[k] = residuals[k].sub_(slope * pivot)

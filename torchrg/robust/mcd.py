@@ -1,4 +1,4 @@
-"""Minimum covariance determinant: concentration steps from deterministic or random starts."""
+"""Minimum covariance determinant by concentration steps."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -40,21 +40,21 @@ from torchrg.robust.weights import (
 )
 
 _MAX_STEPS = 100
-"""Concentration steps at most. Sets of tied points that alternate are left as they are then."""
+"""Maximum number of concentration steps, after which alternating sets of tied points are kept."""
 
-_NUM_KEPT = 10
-"""Random starts that are concentrated to the end, as published."""
+_NUM_BEST = 10
+"""Number of random starts that are concentrated to convergence, as published."""
 
-_MAX_COMPARED = 16
-"""Starts of a patch up to which equal sets are sought; with more, comparing costs more than it
-saves."""
+_MAX_COMPARED_STARTS = 16
+"""Maximum number of starts per patch for which duplicate sets are detected; with more, comparing
+costs more than it saves."""
 
 _DIGITS = 24
-"""Points whose membership one number holds exactly, a binary digit for each."""
+"""Number of points encoded exactly in one number, one binary digit each."""
 
 
 class _Settings(NamedTuple):
-    """How much is trusted, and how the raw fit becomes the final one: see :func:`fit_detmcd`."""
+    """Settings of :func:`fit_detmcd`."""
 
     support_fraction: float
     quantile: float
@@ -64,9 +64,9 @@ class _Settings(NamedTuple):
 
 
 class _Concentrated(NamedTuple):
-    """Sets that concentration ended with, ``(K, S, M)``, 1 for a point of one, 0 for another.
+    """Sets after concentration: masks ``(K, S, M)`` of 1 and 0.
 
-    The determinants ``(S, M)`` are those of their scatter over h - 1, float64; inf for a start that
+    The determinants ``(S, M)`` of their scatter over h - 1 are float64; inf for a start that
     repeats an earlier one of its lane.
     """
 
@@ -90,49 +90,50 @@ def fit_detmcd(
 ) -> RobustFit:
     """Fit location and scatter to the majority of each patch by the deterministic MCD.
 
-    Six cheap robust scatter estimates each name an initial set of points; from each, concentration
-    steps lead to a set of h points whose covariance has a small determinant; the smallest wins
-    [1]. Points within the chi-square quantile of its scatter are then taken together.
+    Six fast robust scatter estimates each select an initial set of points. Concentration steps lead
+    from each to a set of h points with a small covariance determinant; the smallest wins [1].
+    Points within the chi-square quantile of its scatter are then fitted together.
 
     Convention:
-        The defaults are those of the publication. The factors for small samples are off, because a
-        normal does not depend on them: they only widen the cut-off (by 19 % at K = 50).
+        The defaults are the publication's. Small-sample factors are off, because normals do not
+        depend on them: they only widen the cutoff (by 19 % at K = 50).
 
-        What else is called DetMCD differs in four settings. R's robustbase [2]:
+        Other implementations of DetMCD differ in four settings. R's robustbase [2]:
         ``starts="robustbase"``, ``small_sample=True``, and ``inliers="reweighted"`` for its
         ``mcd.wt`` after reweighting (robustbase since 0.99-0). MATLAB's LIBRA [3]:
         ``support_fraction=0.75``, ``scaling="quantile"``, ``inliers="reweighted"``; it stops at
         exact fits.
 
-        The published starts use the coordinate axes: turning a patch changes the final set of
-        every second one, and a compact minority can draw all six. On made patches near edges of 90
-        degrees, the share of normals more than 10 degrees off is 21 % from them, 4.6 % from
-        ``"planes"`` and 4.8 % from ``"more"``; with 30 % of outliers in one cluster 54 %, 0 and 0.
+        The published starts use the coordinate axes: rotating a patch changes the final set of
+            every second one, and a compact minority can mislead all six. On synthetic patches near
+            edges of 90 degrees, the fraction of normals more than 10 degrees off is 21 % with them,
+            4.6 % with ``"planes"`` and 4.8 % with ``"more"``; with 30 % of outliers in one cluster
+            54 %, 0 and 0.
 
     Args:
-        patches: Points of each neighbourhood, shape ``(*, K, P)``; see :class:`RobustFit`.
-        mask: Which points count, shape ``(*, K)``, bool. Default: all.
-        support_fraction: Share of the points that may be trusted, from 0.5 (h = 27 of 50) to 1.
+        patches: Points of each neighborhood, shape ``(*, K, P)``; see :class:`RobustFit`.
+        mask: Mask of points to use, shape ``(*, K)``, bool. Default: all.
+        support_fraction: Fraction of points to trust, from 0.5 (h = 27 of 50) to 1.
         quantile: Level of the chi-square distribution within which points are inliers.
-        starts: ``"paper"``: initial sets of ceil(K / 2) points, as published. ``"robustbase"``:
-            of h points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes
-            through P points; a third of the cost, no rotation changes it, and it withstands
-            clusters. ``"more"``: these, and the published six in the patch's own axes.
-        small_sample: Apply the factors for small samples (P = 3 only).
-        scaling: What the scatters are multiplied by. ``"consistency"``: the factors that make them
-            consistent for normal points. ``"quantile"``: the raw one by ``d2_(h) / chi2inv(h/n)``,
-            the h-th smallest squared distance to it over the quantile that it should be, the final
-            one by nothing. The cut-off is wider the less the h points look like the inner part of
-            normal ones. Nothing where h is all points.
-        inliers: Which distances are cut. ``"raw"``: those to the raw fit. ``"reweighted"``: these
-            first, then those to location and covariance of what is left, which become
-            ``sq_distances``; location and covariance stay.
-        min_dimension: Least dimension of a flat that is an exact fit: 0 for a place, 1 for a line,
-            2 for a plane. What lies on smaller ones is set aside; see :class:`RobustFit`.
-        chunk_size: Patches worked on together.
+        starts: ``"paper"``: sets of ceil(K / 2) points, as published. ``"robustbase"``: of h
+        points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes through P
+        points; a third of the cost, rotation invariant, and robust against clusters. ``"more"``:
+        these, and the published six in the principal axes of the patch.
+        small_sample: Apply the small-sample factors (P = 3 only).
+        scaling: Factors of the scatters. ``"consistency"``: consistent for normal points.
+        ``"quantile"``: ``d2_(h) / chi2inv(h/n)`` for the raw scatter, that is the h-th smallest
+        squared distance over its expected quantile, and 1 for the final one. The cutoff is wider,
+        the less the h points resemble the inner part of a normal sample. 1 if h is all points.
+        inliers: Distances to which the cutoff applies. ``"raw"``: distances to the raw fit.
+        ``"reweighted"``: first these, then the distances to the reweighted fit, which become
+        ``sq_distances``; location and covariance stay the same.
+        min_dimension: Minimum dimension of a flat that is an exact fit: 0 for a point, 1 for a
+        line, 2 for a plane. Points on smaller flats are excluded; see :class:`RobustFit`.
+        chunk_size: Number of patches processed at a time.
 
     Returns:
-        The fits; ``log_det`` is that of the covariance of the h points, without factors.
+        The fits; ``log_det`` is the log determinant of the covariance of the h points, without
+        factors.
 
     References:
         [1] M. Hubert, P. J. Rousseeuw, T. Verdonck. A deterministic algorithm for robust location
@@ -156,8 +157,8 @@ def fit_detmcd(
     )
     if small_sample and scaling == "quantile":
         raise ConfigError(
-            "fit_detmcd: expected small_sample off with scaling='quantile', which has no such "
-            "factors, got True."
+            "fit_detmcd: expected small_sample=False with scaling='quantile', which has no "
+            "small-sample factors, got True."
         )
 
     def search(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrated:
@@ -188,12 +189,12 @@ def fit_fastmcd(
     r"""Fit location and scatter to the majority of each patch by the MCD with random starts.
 
     Two concentration steps from each of many sets of P + 1 random points; the ten best distinct
-    sets are concentrated to the end, and the smallest determinant wins [1]. Unlike DetMCD it is
+    sets are concentrated to convergence, and the smallest determinant wins [1]. Unlike DetMCD it is
     affine equivariant, and it nearly always finds the best set, at a hundred times the cost.
 
-    Every patch gets the same ``num_starts`` random sets, from ``generator`` or by default always
-    the same, or all sets where there are no more than five times as many (up to 17 points of P = 3
-    with 500). The other arguments, errors and results are those of :func:`fit_detmcd`.
+    Every patch gets the same ``num_starts`` random sets, from ``generator`` or a fixed seed. If
+    there are at most five times that number, it gets all sets (up to 17 points of P = 3 with 500).
+    Other arguments, errors and results are as in :func:`fit_detmcd`.
 
     References:
         [1] P. J. Rousseeuw, K. Van Driessen. A fast algorithm for the minimum covariance
@@ -216,7 +217,7 @@ def fit_fastmcd(
         marks = columns[0].new_zeros(len(sets), num_points).scatter_(1, sets, 1.0)
         initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
         quick = _concentrate(columns, initial, num_coordinates + 1, size, floor, max_steps=1)
-        return _concentrate(columns, _distinct_best(quick, _NUM_KEPT), size, size, floor)
+        return _concentrate(columns, _distinct_best(quick, _NUM_BEST), size, size, floor)
 
     settings = _Settings(support_fraction, quantile, small_sample)
     return _fit_mcd("fit_fastmcd", patches, mask, settings, min_dimension, chunk_size, search)
@@ -231,7 +232,7 @@ def _fit_mcd(
     chunk_size: int,
     search: Callable[[list[Tensor], Tensor, int], _Concentrated],
 ) -> RobustFit:
-    """Take the best set that a search finds as raw fit, and reweight by the distances to it."""
+    """Use the best set of a search as raw fit, and reweight by the distances to it."""
 
     def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
         sets = search(columns, floor, size)
@@ -260,7 +261,7 @@ def _fit_mcd(
     def weigh(fit: RobustFit, points: Tensor) -> Tensor:
         if settings.inliers == "raw":
             return fit.support
-        # The second cut leaves location and covariance as they were: those of the first.
+        # The second cutoff keeps location and covariance: the weights are those of the first.
         offsets = (points.nan_to_num(0.0, 0.0, 0.0) - fit.raw_location[..., None, :]).mT
         solved = torch.linalg.lstsq(fit.raw_covariance.double(), offsets.double()).solution
         bound = chi2_quantile(settings.quantile, points.shape[-1])
@@ -281,7 +282,7 @@ def _fit_mcd(
 
 
 def _factors(ellipsoid: Ellipsoid, size: int, settings: _Settings) -> tuple[Tensor, float]:
-    """Return what the raw scatter ``(M,)`` and the final one are multiplied by."""
+    """Return the factors of the raw scatter ``(M,)`` and of the final one."""
     num_points, num_coordinates = len(ellipsoid.residuals[0]), len(ellipsoid.residuals)
     if settings.scaling == "quantile":
         if size == num_points:
@@ -298,12 +299,12 @@ def _factors(ellipsoid: Ellipsoid, size: int, settings: _Settings) -> tuple[Tens
 
 
 def _distinct_best(sets: _Concentrated, number: int) -> Tensor:
-    """Members ``(K, number, M)`` of the best sets of each lane, of equal ones only the first."""
+    """Members ``(K, number, M)`` of the best sets of each lane, without duplicates."""
     values, order = sets.determinants.sort(dim=0, stable=True)
     repeated = torch.zeros_like(values, dtype=torch.bool)
     repeated[1:] = values[1:] == values[:-1]
-    place = torch.where(repeated, torch.inf, values).argsort(dim=0, stable=True)[:number]
-    chosen = order.gather(0, place)
+    ranks = torch.where(repeated, torch.inf, values).argsort(dim=0, stable=True)[:number]
+    chosen = order.gather(0, ranks)
     return sets.members.gather(1, chosen.expand(len(sets.members), -1, -1))
 
 
@@ -315,43 +316,43 @@ def _concentrate(
     floor: Tensor,
     max_steps: int = _MAX_STEPS,
 ) -> _Concentrated:
-    """Iterate concentration steps from each start of each lane until the set stays the same.
+    """Iterate concentration steps from each start of each lane until the set is stable.
 
-    A step takes mean and scatter of the set and keeps the ``size`` points nearest to them; the
-    determinant never grows (Rousseeuw and Van Driessen 1999, theorem 1). Starts that have arrived
-    leave the batch, and so do those whose set another one has. Starts are sets of ``initial_size``
-    points, as :class:`_Concentrated` has them.
+    A step computes mean and scatter of the set, and keeps the ``size`` nearest points; the
+    determinant never grows (Rousseeuw and Van Driessen 1999, theorem 1). Converged starts leave the
+    batch, and so do duplicates. Starts are sets of ``initial_size`` points, in the form of
+    :class:`_Concentrated`.
     """
     num_points, num_starts, num_lanes = initial.shape
     shape = (num_starts, num_lanes)
     members = initial.reshape(num_points, -1)
     final = torch.zeros_like(members)
     best = torch.full_like(floor, torch.inf, dtype=torch.float64).repeat(num_starts)
-    places = torch.arange(num_starts * num_lanes, device=floor.device)
-    distinct = _first_of_equal(members, places, shape)
-    places, members = places[distinct], members.index_select(1, distinct)
-    points, floors = take_lanes(columns, places % num_lanes), floor[places % num_lanes]
-    distances, _ = _to_sets(members, floor.new_tensor(initial_size), floors, *points)
+    indices = torch.arange(num_starts * num_lanes, device=floor.device)
+    distinct = _first_occurrences(members, indices, shape)
+    indices, members = indices[distinct], members.index_select(1, distinct)
+    points, floors = take_lanes(columns, indices % num_lanes), floor[indices % num_lanes]
+    distances, _ = _fit_sets(members, floor.new_tensor(initial_size), floors, *points)
     members, full_size = smallest_points(distances, size), floor.new_tensor(size)
-    moving, previous = _first_of_equal(members, places, shape), best[places]
+    moving, previous = _first_occurrences(members, indices, shape), best[indices]
     for step in range(max_steps + 1):
         points, members = take_lanes(points, moving), members.index_select(1, moving)
-        floors, places, previous = floors[moving], places[moving], previous[moving]
-        distances, value = _to_sets(members, full_size, floors, *points)
+        floors, indices, previous = floors[moving], indices[moving], previous[moving]
+        distances, value = _fit_sets(members, full_size, floors, *points)
         candidate = smallest_points(distances, size)
-        # Rounding may let the determinant grow, or two sets of tied points follow each other.
+        # Rounding may increase the determinant, or make two sets of tied points alternate.
         converged = (sum_points(candidate * members) >= size) | ~(value < previous)
         converged |= step == max_steps
         done, moving = torch.nonzero(converged).squeeze(1), torch.nonzero(~converged).squeeze(1)
-        final.index_copy_(1, places[done], members.index_select(1, done))
-        best[places[done]] = value[done]
+        final.index_copy_(1, indices[done], members.index_select(1, done))
+        best[indices[done]] = value[done]
         if len(moving) == 0:
             break
         members, previous = candidate, value
     return _Concentrated(final.reshape(num_points, *shape), best.reshape(shape))
 
 
-def _to_sets(
+def _fit_sets(
     members: Tensor, size: Tensor, floor: Tensor, *columns: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return squared distances ``(K, M)`` to the scatters of sets, and their determinants."""
@@ -359,19 +360,19 @@ def _to_sets(
     return sq_distances(ellipsoid, size - 1), determinant(ellipsoid, size - 1)
 
 
-def _first_of_equal(members: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return which of the sets ``(K, n)`` at ``places`` among ``(S, M)`` no earlier start has."""
+def _first_occurrences(members: Tensor, indices: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the first occurrences among sets ``(K, n)`` at ``indices`` of ``(S, M)``."""
     num_starts, num_lanes = shape
-    if not 1 < num_starts <= _MAX_COMPARED:
-        return torch.arange(len(places), device=places.device)
+    if not 1 < num_starts <= _MAX_COMPARED_STARTS:
+        return torch.arange(len(indices), device=indices.device)
     digits = 2.0 ** (torch.arange(len(members), device=members.device) % _DIGITS)
     weighted = members * digits.to(members.dtype)[:, None]
     parts = [sum_points(weighted[chunk]) for chunk in chunks_of(len(members), _DIGITS)]
     numbers = members.new_zeros(len(parts), num_starts * num_lanes)
-    numbers[:, places] = torch.stack(parts)
+    numbers[:, indices] = torch.stack(parts)
     numbers = numbers.reshape(-1, num_starts, num_lanes)
     first = torch.ones(shape, dtype=torch.bool, device=members.device)
     for start in range(1, num_starts):
         same = (numbers[:, :start] == numbers[:, start : start + 1]).all(dim=0)
         first[start] = ~same.any(dim=0)
-    return torch.nonzero(first.reshape(-1)[places]).squeeze(1)
+    return torch.nonzero(first.reshape(-1)[indices]).squeeze(1)

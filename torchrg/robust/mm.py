@@ -1,4 +1,4 @@
-"""S and MM estimates of location and scatter from deterministic starts."""
+"""S- and MM-estimators of location and scatter with deterministic starts."""
 
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -28,26 +28,26 @@ from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]
-"""Estimate that the efficiency of 95 % at the normal distribution refers to."""
+"""Estimate to which the efficiency of 95 % at the normal distribution refers."""
 
 _BREAKDOWN = 0.5
-"""Share of the points that may be arbitrary."""
+"""Fraction of points that may be arbitrary."""
 
 _EFFICIENCY = 0.95
-"""Efficiency of the MM-estimate for normal data."""
+"""Efficiency of the MM-estimator for normal data."""
 
 _MAX_STEPS = 300
-"""Reweightings at most. Weights that have not converged are left as they are then."""
+"""Maximum number of reweightings, after which unconverged weights are kept."""
 
 _CONVERGED = {torch.float32: 16, torch.float64: 4096}
-"""Relative change of a reweighting, in units of rounding, below which weights have converged."""
+"""Relative change of converged weights in one reweighting, in units of the machine epsilon."""
 
 _CHECK_EVERY = 4
-"""Reweightings between two looks at which weights have converged."""
+"""Number of reweightings between convergence checks."""
 
 
 class _Shape(NamedTuple):
-    """Weights ``(K, M)`` of lanes, their scatter of determinant one, squared distances to it."""
+    """Weights ``(K, M)`` of lanes, scatter of determinant one, squared distances to it."""
 
     weights: Tensor
     ellipsoid: Ellipsoid
@@ -66,15 +66,15 @@ def fit_dets(
 ) -> RobustFit:
     """Fit location and scatter of each patch by the deterministic S-estimator.
 
-    The scatter is the one of least volume for which the mean bisquare loss of the distances is
-    half of its maximum, so that half of the points may be arbitrary. Each deterministic start is
-    iterated to a local minimum, and the smallest wins [1]. Arguments and errors are those of
+    The scatter has minimum volume with a mean bisquare loss of the distances of half of its
+    maximum. Half of the points may therefore be arbitrary. Each deterministic start is iterated to
+    a local minimum, and the smallest wins [1]. Arguments and errors are as in
     :func:`torchrg.robust.fit_detmcd`; the ``"robustbase"`` starts are those of R's rrcov.
 
     Returns:
-        The fits. Location and covariance are the estimate itself, not reweighted, and the same as
-        the raw ones; ``raw_support`` are the points with a weight above zero; ``log_det`` is that
-        of the covariance. More than half of the points on one flat are an exact fit.
+        The fits. Location and covariance are the estimate itself, without reweighting, and equal
+        the raw ones. ``raw_support`` are the points with positive weight; ``log_det`` is the log
+        determinant of the covariance. More than half of the points on one flat are an exact fit.
 
     References:
         [1] M. Hubert, P. Rousseeuw, D. Vanpaemel, T. Verdonck. The DetS and DetMM estimators for
@@ -115,15 +115,15 @@ def fit_detmm(
 ) -> RobustFit:
     """Fit location and scatter of each patch by the deterministic MM-estimator.
 
-    The scale of the S-estimate is kept, and location and shape are iterated on with a wider
-    bisquare that is 95 % efficient for normal data; see the reference of :func:`fit_dets`, whose
-    arguments these are. ``tuned_for`` says whether the efficiency is that of the ``"shape"``
-    (cut-off 6.0963 for P = 3), as normals want and R's rrcov has it, or of the ``"location"``
+    The scale of the S-estimate is kept, and location and shape are iterated with a wider bisquare
+    that is 95 % efficient for normal data; see the reference of :func:`fit_dets`, which has the
+    same arguments. ``tuned_for`` selects whether the efficiency applies to the ``"shape"`` (cutoff
+    6.0963 for P = 3), suitable for normals and used by R's rrcov, or to the ``"location"``
     (5.4902).
 
     Returns:
-        The fits. Location and covariance are the MM-estimate, ``raw_*`` the S-estimate it started
-        from; distances, ``support`` and ``log_det`` belong to the MM-estimate.
+        The fits. Location and covariance are the MM-estimate, ``raw_*`` the initial S-estimate;
+        distances, ``support`` and ``log_det`` belong to the MM-estimate.
 
     Example:
         >>> fit_detmm(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit
@@ -135,11 +135,11 @@ def fit_detmm(
         first, scale = _best_s_estimate(columns, floor, size, starts)
         cutoff = efficiency_constant(len(columns), tuned_for)
         weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
-        final = _shape_of(columns, weights, floor)
+        final = _fit_shape(columns, weights, floor)
         sq_unit = cutoff * cutoff * scale * scale
         before = sum_points(_bisquare_loss(first.distances / sq_unit))
         after = sum_points(_bisquare_loss(final.distances / sq_unit))
-        final = _shape_of(columns, torch.where(after <= before, weights, first.weights), floor)
+        final = _fit_shape(columns, torch.where(after <= before, weights, first.weights), floor)
         return _estimate(columns, first, final, scale, quantile)
 
     cutoff_of = partial(efficiency_constant, target=tuned_for)
@@ -158,7 +158,7 @@ def _fit_shapes(
     estimator: Estimator,
     cutoff_of: Callable[[int], float],
 ) -> RobustFit:
-    """Fit patches by an estimator with bisquare weights that vanish at a cut-off for P."""
+    """Fit patches by an estimator with bisquare weights that vanish at a cutoff for P."""
 
     def weigh(fit: RobustFit, points: Tensor) -> Tensor:
         return _bisquare_weights(fit.sq_distances / cutoff_of(points.shape[-1]) ** 2)
@@ -180,7 +180,7 @@ def _fit_shapes(
 def _best_s_estimate(
     columns: list[Tensor], floor: Tensor, size: int, starts: Starts
 ) -> tuple[_Shape, Tensor]:
-    """Iterate every start of each lane to an S-estimate, and keep that of the smallest scale."""
+    """Iterate every start of each lane to an S-estimate, and keep the one of smallest scale."""
     num_points, num_lanes = columns[0].shape
     cutoff = breakdown_constant(len(columns))
     weights, scales = [], []
@@ -191,7 +191,7 @@ def _best_s_estimate(
         members = initial.reshape(num_points, -1)
         ellipsoid = fit_ellipsoid(points, members, count, floors)
         members = smallest_points(sq_distances(ellipsoid, count), size)
-        shape = _shape_of(points, members, floors)
+        shape = _fit_shape(points, members, floors)
         scale = _m_scale(shape.distances, cutoff)
         converged, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
         weights.append(converged.reshape(num_points, num_starts, num_lanes))
@@ -199,13 +199,13 @@ def _best_s_estimate(
     scale = torch.cat(scales)
     best = scale.argmin(dim=0)
     chosen = torch.cat(weights, dim=1).gather(1, best.expand(num_points, 1, -1)).squeeze(1)
-    return _shape_of(columns, chosen, floor), scale.gather(0, best[None]).squeeze(0)
+    return _fit_shape(columns, chosen, floor), scale.gather(0, best[None]).squeeze(0)
 
 
 def _estimate(
     columns: list[Tensor], raw: _Shape, final: _Shape, scale: Tensor, quantile: float
 ) -> Estimate:
-    """Location, covariance, distances and inliers of a shape at a scale."""
+    """Create the estimate of a shape at a scale."""
     size = len(columns)
     sq_scale = scale * scale
     distances = final.distances / sq_scale
@@ -237,22 +237,22 @@ def _reweight(
     *,
     adapt_scale: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Reweight until the weights converge, and return them and the scale.
+    """Reweight until the weights converge, and return weights and scale.
 
-    Lanes that have converged leave the batch. With ``adapt_scale`` the scale takes one step to the
-    M-scale before each reweighting: solving for it fully can lead to another local minimum.
+    Converged lanes leave the batch. With ``adapt_scale`` the scale takes one step toward the
+    M-scale before each reweighting; solving for it completely can lead to another local minimum.
     """
     eps = machine_epsilon(scale.dtype)
     enough = _CONVERGED[scale.dtype] * eps
     weights, scales = start.weights.clone(), scale.clone()
-    places = torch.arange(len(scale), device=scale.device)
+    indices = torch.arange(len(scale), device=scale.device)
     points, floors = columns, floor
     distances, previous = start.distances, start.weights
     for step in range(1, _MAX_STEPS + 1):
         if adapt_scale:
             scale = _m_scale_step(distances, scale, cutoff)
         current = _bisquare_weights(distances / (cutoff * scale) ** 2)
-        distances = _shape_of(points, current, floors).distances
+        distances = _fit_shape(points, current, floors).distances
         if step % _CHECK_EVERY and step != _MAX_STEPS:
             previous = current
             continue
@@ -262,18 +262,18 @@ def _reweight(
             converged |= True
         done, moving = torch.nonzero(converged).squeeze(1), torch.nonzero(~converged).squeeze(1)
         if len(done):
-            weights.index_copy_(1, places[done], current.index_select(1, done))
-            scales[places[done]] = scale[done]
+            weights.index_copy_(1, indices[done], current.index_select(1, done))
+            scales[indices[done]] = scale[done]
             if len(moving) == 0:
                 break
             points = take_lanes(points, moving)
-            places, scale, floors = places[moving], scale[moving], floors[moving]
+            indices, scale, floors = indices[moving], scale[moving], floors[moving]
             distances, current = take_lanes([distances, current], moving)
         previous = current
     return weights, scales
 
 
-def _shape_of(columns: list[Tensor], weights: Tensor, floor: Tensor) -> _Shape:
+def _fit_shape(columns: list[Tensor], weights: Tensor, floor: Tensor) -> _Shape:
     """Fit the weighted points of each lane, and scale the scatter to determinant one."""
     total = sum_points(weights)
     ellipsoid = fit_ellipsoid(columns, weights, total, floor)
@@ -289,7 +289,7 @@ def _volume(ellipsoid: Ellipsoid) -> Tensor:
 
 
 def _m_scale(distances: Tensor, cutoff: float) -> Tensor:
-    """Scale at which the mean loss of each lane's distances is half of its maximum."""
+    """Scale at which the mean loss of the distances of each lane is half of its maximum."""
     scale = (median_points(distances) / chi2_quantile(0.5, 1)).sqrt()
     scale = scale.clamp(min=smallest_normal(scale.dtype))
     for _ in range(50):
@@ -303,20 +303,20 @@ def _m_scale_step(distances: Tensor, scale: Tensor, cutoff: float) -> Tensor:
 
 
 def _bisquare_weights(sq_ratios: Tensor) -> Tensor:
-    """Weights ``(1 - t)^2`` of squared distances in units of the cut-off, 0 beyond it."""
+    """Weights ``(1 - t)^2`` of squared distances in units of the cutoff, 0 beyond it."""
     inside = 1 - sq_ratios.clamp(max=1)
     return inside * inside
 
 
 def _bisquare_loss(sq_ratios: Tensor) -> Tensor:
-    """Loss ``1 - (1 - t)^3`` of squared distances in units of the cut-off, 1 beyond it."""
+    """Loss ``1 - (1 - t)^3`` of squared distances in units of the cutoff, 1 beyond it."""
     inside = 1 - sq_ratios.clamp(max=1)
     return 1 - inside * inside * inside
 
 
 @lru_cache(maxsize=64)
 def breakdown_constant(num_coordinates: int) -> float:
-    """Cut-off at which half of the points may be arbitrary, for unit scale at the normal."""
+    """Cutoff with a breakdown point of one half, for unit scale at the normal distribution."""
 
     def excess(cutoff: float) -> float:
         moments = [_moment(m, num_coordinates, cutoff) / cutoff**m for m in (0, 2, 4, 6)]
@@ -328,7 +328,7 @@ def breakdown_constant(num_coordinates: int) -> float:
 
 @lru_cache(maxsize=64)
 def efficiency_constant(num_coordinates: int, target: Target) -> float:
-    """Cut-off with 95 % efficiency at the normal distribution.
+    """Cutoff with 95 % efficiency at the normal distribution.
 
     For the shape of the scatter (Tyler 1983) or for the location (Lopuhaä 1989).
     """
@@ -352,7 +352,7 @@ def efficiency_constant(num_coordinates: int, target: Target) -> float:
 
 
 def _moment(power: int, num_coordinates: int, cutoff: float) -> float:
-    """Mean of d^power where d, the length of a standard normal vector, is below the cut-off."""
+    """Mean of d^power, d below the cutoff, where d is the length of a standard normal."""
     from scipy.special import gammainc
 
     half = num_coordinates / 2

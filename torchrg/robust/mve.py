@@ -24,8 +24,8 @@ from torchrg.robust.weights import (
     reweight,
 )
 
-_LANES_AT_ONCE = 1024
-"""Sets times patches that are worked on together, so that what they need fits the cache."""
+_LANES_PER_CHUNK = 1024
+"""Number of sets times patches processed at a time, so that their data fits into the cache."""
 
 
 @patchwise
@@ -41,18 +41,19 @@ def fit_mve(
     generator: torch.Generator | None = None,
     chunk_size: int = 64,
 ) -> RobustFit:
-    r"""Fit to each patch the ellipsoid of least volume that covers h points.
+    r"""Fit to each patch the ellipsoid of minimum volume that covers h points.
 
-    Each set of P + 1 points gives an ellipsoid by its mean and covariance; it is blown up until
-    it covers h points, and the smallest wins [1].
+    Each set of P + 1 points defines an ellipsoid by its mean and covariance; it is scaled until it
+    covers h points, and the smallest wins [1].
 
-    Random sets nearly always miss the least volume by a little; with ``exhaustive`` all are taken,
-    230,300 of 50 points, a tenth of a second for each patch. The other arguments are those of
-    :func:`torchrg.robust.fit_fastmcd`; ``support_fraction`` is the share of the points to cover.
+    Random sets nearly always miss the minimum volume by a little; ``exhaustive`` uses all sets:
+    230,300 for 50 points, a tenth of a second per patch. Other arguments are as in
+    :func:`torchrg.robust.fit_fastmcd`; ``support_fraction`` is the fraction of covered points.
 
     Returns:
-        The fits; ``log_det`` is that of the ellipsoid that just covers h points, and
-        ``raw_support`` are these. The raw covariance is scaled to be consistent at the normal.
+        The fits; ``log_det`` is the log determinant of the ellipsoid that just covers h points, and
+        ``raw_support`` are these points. The raw covariance is consistent at the normal
+        distribution.
 
     References:
         [1] P. J. Rousseeuw, A. M. Leroy. Robust Regression and Outlier Detection, chapter 7.
@@ -109,12 +110,12 @@ def fit_mve(
 def _smallest_ellipsoid(
     columns: list[Tensor], sets: Tensor, floor: Tensor, size: int
 ) -> tuple[Tensor, Tensor]:
-    """Determinant of the smallest ellipsoid of each lane, float64, and the set it comes from."""
+    """Determinant of the smallest ellipsoid of each lane, float64, and the index of its set."""
     num_points, num_lanes = columns[0].shape
     num_coordinates = len(columns)
     best = torch.full_like(floor, torch.inf, dtype=torch.float64)
     chosen = torch.zeros_like(best, dtype=torch.int64)
-    step = max(1, _LANES_AT_ONCE // num_lanes)
+    step = max(1, _LANES_PER_CHUNK // num_lanes)
     wide = [column.repeat(1, step) for column in columns]
     floors = floor.repeat(step)
     for first in range(0, len(sets), step):
@@ -130,8 +131,8 @@ def _smallest_ellipsoid(
             value = value * reach
         value = value.reshape(len(tried), num_lanes)
         index = value.argmin(dim=0)
-        least = value.gather(0, index[None]).squeeze(0)
-        better = least < best
-        best = torch.where(better, least, best)
+        smallest = value.gather(0, index[None]).squeeze(0)
+        better = smallest < best
+        best = torch.where(better, smallest, best)
         chosen = torch.where(better, first + index, chosen)
     return best, chosen

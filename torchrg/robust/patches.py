@@ -1,4 +1,4 @@
-"""From patches of any shape to lanes and back: masks, units, exact planes, chunks, threads."""
+"""Application of robust estimators to batches of patches."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -24,52 +24,51 @@ from torchrg.robust.scale import sum_points
 from torchrg.robust.weights import Estimate, subset_size
 
 Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
-"""Fit lanes in general position: columns ``(K, M)``, least variance ``(M,)``, h."""
+"""Estimator of lanes in general position: columns ``(K, M)``, minimum variance ``(M,)``, h."""
 
 PATCHES_IN_CACHE = 4096
-"""Patches that are worked on together, so that what they need fits the processor's cache."""
+"""Number of patches processed at a time, so that their data fits into the cache."""
 
 _MIN_PATCHES = 64
-"""Fewer patches than this are not worth the start of a thread."""
+"""Minimum number of patches per thread."""
 
 
 class RobustFit(NamedTuple):
     """Robust location and scatter of each patch.
 
-    Every estimator takes patches of floating point, and a mask of the points that count; points
-    with a non-finite coordinate never do. ``quantile`` is the level of the chi-square distribution
+    Every estimator takes floating-point patches, and a mask of the points to use; points with a
+    non-finite coordinate are ignored. ``quantile`` is the level of the chi-square distribution
     within which points are inliers: 0.975 means a squared distance of 9.3484 for P = 3.
-    ``chunk_size`` bounds the memory and never changes a result. Another shape, dtype or device is a
-    :class:`torchrg.errors.ShapeError`, a setting out of range a
+    ``chunk_size`` bounds the memory and does not change the result. An invalid shape, dtype or
+    device raises :class:`torchrg.errors.ShapeError`, a setting out of range
     :class:`torchrg.errors.ConfigError`.
 
-    Where a majority of the points lies exactly on a flat, such as a plane, a line, or one place,
-    the flat of least dimension is the fit: the limit of the fits to a majority ever closer to it.
-    Its covariance is singular. A normal needs a plane: with ``min_dimension=2`` points on a line or
-    in one place are set aside, and the others of the patch are fitted.
-    :func:`torchrg.normals.fit_normals_robust` and the normals of a cloud do so.
+    If a majority of the points lies exactly on a flat, such as a plane, a line or a point, the flat
+    of lowest dimension is the fit: the limit of fits to points approaching it. Its covariance is
+    singular. A normal needs a plane: with ``min_dimension=2`` points on a line or at one position
+    are excluded, and the remaining points of the patch are fitted.
+    :func:`torchrg.normals.fit_normals_robust` and the normals of a cloud use this.
 
-    ``location`` and ``covariance`` have gradients: those of the weighted mean
-    ``m = sum w_i x_i / sum w_i`` and of ``c sum w_i (x_i - m) (x_i - m)^T``, with the weights ``w``
-    (1 for the chosen points, those of the last step for DetS and DetMM) and the factor ``c`` held
-    fixed. The other fields have none.
+    ``location`` and ``covariance`` have gradients: those of the weighted mean ``m = sum w_i x_i /
+    sum w_i`` and of ``c sum w_i (x_i - m) (x_i - m)^T``, with fixed weights ``w`` (1 for the chosen
+    points; the last step's for DetS and DetMM) and factor ``c``. The other fields have none.
 
     Attributes:
         location: Mean of the points in ``support``, shape ``(*, P)``.
-        covariance: Their covariance with its consistency factor, shape ``(*, P, P)``. Of an exact
-            fit: that of the points on the flat, singular.
+        covariance: Their covariance with its consistency factor, shape ``(*, P, P)``. For an exact
+            fit: the singular covariance of the points on the flat.
         support: Points that are not outliers, shape ``(*, K)``, bool.
-        sq_distances: Squared Mahalanobis distances to the raw fit, shape ``(*, K)``; these decide
-            ``support``. Of an exact fit: 0 on the flat and inf off it. Points that do not count,
-            and all points of a patch that is not valid: inf.
+        sq_distances: Squared Mahalanobis distances to the raw fit, shape ``(*, K)``, which
+            determine ``support``. For an exact fit: 0 on the flat and inf off it. Ignored points,
+            and all points of an invalid patch: inf.
         raw_location: Location before reweighting, shape ``(*, P)``.
         raw_covariance: Scatter before reweighting with its consistency factor, ``(*, P, P)``.
-        raw_support: The points that ``raw_location`` and ``raw_covariance`` come from, ``(*, K)``.
-        log_det: What the estimator minimised, shape ``(*)``; see its function. -inf for an exact
-            fit, NaN where not valid.
+        raw_support: Points used for ``raw_location`` and ``raw_covariance``, ``(*, K)``.
+        log_det: Objective of the estimator, shape ``(*)``; see its function. -inf for an exact fit,
+            NaN if not valid.
         exact_fit: Whether the points in ``support`` lie exactly on one flat, of dimension P - 1 or
             less, and are a majority, shape ``(*)``, bool.
-        valid: Whether there is a fit, shape ``(*)``, bool. Where not, everything else is zero.
+        valid: Whether there is a fit, shape ``(*)``, bool. Otherwise the other fields are zero.
     """
 
     location: Tensor
@@ -85,25 +84,25 @@ class RobustFit(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """Where lanes lie in their patches: ``point = (lane / zoom + middle) / unit``.
+    """Transform from lanes to patches: ``point = (lane / zoom + offset) / unit``.
 
-    The factors are powers of two, which change no digit.
+    The factors are powers of two, which preserve all digits.
     """
 
-    middle: Tensor
+    offset: Tensor
     unit: Tensor
     zoom: Tensor
 
     def of(self, rows: Tensor) -> "_Frame":
-        """The frames of some of the patches."""
+        """Select the frames of patches."""
         return _Frame(*(field[rows] for field in self))
 
     def point(self, lanes: Tensor) -> Tensor:
-        """Bring points ``(B, P)`` back to the coordinates of their patches."""
-        return (lanes / self.zoom[:, None] + self.middle) / self.unit[:, None]
+        """Transform points ``(B, P)`` to the coordinates of their patches."""
+        return (lanes / self.zoom[:, None] + self.offset) / self.unit[:, None]
 
     def matrix(self, lanes: Tensor) -> Tensor:
-        """Bring scatter matrices ``(B, P, P)`` back to the unit of their patches."""
+        """Transform scatter matrices ``(B, P, P)`` to the units of their patches."""
         length = (self.zoom * self.unit)[:, None, None]
         return lanes / length / length
 
@@ -125,11 +124,11 @@ def fit_patchwise(
     majority: Callable[[int], int] | None = None,
     weigh: Callable[[RobustFit, Tensor], Tensor] = lambda fit, points: fit.support,
 ) -> RobustFit:
-    """Apply an estimator to every patch, and answer the degenerate ones.
+    """Apply an estimator to every patch, and handle degenerate ones.
 
-    Patches are grouped by their number of points that count. Those on one flat are an exact fit if
-    they are ``majority(n)`` of n, by default h. Only gradients ask ``weigh`` for the weights
-    ``(*, K)`` of the points that a fit is the mean of.
+    Patches are grouped by their number of used points. Points on one flat are an exact fit if they
+    are at least ``majority(n)`` of n, by default h. ``weigh`` returns the weights ``(*, K)`` of the
+    points in a fit, for gradients only.
     """
     patches = as_tensor(caller, "patches", patches)
     check_floating(caller, patches=patches)
@@ -145,7 +144,7 @@ def fit_patchwise(
     batch, (num_points, size) = patches.shape[:-2], patches.shape[-2:]
     if not 0 <= min_dimension < max(size, 1):
         raise ConfigError(
-            f"{caller}: expected min_dimension from 0 to {size - 1}, of points of {size} "
+            f"{caller}: expected min_dimension from 0 to {size - 1} for points with {size} "
             f"coordinates, got {min_dimension!r}."
         )
     dense = patches.detach().reshape(batch.numel(), num_points, size)
@@ -165,7 +164,7 @@ def fit_patchwise(
 
 
 def _with_gradients(fit: RobustFit, patches: Tensor, weights: Tensor) -> RobustFit:
-    """Return a fit whose location and covariance have the gradients of weighted points."""
+    """Attach the gradients of weighted points to location and covariance of a fit."""
     total = weights.sum(dim=-1, keepdim=True)
     fractions = (weights / torch.where(total > 0, total, 1.0))[..., None]
     points = torch.where(fractions > 0, patches, 0.0)
@@ -188,7 +187,7 @@ def _with_gradients(fit: RobustFit, patches: Tensor, weights: Tensor) -> RobustF
 def _fit_groups(
     patches: Tensor, counted: Tensor, chunk_size: int, fit: Callable[[Tensor], RobustFit]
 ) -> RobustFit:
-    """Fit patches ``(B, K, P)`` group by group of equally many points that count ``(B, K)``."""
+    """Fit patches ``(B, K, P)`` in groups with the same number of used points ``(B, K)``."""
     num_points, size = patches.shape[1:]
     out = _no_fit(patches)
     counts = counted.sum(dim=1)
@@ -205,7 +204,7 @@ def _fit_groups(
             if whole:
                 _store(out, chosen, fit(block))
                 return
-            # The points that count move to the front, in their order.
+            # Move the used points to the front, in their order.
             order = torch.argsort((~counted[chosen]).to(torch.uint8), dim=1, stable=True)[:, :count]
             block = block.gather(1, order[..., None].expand(-1, -1, size))
             _store(out, chosen, _spread(fit(block), order, num_points))
@@ -215,7 +214,7 @@ def _fit_groups(
 
 
 def _spread(fit: RobustFit, order: Tensor, num_points: int) -> RobustFit:
-    """Put the points of a fit back to their places ``order (B, n)`` among K."""
+    """Scatter the points of a fit to their indices ``order (B, n)`` among K."""
     shape = (len(order), num_points)
     flags = fit.support.new_zeros(shape)
     far = fit.sq_distances.new_full(shape, torch.inf)
@@ -256,7 +255,7 @@ def _fit_chunk(
     if len(regular):
         estimate = estimator(lanes_of(regular), tolerance[regular] ** 2, subset)
         _store(out, regular, _general_fit(estimate, frame.of(regular)))
-        # A plane that no simplex lay on may have been found by concentration.
+        # Concentration may find a plane that no simplex lies on.
         thin = torch.nonzero(estimate.singular).squeeze(1)
         if len(thin):
             rows, chosen = regular[thin], estimate.raw_support[:, thin]
@@ -286,7 +285,7 @@ def _fit_chunk(
 
 
 def _general_fit(estimate: Estimate, frame: _Frame) -> RobustFit:
-    """The fit of lanes in general position, back in the patches' own coordinates."""
+    """Transform the fit of lanes in general position to patch coordinates."""
     size = estimate.location.shape[1]
     units = 2 * size * map_values(np.log, torch.log, frame.zoom.double() * frame.unit.double())
     valid = torch.ones_like(estimate.singular)
@@ -307,7 +306,7 @@ def _general_fit(estimate: Estimate, frame: _Frame) -> RobustFit:
 
 
 def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustFit:
-    """The fit of lanes whose ``members (K, M)`` lie on a flat; these are the inliers."""
+    """Fit lanes whose inliers ``members (K, M)`` lie on a flat."""
     dtype = columns[0].dtype
     weights = members.double()
     count = sum_points(weights)
@@ -335,7 +334,7 @@ def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustF
 
 
 def _no_fit(patches: Tensor) -> RobustFit:
-    """Fits of patches ``(*, K, P)`` that are not valid."""
+    """Return invalid fits of patches ``(*, K, P)``."""
     *batch, num_points, size = patches.shape
     points = patches.new_zeros((*batch, num_points), dtype=torch.bool)
     flag = patches.new_zeros(batch, dtype=torch.bool)
@@ -354,20 +353,20 @@ def _no_fit(patches: Tensor) -> RobustFit:
 
 
 def _to_lanes(patches: Tensor) -> tuple[list[Tensor], _Frame, Tensor]:
-    """Columns about each patch's median, of size 1/2 to 1, with their frame and tolerance."""
+    """Return columns relative to the patch median, scaled to 1/2 to 1, with frame and tolerance."""
     unit = _power_of_two(patches.abs().amax(dim=(1, 2)))
     patches = patches * unit[:, None, None]
     columns = columns_of_points(patches)
-    middle = [median_points(column) for column in columns]
-    columns = [column - center for column, center in zip(columns, middle, strict=True)]
+    offset = [median_points(column) for column in columns]
+    columns = [column - center for column, center in zip(columns, offset, strict=True)]
     extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)
     zoom = _power_of_two(extent)
     tolerance = flatness_tolerance(patches, extent) * zoom
     columns = [column * zoom for column in columns]
-    return columns, _Frame(torch.stack(middle, dim=-1), unit, zoom), tolerance
+    return columns, _Frame(torch.stack(offset, dim=-1), unit, zoom), tolerance
 
 
 def _power_of_two(length: Tensor) -> Tensor:
-    """The power of two that brings a length to between 1/2 and 1; a finite one for zero."""
+    """Return the power of two that scales a length to [1/2, 1); a finite one for zero."""
     length = length.clamp(min=4 * smallest_normal(length.dtype))
     return torch.frexp(length).mantissa / length

@@ -1,6 +1,6 @@
-"""Robust scales of many short rows: median absolute deviation, Qn, tau; all from sorted rows.
+"""Robust scales of many short rows: median absolute deviation, Qn and tau.
 
-The constants make the scales consistent for the standard deviation of normal data.
+The factors make the scales consistent with the standard deviation of normal data.
 """
 
 from collections.abc import Callable
@@ -20,29 +20,29 @@ from torchrg._parallel import CACHE_BYTES, map_chunks, map_rows
 from torchrg.errors import ShapeError
 
 MAD_FACTOR = 1.4826
-"""1 / Phi^-1(3/4), to the digits of the literature."""
+"""1 / Phi^-1(3/4), with the digits used in the literature."""
 
 QN_FACTOR = 2.2219
-"""Factor of Qn as printed by Rousseeuw and Croux (1993), eq. 3.9, and by the method's eq. 7.
+"""Factor of Qn in Rousseeuw and Croux (1993), eq. 3.9, and in the method's eq. 7.
 
 The exact value 1 / (sqrt(2) Phi^-1(5/8)) is 2.219144.
 """
 
 _QN_REVISED_FACTOR = 2.21914
-"""Factor that goes with the finite-sample factors of :func:`qn_sample_factor`."""
+"""Factor used with the finite-sample factors of :func:`qn_sample_factor`."""
 
 _QN_SMALL: tuple[float, ...] = (0.399356, 0.99365, 0.51321, 0.84401, 0.6122, 0.85877)
 _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
-"""Finite-sample factors of 2 to 12 values."""
+"""Finite-sample factors for 2 to 12 values."""
 
 _TAU_WEIGHT_CUT = 4.5
-"""A value that deviates by more than this many median deviations has no weight in the centre."""
+"""Deviation, in median deviations, beyond which a value has no weight in the center."""
 
 _GPU_FRACTION = 256
-"""Factor of the work at a time on a GPU, which has the memory for it and is slow to start."""
+"""Factor of the chunk size on a GPU, which has enough memory and a high launch overhead."""
 
 _TAU_SCALE_CUT = 3.0
-"""Deviations are cut off at this many median deviations."""
+"""Deviation at which values are truncated, in median deviations."""
 
 
 def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -51,31 +51,31 @@ def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     Args:
         x: Values, floating point, any shape.
         dim: Axis to reduce.
-        mask: Which values count, same shape as ``x``, bool. Default: all.
+        mask: Mask of values to use, same shape as ``x``, bool. Default: all.
 
     Returns:
-        The shape of ``x`` without ``dim``; NaN where no value counts or one that counts is NaN.
+        The shape of ``x`` without ``dim``; NaN for empty rows and rows with NaN.
 
     Raises:
-        ShapeError: If ``x`` is not floating point, has no such axis, or ``mask`` differs in shape.
+        ShapeError: If ``x`` is not floating point or lacks the axis, or ``mask`` differs in shape.
 
     Example:
         >>> median(torch.tensor([4.0, 1.0, 3.0, 2.0])).item()
         2.5
     """
-    return _along("median", x, dim, mask)
+    return _reduce_axis("median", x, dim, mask)
 
 
 def mad(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Return the median absolute deviation from the median, times 1.4826.
 
-    The rest is as for :func:`median`. It is 0 where more than half of the values are equal.
+    Otherwise as :func:`median`. It is 0 if more than half of the values are equal.
 
     Example:
         >>> mad(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])).item()
         1.4825999736785889
     """
-    return _along("mad", x, dim, mask)
+    return _reduce_axis("mad", x, dim, mask)
 
 
 def qn(
@@ -86,8 +86,8 @@ def qn(
     :math:`Q_n = 2.2219 \{|x_i - x_j|;\ i < j\}_{(\kappa)}` with :math:`\kappa = \binom{h}{2}` and
     :math:`h = \lfloor n/2 \rfloor + 1` [1]. The order statistic is exact, without interpolation.
     With ``finite_sample`` it is multiplied by the revised factor 2.21914 and by
-    :func:`qn_sample_factor` instead of 2.2219, as R's robustbase does by default. The rest is as
-    for :func:`median`. It is 0 where h values or more are equal or only one counts.
+    :func:`qn_sample_factor` instead of 2.2219, as in R's robustbase by default. Otherwise as
+    :func:`median`. It is 0 if at least h values are equal, or for a single value.
 
     References:
         [1] P. J. Rousseeuw, C. Croux. Alternatives to the median absolute deviation. Journal of
@@ -97,13 +97,13 @@ def qn(
         >>> qn(torch.tensor([1.0, 2.0, 4.0, 8.0, 100.0]))
         tensor(6.6657)
     """
-    return _along("qn", x, dim, mask, finite_sample)
+    return _reduce_axis("qn", x, dim, mask, finite_sample)
 
 
 def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """Tell where ``qn(x, dim=dim, mask=mask) > threshold``.
+    """Return whether ``qn(x, dim=dim, mask=mask) > threshold``.
 
-    ``threshold`` is in the unit of ``x``; the rest is as for :func:`median`. False where Qn is NaN.
+    ``threshold`` is in units of ``x``. Otherwise as :func:`median`. False where Qn is NaN.
 
     Example:
         >>> qn_exceeds(torch.tensor([[1.0, 2, 3, 4], [1, 2, 30, 40]]), 5.0)
@@ -115,11 +115,10 @@ def qn_exceeds(x: Tensor, threshold: float, *, dim: int = -1, mask: Tensor | Non
 def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Return the tau scale of Maronna and Zamar: a truncated standard deviation.
 
-    With :math:`s_0` the median of the deviations from the median: the centre is the mean with
-    bisquare weights that vanish at :math:`4.5 s_0`, and the scale the root of the mean square
-    about it, each deviation cut at :math:`3 s_0` [1]. Cheaper than Qn for long rows, linear but
-    for a sort. The rest is as for :func:`median`. It is 0 where more than half of the values are
-    equal.
+    Let :math:`s_0` be the median of the deviations from the median. The center is the mean with
+    bisquare weights that vanish at :math:`4.5 s_0`. The scale is the RMS deviation from it, with
+    each deviation truncated at :math:`3 s_0` [1]. Faster than Qn for long rows: linear except for a
+    sort. Otherwise as :func:`median`. It is 0 if more than half of the values are equal.
 
     References:
         [1] R. A. Maronna, R. H. Zamar. Robust estimates of location and dispersion for
@@ -129,16 +128,16 @@ def tau(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
         >>> tau(torch.tensor([1.0, 2.0, 3.0, 4.0, 1000.0]))
         tensor(1.7441)
     """
-    return _along("tau", x, dim, mask)
+    return _reduce_axis("tau", x, dim, mask)
 
 
 Scale = Literal["median", "mad", "qn", "tau"]
 
 
-def _along(
+def _reduce_axis(
     name: Scale, x: Tensor, dim: int, mask: Tensor | None, finite_sample: bool = False
 ) -> Tensor:
-    """Check the arguments of a scale, and reduce an axis by it."""
+    """Check the arguments of a scale, and reduce an axis."""
     rows, counted = _rows_along(name, x, dim, mask)
     return scale_of_rows(rows, counted, name=name, finite_sample=finite_sample)
 
@@ -146,7 +145,7 @@ def _along(
 def _rows_along(
     caller: str, x: Tensor, dim: int, mask: Tensor | None
 ) -> tuple[Tensor, Tensor | None]:
-    """Check values and mask, and return them with an axis as the last."""
+    """Check values and mask, and move the axis to the end."""
     x = as_tensor(caller, "x", x)
     check_floating(caller, x=x)
     check_shapes(caller, x=(x, "*"), mask=(mask, "*"))
@@ -161,26 +160,26 @@ def scale_of_rows(
 ) -> Tensor:
     """Return a scale of each row of ``(*, n)``.
 
-    Its gradient is that of the formula, with the values that it picks held fixed: Qn picks a pair.
+    The gradient keeps the selected values fixed: for Qn, a pair.
     """
     if not torch.is_grad_enabled():
         rows = rows.detach()
     if name == "median":
-        return _per_count(rows, mask, _sorted_median)
+        return _map_counts(rows, mask, _sorted_median)
     if name == "mad":
-        return _per_count(rows, mask, lambda ascending: MAD_FACTOR * _median_deviation(ascending))
+        return _map_counts(rows, mask, lambda ascending: MAD_FACTOR * _median_deviation(ascending))
     if name == "tau":
-        return _per_count(rows, mask, tau_of_sorted)
-    return _per_count(
+        return _map_counts(rows, mask, tau_of_sorted)
+    return _map_counts(
         rows, mask, lambda ascending: qn_of_sorted(ascending, finite_sample=finite_sample)
     )
 
 
-def _per_count(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply a function of sorted rows ``(B, n)`` to those of ``(*, n)``, once for each number.
+def _map_counts(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]) -> Tensor:
+    """Apply a function of sorted rows ``(B, n)`` to rows ``(*, n)``, grouped by number of values.
 
-    Values that do not count become +inf, sort last, and are cut off; a NaN that counts sorts
-    behind them, so rows with one are set apart first.
+    Masked-out values become +inf, sort last, and are cut off. A NaN would sort behind them, so rows
+    with NaN are handled first.
     """
     shape, n = rows.shape[:-1], rows.shape[-1]
     rows = rows.reshape(shape.numel(), n)
@@ -201,7 +200,7 @@ def _per_count(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], 
 
 
 def sort_rows(rows: Tensor) -> Tensor:
-    """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is the fast one on a CPU."""
+    """Sort each row of a contiguous ``(B, n)`` tensor, NaN last; NumPy is faster on CPUs."""
     if rows.device.type == "cpu" and not rows.requires_grad:
         return torch.from_numpy(np.sort(rows.numpy(), axis=1))
     return rows.sort(dim=1).values
@@ -215,7 +214,7 @@ def median_of_sorted(rows: Tensor) -> Tensor:
 
 
 def _sorted_median(rows: Tensor) -> Tensor:
-    """Median of each sorted row; NaN where the row is empty or has a NaN, which sorts last."""
+    """Median of each sorted row; NaN if the row is empty or contains NaN, which sorts last."""
     if rows.shape[1] == 0:
         return rows.new_full((len(rows),), torch.nan)
     return torch.where(rows[:, -1].isnan(), torch.nan, median_of_sorted(rows))
@@ -244,14 +243,14 @@ def tau_of_sorted(rows: Tensor) -> Tensor:
 def sum_points(values: Tensor) -> Tensor:
     """Sum each lane of ``(K, *)`` over its points, in the same order for every lane.
 
-    So a sum is the same, to the last bit, wherever its lane stands. ``torch.sum`` does not promise
-    that: it adds the last lanes of a tensor in another order than the first.
+    Sums are therefore bit-identical at any position. ``torch.sum`` does not guarantee this: it adds
+    the last lanes of a tensor in a different order.
     """
     if values.requires_grad:
         total = values.sum(dim=0)
         return sum_points(values.detach()) + (total - total.detach())
     if values.device.type == "cpu":
-        # NumPy adds row by row only where rows are contiguous and longer than one.
+        # NumPy adds row by row only if rows are contiguous and longer than one.
         flat = values.reshape(len(values), -1).contiguous()
         if flat.shape[1] == 1:
             flat = flat.expand(-1, 2).contiguous()
@@ -265,7 +264,7 @@ def sum_points(values: Tensor) -> Tensor:
 
 
 def _tau_consistency() -> float:
-    """Mean of the truncated squares where the values are standard normal."""
+    """Mean of the truncated squares of standard normal values."""
     normal = NormalDist()
     cut = _TAU_SCALE_CUT * normal.inv_cdf(0.75)
     inside = (1 - cut * cut) * normal.cdf(cut) - cut * normal.pdf(cut) + cut * cut
@@ -282,7 +281,7 @@ def qn_of_sorted(rows: Tensor, *, finite_sample: bool) -> Tensor:
 
 
 def qn_sample_factor(n: int) -> float:
-    """Return the factor that makes Qn of ``n`` normal values unbiased (robustbase's revision)."""
+    """Return the factor that makes Qn of ``n`` normal values unbiased (revised in robustbase)."""
     if n < 2:
         return 1.0
     if n <= 12:
@@ -293,29 +292,29 @@ def qn_sample_factor(n: int) -> float:
 
 
 def half_size(n: int) -> int:
-    """Size of the smallest majority of ``n`` values, the h of Qn: ``floor(n / 2) + 1``."""
+    """Size of the smallest majority of ``n`` values, h in Qn: ``floor(n / 2) + 1``."""
     return n // 2 + 1
 
 
 def _majority_difference(sorted_rows: Tensor) -> Tensor:
     """Return the C(h, 2)-th smallest pairwise difference of each sorted row; NaN with a NaN.
 
-    Two values that are h or more places apart enclose at least C(h + 1, 2) pairs that are no
-    further apart than they are, so only lags 1 to h - 1 of the sorted row can hold the answer.
+    Two values at least h ranks apart enclose at least C(h + 1, 2) pairs that are no farther apart.
+    Only lags 1 to h - 1 of the sorted row can contain the result.
     """
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
         (differences,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
-        endless = differences.isnan().nonzero().squeeze(1)
-        if len(endless):
-            differences[endless] = _difference_by_lags(sorted_rows[endless])
+        infinite = differences.isnan().nonzero().squeeze(1)
+        if len(infinite):
+            differences[infinite] = _difference_by_lags(sorted_rows[infinite])
         return differences
     return _difference_by_lags(sorted_rows)
 
 
 def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
-    """Do as :func:`_majority_difference`, for all values and devices."""
+    """Implement :func:`_majority_difference` for all values and devices."""
     n, on_cpu = sorted_rows.shape[1], sorted_rows.device.type == "cpu"
     lags = range(1, half_size(n))
     rank, width = comb(half_size(n), 2), sum(n - lag for lag in lags)
@@ -324,7 +323,7 @@ def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
     def select(chunk: slice) -> Tensor:
         rows = sorted_rows[chunk]
         differences = torch.cat([rows[:, lag:] - rows[:, : n - lag] for lag in lags], dim=1)
-        # Of two infinite values, which are beyond all others.
+        # The difference of two infinite values is larger than all others.
         differences.nan_to_num_(nan=torch.inf, posinf=torch.inf)
         if on_cpu:
             differences.numpy().partition(rank - 1, axis=1)
@@ -336,12 +335,12 @@ def _difference_by_lags(sorted_rows: Tensor) -> Tensor:
 
 
 def _difference_of_pair(sorted_rows: Tensor, difference: Tensor) -> Tensor:
-    """Return a difference that occurs in each row as that of the first pair that has it."""
+    """Express the selected difference of each row by its first matching pair."""
     rows = sorted_rows.detach()
-    # The sum may be off by a rounding; the value itself or one beside it is the partner.
-    place = torch.searchsorted(rows, rows + difference[:, None])
+    # The sum may have a rounding error; the partner is at this index or next to it.
+    index = torch.searchsorted(rows, rows + difference[:, None])
     last = rows.shape[1] - 1
-    partners = torch.stack([(place + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
+    partners = torch.stack([(index + step).clamp(0, last) for step in (-1, 0, 1)], dim=-1)
     numbers = torch.arange(last + 1, device=rows.device)[:, None].expand_as(partners)
     gaps = rows[:, None].expand(*partners.shape[:2], -1).gather(2, partners) - rows[..., None]
     is_pair = (gaps == difference[:, None, None]) & (partners > numbers)

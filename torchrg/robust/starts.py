@@ -1,4 +1,4 @@
-"""Where the searches start: deterministic scatters, planes through a few points, random sets."""
+"""Starts of the searches: deterministic scatters, planes and random sets."""
 
 from functools import lru_cache
 from itertools import combinations
@@ -31,24 +31,24 @@ from torchrg.robust.scale import (
 
 Starts = Literal["paper", "robustbase", "planes", "more"]
 
-_LONG = 1000
-"""Values from which tau takes the place of Qn, which needs all differences, as in robustbase."""
+_MIN_TAU_VALUES = 1000
+"""Number of values from which tau replaces Qn, which needs all differences, as in robustbase."""
 
-_STARTS_AT_ONCE = 3
-"""Starts that are worked on together, so that what they need fits the cache."""
+_STARTS_PER_CHUNK = 3
+"""Number of starts processed at a time, so that their data fits into the cache."""
 
 _NUM_PLANES = 64
-"""Planes among which the best are chosen."""
+"""Number of candidate planes."""
 
 _NUM_PLANE_STARTS = 4
-"""Planes that become starts."""
+"""Number of planes used as starts."""
 
-_PLANES_AT_ONCE = 8
-"""Planes that are worked on together, so that what they need fits the cache."""
+_PLANES_PER_CHUNK = 8
+"""Number of planes processed at a time, so that their data fits into the cache."""
 
 
 def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:
-    """Initial sets ``(K, S, M)``, as 0 and 1, of the chosen starts, each with its size."""
+    """Initial sets ``(K, S, M)``, as masks of 0 and 1, of the chosen starts, each with its size."""
     half = -(-len(columns[0]) // 2)
     if starts == "paper":
         return [(_deterministic_starts(columns, half), half)]
@@ -65,7 +65,7 @@ def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
     standard = [_standardize(column) for column in columns]
     distances = [
         _sphered_distances(standard, eigenvectors(matrices))
-        for matrices in torch.split(_scatter_matrices(standard), _STARTS_AT_ONCE)
+        for matrices in torch.split(_scatter_matrices(standard), _STARTS_PER_CHUNK)
     ]
     sets = [smallest_points(group.flatten(1), size).view_as(group) for group in distances]
     return torch.cat(sets, dim=1)
@@ -79,17 +79,17 @@ def _standardize(column: Tensor) -> Tensor:
 
 
 def _scale(rows: Tensor) -> Tensor:
-    """Qn of sorted rows with its finite-sample factor; tau of long ones, as robustbase has it."""
-    if rows.shape[1] >= _LONG:
+    """Qn of sorted rows with its finite-sample factor; tau for long rows, as in robustbase."""
+    if rows.shape[1] >= _MIN_TAU_VALUES:
         return tau_of_sorted(rows)
     return qn_of_sorted(rows, finite_sample=True)
 
 
 def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
-    """Scale of sorted rows; where that is zero, the first positive quantile of the deviations.
+    """Scale of sorted rows; if zero, the first positive quantile of the deviations.
 
-    It is zero where most values are equal. The quantiles, at levels 0.5, 0.55, ..., 0.95, 0.9875,
-    are divided by those of a normal distribution; a constant row has scale 1.
+    The scale is zero if most values are equal. The quantiles, at levels 0.5, 0.55, ..., 0.95,
+    0.9875, are divided by those of a normal distribution; a constant row has scale 1.
     """
     scale = _scale(rows)
     zero = torch.nonzero(~(scale > 0)).squeeze(1)
@@ -108,7 +108,7 @@ def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
 
 
 def _scatter_matrices(columns: list[Tensor]) -> Tensor:
-    """Stack the six scatter matrices of standardised columns into ``(6, M, P, P)``.
+    """Stack the six scatter matrices of standardized columns into ``(6, M, P, P)``.
 
     Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order.
     """
@@ -163,7 +163,7 @@ def _correlation(columns: list[Tensor]) -> Tensor:
 
 
 def _pairwise_qn(columns: list[Tensor]) -> Tensor:
-    """Raw orthogonalised Gnanadesikan-Kettenring matrix: (Qn(a + b)^2 - Qn(a - b)^2) / 4."""
+    """Raw orthogonalized Gnanadesikan-Kettenring matrix: (Qn(a + b)^2 - Qn(a - b)^2) / 4."""
     size = len(columns)
     matrix = columns[0].new_zeros(columns[0].shape[1], size, size)
     matrix.diagonal(dim1=-2, dim2=-1).fill_(1.0)
@@ -211,15 +211,15 @@ def _score_table(count: int) -> tuple[float, ...]:
 def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
     """Choose the sets nearest to the best of 64 planes through P points each.
 
-    The best planes are those with the smallest ``size``-th distance (least median of squares).
-    With a minority of outliers some of the planes pass through clean points only, wherever the
-    outliers are. There are only sums and one sort a plane, against 27 Qn for the published starts.
+    The best planes have the smallest ``size``-th distance (least median of squares). With a
+    minority of outliers, some planes pass through clean points only, wherever the outliers are.
+    This takes only sums and one sort per plane, compared with 27 Qn for the published starts.
     """
     num_points, num_lanes = columns[0].shape
     sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
     scores = []
-    for first in range(0, len(sets), _PLANES_AT_ONCE):
-        tried = sets[first : first + _PLANES_AT_ONCE]
+    for first in range(0, len(sets), _PLANES_PER_CHUNK):
+        tried = sets[first : first + _PLANES_PER_CHUNK]
         nearest = sorted_points(_sq_residuals(columns, tried[:, :, None]))[:, size - 1]
         scores.append(nearest.reshape(len(tried), num_lanes))
     score = torch.cat(scores)
@@ -240,15 +240,15 @@ def _sq_residuals(columns: list[Tensor], sets: Tensor) -> Tensor:
         for k in range(len(columns))
     ]
     edges = [[a - b for a, b in zip(corner, corners[0], strict=True)] for corner in corners[1:]]
-    normal = _across(edges, corners[0])
+    normal = _orthogonal_direction(edges, corners[0])
     residual = dot([column[:, None] for column in columns], normal)
-    # Points that span no hyperplane are infinitely far from it.
+    # Points that span no hyperplane get an infinite distance.
     residual -= torch.where(sum_squares(normal) > 0, dot(corners[0], normal), torch.inf)
     return (residual * residual).reshape(num_points, -1)
 
 
-def _across(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
-    """Unit vectors across P - 1 edges; zero where these do not span a hyperplane."""
+def _orthogonal_direction(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
+    """Unit vectors orthogonal to P - 1 edges; zero if these do not span a hyperplane."""
     size = len(like)
     if size == 1:
         return [torch.ones_like(like[0])]
@@ -268,7 +268,7 @@ def _across(edges: list[list[Tensor]], like: list[Tensor]) -> list[Tensor]:
 
 
 def _rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:
-    """Express the points of each lane in the eigenvectors of its covariance."""
+    """Transform the points of each lane to the eigenvectors of its covariance."""
     ones = torch.ones_like(columns[0])
     means = [sum_points(column) / len(column) for column in columns]
     vectors = eigenvectors(covariance_entries(columns, means, ones, len(ones)))
@@ -278,11 +278,11 @@ def _rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:
 
 @lru_cache(maxsize=64)
 def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tensor:
-    """Choose sets of ``size`` among ``num_points`` points at random, or all where they are few.
+    """Choose random sets of ``size`` among ``num_points`` points, or all sets if there are few.
 
-    The same sets serve every patch, so a patch's result depends on the seed and on nothing else in
-    its batch. Returns point indices ``(S, size)``: all sets where there are at most
-    ``5 * num_sets``, otherwise ``num_sets`` of them.
+    All patches share the sets, so the result of a patch depends only on the seed, not on its batch.
+    Returns point indices ``(S, size)``: all sets if there are at most ``5 * num_sets``, otherwise
+    ``num_sets`` of them.
     """
     if comb(num_points, size) <= 5 * num_sets:
         return torch.tensor(list(combinations(range(num_points), size)), device="cpu")

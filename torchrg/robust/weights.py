@@ -1,4 +1,4 @@
-"""From a raw fit to the final one: h, cut-offs, correction factors, and the reweighted scatter."""
+"""Reweighting of raw fits: cutoffs, correction factors and scatter."""
 
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -21,14 +21,14 @@ Inliers = Literal["raw", "reweighted"]
 
 
 def subset_size(num_points: int, num_coordinates: int, support_fraction: float) -> int:
-    """Return h, the number of points whose scatter the MCD minimises, as R's ``h.alpha.n``.
+    """Return h, the number of points whose scatter the MCD minimizes, as R's ``h.alpha.n``.
 
-    Between the smallest size with the highest breakdown point, ``(n + p + 1) // 2``, at a support
-    fraction of 0.5 and all n points at 1.
+    From the smallest size with the highest breakdown point, ``(n + p + 1) // 2``, at a support
+    fraction of 0.5, to all n points at 1.
     """
     half = (num_points + num_coordinates + 1) // 2
     size = 2 * half - num_points + 2 * (num_points - half) * support_fraction
-    # Products such as 2 * 23 * 0.7 may fall a rounding error short of a whole number.
+    # Products such as 2 * 23 * 0.7 may be a rounding error below an integer.
     return min(int(size + 1e-9), num_points)
 
 
@@ -53,7 +53,8 @@ def consistency_factor(fraction: float, num_coordinates: int) -> float:
 
 _RAW_SMALL = (2.12777, 2.718898, 1.993509, 2.220433, 1.820585)
 _FINAL_SMALL = (1.73511, 2.06681, 1.545905, 1.659655, 1.456835)
-"""Factors of 6 to 10 points at a support fraction of 0.5, which the published formula misses."""
+"""Small-sample factors of 6 to 10 points at a support fraction of 0.5, poorly fitted by the
+published formula."""
 
 
 def small_sample_factor(
@@ -61,13 +62,13 @@ def small_sample_factor(
 ) -> float:
     """Factor that removes the bias of the MCD scatter of few normal points (Pison et al. 2002).
 
-    For the raw scatter or the reweighted one. Where the published formula has its pole (five points
-    and fewer) or is negative (six), the factor is 1.
+    For the raw or the reweighted scatter. The factor is 1 where the published formula has its pole
+    (up to five points) or is negative (six).
     """
     if num_coordinates != 3:
         raise ConfigError(
-            "small_sample_factor: expected points of 3 coordinates, for which the factor is known, "
-            f"got {num_coordinates}; leave small_sample off."
+            "small_sample_factor: expected points with 3 coordinates, got "
+            f"{num_coordinates}; leave small_sample off."
         )
     n = num_points
     if n <= 5:
@@ -86,10 +87,10 @@ def small_sample_factor(
 
 
 class Estimate(NamedTuple):
-    """A fit of each of M lanes; the fields of :class:`torchrg.robust.RobustFit`, points on axis 0.
+    """Fits of M lanes: the fields of :class:`torchrg.robust.RobustFit`, with points on axis 0.
 
-    ``objective`` ``(M,)`` is the determinant that was minimised, float64; ``singular`` ``(M,)``
-    tells whether ``raw_support`` lies on a hyperplane.
+    ``objective`` ``(M,)`` is the minimized determinant, float64; ``singular`` ``(M,)`` marks lanes
+    whose ``raw_support`` lies on a hyperplane.
     """
 
     location: Tensor
@@ -106,14 +107,14 @@ class Estimate(NamedTuple):
 def quantile_factor(distances: Tensor, size: int, num_coordinates: int) -> Tensor:
     """Factor ``(M,)`` of a scatter, ``d2_(h) / chi2inv(h / n)`` of squared distances ``(K, M)``.
 
-    Of n normal points the h-th smallest, h below n, is about the quantile of level h / n.
+    For n normal points the h-th smallest, h below n, is about the quantile of level h / n.
     """
     reach = sorted_points(distances)[:, size - 1]
     return reach / chi2_quantile(size / len(distances), num_coordinates)
 
 
 def within_quantile(distances: Tensor, quantile: float, num_coordinates: int) -> Tensor:
-    """Return 1 where squared distances ``(K, M)`` are within a chi-square quantile, 0 elsewhere."""
+    """Return 1 where squared distances ``(K, M)`` are within a chi-square quantile, else 0."""
     return at_most(distances, distances.new_tensor([chi2_quantile(quantile, num_coordinates)]))
 
 
@@ -122,7 +123,7 @@ def reweight(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return location, covariance and support of points within a quantile of a raw fit.
 
-    The covariance is multiplied by the factor except where no point is left out.
+    The covariance is multiplied by the factor unless all points are included.
     """
     weights = within_quantile(distances, quantile, len(columns))
     count = sum_points(weights)

@@ -1,8 +1,8 @@
-"""Synthetic indoor scenes with exact labels and normals, for demos, tests and benchmarks.
+"""Synthetic indoor scenes with exact labels and normals.
 
-:func:`make_room` is all that most need. To build a scene of your own, put surfaces and the bodies
-behind them into :class:`Part`, parts and places for a scanner into :class:`SceneModel`, and draw
-points from it by :func:`sample_scene`. The modules below this one may change without notice.
+:func:`make_room` suffices for most uses. For other scenes, combine surfaces and solids in a
+:class:`Part`, parts and scanner positions in a :class:`SceneModel`, and sample points with
+:func:`sample_scene`. The submodules may change without notice.
 """
 
 from torchrg.scenes.geometry import Array, Frame, unit

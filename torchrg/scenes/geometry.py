@@ -1,4 +1,4 @@
-"""Local frames: an origin and three axes, in which parts of a scene are described."""
+"""Local coordinate frames of scene parts."""
 
 from dataclasses import dataclass
 
@@ -29,57 +29,57 @@ class Frame:
 
     @classmethod
     def upright(cls, origin: Array, heading_deg: float = 0.0) -> "Frame":
-        """Return a frame whose third axis is up, rotated about it by ``heading_deg``."""
+        """Return a frame with its third axis up, rotated about it by ``heading_deg``."""
         heading = np.deg2rad(heading_deg)
         cosine, sine = np.cos(heading), np.sin(heading)
         return cls(origin, np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1.0]]))
 
     @classmethod
     def spanned(cls, origin: Array, first: Array, second: Array) -> "Frame":
-        """Return a frame with its first axis along ``first``, whose first plane has ``second``."""
+        """Return a frame with its first axis along ``first``, and ``second`` in its first plane."""
         axis0 = unit(first)
         axis1 = unit(second - np.vecdot(second, axis0) * axis0)
         return cls(origin, np.stack([axis0, axis1, np.cross(axis0, axis1)]))
 
     def placed(self, origin: Triple, first: Triple, second: Triple) -> "Frame":
-        """Return another frame, described in this one by its origin and two directions."""
+        """Return another frame, defined in this one by its origin and two directions."""
         local = Frame.spanned(*(np.array(v, dtype=np.float64) for v in (origin, first, second)))
         return local.inside(self)
 
     def moved(self, x: float, y: float = 0, z: float = 0) -> "Frame":
-        """Return the same frame with its origin moved by local coordinates."""
+        """Return this frame translated by local coordinates."""
         return Frame(self.to_world(np.array((x, y, z), dtype=np.float64)), self.axes)
 
     def inside(self, outer: "Frame") -> "Frame":
-        """Return this frame, given in ``outer``, in the world of ``outer``."""
+        """Transform this frame from ``outer`` to the world coordinates of ``outer``."""
         return Frame(outer.to_world(self.origin), outer.vectors_to_world(self.axes))
 
     def to_world(self, local: Array) -> Array:
-        """Return points of shape ``(*, 3)``, given in this frame, in the world."""
+        """Transform points of shape ``(*, 3)`` from this frame to world coordinates."""
         return self.origin + self.vectors_to_world(local)
 
     def to_local(self, world: Array) -> Array:
-        """Return points of shape ``(*, 3)``, given in the world, in this frame."""
+        """Transform points of shape ``(*, 3)`` from world coordinates to this frame."""
         return self.vectors_to_local(world - self.origin)
 
     def vectors_to_world(self, local: Array) -> Array:
-        """Return vectors of shape ``(*, 3)``, given in this frame, in the world."""
-        # A matrix product would round each row in a way that depends on how many there are.
+        """Rotate vectors of shape ``(*, 3)`` from this frame to world axes."""
+        # The rounding of a matrix product would depend on the number of rows.
         world: Array = np.einsum("...i,ij->...j", local, self.axes)
         return world
 
     def vectors_to_local(self, world: Array) -> Array:
-        """Return vectors of shape ``(*, 3)``, given in the world, in this frame."""
+        """Rotate vectors of shape ``(*, 3)`` from world axes to this frame."""
         local: Array = np.vecdot(world[..., None, :], self.axes)
         return local
 
 
 def unit(vectors: Array) -> Array:
-    """Return vectors of shape ``(*, 3)`` divided by their lengths."""
+    """Normalize vectors of shape ``(*, 3)``."""
     result: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     return result
 
 
 def box_around(points: Array) -> Array:
-    """Return lowest and highest coordinates of points of shape ``(N, 3)``, shape ``(2, 3)``."""
+    """Return the bounding box of points of shape ``(N, 3)``, shape ``(2, 3)``."""
     return np.stack([points.min(axis=0), points.max(axis=0)])

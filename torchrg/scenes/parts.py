@@ -1,4 +1,4 @@
-"""Parts of rooms: walls with doors and windows, and furniture of random sizes."""
+"""Parts of rooms: walls with doors and windows, and furniture of random size."""
 
 from collections.abc import Collection, Mapping
 
@@ -9,14 +9,14 @@ from torchrg.scenes.scene import Part
 from torchrg.scenes.surfaces import Hole, Solid, rectangle
 
 SIDES = ("left", "right", "front", "back")
-"""Left and right are across the first axis of a body, front and back across the second."""
+"""Sides of a solid: left and right across its first axis, front and back across the second."""
 
 TABLE_HEIGHT = (0.62, 0.92)
-"""Least and greatest height of a table top, metres."""
+"""Minimum and maximum height of a table top, in meters."""
 
 
 def room_walls(room: Frame, size: Triple) -> list[Frame]:
-    """Return the frames of the four walls: first axis along the wall, second up, third inwards.
+    """Return the frames of the four walls: first axis along the wall, second up, third inward.
 
     Example:
         >>> walls = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))
@@ -33,9 +33,10 @@ def room_walls(room: Frame, size: Triple) -> list[Frame]:
 
 
 def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
-    """Return what is behind a hole in a wall: a leaf ``depth`` behind it, and the four sides to it.
+    """Return the recess behind a hole in a wall: a panel at ``depth``, and the four sides.
 
-    The hole is in the first two axes of the wall, along it and up; the third is into the room.
+    The hole is given along the first two axes of the wall (along and up); the third points into the
+    room.
     """
     left, right, low, high = hole
     leaf = rectangle(kind, wall.moved(left, low, -depth), right - left, high - low)
@@ -45,7 +46,7 @@ def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
 
 
 def passage(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
-    """Return the left, right and upper side of a hole through a wall of a thickness ``depth``."""
+    """Return the left, right and upper side of a hole through a wall of thickness ``depth``."""
     left, right, low, high = hole
     sides = (
         ((left, low, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), high - low),
@@ -65,10 +66,10 @@ def block(
     without: Collection[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> Part:
-    """Return a rectangular body, and its faces: :data:`SIDES`, "bottom" and "top".
+    """Return a box and its faces: :data:`SIDES`, "bottom" and "top".
 
-    The third axis of the frame is up, the origin the middle of the base. Faces that something
-    covers completely are left out by ``without``; ``kinds`` names those not called ``kind``.
+    The third axis of the frame is up, the origin is the center of the base. ``without`` lists
+    completely covered faces; ``kinds`` overrides ``kind`` for single faces.
     """
     x, y, z = size
     corners = {
@@ -88,28 +89,28 @@ def block(
 
 
 def against(wall: Frame, along: float, height: float, depth: float) -> Frame:
-    """Return the frame of an object of a depth with its back against a wall.
+    """Return the frame of an object with its back against a wall.
 
-    Its first axis is along the wall, the second into it, the third up; its origin is the middle
-    of its base, ``along`` from the start of the wall and ``height`` above the floor.
+    Its first axis is along the wall, the second into the wall, the third up. Its origin is the
+    center of its base, ``along`` from the start of the wall and ``height`` above the floor.
     """
     along_axis, up, inwards = wall.axes
     return Frame(wall.moved(along, height, depth / 2).origin, np.stack([along_axis, -inwards, up]))
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> float:
-    """Return a random number between two others."""
+    """Return a random number in an interval."""
     return float(low + (high - low) * rng.random())
 
 
 def draw_door(rng: np.random.Generator, middle: float) -> Hole:
-    """Return the hole of a door around a place of a wall, with a low sill."""
+    """Return the hole of a door centered at a position along a wall, with a low sill."""
     half = between(rng, 0.42, 0.5)
     return middle - half, middle + half, between(rng, 0.01, 0.05), between(rng, 1.98, 2.15)
 
 
 def draw_window(rng: np.random.Generator, middle: float, ceiling: float) -> Hole:
-    """Return the hole of a window around a place of a wall."""
+    """Return the hole of a window centered at a position along a wall."""
     half, top = between(rng, 0.5, 0.75), ceiling - between(rng, 0.4, 0.8)
     return middle - half, middle + half, between(rng, 0.8, 1.05), top
 
@@ -127,13 +128,13 @@ def draw_shelf(rng: np.random.Generator, wall: Frame, along: float, thickness: f
 
 
 def draw_panel(rng: np.random.Generator, wall: Frame, along: float, thickness: float) -> Part:
-    """Return an upright board on a wall, up to twice as thick as asked for."""
+    """Return a vertical board on a wall, of up to twice the thickness."""
     size = (between(rng, 1, 1.5), thickness * between(rng, 1, 2), between(rng, 0.8, 1.1))
     return _board("panel", against(wall, along, between(rng, 0.8, 1.1), size[1]), size)
 
 
 def _board(kind: str, frame: Frame, size: Triple) -> Part:
-    """Return a plate fixed to a wall by its back; its narrow faces are called its edge."""
+    """Return a board fixed to a wall by its back; its narrow faces are its edge."""
     shortest = int(np.argmin(size))
     pairs = (("left", "right"), ("front", "back"), ("bottom", "top"))
     narrow = [face for axis, pair in enumerate(pairs) if axis != shortest for face in pair]
@@ -142,7 +143,7 @@ def _board(kind: str, frame: Frame, size: Triple) -> Part:
 
 
 def draw_table(rng: np.random.Generator, frame: Frame, thickness: float) -> Part:
-    """Return a plate with all its faces on a square post."""
+    """Return a board with all its faces on a square post."""
     height = between(rng, *TABLE_HEIGHT)
     length, width, post = between(rng, 1.25, 1.5), between(rng, 0.65, 0.8), between(rng, 0.2, 0.35)
     names = dict.fromkeys(SIDES, "table edge") | {"bottom": "table underside", "top": "table top"}
@@ -153,15 +154,15 @@ def draw_table(rng: np.random.Generator, frame: Frame, thickness: float) -> Part
 
 
 def draw_box(rng: np.random.Generator, frame: Frame) -> Part:
-    """Return a box that stands on the floor."""
+    """Return a box on the floor."""
     size = (between(rng, 0.35, 0.8), between(rng, 0.35, 0.6), between(rng, 0.3, 0.9))
     return block("box", frame, size, without=("bottom",))
 
 
 def draw_small_box(rng: np.random.Generator, top: Frame) -> Part:
-    """Return a box that stands on a table, given the middle of the table's upper side."""
-    place = top.moved(between(rng, -0.08, 0.08), between(rng, -0.08, 0.08), 0)
-    frame = Frame.upright(place.origin, between(rng, -90, 90))
+    """Return a box on a table, placed near the center of the table top."""
+    position = top.moved(between(rng, -0.08, 0.08), between(rng, -0.08, 0.08), 0)
+    frame = Frame.upright(position.origin, between(rng, -90, 90))
     size = (between(rng, 0.2, 0.35), between(rng, 0.2, 0.3), between(rng, 0.15, 0.4))
     return block("box", frame, size, without=("bottom",))
 

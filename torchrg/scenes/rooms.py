@@ -1,4 +1,4 @@
-"""Furnished rooms: the sizes and places of all that is in them, drawn from a seed."""
+"""Furnished rooms, generated from a seed."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -26,38 +26,39 @@ from torchrg.scenes.surfaces import Hole, rectangle
 
 T = TypeVar("T")
 Furniture = Callable[[np.random.Generator, Frame], Part]
-"""A function that draws an object on a place of the floor."""
+"""Function that creates an object at a position on the floor."""
 
 _ROOM = 100
-"""Purpose of the random numbers: sizes and places in a room."""
+"""Purpose of the random numbers: sizes and positions in a room."""
 
 _FLOOR_CELL = (1.85, 1.35)
-"""Metres along and across a place on the floor: a table with room to pass around it."""
+"""Size of a floor cell in meters: a table with space to walk around it."""
 _WALL_CELL = 1.75
-"""Metres along a place on a wall: a window or a cabinet with wall on both sides."""
+"""Length of a wall cell in meters: a window or cabinet with wall on both sides."""
 _CORNER = 0.6
-"""Metres that are free at both ends of a wall, for a cabinet on the next wall."""
+"""Free length at both ends of a wall in meters, for a cabinet on the next wall."""
 _AISLE = 0.75
-"""Metres that are free along the walls, for doors and cabinets."""
+"""Free width along the walls in meters, for doors and cabinets."""
 _DOORWAY_AISLE = 1.6
-"""Metres from the middle of a doorway to whatever is on a wall."""
+"""Minimum distance from the center of a doorway to objects on walls, in meters."""
 _DOORWAY_SPACE = 1.9
-"""Metres from the middle of a doorway to whatever stands on the floor, for an open door."""
+"""Minimum distance from the center of a doorway to objects on the floor, in meters, for an open
+door."""
 _TRIES = 1000
-"""Times that an object is drawn until none of its faces lies in the plane of another."""
+"""Maximum number of attempts to create an object without a face in the plane of another."""
 _PARALLEL = 1 - 0.02**2 / 2
-"""Least cosine between faces that count as parallel, of about one degree."""
+"""Minimum cosine between parallel faces (about one degree)."""
 _CLEARANCES = (1.0, 0.6, 0.4, 0.2)
-"""Metres of free space around a scanner, the first that there is."""
+"""Free space around a scanner in meters, in order of preference."""
 _MAX_SIDE, _MAX_COUNT = 1000, 1000
-"""Longest side of a room in meters, and most objects of a kind: places are listed one by one."""
-_PLACE_TRIES = 50
-"""Times that a place for a scanner is drawn with each clearance."""
+"""Maximum side of a room in meters, and number of objects of a kind; bounds the list of cells."""
+_POSITION_TRIES = 50
+"""Maximum number of attempts to find a scanner position with each clearance."""
 
 
 @dataclass(frozen=True)
 class RoomLayout:
-    """What is in a room; lengths in metres. The defaults make 153 faces, 35 of them 4 cm wide."""
+    """Contents of a room; lengths in meters. The default has 153 faces, 35 of them 4 cm wide."""
 
     size: Triple = (9.0, 7.0, 2.8)
     """Length, width, height."""
@@ -67,23 +68,23 @@ class RoomLayout:
     num_shelves: int = 1
     """Horizontal boards on walls."""
     num_panels: int = 0
-    """Upright boards on walls."""
+    """Vertical boards on walls."""
     num_tables: int = 8
     num_boxes: int = 3
     """On the floor."""
     num_small_boxes: int = 2
-    """On tables, at most one on each."""
+    """On tables, at most one per table."""
     num_pillars: int = 1
     plate_thickness: float = 0.04
     """Thickness of table tops and shelves."""
     panel_thickness: float = 0.015
-    """Least thickness of panels; each is up to twice as thick, so that no two are in one plane."""
+    """Minimum thickness of panels; they are up to twice as thick, so that no two are coplanar."""
     heading_deg: float = 0.0
-    """How far the room is turned about the upward axis."""
+    """Rotation of the room about the up axis, in degrees."""
     min_plane_gap: float = 0.005
-    """Least distance of any face to the plane of another face that is parallel to it."""
+    """Minimum distance between a face and the plane of a parallel face."""
     num_viewpoints: int = 1
-    """Places where a scanner may stand, spread along the room."""
+    """Number of scanner positions, spread along the room."""
 
     def __post_init__(self) -> None:
         check_values(self)
@@ -113,7 +114,7 @@ class RoomLayout:
         return Part((rectangle("wall", wall, length, self.size[2], holes),))
 
     def furniture(self) -> list[tuple[int, Furniture]]:
-        """Return the number of each kind on the floor but tables, and what draws one of them."""
+        """Return the number and generator of each kind of object on the floor except tables."""
         pillar = partial(draw.draw_pillar, ceiling=self.size[2])
         return [(self.num_boxes, draw.draw_box), (self.num_pillars, pillar)]
 
@@ -125,23 +126,23 @@ def make_room(
     *,
     layout: RoomLayout | None = None,
 ) -> Scene:
-    """Make a cloud of a furnished room with exact truth.
+    """Generate a point cloud of a furnished room with exact ground truth.
 
     Convention:
-        Metres, z up, the floor at z = 0 and one of its corners at the origin. The room depends on
-        ``seed`` and ``layout`` alone: other settings give other samples of the same room.
+        Units are meters, z is up, the floor is at z = 0 with a corner at the origin. The room
+        depends only on ``seed`` and ``layout``; other settings give other samples of the same room.
 
     Args:
         num_points: Number of points.
-        noise: Standard deviation of the noise along the normals, in metres.
-        seed: Two calls with equal arguments give equal clouds; see :func:`sample_scene`.
-        layout: What is in the room. Default: ``RoomLayout()``.
+        noise: Standard deviation of the noise along the normals, in meters.
+        seed: Identical arguments give identical clouds; see :func:`sample_scene`.
+        layout: Contents of the room. Default: ``RoomLayout()``.
 
     Returns:
-        The cloud and its truth.
+        The cloud and its ground truth.
 
     Raises:
-        ConfigError: If a setting is not allowed, or the room too small for its furniture.
+        ConfigError: If a setting is invalid, or the room is too small for its furniture.
 
     Example:
         >>> room = make_room(5000, noise=0.002, seed=1)
@@ -152,10 +153,10 @@ def make_room(
 
 
 def build_room(seed: int = 0, *, layout: RoomLayout | None = None) -> SceneModel:
-    """Build the description of a furnished room, to be sampled or rendered; see :func:`make_room`.
+    """Generate the model of a furnished room; see :func:`make_room`.
 
     Returns:
-        The scene. Its first six faces are floor, ceiling and walls.
+        The model. Its first six faces are floor, ceiling and walls.
 
     Example:
         >>> [surface.kind for surface in build_room().surfaces[:3]]
@@ -176,9 +177,9 @@ def furnish(
     doorways: Sequence[tuple[int, Hole]] = (),
     with_floor: bool = True,
 ) -> tuple[Part, ...]:
-    """Return the parts of a room, whose origin is a corner of the floor; the shell is the first.
+    """Return the parts of a room with a floor corner at its origin; the shell comes first.
 
-    ``doorways`` are holes in walls that are there already, each with its wall.
+    ``doorways`` are existing holes in walls, each with the index of its wall.
 
     Raises:
         ConfigError: If the room is too small for its furniture.
@@ -190,19 +191,19 @@ def furnish(
     is_flat = [surface.plane is not None for surface in parts[0].surfaces[-len(walls) :]]
     wall_places = [
         (wall, along)
-        for wall, along in _wall_places(layout.size)
+        for wall, along in _wall_cells(layout.size)
         if is_flat[wall] and _is_away(walls[wall].moved(along), middles, _DOORWAY_AISLE)
     ]
     wall_places = [wall_places[row] for row in rng.permutation(len(wall_places))]
     floor_places = [
         (x, y)
-        for x, y in _floor_places(layout.size)
+        for x, y in _floor_cells(layout.size)
         if _is_away(room.moved(x, y), middles, _DOORWAY_SPACE)
     ]
     floor_places = [floor_places[row] for row in rng.permutation(len(floor_places))]
 
-    def place(drawn: Iterator[Part]) -> None:
-        parts.append(_first_apart(drawn, parts, layout.min_plane_gap))
+    def add(drawn: Iterator[Part]) -> None:
+        parts.append(_first_separated(drawn, parts, layout.min_plane_gap))
 
     def open_wall(kind: str, draw_hole: Callable[[np.random.Generator, float], Hole]) -> None:
         wall, middle = _take(wall_places, "walls")
@@ -213,7 +214,7 @@ def furnish(
                 holes[wall][-1] = draw_hole(rng, middle)
                 yield recess(kind, walls[wall], holes[wall][-1], between(rng, 0.06, 0.16))
 
-        place(recesses())
+        add(recesses())
 
     def standing(middle: tuple[float, float], max_heading_deg: float) -> Frame:
         x, y = (value + between(rng, -0.1, 0.1) for value in middle)
@@ -232,24 +233,24 @@ def furnish(
     ]
     for draw_at in (draw_at for number, draw_at in on_walls for _ in range(number)):
         wall, along = _take(wall_places, "walls")
-        place(draw_at(rng, walls[wall], along + between(rng, -0.1, 0.1)) for _ in count())
+        add(draw_at(rng, walls[wall], along + between(rng, -0.1, 0.1)) for _ in count())
     for number in range(layout.num_tables):
         middle = _take(floor_places, "floor")
-        place(draw.draw_table(rng, standing(middle, 12), plate) for _ in count())
+        add(draw.draw_table(rng, standing(middle, 12), plate) for _ in count())
         if number < layout.num_small_boxes:
             [top] = [surface for surface in parts[-1].surfaces if surface.kind == "table top"]
             middle_of_top = Frame.upright(top.bounds.mean(axis=0))
-            place(draw.draw_small_box(rng, middle_of_top) for _ in count())
+            add(draw.draw_small_box(rng, middle_of_top) for _ in count())
     for draw_on in (draw_on for number, draw_on in layout.furniture() for _ in range(number)):
         middle = _take(floor_places, "floor")
-        place(draw_on(rng, standing(middle, 90)) for _ in count())
+        add(draw_on(rng, standing(middle, 90)) for _ in count())
     return tuple(parts)
 
 
 def _shell(
     layout: RoomLayout, room: Frame, holes: Sequence[Sequence[Hole]], with_floor: bool
 ) -> Part:
-    """Return floor, ceiling and four walls, each with its holes, as one part."""
+    """Return floor, ceiling and four walls with their holes as one part."""
     length, width, height = layout.size
     above = room.placed((0, width, height), (1, 0, 0), (0, -1, 0))
     ends = [rectangle("floor", room, length, width), rectangle("ceiling", above, length, width)]
@@ -263,59 +264,59 @@ def _shell(
     )
 
 
-def _is_away(place: Frame, middles: Sequence[Array], distance: float) -> bool:
-    """Return whether a place is so far from the middles of all doorways, on the floor."""
-    gaps = (middle - place.origin for middle in middles)
+def _is_away(position: Frame, middles: Sequence[Array], distance: float) -> bool:
+    """Return whether a position is at least ``distance`` from all doorways."""
+    gaps = (middle - position.origin for middle in middles)
     return all(np.vecdot(gap, gap) >= distance * distance for gap in gaps)
 
 
-def _first_apart(drawn: Iterator[Part], others: Sequence[Part], gap: float) -> Part:
-    """Return the first of several drawn objects that has no face in the plane of another."""
+def _first_separated(drawn: Iterator[Part], others: Sequence[Part], gap: float) -> Part:
+    """Return the first generated object without a face in the plane of another."""
     for part in islice(drawn, _TRIES):
-        if not _shares_plane(part, others, gap):
+        if not _has_coplanar_face(part, others, gap):
             return part
     raise ConfigError(
-        f"build_room: expected no face within min_plane_gap={gap} of the plane of another, "
-        "got too many objects for that; lower it."
+        f"build_room: expected faces at least min_plane_gap={gap} from the planes of others, "
+        "got too many objects; lower min_plane_gap."
     )
 
 
-def _take(places: list[T], where: str) -> T:
-    """Take the next free place."""
-    if not places:
+def _take(cells: list[T], where: str) -> T:
+    """Take the next free position."""
+    if not cells:
         raise ConfigError(
-            f"build_room: expected a place on the {where} for each object, got too many objects; "
-            "enlarge the room."
+            f"build_room: expected enough space on the {where}, got too many objects; enlarge the "
+            "room."
         )
-    return places.pop()
+    return cells.pop()
 
 
-def _wall_places(size: Triple) -> list[tuple[int, float]]:
-    """Return where things fit on the four walls: wall, and distance from its start."""
+def _wall_cells(size: Triple) -> list[tuple[int, float]]:
+    """Return the cells on the four walls: wall, and distance from its start."""
     return [
         (wall, _CORNER + middle)
         for wall, length in enumerate((size[0], size[1]) * 2)
-        for middle in _middles(length - 2 * _CORNER, _WALL_CELL)
+        for middle in _cell_centers(length - 2 * _CORNER, _WALL_CELL)
     ]
 
 
-def _floor_places(size: Triple) -> list[tuple[float, float]]:
-    """Return where things fit on the floor, away from the walls."""
+def _floor_cells(size: Triple) -> list[tuple[float, float]]:
+    """Return the cells on the floor, away from the walls."""
     xs, ys = (
-        [_AISLE + middle for middle in _middles(length - 2 * _AISLE, cell)]
+        [_AISLE + middle for middle in _cell_centers(length - 2 * _AISLE, cell)]
         for length, cell in zip(size[:2], _FLOOR_CELL, strict=True)
     )
     return list(product(xs, ys))
 
 
-def _middles(length: float, cell: float) -> list[float]:
-    """Return the middles of as many equal cells of at least ``cell`` as fit into a length."""
+def _cell_centers(length: float, cell: float) -> list[float]:
+    """Return the centers of as many equal cells of at least ``cell`` as fit into a length."""
     count = max(int(length / cell), 0)
     return [length * (number + 0.5) / count for number in range(count)]
 
 
-def _shares_plane(part: Part, others: Sequence[Part], min_gap: float) -> bool:
-    """Return whether a face of a part is closer than ``min_gap`` to the plane of a parallel one."""
+def _has_coplanar_face(part: Part, others: Sequence[Part], min_gap: float) -> bool:
+    """Return whether a face is closer than ``min_gap`` to the plane of a parallel one."""
     mine = [surface for surface in part.surfaces if surface.plane is not None]
     theirs = [surface for other in others for surface in other.surfaces if surface.plane]
     if not mine or not theirs:
@@ -331,23 +332,25 @@ def _shares_plane(part: Part, others: Sequence[Part], min_gap: float) -> bool:
 def free_places(
     layout: RoomLayout, room: Frame, parts: Sequence[Part], rng: np.random.Generator
 ) -> Array:
-    """Return places for a scanner, spread along a room, shape ``(num_viewpoints, 3)``.
+    """Return scanner positions, spread along a room, shape ``(num_viewpoints, 3)``.
 
     Raises:
         ConfigError: If there is no free space.
     """
     length, width, _ = layout.size
-    places: list[Array] = []
+    positions: list[Array] = []
     for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
-        for _ in range(_PLACE_TRIES if len(places) == number else 0):
+        for _ in range(_POSITION_TRIES if len(positions) == number else 0):
             x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
-            place = room.moved(x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)).origin
-            near = place + clearance * (2 * rng.random((64, 3)) - 1)
+            position = room.moved(
+                x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)
+            ).origin
+            near = position + clearance * (2 * rng.random((64, 3)) - 1)
             if not is_occupied(parts, near).any():
-                places.append(place)
+                positions.append(position)
                 break
-    if len(places) < layout.num_viewpoints:
+    if len(positions) < layout.num_viewpoints:
         raise ConfigError(
-            "build_room: expected free space for a scanner in the room, got none; enlarge it."
+            "build_room: expected free space for a scanner, got none; enlarge the room."
         )
-    return np.stack(places)
+    return np.stack(positions)

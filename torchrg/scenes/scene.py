@@ -1,4 +1,4 @@
-"""What a scene is made of, and clouds sampled from it."""
+"""Scene models, and point clouds sampled from them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,28 +18,28 @@ from torchrg.structures import FARTHEST, MAX_POINTS
 NoiseDirection = Literal["normal", "isotropic"]
 
 PLACES, NOISE = range(2)
-"""Purposes of the random numbers. Places are the same whatever the noise is."""
+"""Purposes of the random numbers; positions do not depend on the noise."""
 _CLEARANCE = 1e-7
-"""Share of the size of a scene that must be free in front of a surface for it to be seen."""
-_SPARE = 1.02
-"""Points that are tried for each one that is expected to be needed, which saves repetitions."""
+"""Free space required in front of a visible surface, as a fraction of the scene size."""
+_OVERSAMPLING = 1.02
+"""Oversampling factor, which avoids repetitions."""
 
 
 class Scene(NamedTuple):
-    """A cloud with its exact truth.
+    """A point cloud with exact ground truth.
 
     Attributes:
-        points: Shape ``(N, 3)``, float32, metres.
-        labels: Row of each point's face in the tables below, shape ``(N,)``, int64. Curved faces
+        points: Shape ``(N, 3)``, float32, in meters.
+        labels: Face of each point as a row of the tables below, shape ``(N,)``, int64. Curved faces
             have labels too, see ``planar``.
-        normals: Unit normals of the faces at the points before noise, towards free space, shape
-            ``(N, 3)``, float32.
-        planar: Whether each face lies in a plane, shape ``(M,)``, bool.
+        normals: Unit normals of the faces at the noise-free points, toward free space, shape ``(N,
+            3)``, float32.
+        planar: Mask of planar faces, shape ``(M,)``, bool.
         face_normals: Normals of the planar faces, shape ``(M, 3)``, float64; zero for curved ones.
         face_offsets: Offsets of their planes, ``normal . x = offset``, shape ``(M,)``, float64.
-        face_areas: Areas, covered parts included, shape ``(M,)``, float64.
-        kinds: What each face is part of, as in ``"table edge"``, of length M.
-        objects: Which object each face belongs to, shape ``(M,)``, int64.
+        face_areas: Areas including covered parts, shape ``(M,)``, float64.
+        kinds: Kind of each face, such as ``"table edge"``, of length M.
+        objects: Object of each face, shape ``(M,)``, int64.
     """
 
     points: Tensor
@@ -55,7 +55,7 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True)
 class Part:
-    """An object: its visible surfaces, each a face, and the bodies that hide what is in them."""
+    """An object: its visible surfaces (faces), and the solids that occlude."""
 
     surfaces: tuple[Surface, ...]
     solids: tuple[Solid, ...] = ()
@@ -63,11 +63,11 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class SceneModel:
-    """The description of a scene, to be sampled or rendered.
+    """Model of a scene, for sampling or rendering.
 
     Args:
         parts: The objects; their surfaces, in order, are the faces.
-        viewpoints: Places in free space where a scanner may stand, shape ``(V, 3)``, at least one.
+        viewpoints: Scanner positions in free space, shape ``(V, 3)``, at least one.
     """
 
     parts: tuple[Part, ...]
@@ -75,17 +75,17 @@ class SceneModel:
 
     @cached_property
     def surfaces(self) -> tuple[Surface, ...]:
-        """The faces."""
+        """All faces."""
         return tuple(surface for part in self.parts for surface in part.surfaces)
 
     @cached_property
     def objects(self) -> NDArray[np.int64]:
-        """Which part each face belongs to, shape ``(M,)``."""
+        """Part of each face, shape ``(M,)``."""
         counts = [len(part.surfaces) for part in self.parts]
         return np.repeat(np.arange(len(counts)), counts)
 
     def is_visible(self, face: int, points: Array, normals: Array) -> NDArray[np.bool_]:
-        """Return at which points of a face there is free space in front of it, shape ``(N,)``."""
+        """Return the mask of points of a face with free space in front, shape ``(N,)``."""
         low, high = self.surfaces[face].bounds + np.outer((-1, 1), np.full(3, self._clearance))
         near = [
             part
@@ -96,7 +96,7 @@ class SceneModel:
 
     @cached_property
     def _clearance(self) -> float:
-        """Length by which what is in front of a face is told from what touches it."""
+        """Minimum length of free space in front of a visible face."""
         lowest, highest = zip(*(surface.bounds for surface in self.surfaces), strict=True)
         return _CLEARANCE * float((np.max(highest, axis=0) - np.min(lowest, axis=0)).max())
 
@@ -111,25 +111,25 @@ def sample_scene(
 ) -> Scene:
     """Sample the visible surface of a scene.
 
-    Each point is drawn independently and evenly from all of the surface that has free space in
-    front of it, so the number of points of a face is proportional to its visible area. What other
-    objects hide from a scanner is sampled as well.
+    Points are drawn independently and uniformly from all surfaces with free space in front of them.
+    The number of points of a face is proportional to its visible area. Surfaces occluded from a
+    scanner are sampled as well.
 
     Args:
         model: The scene.
         num_points: Number of points.
-        noise: Standard deviation of the noise, in metres: the difference to the cloud of the same
-            seed with ``noise=0``.
-        seed: Two calls with equal arguments give equal clouds; on another processor sines of
-            slanted parts may differ in the last bit.
+        noise: Standard deviation of the noise, in meters, relative to the cloud of the same seed
+            with ``noise=0``.
+        seed: Identical arguments give identical clouds; on another processor, sines of slanted
+            parts may differ in the last bit.
         noise_direction: ``"normal"``: along the normal of the face. ``"isotropic"``: the same in
-            every direction.
+            all directions.
 
     Returns:
-        The cloud and its truth, in random order.
+        The cloud and its ground truth, in random order.
 
     Raises:
-        ConfigError: If a setting is not allowed.
+        ConfigError: If a setting is invalid.
 
     Example:
         >>> from torchrg.scenes import build_room
@@ -151,7 +151,7 @@ def sample_scene(
             f"{noise_direction!r}."
         )
     rng = seeded_generator(seed, PLACES)
-    points, normals, labels = _draw_places(model, num_points, rng)
+    points, normals, labels = _sample_faces(model, num_points, rng)
     if noise > 0:
         shake = seeded_generator(seed, NOISE)
         if noise_direction == "normal":
@@ -163,15 +163,15 @@ def sample_scene(
     return label_points(model, points[rows], labels[rows], normals[rows])
 
 
-def _draw_places(
+def _sample_faces(
     model: SceneModel, num_points: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Return points, normals and faces of exactly ``num_points`` places, face after face."""
+    """Sample exactly ``num_points`` points with normals and faces, face by face."""
     areas = np.array([surface.area for surface in model.surfaces])
     drawn: list[tuple[Floats, Floats, NDArray[np.int64]]] = []
     missing, fraction_kept = num_points, 1.0
     while missing > 0:
-        num_tried = int(missing / fraction_kept * _SPARE) + 16
+        num_tried = int(missing / fraction_kept * _OVERSAMPLING) + 16
         num_kept = 0
         for face, count in enumerate(rng.multinomial(num_tried, areas / areas.sum())):
             tried = model.surfaces[face].sample(rng, int(count))
@@ -183,13 +183,13 @@ def _draw_places(
         missing -= num_kept
         fraction_kept = max(num_kept, 1) / num_tried
     points, normals, labels = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-    # A random subset: to keep the first would leave the last faces short of points.
+    # A random subset: the first points would underrepresent the last faces.
     chosen = np.sort(rng.permutation(len(labels))[:num_points])
     return points[chosen], normals[chosen], labels[chosen]
 
 
 def is_occupied(parts: Iterable[Part], points: Array) -> NDArray[np.bool_]:
-    """Return which points of shape ``(N, 3)`` are inside a body."""
+    """Return the mask of points of shape ``(N, 3)`` inside a solid."""
     inside = np.zeros(len(points), dtype=bool)
     for solid in (solid for part in parts for solid in part.solids):
         inside |= solid.contains(points)
@@ -207,7 +207,7 @@ def plane_table(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
 def label_points(
     model: SceneModel, points: Floats, labels: NDArray[np.int64], normals: Floats
 ) -> Scene:
-    """Return points ``(N, 3)`` of known faces ``(N,)`` as a cloud with the tables of its scene."""
+    """Combine points ``(N, 3)`` of known faces ``(N,)`` with the tables of their scene."""
     face_normals, face_offsets = plane_table(model.surfaces)
     return Scene(
         points=torch.from_numpy(points),
@@ -223,12 +223,12 @@ def label_points(
 
 
 def seeded_generator(seed: int, purpose: int) -> np.random.Generator:
-    """Return one of several independent generators that belong to a seed, one for each purpose."""
+    """Return an independent generator for a seed and purpose."""
     if seed < 0:
         raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
     return np.random.Generator(np.random.PCG64([seed, purpose]))
 
 
 def to_float32(values: Array) -> Floats:
-    """Return values rounded to float32, in rows of their own."""
+    """Convert values to a contiguous float32 array."""
     return np.ascontiguousarray(values, dtype=np.float32)

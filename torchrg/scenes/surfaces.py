@@ -1,4 +1,4 @@
-"""Surfaces that can be sampled evenly, and bodies that hide what is in them."""
+"""Surfaces for uniform sampling, and occluding solids."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -13,16 +13,16 @@ from torchrg.scenes.geometry import Array, Frame, Triple, box_around
 
 Plane = tuple[Array, float]
 Hole = tuple[float, float, float, float]
-"""A rectangle left out of a surface: left, right, low and high end along its first two axes."""
+"""Rectangular hole in a surface: left, right, low and high end along its first two axes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface(ABC):
-    """A surface that can be sampled evenly; a face of a scene.
+    """A surface that can be sampled uniformly; a face of a scene.
 
     Args:
-        kind: What it is part of, as in ``"table edge"``.
-        frame: The axes in which it is described.
+        kind: Kind of the face, such as ``"table edge"``.
+        frame: Local coordinate frame.
     """
 
     kind: str
@@ -30,44 +30,45 @@ class Surface(ABC):
 
     @property
     def plane(self) -> Plane | None:
-        """Normal and offset of its plane, ``normal . x = offset``; None if it is curved."""
+        """Normal and offset of its plane, ``normal . x = offset``; None if curved."""
         return None
 
     @property
     @abstractmethod
     def area(self) -> float:
-        """Its area, covered parts included."""
+        """Area including covered parts."""
 
     @cached_property
     def bounds(self) -> Array:
-        """Lowest and highest coordinates of a box around it, shape ``(2, 3)``."""
+        """Bounding box, shape ``(2, 3)``."""
         return box_around(self.frame.to_world(self._corners()))
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return points spread evenly over it, shape ``(count, 3)``."""
+        """Return uniformly distributed points, shape ``(count, 3)``."""
         return self.frame.to_world(self._draw(rng, count))
 
     @abstractmethod
     def normals_at(self, points: Array) -> Array:
-        """Return the outward unit normals at points on it, shape ``(N, 3)``."""
+        """Return the outward unit normals at points of the surface, shape ``(N, 3)``."""
 
     @abstractmethod
     def _corners(self) -> Array:
-        """Return points of the frame whose box holds the surface, shape ``(K, 3)``."""
+        """Return local points whose bounding box contains the surface, shape ``(K, 3)``."""
 
     @abstractmethod
     def _draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Return what :meth:`sample` does, in the frame."""
+        """Implement :meth:`sample` in local coordinates."""
 
 
 @dataclass(frozen=True, eq=False)
 class Flat(Surface):
-    """A union of rectangles, or of parallelograms, in one plane; they do not overlap.
+    """A union of disjoint coplanar rectangles or parallelograms.
 
     Args:
-        kind: What it is part of.
-        frame: Its plane is that of the first two axes; the third is the outward normal.
-        cells: A corner and the two edges that leave it, in the plane, shape ``(M, 3, 2)``.
+        kind: Kind of the face.
+        frame: Local coordinate frame: the first two axes span the plane, the third is the outward
+            normal.
+        cells: Corner and two edges of each cell, in the plane, shape ``(M, 3, 2)``.
     """
 
     cells: Array
@@ -86,7 +87,7 @@ class Flat(Surface):
 
     @property
     def area(self) -> float:
-        """Its area, covered parts included."""
+        """Area including covered parts."""
         return float(self._cell_areas.sum())
 
     def normals_at(self, points: Array) -> Array:
@@ -96,22 +97,22 @@ class Flat(Surface):
     def _corners(self) -> Array:
         corner, first, second = self.cells[:, 0], self.cells[:, 1], self.cells[:, 2]
         ends = [corner, corner + first, corner + second, corner + first + second]
-        return in_space(np.concatenate(ends))
+        return append_zero(np.concatenate(ends))
 
     def _draw(self, rng: np.random.Generator, count: int) -> Array:
         counts = rng.multinomial(count, self._cell_areas / self._cell_areas.sum())
-        first, second = self._shares(*rng.random((2, count)))
+        first, second = self._edge_fractions(*rng.random((2, count)))
         corner, edge, other = self.cells[np.repeat(np.arange(len(counts)), counts)].swapaxes(0, 1)
-        return in_space(corner + (first[:, None] * edge + second[:, None] * other))
+        return append_zero(corner + (first[:, None] * edge + second[:, None] * other))
 
-    def _shares(self, first: Array, second: Array) -> tuple[Array, Array]:
-        """Return the shares of both edges that lead to places in a cell, from random numbers."""
+    def _edge_fractions(self, first: Array, second: Array) -> tuple[Array, Array]:
+        """Map random numbers to the fractions of both edges of a cell."""
         return first, second
 
 
-def in_space(places: Array) -> Array:
-    """Return places in a plane, shape ``(N, 2)``, with a third coordinate of zero."""
-    return np.column_stack([places, np.zeros(len(places))])
+def append_zero(positions: Array) -> Array:
+    """Append a zero coordinate to plane coordinates of shape ``(N, 2)``."""
+    return np.column_stack([positions, np.zeros(len(positions))])
 
 
 def rectangle(
@@ -119,7 +120,7 @@ def rectangle(
 ) -> Flat:
     """Return a rectangle from the origin of a frame along its first two axes, with holes.
 
-    The third axis is the outward normal; the holes do not overlap.
+    The third axis is the outward normal; the holes are disjoint.
 
     Example:
         >>> rectangle("wall", Frame.upright(np.zeros(3)), 4, 3, holes=[(1, 2, 1, 2)]).area
@@ -138,12 +139,12 @@ def rectangle(
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A body that hides what is inside it: a box, a cylinder or a ball.
+    """An occluding solid: a box, a cylinder or a ball.
 
     Args:
-        frame: Its axes; the origin is its middle.
+        frame: Local coordinate frame at the center.
         size: Lengths along the three axes.
-        num_round: Axes that are round: 0 for a box, the first 2 for a cylinder, 3 for a ball.
+        num_round: Number of round axes: 0 (box), 2 (cylinder, the first two) or 3 (ball).
 
     Example:
         >>> drum = Solid(Frame.upright(np.zeros(3)), (2, 2, 1), num_round=2)
@@ -157,12 +158,12 @@ class Solid:
 
     @cached_property
     def bounds(self) -> Array:
-        """Lowest and highest coordinates of a box around it, shape ``(2, 3)``."""
+        """Bounding box, shape ``(2, 3)``."""
         corners = np.array(list(product((-0.5, 0.5), repeat=3))) * self.size
         return box_around(self.frame.to_world(corners))
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Return which points of shape ``(N, 3)`` are inside it, or on its surface."""
+        """Return the mask of points of shape ``(N, 3)`` inside or on the solid."""
         fractions = 2 * np.abs(self.frame.to_local(points)) / self.size
         curved, straight = fractions[:, : self.num_round], fractions[:, self.num_round :]
         inside: NDArray[np.bool_] = np.vecdot(curved, curved) <= 1
