@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from torchrg.cli import COMMANDS, convert
-from torchrg.cli.arguments import NEEDED, Flag, describe, example_lines, group_flags, list_flags
+from torchrg.cli.arguments import REQUIRED, Flag, describe, example_lines, group_flags, list_flags
 from torchrg.cli.flags import PlaneSettings
 
 PROGS: dict[str, type] = {
@@ -33,7 +33,7 @@ def flags_of(kind: type) -> list[Flag]:
 def _section(prog: str, kind: type) -> Iterator[str]:
     """Yield the paragraphs on a command, whose arguments can be searched for and linked to."""
     groups = group_flags(flags_of(kind))
-    needed = " ".join(flag.spelling for flag in groups.get(NEEDED, ()))
+    needed = " ".join(flag.spelling for flag in groups.get(REQUIRED, ()))
     yield f"## {prog}"
     yield _escaped(describe(kind))
     yield f"```text\n{prog} {needed} [options]\n```"

@@ -27,7 +27,10 @@ def messages_of(path: Path) -> Iterator[Message]:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             error, arguments = ast.unparse(node.exc.func), node.exc.args
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("warnings.warn", "refusing"):
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in (
+            "warnings.warn",
+            "wrap_errors",
+        ):
             error, arguments = ast.unparse(node.func), node.args[:1]
         else:
             continue

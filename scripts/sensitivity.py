@@ -126,12 +126,12 @@ def read_table() -> list[Constant]:
 
 @contextmanager
 def moved(constant: Constant, factor: float) -> Iterator[float]:
-    """Multiply a constant for a while; counts stay whole and at least 1, shares at most 1."""
+    """Multiply a constant for a while; counts stay whole and at least 1, fractions at most 1."""
     before = getattr(constants, constant.name)
     value = constant.value * factor
     if isinstance(constant.value, int):
         value = max(round(value), 1)
-    if constant.unit.startswith("Share"):
+    if constant.unit.startswith("Fraction"):
         value = min(value, 1.0)
     after = value
     if constant.place is not None:

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
 
 from tests.made import CurvedLayout
 from torchrg import segment_planes
-from torchrg.neighbors import restore_points, sample_voxels, search_knn
+from torchrg.neighbors import expand_to_points, sample_voxels, search_knn
 from torchrg.scenes import Scene, make_room
 
 CLASSES = {
@@ -284,7 +284,7 @@ def class_ious(predicted: Sequence[Tensor], truth: Sequence[Tensor]) -> Tensor:
 def score(model: PointUNet, rooms: Sequence[Sample], variant: Variant) -> Tensor:
     """Return the IoU of each class over all points of the rooms."""
     labels = [predict(model, room, variant, torch.eye(3)).argmax(dim=1) for room in rooms]
-    restored = [restore_points(of, room.inverse) for of, room in zip(labels, rooms, strict=True)]
+    restored = [expand_to_points(of, room.inverse) for of, room in zip(labels, rooms, strict=True)]
     return class_ious(restored, [room.truth for room in rooms])
 
 

@@ -76,12 +76,12 @@ def test_one_angle_moves_sharp_points_and_growth_unless_they_are_named(tmp_path,
     path = tmp_path / "my.yaml"
     path.write_text(text)
     assert angles_of(load_config(path)) == angles
-    assert angles_of(load_config(path).at_angle(4)) == (4, 4)
+    assert angles_of(load_config(path).with_angle(4)) == (4, 4)
 
 
 def test_an_angle_beyond_a_right_one_is_refused():
     with pytest.raises(ConfigError, match=r"expected angle_deg in \[0, 90\], got 90.5"):
-        PipelineConfig().at_angle(90.5)
+        PipelineConfig().with_angle(90.5)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ RAYS = Sampling(whiteness=0.9, variation=0.6, density=7000.0, height=2.7)
 def test_settings_follow_from_how_a_cloud_samples_surfaces(
     sampling, scope, tolerance, faceted, least
 ):
-    config = load_config().at_sampling(sampling)
+    config = load_config().with_sampling(sampling)
     assert config.normals.noise_scope == scope
     assert config.growing.facet_tolerance == tolerance
     assert config.growing.min_size == least
@@ -225,7 +225,7 @@ def test_settings_follow_from_how_a_cloud_samples_surfaces(
 def test_settings_that_are_numbers_stay():
     fixed = dataclasses.replace(load_config().growing, min_size=7, facet_tolerance=None)
     config = dataclasses.replace(load_config("classic"), growing=fixed)
-    assert config.at_sampling(FACETS).growing == fixed
+    assert config.with_sampling(FACETS).growing == fixed
     assert "growing.min_size" not in config.measured(FACETS)["settings"]
 
 

@@ -267,7 +267,9 @@ def test_borders_of_superpoints_are_scored_once_for_copies(points, room, rows):
 def test_a_labeled_point_that_is_not_finite_is_refused(points):
     spoiled = copied(points, ROWS)
     labels = torch.zeros(len(spoiled), dtype=torch.int64)
-    with pytest.raises(torchrg.errors.ShapeError, match="summarize_planes: expected finite points"):
+    with pytest.raises(
+        torchrg.errors.ShapeError, match="summarize_planes: expected finite labeled points"
+    ):
         summarize_planes(spoiled, torch.ones_like(spoiled), labels)
 
 

@@ -12,7 +12,7 @@ from torchrg import mesh
 from torchrg.errors import ShapeError
 from torchrg.io import ply, read_cloud, write_cloud
 from torchrg.merge import merge_clouds
-from torchrg.regions.axes import move_cloud
+from torchrg.regions.axes import transform_cloud
 from torchrg.structures import Cloud
 
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -104,7 +104,7 @@ def test_fronts_are_the_sums_of_the_normals_of_faces(tmp_path, order, corners, o
 def test_fronts_do_not_depend_on_how_much_is_read_at_a_time(tmp_path, monkeypatch, order):
     points, faces = make_points(), make_faces(500, 5)
     path = write_mesh(tmp_path / "a.ply", points, faces, order)
-    monkeypatch.setattr(ply, "_BYTES_AT_ONCE", 100)
+    monkeypatch.setattr(ply, "_BYTES_PER_READ", 100)
     monkeypatch.setattr(mesh, "_CORNERS_AT_ONCE", 10)
     np.testing.assert_allclose(read_cloud(path).front, fronts_by_loop(points, faces), atol=1e-6)
 
@@ -124,9 +124,7 @@ def test_other_elements_may_stand_between_vertices_and_faces(tmp_path):
         path.write_bytes(head + b"end_header\n" + body)
         cloud = read_cloud(path)
         np.testing.assert_allclose(cloud.front, fronts_by_loop(points, faces), atol=1e-6)
-        assert cloud.notes == (
-            "elements left out, as only vertices and their faces are read: 2 of edge",
-        )
+        assert cloud.notes == ("elements skipped (only vertices and faces are read): 2 of edge",)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -146,7 +144,7 @@ def test_damaged_lists_are_left_out_with_a_note(tmp_path, order, change):
     assert len(cloud) == 30
     assert cloud.front is None
     (note,) = cloud.notes
-    assert note.startswith("its faces left out: ")
+    assert note.startswith("faces skipped: ")
     assert "expected " in note
     assert str(path) not in note
 
@@ -178,7 +176,7 @@ MIXED = {
 @pytest.mark.parametrize("kind", MIXED)
 @pytest.mark.parametrize("at_once", [50, 500, 1 << 19])
 def test_faces_of_several_lengths_keep_their_side(tmp_path, order, kind, at_once, monkeypatch):
-    monkeypatch.setattr(ply, "_BYTES_AT_ONCE", at_once)
+    monkeypatch.setattr(ply, "_BYTES_PER_READ", at_once)
     points, faces = make_points(), MIXED[kind]
     extra = ("before short", "list uchar float")
     path = write_mesh(tmp_path / "a.ply", points, faces, order, extra=extra)
@@ -205,9 +203,7 @@ def test_a_face_of_a_vertex_that_there_is_not_is_damage(tmp_path, order, wrong):
     faces[3][1] = wrong
     cloud = read_cloud(write_mesh(tmp_path / "a.ply", make_points(), faces, order))
     assert cloud.front is None
-    assert cloud.notes == (
-        f"its faces left out: expected vertex indices in [0, 30), got {wrong:,}",
-    )
+    assert cloud.notes == (f"faces skipped: expected vertex indices in [0, 30), got {wrong:,}",)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -215,7 +211,7 @@ def test_a_face_of_more_corners_than_its_mesh_can_have_is_damage(tmp_path, order
     faces = [*make_faces(6), [0, 1] * 31]
     cloud = read_cloud(write_mesh(tmp_path / "a.ply", make_points(), faces, order))
     assert cloud.front is None
-    told = "its faces left out: expected at most 60 corners a face, got 62"
+    told = "faces skipped: expected at most 60 corners a face, got 62"
     assert cloud.notes == (told,)
 
 
@@ -230,7 +226,7 @@ def test_words_and_lengths_that_are_none_are_damage(tmp_path, place, word):
     cloud = read_cloud(path)
     assert cloud.front is None
     (note,) = cloud.notes
-    assert note.startswith("its faces left out: ")
+    assert note.startswith("faces skipped: ")
     assert len(note) < 170
 
 
@@ -270,7 +266,9 @@ def test_fronts_stay_with_their_points_and_are_not_written(tmp_path):
     np.testing.assert_array_equal(merged.front, np.concatenate([cloud.front, 0 * cloud.front]))
     quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]).double()
     x, y, z = cloud.front.T
-    np.testing.assert_array_equal(move_cloud(cloud, quarter).front, np.stack([-y, x, z], axis=1))
+    np.testing.assert_array_equal(
+        transform_cloud(cloud, quarter).front, np.stack([-y, x, z], axis=1)
+    )
 
 
 def test_a_front_of_another_shape_is_refused():

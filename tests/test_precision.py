@@ -12,7 +12,7 @@ from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.datasets import FolderOfClouds
 from torchrg.errors import PrecisionWarning
-from torchrg.precision import note_on_steps
+from torchrg.precision import describe_steps
 from torchrg.transforms import SegmentPlanes
 
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -34,7 +34,7 @@ def test_the_line_comes_where_steps_are_a_tenth_of_the_spacing(num_points, offse
     places = room(num_points, 0.003, 0).points.double().numpy()
     spacing = np.median(KDTree(places).query(places, k=2)[0][:, 1])
     step = np.spacing(np.float32(np.max(offset)))
-    found = note_on_steps(moved(places, offset))
+    found = describe_steps(moved(places, offset))
     if not 0.07 < step / spacing < 0.15:
         assert bool(found) == (step > 0.1 * spacing)
     if found:
@@ -47,7 +47,7 @@ def test_the_line_does_not_depend_on_the_order_of_the_points(places):
     random = np.random.default_rng(0)
     for offset in (3e5, UTM):
         points = moved(places, offset)
-        found = {note_on_steps(points[random.permutation(len(points))]) for _ in range(5)}
+        found = {describe_steps(points[random.permutation(len(points))]) for _ in range(5)}
         assert len(found) == 1
         assert found != {""}
 
@@ -62,14 +62,14 @@ def test_dense_parts_of_a_cloud_count_though_the_whole_is_wide():
     even = np.subtract(*np.quantile(points, [0.75, 0.25], axis=0)).max() / len(points) ** 0.5
     assert step < 0.1 * even
     assert step > 0.1 * np.median(nearest)
-    assert f"steps of {step:.2g} for" in note_on_steps(points.astype(np.float32))
+    assert f"steps of {step:.2g} for" in describe_steps(points.astype(np.float32))
 
 
 def test_single_points_far_off_do_not_decide(places):
     near, far = moved(places, 0), moved(places, UTM)
     near[:5], far[:5] = 1e7, 0
-    assert note_on_steps(near) == ""
-    assert LINE in note_on_steps(far)
+    assert describe_steps(near) == ""
+    assert LINE in describe_steps(far)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, np.finfo(np.float32).max])
@@ -80,11 +80,11 @@ def test_missing_points_do_not_count(places, value):
 
 
 def test_what_cannot_be_told_is_not_told(places):
-    assert note_on_steps(moved(places, UTM)[:2]) == ""
-    assert note_on_steps(np.full((50, 3), 5.4e6, np.float32)) == ""
-    assert note_on_steps(np.zeros((0, 3), np.float32)) == ""
-    assert note_on_steps(np.full((9, 3), np.nan, np.float32)) == ""
-    assert note_on_steps(places + UTM) == ""
+    assert describe_steps(moved(places, UTM)[:2]) == ""
+    assert describe_steps(np.full((50, 3), 5.4e6, np.float32)) == ""
+    assert describe_steps(np.zeros((0, 3), np.float32)) == ""
+    assert describe_steps(np.full((9, 3), np.nan, np.float32)) == ""
+    assert describe_steps(places + UTM) == ""
 
 
 @pytest.mark.parametrize(

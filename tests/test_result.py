@@ -375,7 +375,7 @@ def test_columns_of_files_are_those_of_the_table():
 def test_segmentations_of_other_points_and_other_files_are_refused(tmp_path, cloud, seg):
     with pytest.raises(ShapeError, match="expected a segmentation of 3 points, got 6,000"):
         Result.of(Cloud(np.eye(3)), seg)
-    with pytest.raises(FormatError, match=r"no such file"):
+    with pytest.raises(FormatError, match=r"file not found"):
         torchrg.read_result(tmp_path / "gone.npz")
     with pytest.raises(FormatError, match=r"expected coord\.npy in this folder, got none"):
         torchrg.read_result(tmp_path)

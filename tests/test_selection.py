@@ -121,7 +121,7 @@ def test_classes_are_those_of_the_table_or_of_the_direction(points, whole, chose
     turned = torchrg.select_planes(whole, kinds="floor", up="-z")
     ceiling = torchrg.select_planes(whole, kinds="ceiling")
     assert torch.equal(turned.labels, ceiling.labels)
-    with pytest.raises(ConfigError, match="pass up to segment_depth"):
+    with pytest.raises(ConfigError, match="Pass up to segment_depth"):
         torchrg.select_planes(replace(without, points=None), kinds="wall")
 
 

@@ -146,13 +146,13 @@ def is_tensor(value: object) -> TypeGuard[Tensor]:
     return isinstance(value, Tensor)
 
 
-def has_values(*tensors: Tensor | None) -> bool:
+def is_concrete(*tensors: Tensor | None) -> bool:
     """Return whether tensors have concrete data: not traced, vmapped or on the meta device.
 
     Example:
-        >>> has_values(torch.zeros(2)), has_values(torch.zeros(2, device="meta"))
+        >>> is_concrete(torch.zeros(2)), is_concrete(torch.zeros(2, device="meta"))
         (True, False)
-        >>> torch.vmap(lambda row: torch.tensor(has_values(row)))(torch.zeros(2, 3)).tolist()
+        >>> torch.vmap(lambda row: torch.tensor(is_concrete(row)))(torch.zeros(2, 3)).tolist()
         [False, False]
     """
     if torch.compiler.is_compiling():
@@ -164,7 +164,7 @@ def has_values(*tensors: Tensor | None) -> bool:
         return False
 
 
-def refuse_forward_mode(caller: str) -> NoReturn:
+def raise_forward_mode(caller: str) -> NoReturn:
     """Raise for ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
     raise NotImplementedError(
         f"{caller}: supports reverse mode only; use torch.func.jacrev, vjp or grad instead of "
@@ -178,11 +178,11 @@ def _plain(value: object) -> object:
 
 
 @contextmanager
-def made_on_cpu() -> Iterator[None]:
+def default_device_cpu() -> Iterator[None]:
     """Create tensors on the CPU, ignoring ``torch.set_default_device``.
 
     Example:
-        >>> with torch.device("meta"), made_on_cpu():
+        >>> with torch.device("meta"), default_device_cpu():
         ...     torch.zeros(2).device
         device(type='cpu')
     """
@@ -193,11 +193,11 @@ def made_on_cpu() -> Iterator[None]:
         yield
 
 
-def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def eager_only(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Exclude a function of clouds from compilation, and reject tensors without data.
 
     A compiler breaks its graph there and compiles the remaining model. Tensors are created on the
-    CPU, as by :func:`made_on_cpu`, and tensor subclasses become plain tensors.
+    CPU, as by :func:`default_device_cpu`, and tensor subclasses become plain tensors.
     """
 
     @wraps(function)
@@ -206,19 +206,19 @@ def of_clouds(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
             uncompiled = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
             result: Result = uncompiled(*args, **kwargs)
             return result
-        if not has_values(*(value for value in (*args, *kwargs.values()) if is_tensor(value))):
+        if not is_concrete(*(value for value in (*args, *kwargs.values()) if is_tensor(value))):
             raise ShapeError(
                 f"{function.__name__}: expected points with values, got a tensor of vmap, "
                 "torch.func or the meta device; call it outside of them."
             )
-        with made_on_cpu():
+        with default_device_cpu():
             plain: Callable[..., Result] = function
             return plain(*map(_plain, args), **{name: _plain(kwargs[name]) for name in kwargs})
 
     return call
 
 
-def in_own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def disable_autocast(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Disable ``torch.autocast`` in a function that multiplies matrices."""
 
     @wraps(function)

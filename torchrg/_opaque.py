@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import Arguments, Result, has_values, is_tensor, refuse_forward_mode
+from torchrg._checks import Arguments, Result, is_concrete, is_tensor, raise_forward_mode
 from torchrg.errors import ConfigError
 
 
@@ -54,7 +54,7 @@ def opaque(
             arguments: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
             arguments = {**arguments, **kwargs}
             tensors = {key: arguments[key] for key in parameters if is_tensor(arguments.get(key))}
-            if has_values(*tensors.values()):
+            if is_concrete(*tensors.values()):
                 return function(*args, **kwargs)
             parts = [name, ",".join(tensors)]
             for key, value in arguments.items():
@@ -196,7 +196,7 @@ class _ReverseOnly(_Differentiable):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
-        refuse_forward_mode(ctx.call.split("|")[0])
+        raise_forward_mode(ctx.call.split("|")[0])
 
 
 def _operation() -> type[_Differentiable]:

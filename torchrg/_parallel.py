@@ -53,7 +53,7 @@ _RETAINED_BYTES = 31 * 2**20
 
 
 @contextmanager
-def in_empty_folder() -> Iterator[None]:
+def in_root_directory() -> Iterator[None]:
     """Start processes in an empty directory, because Python 3.10 and libraries import from there.
 
     Their paths must be absolute.
@@ -66,11 +66,11 @@ def in_empty_folder() -> Iterator[None]:
         os.chdir(folder)
 
 
-def chunks_of(num_rows: int, chunk_size: int) -> list[slice]:
+def split_rows(num_rows: int, chunk_size: int) -> list[slice]:
     """Split ``num_rows`` rows into slices of at most ``chunk_size`` rows.
 
     Example:
-        >>> chunks_of(5, 2)
+        >>> split_rows(5, 2)
         [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
     """
     return [
@@ -101,7 +101,7 @@ def map_chunks(
     # Each thread gets the same number of slices.
     num_chunks = -(-num_rows // (chunk_size * num_threads)) * num_threads
     size = max(-(-num_rows // max(num_chunks, 1)), min(least, chunk_size))
-    return map_tasks(work, chunks_of(num_rows, size) or [slice(0, 0)], device)
+    return map_tasks(work, split_rows(num_rows, size) or [slice(0, 0)], device)
 
 
 def map_rows(
@@ -126,9 +126,9 @@ def map_rows(
     return [torch.cat(same) for same in parts] if more else list(first)
 
 
-def map_chosen(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:
+def map_selected(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:
     """Call ``work`` on chunks of the row indices of the chosen points; see :func:`map_chunks`."""
-    rows = places_of(chosen)
+    rows = nonzero_rows(chosen)
     return map_chunks(lambda chunk: work(rows[chunk]), len(rows), chunk_size, rows.device)
 
 
@@ -282,11 +282,11 @@ def return_freed_memory() -> None:
         trim(0)
 
 
-def places_of(mask: Tensor) -> Tensor:
+def nonzero_rows(mask: Tensor) -> Tensor:
     """Return the flat indices of True elements, shape ``(n,)``, int64.
 
     Example:
-        >>> places_of(torch.tensor([[True, False], [False, True]]))
+        >>> nonzero_rows(torch.tensor([[True, False], [False, True]]))
         tensor([0, 3])
     """
     if mask.device.type == "cpu":

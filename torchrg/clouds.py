@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.errors import FormatError
-from torchrg.io.fields import are_whole
+from torchrg.io.fields import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
@@ -71,7 +71,7 @@ def segment_cloud(
     seg = segment_planes(
         cloud,
         # Superpoints keep to the borders of all planes.
-        settings.of_all_planes() if is_kept else settings,
+        settings.without_selection() if is_kept else settings,
         orient=orient,
         viewpoint=viewpoint,
         voxel=voxel,
@@ -160,7 +160,7 @@ def find_objects(cloud: Cloud, name: str | None) -> NDArray[np.int64] | None:
         names = ", ".join(sorted(fields)) or "none"
         names += "".join(f" ({note})" for note in cloud.notes if name in note)
         raise FormatError(f"{cloud.source}: expected {wanted}, got {names}; name one of these.")
-    if values.dtype.kind not in "iubf" or len(values) != len(cloud) or not are_whole(values):
+    if values.dtype.kind not in "iubf" or len(values) != len(cloud) or not are_integers(values):
         raise FormatError(
             f"{cloud.source}: expected {wanted} to be a whole number for each of {len(cloud):,} "
             f"points, got {values.dtype} of shape {values.shape}; number the objects."

@@ -28,7 +28,7 @@ NormalMethod = Literal[
 ]
 DEFAULT_PRESET = "consensus"
 Auto = Literal["auto"]
-"""Value of a setting that is determined from the data; see :meth:`PipelineConfig.at_sampling`."""
+"""Value of a setting that is determined from the data; see :meth:`PipelineConfig.with_sampling`."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """Up axis of the coordinates."""
 NO_FLAG = {"is_flag": False}
@@ -84,8 +84,8 @@ class NormalsConfig:
         _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
         _require(self, "irls_decay", "> 1", self.irls_decay > 1)
 
-    def at_sampling(self, sampling: Sampling) -> "NormalsConfig":
-        """Resolve ``auto`` values; see :meth:`PipelineConfig.at_sampling`."""
+    def with_sampling(self, sampling: Sampling) -> "NormalsConfig":
+        """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
         if self.noise_scope != "auto":
             return self
         is_regional = _shape_fraction(sampling) < 0.5 and sampling.variation < _VARIATION
@@ -192,8 +192,8 @@ class GrowingConfig:
         _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
         _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
-    def at_sampling(self, sampling: Sampling) -> "GrowingConfig":
-        """Resolve ``auto`` values; see :meth:`PipelineConfig.at_sampling`."""
+    def with_sampling(self, sampling: Sampling) -> "GrowingConfig":
+        """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
         count, tolerance = self.min_size, self.facet_tolerance
         if count == "auto":
             side, (low, high) = _MIN_SIDE_FRACTION, _MIN_SIZES
@@ -298,18 +298,18 @@ class PipelineConfig(SelectionConfig):
         super().__post_init__()
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
 
-    def of_all_planes(self) -> "PipelineConfig":
+    def without_selection(self) -> "PipelineConfig":
         """Return settings that keep all planes, with an up axis if ``kinds`` requires classes.
 
         Example:
-            >>> load_config(kinds="wall").of_all_planes().planes.up
+            >>> load_config(kinds="wall").without_selection().planes.up
             'z'
         """
         up = "z" if self.planes.up is None and self.kinds is not None else self.planes.up
         planes = dataclasses.replace(self.planes, up=up)
         return dataclasses.replace(self, min_area=0.0, kinds=None, sort="points", planes=planes)
 
-    def at_angle(self, angle_deg: float) -> "PipelineConfig":
+    def with_angle(self, angle_deg: float) -> "PipelineConfig":
         """Set the paper's single threshold.
 
         Eq. (9) uses one theta for sharp points and for growth, so this sets both
@@ -321,7 +321,7 @@ class PipelineConfig(SelectionConfig):
             ConfigError: If the angle is not in [0, 90].
 
         Example:
-            >>> config = load_config("paper").at_angle(8)
+            >>> config = load_config("paper").with_angle(8)
             >>> config.normals.sharp_angle_deg, config.growing.max_angle_deg
             (8, 8)
         """
@@ -332,7 +332,7 @@ class PipelineConfig(SelectionConfig):
         }
         return dataclasses.replace(self, **parts)
 
-    def at_sampling(self, sampling: Sampling) -> "PipelineConfig":
+    def with_sampling(self, sampling: Sampling) -> "PipelineConfig":
         """Replace ``auto`` by values that match how a cloud samples its surfaces.
 
         If whiteness is below 0.4, surfaces are bent or faceted, and ``facet_tolerance`` is 1/240 of
@@ -345,14 +345,14 @@ class PipelineConfig(SelectionConfig):
 
         Example:
             >>> mesh = Sampling(0.06, variation=0.5, exactness=0.6, density=4e3, height=2.7)
-            >>> config = load_config().at_sampling(mesh)
+            >>> config = load_config().with_sampling(mesh)
             >>> config.growing.facet_tolerance, config.growing.min_size, config.normals.noise_scope
             (0.0113, 173, 'local')
         """
         return dataclasses.replace(
             self,
-            normals=self.normals.at_sampling(sampling),
-            growing=self.growing.at_sampling(sampling),
+            normals=self.normals.with_sampling(sampling),
+            growing=self.growing.with_sampling(sampling),
         )
 
     def measured(self, sampling: Sampling | None) -> dict[str, Any]:
@@ -364,7 +364,7 @@ class PipelineConfig(SelectionConfig):
         """
         if sampling is None:
             return {}
-        chosen = self.at_sampling(sampling)
+        chosen = self.with_sampling(sampling)
         settings = {
             f"{section}.{name}": getattr(getattr(chosen, section), name)
             for section in ("normals", "growing")
@@ -476,7 +476,7 @@ def load_config(config: AnyConfig = DEFAULT_PRESET, **changes: Any) -> PipelineC
 
     Values omitted by a file or dictionary come from ``consensus``, or from the preset in ``base``.
     Keys are sections, or dotted settings such as ``normals.k``. A top-level ``angle_deg`` sets both
-    angles: see :meth:`PipelineConfig.at_angle`.
+    angles: see :meth:`PipelineConfig.with_angle`.
 
     Args:
         config: A name from :func:`preset_names`, the path of a ``.yaml`` file, a dictionary, or
@@ -605,7 +605,7 @@ def _override(config: Settings, values: object, where: str) -> Settings:
         angle = _convert(settings.pop("angle_deg"), float, f"{where}: angle_deg")
         _check_angle(where, angle)
         # Explicit values of the two angles take precedence.
-        config = typing.cast(Settings, config.at_angle(angle))
+        config = typing.cast(Settings, config.with_angle(angle))
     for key, value in settings.items():
         if key not in hints:
             raise ConfigError(f"{where}: unknown setting {key!r}; {_fix_for(key, value, kind)}.")

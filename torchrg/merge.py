@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrg.errors import FormatError
 from torchrg.io.e57 import SYSTEM
-from torchrg.io.headers import LARGEST_INTEGER
+from torchrg.io.headers import MAX_INTEGER
 from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.structures import Cloud
 
@@ -126,7 +126,7 @@ def _common_las(clouds: Sequence[Cloud]) -> Mapping[str, Any]:
     header = copy.deepcopy(headers[0])
     header.scales = np.min([each.scales for each in headers], axis=0)
     farthest = max(np.abs(cloud.coordinates - header.offsets).max() for cloud in clouds)
-    return {"las": header} if farthest <= LARGEST_INTEGER * header.scales.min() else {}
+    return {"las": header} if farthest <= MAX_INTEGER * header.scales.min() else {}
 
 
 def _check_systems(clouds: Sequence[Cloud]) -> list[str]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import scratch
-from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, of_clouds
+from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
 from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
@@ -23,19 +23,19 @@ from torchrg.neighbors import (
     DistinctPoints,
     canonical_order,
     distinct_points,
+    expand_to_points,
     measure_sampling,
-    restore_points,
     sample_voxels,
     search_knn,
 )
-from torchrg.neighbors.knn import keep_within
+from torchrg.neighbors.knn import restrict_to_groups
 from torchrg.normals import ESTIMATORS
 from torchrg.normals.orient import Orientation, Points, choose_side, find_directions, turn_faces
-from torchrg.precision import warn_of_steps
+from torchrg.precision import warn_about_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
-from torchrg.regions.growth import needs_sampling, number_by_count
+from torchrg.regions.growth import needs_sampling, rank_by_count
 from torchrg.regions.selection import choose_planes, keep_planes
-from torchrg.regions.superpoints import merge_copies
+from torchrg.regions.superpoints import merge_duplicates
 from torchrg.structures import UNLABELED, Cloud, Neighbors, Rows, Segmentation, Superpoints
 
 BYTES_PER_POINT = 900
@@ -49,7 +49,7 @@ _STRENGTH_OF_K = 100.0
 shall be about as many superpoints as it makes segments of meshed depth frames."""
 
 
-@of_clouds
+@eager_only
 @sequential_operations()
 def segment_planes(
     points: Points | Cloud | str | os.PathLike[str],
@@ -137,7 +137,7 @@ def segment_planes(
     points, directions = find_directions(
         "segment_planes", points, orient, viewpoint=viewpoint, front=front
     )
-    warn_of_steps("segment_planes", points)
+    warn_about_steps("segment_planes", points)
     objects = None if within is None else as_tensor("segment_planes", "within", within)
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
     if objects is not None and (objects.is_floating_point() or objects.is_complex()):
@@ -157,7 +157,7 @@ def segment_planes(
     objects = None if objects is None else objects.long().to(points.device)
     side = _Side(orient, directions)
     if settings.min_area > 0 or settings.kinds is not None or settings.sort != "points":
-        seg = _segment(points, settings.of_all_planes(), side, voxel, objects, begin)
+        seg = _segment(points, settings.without_selection(), side, voxel, objects, begin)
         seg = keep_planes(seg, choose_planes(seg.planes, settings))
     else:
         seg = _segment(points, settings, side, voxel, objects, begin)
@@ -196,7 +196,7 @@ def _segment(
     sampling = None
     if _has_auto(config):
         sampling = measure_sampling(places, neighbors)
-        config = config.at_sampling(sampling)
+        config = config.with_sampling(sampling)
 
     begin("normals")
     estimate = ESTIMATORS[config.normals.method]
@@ -208,7 +208,7 @@ def _segment(
     if objects is not None:
         parts, groups, part_of = _split_places(inverse, objects, len(places))
         # Growth, and all steps after it, join neighbours alone.
-        beside = keep_within(neighbors, groups, config.chunk_size, parts)
+        beside = restrict_to_groups(neighbors, groups, config.chunk_size, parts)
         if len(groups) > len(places):
             around = search_knn(places[parts], neighbors.indices.shape[1], canonical=True)
     normals, curvature, valid, residual_rms = (values[parts] for values in fit[:4])
@@ -225,8 +225,8 @@ def _segment(
     )
 
     begin("planes")
-    of_points = restore_points(labels, part_of, fill=UNLABELED)
-    numbers = number_by_count(of_points)
+    of_points = expand_to_points(labels, part_of, fill=UNLABELED)
+    numbers = rank_by_count(of_points)
     labels, of_points = numbers[labels], numbers[of_points]
     growing = config.growing
     describe = partial(
@@ -238,7 +238,8 @@ def _segment(
     planes = describe(places[parts], normals, labels, neighbors=around, canonical=True)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     normals, curvature, sharp, valid = (
-        restore_points(values, inverse) for values in (fit.normals, fit.curvature, sharp, fit.valid)
+        expand_to_points(values, inverse)
+        for values in (fit.normals, fit.curvature, sharp, fit.valid)
     )
     axes = planes.normal
     if voxel is not None:
@@ -259,7 +260,7 @@ def _segment(
 
     def turn(side: Orientation) -> Tensor:
         turned = turn_faces(places, fit.normals, side, neighbors, labels, axes)
-        return restore_points(turned, inverse)
+        return expand_to_points(turned, inverse)
 
     normals = choose_side(points, normals, side.orient, side.front, turn)
     begin("done")
@@ -309,7 +310,7 @@ def _has_auto(config: PipelineConfig) -> bool:
     return scope == "auto" or needs_sampling(config.growing)
 
 
-@of_clouds
+@eager_only
 @sequential_operations()
 def make_superpoints(
     points: Tensor | NDArray[np.floating],
@@ -381,7 +382,7 @@ def make_superpoints(
         return partition_points(
             tensor, seg.normals, seg.labels, settings, shades, neighbors=neighbors
         )
-    distinct, shades = merge_copies(tensor, seg.normals, seg.labels, shades)
+    distinct, shades = merge_duplicates(tensor, seg.normals, seg.labels, shades)
     rows, inverse = sample_voxels(distinct.points, voxel)
     shades = None if shades is None else shades[rows]
     rows, inverse = distinct.rows[rows], distinct.restore(inverse, fill=UNLABELED)
@@ -389,7 +390,7 @@ def make_superpoints(
         tensor[rows], seg.normals[rows], seg.labels[rows], settings, shades
     )
     labels, *levels = (
-        restore_points(level, inverse, fill=UNLABELED)
+        expand_to_points(level, inverse, fill=UNLABELED)
         for level in (partition.labels, *partition.levels)
     )
     return Superpoints(labels, partition.plane, tuple(levels))
@@ -420,7 +421,7 @@ def _unit_colors(
     return unit.to(points.device)
 
 
-@of_clouds
+@eager_only
 def segment_mesh(
     vertices: Tensor | NDArray[np.floating],
     faces: Tensor | NDArray[np.integer] | None = None,

@@ -36,7 +36,7 @@ _ABOVE_DECORATORS = 5
 """Number of stack frames from here to the caller of a function with two decorators."""
 
 
-def note_on_steps(
+def describe_steps(
     points: NDArray[np.floating],
     *,
     scale: float = 0.0,
@@ -55,9 +55,9 @@ def note_on_steps(
 
     Example:
         >>> points = np.random.default_rng(0).random((1000, 3), dtype=np.float32)
-        >>> note_on_steps(points)
+        >>> describe_steps(points)
         ''
-        >>> note_on_steps(points + np.float32(5_400_000))  # doctest: +ELLIPSIS
+        >>> describe_steps(points + np.float32(5_400_000))  # doctest: +ELLIPSIS
         'coordinates have steps of 0.5 for a spacing of about 0.03; write float64, or subtract ...'
     """
     is_single = points.dtype == np.float32
@@ -88,10 +88,10 @@ def note_on_steps(
     return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {fix}"
 
 
-def warn_of_steps(caller: str, points: Tensor) -> None:
-    """Warn about :func:`note_on_steps`, at the caller of a decorated public function."""
+def warn_about_steps(caller: str, points: Tensor) -> None:
+    """Warn about :func:`describe_steps`, at the caller of a decorated public function."""
     coordinates = points.detach().cpu().numpy()
-    note = note_on_steps(
+    note = describe_steps(
         coordinates, fix="pass float64, or subtract an offset before it is float32"
     )
     if note:

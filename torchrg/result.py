@@ -19,9 +19,9 @@ from torch import Tensor
 from torchrg.errors import ShapeError
 from torchrg.io import atomic_path, read_cloud
 from torchrg.io.colors import narrow_colors, read_colors
-from torchrg.io.fields import are_whole, put_results
-from torchrg.io.files import DAMAGES
-from torchrg.io.npy import POINT_RESULTS, map_folder, read_beside
+from torchrg.io.fields import add_result_fields, are_integers
+from torchrg.io.files import PARSE_ERRORS
+from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.plane_table import (
@@ -34,7 +34,7 @@ from torchrg.plane_table import (
 from torchrg.plane_table import describe_planes as describe_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency
-from torchrg.regions.superpoints import main_planes
+from torchrg.regions.superpoints import majority_planes
 from torchrg.structures import (
     UNLABELED,
     Cloud,
@@ -125,7 +125,7 @@ class Result:
         }
         if superpoints is not None:
             results |= superpoints.by_level()
-        labeled = replace(cloud, fields=put_results(cloud.fields, results))
+        labeled = replace(cloud, fields=add_result_fields(cloud.fields, results))
         plane_of_superpoint = None if superpoints is None else superpoints.plane
         neighbors = segmentation.neighbors
         return cls(labeled, segmentation.planes, plane_of_superpoint, neighbors=neighbors)
@@ -269,7 +269,7 @@ class Result:
         if len(labels) and labels.max() >= len(labels):
             labels, plane = number_labels(labels)[1], None
         if plane is None or len(plane) != labels.max() + 1:
-            plane = main_planes(labels, self.labels)
+            plane = majority_planes(labels, self.labels)
         return Superpoints(labels, plane, tuple(levels))
 
 
@@ -316,10 +316,10 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         whole = {
             name: values.astype(np.int64)
             for name, values in cloud.fields.items()
-            if name.startswith("superpoint") and values.dtype.kind == "f" and are_whole(values)
+            if name.startswith("superpoint") and values.dtype.kind == "f" and are_integers(values)
         }
         cloud = replace(cloud, fields={**cloud.fields, **whole})
-        extras = read_beside(source) if source.suffix.lower() == ".npz" else {}
+        extras = read_result_arrays(source) if source.suffix.lower() == ".npz" else {}
     planes = extras.get("plane_of_superpoint", np.zeros(()))
     result = Result(
         cloud,
@@ -335,7 +335,7 @@ def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None =
         named = torch.equal(result.names, torch.arange(len(sizes)))
         if named and torch.equal(sizes, table.count):
             return replace(result, table=table)
-    except DAMAGES:
+    except PARSE_ERRORS:
         # A table of an older version, or unrelated arrays with these names.
         pass
     note = "plane table left out, because it does not match the labels"
@@ -366,7 +366,7 @@ def _read_folder(folder: Path) -> tuple[Cloud, Arrays]:
         try:
             text = (folder / PLANES_FILE).read_text(encoding="utf-8")
             extras |= described_to_arrays(json.loads(text))
-        except DAMAGES:
+        except PARSE_ERRORS:
             extras["plane_count"] = np.zeros(0)
     return cloud, extras
 
@@ -375,6 +375,6 @@ def _parse_record(text: str) -> dict[str, Any]:
     """Parse a provenance record; return an empty one if invalid."""
     try:
         content = json.loads(text)
-    except DAMAGES:
+    except PARSE_ERRORS:
         return {}
     return content if isinstance(content, dict) else {}

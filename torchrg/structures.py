@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrg import _display
 from torchrg.errors import PrecisionWarning, ShapeError
-from torchrg.precision import note_on_steps
+from torchrg.precision import describe_steps
 
 UNLABELED = -1
 """Label of points without a region."""
@@ -121,11 +121,11 @@ class Cloud:
 
     @cached_property
     def origin(self) -> NDArray[np.float64]:
-        """Origin of :attr:`points`, shape ``(3,)``; see :func:`origin_of_box`."""
+        """Origin of :attr:`points`, shape ``(3,)``; see :func:`local_origin`."""
         finite = self.coordinates[self.finite]
         if len(finite) == 0:
             return np.zeros(3)
-        return origin_of_box(*bounding_box(finite))
+        return local_origin(*bounding_box(finite))
 
     @cached_property
     def points(self) -> Tensor:
@@ -153,12 +153,12 @@ class Cloud:
         """
         scale = float(max(getattr(self.header.get("las"), "scales", (0.0,))))
         finite = self.coordinates if self.finite.all() else self.coordinates[self.finite]
-        if note := note_on_steps(finite, scale=scale):
+        if note := describe_steps(finite, scale=scale):
             return note
         if finite.dtype == np.float32:
             return ""
         fix = "leave out points that are far off, or cut the cloud into parts"
-        return note_on_steps(self._local.numpy(), fix=fix)
+        return describe_steps(self._local.numpy(), fix=fix)
 
     def about(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates relative to ``origin`` ``(3,)``, float32, shape ``(N, 3)``."""
@@ -187,7 +187,7 @@ def bounding_box(
     return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
 
 
-def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
+def local_origin(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the origin of a cloud with this box: zero, or the center if the cloud is far away.
 
     A cloud is far away if centering makes its largest coordinate less than a quarter as large. A
@@ -195,7 +195,7 @@ def origin_of_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDAr
     finite counts as near.
 
     Example:
-        >>> origin_of_box(np.array([10.0, 10.0, 0.0]), np.array([12.0, 12.0, 3.0])).tolist()
+        >>> local_origin(np.array([10.0, 10.0, 0.0]), np.array([12.0, 12.0, 3.0])).tolist()
         [11.0, 11.0, 1.5]
     """
     low, high = low.astype(np.float64), high.astype(np.float64)

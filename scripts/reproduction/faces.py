@@ -8,7 +8,7 @@ from torch import Tensor
 from reproduction.cells import Record
 from reproduction.clouds import EvalCloud
 from torchrg.metrics import contingency_table, match_regions
-from torchrg.render.channels import OUTCOMES, outcomes_of
+from torchrg.render.channels import OUTCOMES, point_outcomes
 from torchrg.structures import UNLABELED, Neighbors
 
 LARGE = 1000
@@ -84,7 +84,7 @@ def score_faces(labels: Tensor, cloud: EvalCloud, at_edges: Tensor) -> Record:
     """
     faces = match_faces(labels, cloud.labels)
     large = faces.sizes >= LARGE
-    near = outcomes_of(labels, cloud.labels)[at_edges]
+    near = point_outcomes(labels, cloud.labels)[at_edges]
     scores = {
         "f1_large": faces.f1(large),
         "f1_of_every": faces.f1_of_every(),

@@ -13,7 +13,7 @@ from torch import Tensor
 from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
 from torchrg.render import color_planes, render_cloud
-from torchrg.render.channels import OUTCOMES, outcomes_of
+from torchrg.render.channels import OUTCOMES, point_outcomes
 
 SETTINGS = {
     "font.family": "serif",
@@ -115,7 +115,7 @@ def draw_outcomes(
         raise ValueError("draw_outcomes: expected a cloud with truth.")
     colors = torch.tensor([color for color, _ in OUTCOMES.values()], dtype=torch.uint8)
     paints = {
-        title: colors[outcomes_of(labels, cloud.labels)] for title, labels in labelings.items()
+        title: colors[point_outcomes(labels, cloud.labels)] for title, labels in labelings.items()
     }
     return _tile(folder, name, cloud, paints, legend=OUTCOMES.values())
 

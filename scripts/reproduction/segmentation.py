@@ -21,7 +21,7 @@ from reproduction.segmentations import (
     score_sphere,
 )
 from torchrg.metrics import METRICS, adjusted_rand_index, contingency_table
-from torchrg.render.channels import OUTCOMES, outcomes_of
+from torchrg.render.channels import OUTCOMES, point_outcomes
 
 FIGURES = {
     "tutorial": "Figure 7",
@@ -166,7 +166,7 @@ def draw_figures(run: Run, key: str, number: str) -> list[Block]:
         return blocks
     fractions = []
     for title, labels in labelings.items():
-        counts = outcomes_of(labels, cloud.labels).bincount(minlength=len(OUTCOMES)).double()
+        counts = point_outcomes(labels, cloud.labels).bincount(minlength=len(OUTCOMES)).double()
         fractions.append([title, *(f"{100 * value:.1f} %" for value in counts / counts.sum())])
     meanings = [meaning for _, meaning in OUTCOMES.values()]
     file = draw_outcomes(run.folder, f"{name}_errors", cloud, labelings)

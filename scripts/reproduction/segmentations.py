@@ -114,7 +114,7 @@ def regrow(run: Run, key: str, method: str, angle_deg: float, curvature_quantile
     The angle is the one of the paper, that of sharp points and of growth.
     """
     usual = load_config(method)
-    settings = usual.at_angle(angle_deg)
+    settings = usual.with_angle(angle_deg)
     growing = replace(settings.growing, curvature_quantile=curvature_quantile)
     if growing == usual.growing:
         return read_segmented(run, key, method).labels

@@ -136,7 +136,7 @@ def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, con
         (["folder", "NONE", "OUT"], "no such folder"),
         (["s3dis", "IN", "OUT"], "expected a folder Area_1"),
         (["folder", "IN", "IN/hall.npz"], "expected a directory outside"),
-        (["folder", "IN", "FILE/out"], "cannot be made: Not a directory"),
+        (["folder", "IN", "FILE/out"], "cannot be created: Not a directory"),
     ],
 )
 def test_mistakes_are_one_line_before_any_work(rooms, tmp_path, convert, arguments, message):

@@ -6,7 +6,7 @@ from multiprocessing import Pipe
 from pathlib import Path
 
 from torchrg.batch.local import _serve, run_local
-from torchrg.batch.memory import memory_of_scan
+from torchrg.batch.memory import scan_memory
 
 PLENTY = 10**12
 
@@ -76,7 +76,7 @@ def test_the_largest_begin_first_and_share_the_memory(faults, tmp_path):
     names = ["1000000_a", "3000000_b", "2000000_c", "900000_d"]
     jobs = faults.make_jobs(tmp_path, dict.fromkeys(names, "sleep 0.3"))
     # The largest leaves room for one of the small ones, never for the second.
-    limit = memory_of_scan(3_000_000) + memory_of_scan(1_000_000)
+    limit = scan_memory(3_000_000) + scan_memory(1_000_000)
     run(jobs, memory_limit=limit)
     log = log_of(tmp_path)
     # Two processes start side by side: which of them writes first is not said.
@@ -84,7 +84,7 @@ def test_the_largest_begin_first_and_share_the_memory(faults, tmp_path):
     running, most = set(), 0
     for name, what in log:
         running = running - {name} if what == "done" else running | {name}
-        most = max(most, sum(memory_of_scan(int(n.split("_")[0])) for n in running))
+        most = max(most, sum(scan_memory(int(n.split("_")[0])) for n in running))
     assert most <= limit
 
 

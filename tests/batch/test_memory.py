@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from torchrg.batch.memory import available_memory, memory_of_scan, peak_memory
+from torchrg.batch.memory import available_memory, peak_memory, scan_memory
 
 MEASURE = """
 import sys
@@ -49,7 +49,7 @@ print(peak_memory())
 def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, what, preset, num_points):
     command = [sys.executable, "-c", MEASURE, what, preset, str(num_points), str(tmp_path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    promised = memory_of_scan(num_points, on_disk=what == "disk")
+    promised = scan_memory(num_points, on_disk=what == "disk")
     assert 0.5 * promised < int(done.stdout) < promised
 
 

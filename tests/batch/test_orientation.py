@@ -258,6 +258,6 @@ def test_damaged_faces_are_noted_and_the_room_decides(mesh, files, tmp_path, run
     (tmp_path / "a.ply").write_bytes(data[:-8] + struct.pack("<ii", 9_000_000, 1))
     places = (tmp_path / "a.ply", "--out", tmp_path / "a.npz")
     done = run("segment", *places, "--preset", "classic")
-    assert re.search(r"its faces left out: expected vertex indices in .* got 9,000,000", done.err)
+    assert re.search(r"faces skipped: expected vertex indices in .* got 9,000,000", done.err)
     assert fraction(np.load(tmp_path / "a.npz")["normals"], truth) > 0.95
     assert read_cloud(tmp_path / "a.ply").front is None

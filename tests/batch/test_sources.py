@@ -148,7 +148,10 @@ def test_far_clouds_keep_their_coordinates_and_planes_are_in_them(tmp_path):
         (lambda color: np.float32(color / 255 * (1 + 1e-6)), ""),
         (lambda color: color.astype(np.float32), ""),
         (lambda color: color * np.uint16(257), ""),
-        (lambda color: color.astype(np.uint16), "its colors are taken as 0..255, by their values"),
+        (
+            lambda color: color.astype(np.uint16),
+            "colors are read as 0..255, judging by their values",
+        ),
     ],
 )
 def test_scenes_have_colors_of_8_bits_whatever_was_in_them(tmp_path, form, note):

@@ -95,7 +95,7 @@ def test_a_scan_that_changes_its_split_leaves_the_old_one(root, out, tmp_path, c
     assert files_of(out) == before
     done = convert(*command)
     assert (done.code, done.err) == (0, "")
-    assert f"{out}/train/{MOVED}: removed, as its scan is val/{MOVED} now\n" in done.out
+    assert f"{out}/train/{MOVED}: removed: its scan is val/{MOVED} now\n" in done.out
     assert "removed" not in convert(*command).out
     found = files_of(out)
     shutil.rmtree(out)
@@ -242,7 +242,7 @@ def test_what_a_killed_command_left_of_a_scan_that_moved_goes_too(root, out, con
     move(root, train=[], val=SCANS)
     done = convert("scannet", root, out)
     assert (done.code, done.err) == (0, "")
-    assert done.out.count("removed, as its scan is") == 1
+    assert done.out.count("removed: its scan is") == 1
     assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["val"]
 
 

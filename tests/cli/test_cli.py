@@ -154,7 +154,7 @@ def mistakes(tmp_path, monkeypatch):
         ("ROOM", ["--threads", "0"], "--threads from 1 to 1,024"),
         ("ROOM", ["--voxel", "nan"], "--voxel > 0"),
         ("ROOM", ["--out", "seg.docx"], "ends in one of"),
-        ("ROOM", ["--out", "no/such/seg.npz"], "there is no folder"),
+        ("ROOM", ["--out", "no/such/seg.npz"], "not found; create it first"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(room_file, run, file, flags, message):
@@ -332,7 +332,7 @@ def test_what_gives_way_to_a_result_is_told(room_file, tmp_path, run):
     out = tmp_path / "a.ply"
     names = "label as label_input, normals as normals_input"
     done = run("segment", room_file, *CLASSIC, "--out", out)
-    assert f"its own fields are kept beside the result's: {names}" in done.err
+    assert f"input fields are kept next to the result: {names}" in done.err
     expected, fields = read_cloud(room_file).fields, read_cloud(out).fields
     np.testing.assert_array_equal(fields["label_input"], expected["labels"])
     np.testing.assert_array_equal(fields["normals_input"], expected["normals"])

@@ -340,4 +340,4 @@ def test_segment_says_where_depth_images_went(tmp_path, frame, run):
     # Pictures of segment are no images.
     for picture in (["--picture", "a.png"], ["--picture=a.png"]):
         error = run("segment", tmp_path / "no.pcd", "--out", tmp_path, *picture).error
-        assert "no.pcd: no such file" in error
+        assert "no.pcd: file not found" in error

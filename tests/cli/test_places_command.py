@@ -129,7 +129,7 @@ def check_refused(place, there, command, target):
     code, out, err = there(*words_of(command))
     assert (code, err.count("\n"), out) == (2, 1, ""), err
     assert f"{target}: cannot be written: " in err
-    assert "is read-only; write to another place, or make it writable." in err
+    assert "is read-only; write to another folder, or make it writable." in err
     assert contents(place) == before
 
 
@@ -147,7 +147,7 @@ def test_a_directory_with_a_file_that_cannot_be_written_is_told_too(place, there
 
 @pytest.mark.parametrize("command", [command for command, _ in FOLDERS])
 def test_a_directory_that_takes_no_files_is_told_before_the_work(place, there, command):
-    for target, message in (("shut/out", "is read-only"), ("shut/new", "cannot be made")):
+    for target, message in (("shut/out", "is read-only"), ("shut/new", "cannot be created")):
         if target == "shut/new" and command.startswith("depth 2.png --out"):
             continue  # One image goes to a file.
         code, _, err = there(*words_of(command.format(target)))

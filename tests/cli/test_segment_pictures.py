@@ -42,7 +42,7 @@ def test_several_pictures_go_to_a_directory_under_the_names_of_the_inputs(rooms,
     ("inputs", "place", "message"),
     [
         (["room1.npz"], "seg.jpg", "expected a file ending in .png"),
-        (["room1.npz"], "no/seg.png", "there is no folder"),
+        (["room1.npz"], "no/seg.png", "not found; create it first"),
         (["room1.npz", "room2.npz"], "both.png", "expected a directory for 2 files"),
     ],
 )

@@ -131,7 +131,7 @@ def test_convert_keeps_its_tables_and_never_replaces_those_of_others(scans, tmp_
             "planes.txt",
             "planes.txt: expected a file ending in .csv or .json, got '.txt'",
         ),
-        ("no/planes.csv", "there is no folder"),
+        ("no/planes.csv", "not found; create it first"),
         ("out.npz", "expected a file ending in .csv or .json, got '."),
         ("room.xyz", "expected a file ending in .csv or .json, got '."),
     ],
@@ -207,7 +207,7 @@ def test_convert_keeps_planes_within_objects_in_every_kind_of_folder(scans, tmp_
     [
         ("object", "room.npz: expected the field object of --within, got height, instance; name"),
         ("height", "each of 5,000 points, got float32 of shape (5000,); number the objects."),
-        ("few", "got height, instance (few left out: not of 5,000 rows); name one of these"),
+        ("few", "got height, instance (few skipped: not 5,000 rows); name one of these"),
     ],
 )
 @pytest.mark.parametrize("command", ["segment", "convert"])

@@ -162,7 +162,7 @@ def test_a_file_of_line_ends_is_an_error(file):
 
 
 def test_an_empty_or_missing_file_is_an_error(file):
-    with pytest.raises(FormatError, match="no such file"):
+    with pytest.raises(FormatError, match="file not found"):
         read_annotation(file)
     file.touch()
     with pytest.raises(FormatError, match="the file is empty"):

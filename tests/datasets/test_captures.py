@@ -24,7 +24,7 @@ from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrames
 from torchrg.datasets.rgbd_files import image_size, read_depth
 from torchrg.datasets.rgbd_layouts import find_layout
-from torchrg.depth.camera import points_of_image
+from torchrg.depth.camera import unproject_image
 from torchrg.errors import FormatError
 from torchrg.pipeline import segment_planes
 
@@ -39,7 +39,7 @@ NAMES = {
 
 def points_of(sample):
     """Return the points of a sample in the world, float64."""
-    points = points_of_image(sample["depth"][0], sample["intrinsics"], sample["pose"])
+    points = unproject_image(sample["depth"][0], sample["intrinsics"], sample["pose"])
     return points.numpy()
 
 
@@ -168,7 +168,7 @@ def test_depth_that_is_missing_fails_its_frame_and_leaves_nothing(tmp_path, run)
     shared = json.loads((root / "transforms.json").read_text())
     write_text(alone / "transforms.json", {**shared, "frames": shared["frames"][1:]})
     error = run("depth", alone, "--out", tmp_path / "labels.png").error
-    assert error.endswith("frame_00001.png: no such file; check the spelling.\n")
+    assert error.endswith("frame_00001.png: file not found; check the path.\n")
     assert not (tmp_path / "labels.png").exists()
 
 

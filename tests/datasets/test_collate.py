@@ -6,7 +6,7 @@ import torch
 
 from torchrg.datasets import collate_offset
 from torchrg.errors import ShapeError
-from torchrg.transforms import SampleVoxels, restore_points
+from torchrg.transforms import SampleVoxels, expand_to_points
 
 
 def sample_of(count, name):
@@ -72,7 +72,7 @@ def test_what_names_points_names_rows_of_the_batch():
     clouds = [torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1, 0, 0]]), torch.eye(3)]
     samples = [SampleVoxels(0.5)({"coord": cloud}) for cloud in clouds]
     for batch in (collate_offset(samples), collate_offset([collate_offset(samples)])):
-        back = restore_points(batch["coord"], batch["inverse"], fill=-1)
+        back = expand_to_points(batch["coord"], batch["inverse"], fill=-1)
         assert batch["inverse"].lt(0).tolist() == [False, True, False, False, False, False]
         assert torch.equal(back[[0, 2, 3, 4, 5]], torch.cat(clouds)[[0, 2, 3, 4, 5]])
     twice = collate_offset([collate_offset(samples)] * 2)

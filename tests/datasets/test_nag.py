@@ -173,7 +173,7 @@ def test_a_command_without_h5py_or_place_is_one_line(tmp_path, run, folder_of_cl
     told = run(*command)
     assert told.code == 3
     assert "a: " in told.err
-    assert "nag: cannot be made: File exists." in told.err
+    assert "nag: cannot be created: File exists." in told.err
     own = {".torchrg.lock", ".torchrg.scans.json", "report.json"}
     assert {path.name for path in out.rglob("*")} == {"nag", *own}
     (out / "nag").unlink()

@@ -237,5 +237,5 @@ def test_pickles_and_wrong_sizes_are_never_loaded(foreign):
 
 def test_a_folder_that_cannot_be_made_is_named(sample, seg, tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(FormatError, match="cannot be made"):
+    with pytest.raises(FormatError, match="cannot be created"):
         write_pointcept_scene(tmp_path / "file" / "room", sample, seg)

@@ -228,9 +228,9 @@ def test_wrong_files_are_refused(tmp_path, tum):
         ("text.png", "expected a PNG image, got: "),
         ("text.npy", "expected an array of numbers, got: "),
         ("flat.npy", r"expected depth of shape \(H, W\), got \(3,\)"),
-        ("missing.png", "no such file; check the spelling"),
+        ("missing.png", "file not found; check the path"),
         ("empty.npy", "byte 0: the file is empty"),
-        ("missing.npy", "no such file; check the spelling"),
+        ("missing.npy", "file not found; check the path"),
         ("depth.jpg", r"expected a depth image that ends in one of .png .npy .pgm, got '.jpg'"),
     ):
         with pytest.raises(FormatError, match=f"{name}: {message}"):

@@ -109,7 +109,7 @@ def test_arrays_that_are_left_out_are_told(tmp_path):
     ours = {"plane_area": np.ones(4), "outline_points": np.ones((4, 3)), "provenance": np.array("")}
     np.savez(tmp_path / "a.npz", points=POINTS, **more, **ours)
     cloud = read_cloud(tmp_path / "a.npz")
-    assert cloud.notes == ("scale, name left out: not of 4 rows",)
+    assert cloud.notes == ("scale, name skipped: not 4 rows",)
     assert list(cloud.fields) == ["plane_id"]
     with pytest.raises(FormatError, match="a field cannot be named 'plane_area'"):
         write_cloud(tmp_path / "b.npz", Cloud(POINTS, {"plane_area": np.ones(4)}))

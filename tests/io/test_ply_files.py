@@ -102,7 +102,7 @@ def test_other_elements_before_and_after_are_passed_over(tmp_path, order):
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
     assert set(cloud.fields) == {"color", "labels"}
     told = "1 of camera, 2 of strip"
-    assert cloud.notes == (f"elements left out, as only vertices and their faces are read: {told}",)
+    assert cloud.notes == (f"elements skipped (only vertices and faces are read): {told}",)
 
 
 @pytest.mark.parametrize("kind", ["ply", "pcd"])
@@ -155,7 +155,7 @@ def test_lists_of_vertices_have_any_length_and_place(tmp_path, order, place, len
 
 @pytest.mark.parametrize("order", ["ascii", *ORDERS])
 def test_lists_longer_than_a_block_are_read(tmp_path, order, monkeypatch):
-    monkeypatch.setattr(ply, "_BYTES_AT_ONCE", 64)
+    monkeypatch.setattr(ply, "_BYTES_PER_READ", 64)
     lists = [range(1000), range(3), range(1000)]
     cloud = read_cloud(write_lists(tmp_path / "a.ply", order, lists, 1, code="h"))
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))

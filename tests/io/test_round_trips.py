@@ -11,7 +11,7 @@ import torch
 import torchrg.io
 from torchrg.errors import FormatError, ShapeError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
-from torchrg.io.fields import notes_on_results
+from torchrg.io.fields import describe_renamed_fields
 from torchrg.structures import Cloud, PlaneAdjacency, Superpoints
 
 WRITTEN = [kind for kind, row in FORMATS.items() if row.write]
@@ -135,14 +135,14 @@ def test_own_fields_that_a_result_has_too_are_kept_aside(
             own = "label_input" if field == "labels" else f"{field}_input"
             np.testing.assert_array_equal(fields[own].astype("f4"), cloud.fields[field])
     assert (tmp_path / f"b{kind}").read_bytes() == (tmp_path / f"c{kind}").read_bytes()
-    told = notes_on_results(cloud.fields, RESULT_FIELDS)
+    told = describe_renamed_fields(cloud.fields, RESULT_FIELDS)
     names = "label as label_input, normals as normals_input, curvature as curvature_input"
-    assert told == [f"its own fields are kept beside the result's: {names}"]
-    assert notes_on_results(again.fields, RESULT_FIELDS) == [
+    assert told == [f"input fields are kept next to the result: {names}"]
+    assert describe_renamed_fields(again.fields, RESULT_FIELDS) == [
         "its own label, normals, curvature left out for the result's; label_input, normals_input, "
         "curvature_input stay"
     ]
-    assert notes_on_results({"color"}, RESULT_FIELDS) == []
+    assert describe_renamed_fields({"color"}, RESULT_FIELDS) == []
 
 
 def test_own_superpoints_are_kept_aside_too(tmp_path, make_cloud):
@@ -333,7 +333,7 @@ def test_unknown_suffix_lists_the_known_ones(tmp_path, call, kinds):
 @pytest.mark.parametrize("kind", [*FORMATS, ".stl"])
 def test_missing_files_directories_and_empty_files_are_refused(tmp_path, kind):
     path = tmp_path / f"a{kind}"
-    with pytest.raises(FormatError, match=r"a\.\w+: no such file"):
+    with pytest.raises(FormatError, match=r"a\.\w+: file not found"):
         read_cloud(path)
     path.touch()
     with pytest.raises(FormatError, match=r"a\.\w+: byte 0: the file is empty"):
@@ -368,7 +368,7 @@ def test_formats_of_one_direction_say_so(tmp_path, make_cloud):
 
 def test_outputs_are_checked_before_the_work(tmp_path):
     check_output(tmp_path / "a.ply")
-    with pytest.raises(FormatError, match="there is no folder"):
+    with pytest.raises(FormatError, match="not found; create it first"):
         check_output(tmp_path / "missing" / "a.ply")
     (tmp_path / "b.ply").mkdir()
     with pytest.raises(FormatError, match=r"b\.ply: expected a file to write, got a directory"):

@@ -7,7 +7,7 @@ from tests.kernels.clouds import clouds, definitions, lists, needs_library
 from torchrg.config import NormalsConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.normals.consensus import estimate_consensus
-from torchrg.normals.consensus.noise import survey_noise
+from torchrg.normals.consensus.noise import estimate_noise
 from torchrg.normals.consensus.smoothing import _inliers, choose_planes, smooth_planes
 from torchrg.normals.consensus.surfaces import TangentPlanes, _paraboloids, broken_planes
 from torchrg.normals.pca import fit_points_pca
@@ -34,7 +34,7 @@ def near(request, points):
 def survey(points, near):
     with definitions():
         fit = fit_points_pca(points, near)
-        return fit, survey_noise(points, near, fit)
+        return fit, estimate_noise(points, near, fit)
 
 
 def both(function, *arguments, **settings):

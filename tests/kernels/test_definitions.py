@@ -5,7 +5,7 @@ import torch
 
 from tests.kernels.clouds import clouds, definitions, lists, needs_library
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.normals.consensus.noise import _neighbor_quantiles, _survey
+from torchrg.normals.consensus.noise import _measure_neighborhoods, _neighbor_quantiles
 from torchrg.normals.pca import fit_points_pca
 from torchrg.robust.scale import _majority_difference
 
@@ -85,7 +85,7 @@ def test_planes_of_all_neighbors_are_those_of_the_definition(name, points, maske
 def test_survey_is_that_of_the_definition(points, masked):
     near = lists(points, 50, masked)
     fit = fit_points_pca(points, near)
-    found, expected = both(_survey, points, near, fit.normals, fit.valid)
+    found, expected = both(_measure_neighborhoods, points, near, fit.normals, fit.valid)
     radius = torch.where(expected[1] > 0, expected[1], 1.0)
     for place in (0, 1, 2):
         assert_close(found[place], expected[place], radius)

@@ -10,7 +10,7 @@ from torchrg.depth import segment_depth
 from torchrg.depth.camera import has_depth, make_intrinsics
 from torchrg.depth.faces import hidden_contacts
 from torchrg.depth.growth import (
-    absorb_pixels,
+    assign_unlabeled_pixels,
     connect_pixels,
     fit_inverse_planes,
     move_to_creases,
@@ -20,8 +20,8 @@ from torchrg.depth.pixels import describe_pixels
 from torchrg.depth.segment import _inverse_cloud
 from torchrg.depth.windows import Image
 from torchrg.linalg.moments import Segments
-from torchrg.regions.extents import outer_places
-from torchrg.regions.growth import number_by_size
+from torchrg.regions.extents import hull_candidates
+from torchrg.regions.growth import rank_by_size
 from torchrg.scenes import build_room
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
@@ -77,14 +77,14 @@ def stages_of(depth):
     x, y = image.u / FOCAL[0], image.v / FOCAL[1]
     planes = fit_pixels(image, focal=FOCAL, noise=None, dtype=depth.dtype)
     pixels = describe_pixels(image, planes, FOCAL, config)
-    labels = number_by_size(connect_pixels(planes.choice.flat, pixels.right, pixels.down), 20)
+    labels = rank_by_size(connect_pixels(planes.choice.flat, pixels.right, pixels.down), 20)
     cloud = _inverse_cloud(image, pixels, x, y)
     found = [*planes.squares.values(), planes.narrow, planes.pixels, *planes.choice, *pixels]
     found += [labels]
     if bool((labels >= 0).any()):
         fit = fit_inverse_planes(cloud, labels, most=500)
-        reach = fit.times_thickness(3.0)
-        absorbed = absorb_pixels(cloud, labels, fit, reach)
+        reach = fit.scale_thickness(3.0)
+        absorbed = assign_unlabeled_pixels(cloud, labels, fit, reach)
         found += [*fit, absorbed, *hidden_contacts(cloud.points, cloud.seen, labels, fit, reach)]
         found += [move_to_creases(cloud, absorbed, fit, reach)]
     return found
@@ -163,7 +163,7 @@ def test_rows_and_outer_points_of_regions_are_those_of_the_definition(most, rng)
         return [
             segments.rows,
             segments.counts,
-            *map(torch.tensor, outer_places(segments, *columns)),
+            *map(torch.tensor, hull_candidates(segments, *columns)),
         ]
 
     found = stages()

@@ -9,9 +9,9 @@ from tests.kernels.clouds import clouds, definitions, lists, needs_library
 from torchrg.config import GrowingConfig, load_config
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals.pca import fit_points_pca
-from torchrg.regions.adjacency import find_contacts
-from torchrg.regions.edges import GrowingCloud, accept_edges
-from torchrg.regions.growth import by_column, grow
+from torchrg.regions.adjacency import find_region_pairs
+from torchrg.regions.edges import GrowingInput, accept_edges
+from torchrg.regions.growth import grow, to_column_major
 from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.scenes import make_room
 from torchrg.structures import Sampling
@@ -60,8 +60,8 @@ def growing_cloud(points, k, masked, reach=None, **settings):
     if reach is not None:
         reach = reach * fit.residual_rms
         reach[::5] = torch.inf
-    columns = by_column(points), by_column(fit.normals)
-    return GrowingCloud(*columns, fit.curvature, near, valid, reach, **settings)
+    columns = to_column_major(points), to_column_major(fit.normals)
+    return GrowingInput(*columns, fit.curvature, near, valid, reach, **settings)
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -100,7 +100,7 @@ def test_shared_neighbors_are_those_of_the_definition(name, k, masked):
 @pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
 @pytest.mark.parametrize("name", ["room", "grid", "doubled"])
 def test_regions_are_those_of_the_definition(name, preset, k):
-    config = load_config(preset).at_sampling(Sampling()).growing
+    config = load_config(preset).with_sampling(Sampling()).growing
     late = {"connectivity": 0.3, "connectivity_scope": "seed"}
     by_region = {
         "curvature_scope": "neighborhood",
@@ -124,9 +124,9 @@ def test_regions_are_those_of_the_definition(name, preset, k):
 def test_rows_at_a_border_are_those_of_the_definition(masked):
     near = lists(ROOM, 20, masked)
     labels = (ROOM[:, 0] - ROOM[:, 0].min()).mul(3).long() - 2  # Slabs: most rows are inside one.
-    found = find_contacts(labels, near)
+    found = find_region_pairs(labels, near)
     with definitions():
-        expected = find_contacts(labels, near)
+        expected = find_region_pairs(labels, near)
     assert len(found[0]) > 10
     for one, other in zip(found, expected, strict=True):
         assert torch.equal(one, other)

@@ -12,11 +12,11 @@ from torchrg.scenes import (
     Scene,
     SceneModel,
     block,
-    free_places,
     furnish,
     passage,
     room_walls,
     sample_scene,
+    scanner_positions,
 )
 from torchrg.scenes.surfaces import Hole
 
@@ -94,13 +94,13 @@ def build_storey(seed: int = 0, *, rooms_per_side: int = 4) -> SceneModel:
     doorways = [(room.hall_wall, room.hall_doorway(length)) for room in rooms]
     hall_parts = furnish(hall_layout, hall, rng, doorways=doorways, with_floor=False)
     parts: list[Part] = [Part((_floor(rooms, length, width),)), *hall_parts]
-    viewpoints = [free_places(hall_layout, hall, hall_parts, rng)]
+    viewpoints = [scanner_positions(hall_layout, hall, hall_parts, rng)]
     for room, (wall, doorway) in zip(rooms, doorways, strict=True):
         layout, holes = replace(_ROOM, size=room.size), [(_FIRST_WALL, room.doorway)]
         contents = furnish(layout, room.frame, rng, doorways=holes, with_floor=False)
         parts += [passage("door frame", walls[wall], doorway, room.thickness), *contents]
         parts.append(_open_door(room, rng))
-        viewpoints.append(free_places(layout, room.frame, parts, rng))
+        viewpoints.append(scanner_positions(layout, room.frame, parts, rng))
     return SceneModel(tuple(parts), np.concatenate(viewpoints))
 
 

@@ -174,7 +174,7 @@ def test_another_unit_scales_height_and_density_alone(cloud, unit):
 @pytest.mark.parametrize("kind", CLOUDS)
 def test_the_choice_stays_where_the_surfaces_stay(kind, seed, change):
     def choice(points):
-        growing = load_config().at_sampling(measure(points)).growing
+        growing = load_config().with_sampling(measure(points)).growing
         return growing.facet_tolerance
 
     here, there = choice(CLOUDS[kind](1)), choice(change(CLOUDS[kind](seed)))
@@ -204,7 +204,7 @@ def test_degenerate_clouds_have_measures_and_choices(points):
     cloud = cloud[canonical_order(cloud)]
     found = measure_sampling(cloud, search_knn(cloud, min(K, len(cloud))))
     assert all(math.isfinite(value) for value in found), found
-    growing = load_config().at_sampling(found).growing
+    growing = load_config().with_sampling(found).growing
     assert isinstance(growing.min_size, int)
     assert growing.facet_tolerance is None or growing.facet_tolerance > 0
 

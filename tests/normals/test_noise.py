@@ -9,7 +9,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.made import make_shape
 from torchrg.config import load_config
 from torchrg.neighbors import search_knn
-from torchrg.normals.consensus.noise import regional_noise, survey_noise
+from torchrg.normals.consensus.noise import estimate_noise, regional_noise
 from torchrg.normals.pca import fit_normals_pca, fit_points
 from torchrg.pipeline import segment_planes
 from torchrg.structures import Neighbors
@@ -18,7 +18,7 @@ from torchrg.structures import Neighbors
 def survey(points, k=50):
     neighbors = search_knn(points, k)
     fit = fit_points(points, neighbors, fit_normals_pca)
-    return survey_noise(points, neighbors, fit)
+    return estimate_noise(points, neighbors, fit)
 
 
 @pytest.mark.parametrize("name", ["cube", "sphere", "bracket", "cylinder"])
@@ -82,9 +82,9 @@ def test_masked_neighbours_take_memory_by_chunks_only():
     fit = fit_points(points, neighbors, fit_normals_pca)
     counted = torch.ones_like(neighbors.indices, dtype=torch.bool)
     with LargestResult() as results:
-        found = survey_noise(points, Neighbors(neighbors.indices, counted), fit, chunk_size=1000)
+        found = estimate_noise(points, Neighbors(neighbors.indices, counted), fit, chunk_size=1000)
     assert results.most < counted.numel()
-    whole = survey_noise(points, neighbors, fit)
+    whole = estimate_noise(points, neighbors, fit)
     assert torch.allclose(found.noise, whole.noise, rtol=1e-5)
 
 
@@ -106,7 +106,7 @@ def test_a_step_that_was_rounded_is_no_noise_of_the_region(offset, ramp):
     points, height = ramped_step(offset, ramp, 0.001, 4)
     neighbors = search_knn(points, 50)
     fit = fit_points(points, neighbors, fit_normals_pca)
-    local = survey_noise(points, neighbors, fit).noise
+    local = estimate_noise(points, neighbors, fit).noise
     assert local[height == 1].median() > 0.0013
     found = torch.minimum(local, regional_noise(local, neighbors))
     assert found.max() < 0.001

@@ -10,7 +10,7 @@ import torch
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.neighbors import search_knn
 from torchrg.regions import adjacency
-from torchrg.regions.adjacency import NearestPoints, find_adjacency
+from torchrg.regions.adjacency import KnnAdjacency, find_adjacency
 from torchrg.structures import Neighbors
 
 
@@ -95,7 +95,7 @@ def test_lengths_are_those_of_literal_loops(masked):
 def test_contacts_are_those_of_literal_loops(masked):
     _, labels, neighbors, *_ = touching_regions(9, masked)
     contacts = contacts_by_loops(labels, neighbors)
-    pairs, counts = NearestPoints(neighbors).contacts(labels)
+    pairs, counts = KnnAdjacency(neighbors).contacts(labels)
     assert list(map(tuple, pairs.tolist())) == sorted(contacts)
     assert counts.tolist() == [len(contacts[pair]) for pair in sorted(contacts)]
 

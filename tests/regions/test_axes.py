@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torchrg import align_axes, segment_planes
 from torchrg.errors import ConfigError
 from torchrg.regions import summarize_planes
-from torchrg.regions.axes import move_planes
+from torchrg.regions.axes import transform_planes
 from torchrg.structures import PLANE_COLUMNS, Planes
 
 
@@ -139,7 +139,7 @@ def test_tables_are_moved_as_if_made_of_moved_points(room):
     points, normals = scene.points.double(), scene.normals.double()
     labels = torch.unique(scene.labels, return_inverse=True)[1]
     given = summarize_planes(points, normals, labels, outline=True)
-    moved = move_planes(given, motion)
+    moved = transform_planes(given, motion)
     expected = summarize_planes(points @ turn.T + motion[:3, 3], normals @ turn.T, labels)
     for name in ("normal", "offset", "centroid"):
         # Of a few points any of several planes is best.

@@ -11,7 +11,7 @@ from tests.regions.growing_clouds import papers_growing
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.growth import curvature_limit, grow_first_in_first_out, number_by_size
+from torchrg.regions.growth import curvature_limit, grow_fifo, rank_by_size
 from torchrg.structures import Neighbors
 
 CLASSIC = papers_growing(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
@@ -88,7 +88,7 @@ def test_regions_smaller_than_min_size_are_not_labelled():
 
 
 def test_labels_descend_by_size_then_by_first_point():
-    labels = number_by_size(torch.tensor([7, 7, 2, 2, 5, 5, 5, -1]), 2)
+    labels = rank_by_size(torch.tensor([7, 7, 2, 2, 5, 5, 5, -1]), 2)
     assert labels.tolist() == [1, 1, 2, 2, 0, 0, 0, -1]
 
 
@@ -163,7 +163,7 @@ def grow_chain(num_points, joins):
     following = (torch.arange(num_points, dtype=torch.int32) + 1).clamp(max=num_points - 1)
     bits = torch.full((num_points, 1), joins)
     every, order = torch.ones(num_points, dtype=torch.bool), torch.arange(num_points)
-    return grow_first_in_first_out(following[:, None], bits, None, every, every, order, late=False)
+    return grow_fifo(following[:, None], bits, None, every, every, order, late=False)
 
 
 def test_neighbours_across_a_gap_join_only_within_the_distance():

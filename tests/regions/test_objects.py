@@ -8,7 +8,7 @@ from tests.kernels.clouds import definitions
 from torchrg import scratch, segment_planes
 from torchrg.errors import ShapeError
 from torchrg.neighbors import sample_voxels, search_knn
-from torchrg.neighbors.knn import keep_within
+from torchrg.neighbors.knn import restrict_to_groups
 from torchrg.result import describe_planes
 from torchrg.structures import UNLABELED
 
@@ -110,7 +110,7 @@ def test_the_table_names_the_object_beside_planes_that_meet_across(room):
 def test_nearest_neighbours_of_the_group_come_first(rng):
     points = torch.rand(300, 3, generator=rng, dtype=torch.float64)
     groups = torch.randint(0, 3, (300,), generator=rng)
-    kept = keep_within(search_knn(points, 20), groups, 64)
+    kept = restrict_to_groups(search_knn(points, 20), groups, 64)
     every = search_knn(points, 20).indices
     for row in range(300):
         own = [i for i in every[row].tolist() if groups[i] == groups[row]]

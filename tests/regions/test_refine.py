@@ -9,11 +9,11 @@ from tests.regions.growing_clouds import papers_growing
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.adjacency import MIN_CONTACTS, NearestPoints
-from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.adjacency import MIN_CONTACTS, KnnAdjacency
+from torchrg.regions.edges import GrowingInput
 from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
 from torchrg.regions.growth import label_regions
-from torchrg.regions.repair import absorb_points, merge_facets, refine_regions
+from torchrg.regions.repair import assign_unlabeled, merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
 
 OFF = papers_growing(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=5)
@@ -32,7 +32,7 @@ def flat_cloud(coordinates, k=16, normals=None):
     normals = up if normals is None else torch.as_tensor(normals)[order]
     valid = torch.ones(len(points), dtype=torch.bool)
     neighbors = search_knn(points, k, canonical=True)
-    return GrowingCloud(points, normals, torch.zeros(len(points)), neighbors, valid), order
+    return GrowingInput(points, normals, torch.zeros(len(points)), neighbors, valid), order
 
 
 def sheet(rng, n=1500, noise=0.002):
@@ -124,10 +124,10 @@ def test_absorption_follows_its_rule_literally():
     for axis in range(3):
         labels[(points[:, axis].abs() < 0.02).nonzero()[:30, 0]] = axis
     valid = torch.from_numpy(rng.random(len(points)) < 0.9)
-    found = absorb_points(
+    found = assign_unlabeled(
         points,
         labels,
-        NearestPoints(neighbors),
+        KnnAdjacency(neighbors),
         planes,
         reach,
         valid=valid,
@@ -141,14 +141,14 @@ def test_absorption_follows_its_rule_literally():
 
 def test_contacts_of_touching_regions_are_counted():
     neighbors = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]]))
-    pairs, counts = NearestPoints(neighbors).contacts(torch.tensor([0, 1, 1]))
+    pairs, counts = KnnAdjacency(neighbors).contacts(torch.tensor([0, 1, 1]))
     assert (pairs.tolist(), counts.tolist()) == ([[0, 1]], [2])
-    assert NearestPoints(neighbors).neighbor_rows(torch.arange(3)).tolist() == [[1], [0], [1]]
+    assert KnnAdjacency(neighbors).neighbor_rows(torch.arange(3)).tolist() == [[1], [0], [1]]
 
 
 def test_entries_that_are_no_neighbours_are_beside_no_point():
     valid = torch.tensor([[True, True], [True, False], [True, False]])
-    adjacency = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 2], [2, 0]]), valid))
+    adjacency = KnnAdjacency(Neighbors(torch.tensor([[0, 1], [1, 2], [2, 0]]), valid))
     assert adjacency.neighbor_rows(torch.tensor([0, 1, 2])).tolist() == [[1], [1], [2]]
     assert adjacency.neighbor_rows(slice(1, 3)).tolist() == [[1], [2]]
     assert adjacency.frontier(torch.tensor([0, 1]), torch.tensor([2])).tolist() == []
@@ -177,7 +177,7 @@ def test_pieces_across_a_gap_are_not_merged():
     points[points[:, 0] > 0.5, 0] += 0.07
     cloud, _ = flat_cloud(points, k=50)
     labels = (cloud.points[:, 0] > 0.5).long()
-    assert len(NearestPoints(cloud.neighbors).contacts(labels)[0]) == 0
+    assert len(KnnAdjacency(cloud.neighbors).contacts(labels)[0]) == 0
     refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
     assert torch.equal(refined, labels)
 
@@ -197,7 +197,7 @@ def test_halves_of_a_rim_are_merged_though_other_faces_are_nearer(gap, step, mer
     normals = np.repeat(np.eye(3)[[2, 2, 1]], [3000, 3000, 300], axis=0)
     cloud, order = flat_cloud(np.concatenate([top, bottom, rim]), k=50, normals=normals)
     labels = torch.from_numpy(faces)[order]
-    pairs, counts = NearestPoints(cloud.neighbors).contacts(labels)
+    pairs, counts = KnnAdjacency(cloud.neighbors).contacts(labels)
     assert counts[(pairs == torch.tensor([0, 1])).all(dim=1)].sum() < MIN_CONTACTS
     refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
     assert bool((refined == torch.where(labels == 1, 0, labels)).all()) == merged
@@ -213,7 +213,7 @@ def test_a_step_or_a_bend_is_not_merged(noise):
     for points in (step, bend):
         cloud, _ = flat_cloud(points)
         labels = (cloud.points[:, 0] > 0.5).long()
-        assert len(NearestPoints(cloud.neighbors).contacts(labels)[0]) == 1
+        assert len(KnnAdjacency(cloud.neighbors).contacts(labels)[0]) == 1
         refined = refine_regions(cloud, labels, with_settings(merge_coplanar=True))
         assert torch.equal(refined, labels)
 
@@ -286,7 +286,7 @@ def test_a_thin_side_is_no_facet_of_the_face_beside_it():
     points = np.concatenate([front, side])
     cloud, order = flat_cloud(points)
     labels = (order >= 3000).long()
-    contacts = NearestPoints(cloud.neighbors).contacts(labels)
+    contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
     planes = fit_regions(cloud, labels, OFF)
     assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == 2
 
@@ -298,7 +298,7 @@ def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, faces
     points = np.concatenate([upper + np.array([0, 0.295, step]), lower])
     cloud, order = flat_cloud(points)
     labels = (order >= 3000).long()
-    contacts = NearestPoints(cloud.neighbors).contacts(labels)
+    contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
     planes = fit_regions(cloud, labels, OFF)
     both = points - points.mean(axis=0)
     across = both @ np.linalg.svd(both, full_matrices=False)[2][2]

@@ -6,7 +6,7 @@ import torch
 
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
-from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.edges import GrowingInput
 from torchrg.regions.fit import fit_planes
 from torchrg.regions.repair import refine_borders
 from torchrg.structures import UNLABELED
@@ -34,7 +34,7 @@ def refined(points, labels, normals, valid=None, reach=9e-3):
     placed = points[order]
     valid = torch.ones(len(points), dtype=torch.bool) if valid is None else valid
     normals = torch.tensor(normals)
-    cloud = GrowingCloud(
+    cloud = GrowingInput(
         placed,
         torch.zeros_like(placed),
         torch.zeros(len(points)),

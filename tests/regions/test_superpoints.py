@@ -377,7 +377,7 @@ def test_arguments_are_checked(room):
         make_superpoints(points[:, :2])
     with pytest.raises(ShapeError, match="expected colors of shape"):
         make_superpoints(points, colors=points[:5])
-    with pytest.raises(ConfigError, match="expected color to be three real numbers a point, got"):
+    with pytest.raises(ConfigError, match=r"expected color of shape \(N, 3\), got"):
         make_superpoints(points, colors=points > 0)
     seg = segment_planes(points[:100])
     with pytest.raises(ShapeError, match="expected seg of 6,000 points, got 100"):
@@ -407,9 +407,9 @@ def test_a_made_room_is_parted_at_its_objects():
 def test_a_superpoint_is_on_the_plane_of_more_than_half_of_its_points():
     parts = torch.tensor([0, 0, 1, 1, 1, 2, 2, -1])
     planes = torch.tensor([3, -1, 3, 4, 4, -1, -1, 5])
-    assert superpoints.main_planes(parts, planes).tolist() == [-1, 4, -1]
+    assert superpoints.majority_planes(parts, planes).tolist() == [-1, 4, -1]
     large = torch.where(planes >= 0, planes * 10**18, -1)
-    assert superpoints.main_planes(parts, large).tolist() == [-1, 4 * 10**18, -1]
+    assert superpoints.majority_planes(parts, large).tolist() == [-1, 4 * 10**18, -1]
 
 
 def test_neighbors_that_are_known_are_not_searched_again(monkeypatch):

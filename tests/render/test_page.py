@@ -268,7 +268,7 @@ def test_view_writes_a_page(tmp_path, run):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--out", "no/page.html"], "there is no folder"),
+        (["--out", "no/page.html"], "not found; create it first"),
         (["--out", "page.pdf"], "expected a file ending in .png or .html"),
         (["--out", "page.png", "--truth", "room.npz"], "with a viewer"),
         (
@@ -276,7 +276,7 @@ def test_view_writes_a_page(tmp_path, run):
             "expected ground truth for 300 points, got 3",
         ),
         (["--out", "page.html", "--color", "sharp"], "expected sharp for color="),
-        (["--out", "page.html", "--beside", "gone.npz"], "no such file"),
+        (["--out", "page.html", "--beside", "gone.npz"], "file not found"),
         (["--out", "page.html", "--max-points", "0"], "expected max_points >= 1"),
     ],
 )

@@ -6,7 +6,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
-from torchrg.regions.adjacency import NearestPoints
+from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
 from torchrg.render.colors import palette_of_planes, rgb_to_lab
 from torchrg.scenes import make_room
@@ -55,7 +55,7 @@ def test_planes_that_touch_look_clearly_different():
     colors = color_planes(room.labels, room.points)
     table = torch.zeros(int(room.labels.max()) + 1, 3, dtype=torch.uint8)
     table[room.labels[room.labels >= 0]] = colors[room.labels >= 0]
-    first, second = NearestPoints(search_knn(room.points, 9)).contacts(room.labels)[0].T
+    first, second = KnnAdjacency(search_knn(room.points, 9)).contacts(room.labels)[0].T
     distances = (lab_of(table[first]) - lab_of(table[second])).norm(dim=1)
     assert len(distances) > 200
     assert float(distances.amin()) > CLEARLY

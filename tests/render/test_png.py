@@ -92,5 +92,5 @@ def test_what_is_no_image_is_refused(tmp_path, image, message):
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="there is no folder"):
+    with pytest.raises(FormatError, match="not found; create it first"):
         write_png(tmp_path / "missing" / "x.png", torch.zeros(2, 2, 3, dtype=torch.uint8))

@@ -20,4 +20,4 @@ def test_messages_are_read_with_their_class_place_and_words(tmp_path, monkeypatc
 def test_every_refusal_of_the_package_is_listed():
     rows = messages.table().splitlines()[2:]
     assert len(rows) > 300
-    assert any("no such file; check the spelling." in row for row in rows)
+    assert any("file not found; check the path." in row for row in rows)

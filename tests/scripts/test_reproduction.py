@@ -85,7 +85,7 @@ def test_growth_from_kept_normals_gives_the_labels_of_the_pipeline(run):
     angle, quantile = limits.max_angle_deg, limits.curvature_quantile
     kept = read_segmented(run, "hallway", method).labels
     points = run.cloud("hallway").cloud.points
-    turned = segment_planes(points, load_config(method).at_angle(8.0)).labels
+    turned = segment_planes(points, load_config(method).with_angle(8.0)).labels
     assert torch.equal(regrow(run, "hallway", method, 8.0, quantile), turned)
     # Another angle by less than rounding: grown again instead of read.
     assert torch.equal(regrow(run, "hallway", method, angle + 1e-12, quantile), kept)

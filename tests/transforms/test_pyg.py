@@ -8,7 +8,7 @@ import torch
 
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
-from torchrg.neighbors import restore_points, sample_voxels
+from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.scenes import make_room
 from torchrg.transforms import (
@@ -94,7 +94,7 @@ def test_labels_of_a_batch_go_back_to_its_points(pyg, data, clouds):
         SampleVoxels(SIZE)(batch(data)),
         KeepFinite()(SampleVoxels(SIZE)(batch(data))),
     ):
-        back = restore_points(found.y, found.inverse_index, fill=-1)
+        back = expand_to_points(found.y, found.inverse_index, fill=-1)
         start = 0
         for points in clouds:
             rows, inverse = sample_voxels(points, SIZE)
@@ -180,7 +180,7 @@ def test_a_stored_data_set_and_its_loader_keep_clouds_in_step(pyg, data, clouds,
     )
     (batch,) = loader
     assert same(batch, pyg.data.Batch.from_data_list(expected))
-    back = restore_points(batch.y, batch.inverse_index, fill=-1)
+    back = expand_to_points(batch.y, batch.inverse_index, fill=-1)
     assert len(back) == sum(len(points) for points in clouds)
     assert (back == -1).nonzero().flatten().tolist() == [1205]
     assert same(pickle.loads(pickle.dumps(steps))(data[0]), steps(data[0]))

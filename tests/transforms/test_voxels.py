@@ -16,7 +16,7 @@ from torchrg.transforms import (
     KeepFinite,
     SampleVoxels,
     SegmentPlanes,
-    restore_points,
+    expand_to_points,
     sample_voxels,
 )
 
@@ -68,7 +68,7 @@ def test_labels_of_voxels_go_back_to_every_point():
     rows, inverse = sample_voxels(points, 0.1)
     assert inverse[7] == seg.labels[7] == -1
     own = segment_planes(points[rows], config).labels
-    back = restore_points(own, inverse, fill=-1)
+    back = expand_to_points(own, inverse, fill=-1)
     pairs = torch.stack([back, seg.labels]).unique(dim=1)
     assert pairs[0].unique().numel() == pairs[1].unique().numel() == pairs.shape[1]
     assert (seg.planes.count.diff() <= 0).all()

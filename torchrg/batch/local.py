@@ -10,7 +10,7 @@ from multiprocessing import connection, get_context, parent_process, resource_tr
 from multiprocessing.connection import Connection
 from threading import Thread
 
-from torchrg._parallel import CHILD_ENVIRONMENT, in_empty_folder
+from torchrg._parallel import CHILD_ENVIRONMENT, in_root_directory
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
@@ -89,7 +89,7 @@ class _Worker:
         self.pipe, child_pipe = context.Pipe()
         # Errors before the first scan go to a report, not as a traceback to the terminal.
         self.errors, errors = os.pipe()
-        with in_empty_folder(), _environment(), _block_sigint(), _redirect(errors) as stderr:
+        with in_root_directory(), _environment(), _block_sigint(), _redirect(errors) as stderr:
             self.process = context.Process(target=_serve, args=(child_pipe, stderr))
             self.process.start()
         os.close(errors)

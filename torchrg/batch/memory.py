@@ -19,13 +19,13 @@ _MEMORY_FRACTION = 0.8
 programs."""
 
 
-def memory_of_scan(num_points: int, *, on_disk: bool = False) -> int:
+def scan_memory(num_points: int, *, on_disk: bool = False) -> int:
     """Return the memory that a process needs for a cloud or a depth image, in bytes.
 
     ``on_disk``: large arrays are spilled to disk.
 
     Example:
-        >>> memory_of_scan(1_000_000), memory_of_scan(10_000_000, on_disk=True)
+        >>> scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)
         (1300000000, 3900000000)
     """
     return PROCESS_BYTES + (BYTES_PER_POINT_ON_DISK if on_disk else BYTES_PER_POINT) * num_points

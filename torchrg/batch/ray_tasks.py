@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from torchrg._optional import require
-from torchrg._parallel import CHILD_ENVIRONMENT, in_empty_folder
+from torchrg._parallel import CHILD_ENVIRONMENT, in_root_directory
 from torchrg.batch.local import POLL_SECONDS
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
@@ -49,7 +49,7 @@ def run_ray(
         "object_store_memory": _OBJECT_STORE_BYTES,
         "include_dashboard": False,
     }
-    with in_empty_folder():
+    with in_root_directory():
         ray.init(
             address=address or "local",
             logging_level="error",

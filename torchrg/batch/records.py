@@ -17,7 +17,7 @@ from torchrg.batch.task import TaskReport
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import DAMAGES
+from torchrg.io.files import PARSE_ERRORS
 from torchrg.result import RECORD as RECORD
 
 Record = dict[str, Any]
@@ -99,7 +99,7 @@ def read_record(folder: Path, *, strict: bool = False) -> Record | None:
     """
     try:
         content = json.loads((folder / RECORD).read_bytes())
-    except (OSError, *DAMAGES):
+    except (OSError, *PARSE_ERRORS):
         return None
     if isinstance(content, dict):
         layouts = content.setdefault("other_layouts", {})

@@ -19,7 +19,7 @@ from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import SceneFiles
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import check_space, folded_name, mark_of, marked_parts
+from torchrg.io.files import check_space, marked_parts, normalize_file_name, run_mark
 
 REPORT = "report.json"
 """Name of the report in the output directory."""
@@ -141,10 +141,10 @@ def _is_inside_scans(source: Source, scans: Sequence[SceneFiles], out: Path) -> 
 
 def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
     """Raise FormatError if results would share a folder, or replace files of the batch."""
-    batch_files = {folded_name(name): name for name in (REPORT, LOCK, DATA_SETS)}
+    batch_files = {normalize_file_name(name): name for name in (REPORT, LOCK, DATA_SETS)}
     owners: dict[str, str] = {}
     for name in (scan.name for scan in scans):
-        key = folded_name(name)
+        key = normalize_file_name(name)
         if name.startswith("/") or ".." in name.split("/"):
             raise FormatError(
                 f"{root}: expected a scan name without '..' and leading /, got {name!r}; rename it."
@@ -186,7 +186,7 @@ def make_plan(
     return Plan(tuple(jobs), named)
 
 
-def check_room(plan: Plan) -> None:
+def check_free_space(plan: Plan) -> None:
     """Raise FormatError if the disk has too little space for the estimated results."""
     if num_scans := len(plan.to_convert):
         repair = "convert fewer with --only"
@@ -312,5 +312,5 @@ def run_plan(
 
 def write_report(out: Path, report: BatchReport) -> None:
     """Write ``report.json`` into the output directory; raise FormatError on failure."""
-    with marked_parts(mark_of(REPORT)), atomic_path(out / REPORT) as temporary:
+    with marked_parts(run_mark(REPORT)), atomic_path(out / REPORT) as temporary:
         temporary.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")

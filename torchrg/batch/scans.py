@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from torchrg.batch.memory import memory_of_scan
+from torchrg.batch.memory import scan_memory
 from torchrg.batch.records import (
     RECORD,
     Record,
@@ -27,7 +27,7 @@ from torchrg.config import DepthConfig, PipelineConfig
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.pointcept import protecting_files
 from torchrg.errors import FormatError
-from torchrg.io.files import check_place, mark_of, marked_parts, remove_leftovers, sync_folder
+from torchrg.io.files import check_writable, marked_parts, remove_leftovers, run_mark, sync_folder
 from torchrg.result import PLANES_FILE, write_table
 
 
@@ -95,7 +95,7 @@ class Job:
     @property
     def memory(self) -> int:
         """Maximum memory of a process with this scan, in bytes."""
-        return memory_of_scan(self.scan.num_points)
+        return scan_memory(self.scan.num_points)
 
     @property
     def folder(self) -> Path:
@@ -105,7 +105,7 @@ class Job:
     @property
     def mark(self) -> str:
         """Mark of the scan's temporary files."""
-        return mark_of(self.scan.name)
+        return run_mark(self.scan.name)
 
     def input_name(self, path: Path) -> str:
         """Return the path of an input file relative to the data set, as in records."""
@@ -155,7 +155,7 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         sync_folder(path.parent)
         if path == job.out:
             break
-    check_place(folder / RECORD)
+    check_writable(folder / RECORD)
     earlier = read_record(folder, strict=True) or {"outputs": {}, "other_layouts": {}}
     table = job.source.table
     if table is not None and table not in earlier["outputs"] and (folder / table).exists():

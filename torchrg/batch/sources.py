@@ -25,7 +25,7 @@ from torchrg.datasets.pointcept import SOURCE_ARRAYS, write_results
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import num_pixels, read_depth
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.depth.camera import Pinhole, numbers_of, points_of_image
+from torchrg.depth.camera import Pinhole, format_intrinsics, unproject_image
 from torchrg.errors import FormatError
 from torchrg.normals.orient import Orientation
 from torchrg.structures import Segmentation
@@ -235,7 +235,7 @@ class RGBDSource(Source):
         seg = segment_depth(
             depth, frame.intrinsics, self.settings, pose=frame.pose, orient=self.orient
         )
-        points = points_of_image(depth, frame.intrinsics, frame.pose)
+        points = unproject_image(depth, frame.intrinsics, frame.pose)
         begin("write")
         files = tuple(write_frame(folder, depth, points, seg))
         num_planes = len(seg.planes)
@@ -248,7 +248,7 @@ class RGBDSource(Source):
             files,
             warnings=tuple(notes),
             measured={
-                "intrinsics": numbers_of(frame.intrinsics),
+                "intrinsics": format_intrinsics(frame.intrinsics),
                 "camera": frame.origin,
                 "depth_scale": frame.depth_scale,
             },

@@ -24,11 +24,11 @@ from torchrg.datasets.pointcept import written_files
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import (
-    DAMAGES,
+    PARSE_ERRORS,
     find_leftovers,
-    mark_of,
     marked_parts,
     remove_leftovers,
+    run_mark,
     sync_folder,
 )
 from torchrg.result import PLANES_FILE
@@ -141,7 +141,7 @@ def remove_stale(result: StaleResult) -> None:
     folder = result.folder
     paths = sorted(result.paths, key=lambda path: path.name == PLANES_FILE)
     if not folder.is_symlink():
-        remove_leftovers(folder, mark_of(result.name))
+        remove_leftovers(folder, run_mark(result.name))
     parents = {folder, *(path.parent for path in paths)}
     for path in paths:
         path.unlink(missing_ok=True)
@@ -167,7 +167,7 @@ def note_data_set(jobs: Sequence[Job], removed: Sequence[StaleResult]) -> None:
             scans = {n: i for n, i in data_set.items() if (out / n).is_dir()} | scans
     updated = sorted([*unrelated, dict(sorted(scans.items()))], key=min)
     if updated != existing:
-        with marked_parts(mark_of(REPORT)), atomic_path(out / DATA_SETS) as temporary:
+        with marked_parts(run_mark(REPORT)), atomic_path(out / DATA_SETS) as temporary:
             temporary.write_text(json.dumps(updated, indent=0), encoding="utf-8")
 
 
@@ -176,7 +176,7 @@ def _read_data_sets(out: Path) -> list[DataSet]:
     try:
         content = json.loads((out / DATA_SETS).read_bytes())
         data_sets = [{str(n): str(first) for n, first in scans.items()} for scans in content]
-    except (OSError, *DAMAGES):
+    except (OSError, *PARSE_ERRORS):
         return []
     return [scans for scans in data_sets if scans]
 
@@ -224,7 +224,7 @@ def _changed_file(result: StaleResult) -> Path | None:
         is_unmodified = path.is_file() if stored is None else is_unchanged(path, stored)
         if os.path.lexists(path) and not is_unmodified:
             return path
-    allowed = {*paths, *find_leftovers(folder, mark_of(result.name))}
+    allowed = {*paths, *find_leftovers(folder, run_mark(result.name))}
     if read_record(folder) is not None:  # A damaged record does not reveal changes.
         allowed.add(folder / RECORD)
     entries = sorted(folder.iterdir())

@@ -18,9 +18,9 @@ from torchrg.cli.loop import STAGES, check_distinct, note_input, output_paths, r
 from torchrg.clouds import check_finite
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
-from torchrg.io.files import check_place
+from torchrg.io.files import check_writable
 from torchrg.pipeline import segment_planes
-from torchrg.regions.axes import align_axes, move_cloud, move_planes
+from torchrg.regions.axes import align_axes, transform_cloud, transform_planes
 from torchrg.structures import Segmentation
 
 
@@ -53,7 +53,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, align each input and write it."""
     start = {"settings": flags.PlaneSettings.asked_for(argv)}
     arguments = parse(Arguments, argv, prog="torchrg align", default=start)
-    flags.use_threads(arguments.threads)
+    flags.limit_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
     check_distinct(outputs, arguments.inputs)
@@ -71,7 +71,7 @@ def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None
     if path.suffix.lower() not in (".npy", ".txt"):
         raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
     check_distinct([path], [*arguments.inputs, *outputs])
-    check_place(path)
+    check_writable(path)
 
 
 def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
@@ -93,7 +93,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     # The transform in file coordinates; points are relative to the cloud's origin.
     file_motion = motion.clone()
     file_motion[:3, 3] -= motion[:3, :3] @ torch.from_numpy(cloud.origin)
-    moved = move_cloud(cloud, file_motion)
+    moved = transform_cloud(cloud, file_motion)
     moved_seg = _move(seg, motion, moved.origin) if arguments.segment else None
     provenance = describe_run(source, settings) | {"motion": file_motion.tolist()}
     write_cloud(target, moved, moved_seg, provenance=provenance)
@@ -113,7 +113,7 @@ def _move(seg: Segmentation, motion: Tensor, origin: NDArray[np.float64]) -> Seg
     about = motion.clone()
     about[:3, 3] -= torch.from_numpy(origin)
     normals = (seg.normals.double() @ motion[:3, :3].T).to(seg.normals.dtype)
-    return replace(seg, normals=normals, planes=move_planes(seg.planes, about), points=None)
+    return replace(seg, normals=normals, planes=transform_planes(seg.planes, about), points=None)
 
 
 def _write_matrix(path: Path, matrix: NDArray[np.float64]) -> None:

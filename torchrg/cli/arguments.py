@@ -46,7 +46,7 @@ RESOURCES = (
 """Flags that set where and how fast a command runs, and do not change its result."""
 ALIASES = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
 """Alternative spellings of flags, accepted but not listed."""
-NEEDED = "required"
+REQUIRED = "required"
 """Title of the required arguments."""
 _PERFORMANCE = "performance (does not change the result)"
 _EXAMPLES = "\n\nExamples:\n"
@@ -318,7 +318,7 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str, complete: bool 
     """
     common = [flag for flag in flags if complete or _is_common(flag)]
     groups = group_flags(common)
-    needed = (flag.spelling for flag in groups.get(NEEDED, ()))
+    needed = (flag.spelling for flag in groups.get(REQUIRED, ()))
     usage = " ".join(["usage:", prog, *needed, "[options]"])
     paragraphs = describe(kind).split("\n\n")
     blocks = [usage, *map(_wrap, paragraphs if complete else paragraphs[:1])]
@@ -355,10 +355,10 @@ def _short_entry(flag: Flag) -> str:
 
 def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
     """Group arguments by title: required, options, performance, then each part."""
-    groups: dict[str, list[Flag]] = {title: [] for title in (NEEDED, "options", _PERFORMANCE)}
+    groups: dict[str, list[Flag]] = {title: [] for title in (REQUIRED, "options", _PERFORMANCE)}
     for flag in flags:
         if flag.is_required:
-            group = NEEDED
+            group = REQUIRED
         elif flag.name in RESOURCES:
             group = _PERFORMANCE
         elif not flag.part or flag.name in COMMON:
@@ -367,7 +367,7 @@ def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
             group = f"advanced: {flag.part}"
         groups.setdefault(group, []).append(flag)
     # Positional arguments come first, in their order.
-    groups[NEEDED].sort(key=lambda flag: not flag.is_positional)
+    groups[REQUIRED].sort(key=lambda flag: not flag.is_positional)
     groups[_PERFORMANCE].sort(key=lambda flag: RESOURCES.index(flag.name))
     return {title: members for title, members in groups.items() if members}
 

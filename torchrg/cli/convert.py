@@ -15,7 +15,7 @@ from torchrg.batch.run import (
     REPORT,
     BatchReport,
     Plan,
-    check_room,
+    check_free_space,
     list_jobs,
     lock_folder,
     make_plan,
@@ -53,7 +53,7 @@ from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.datasets.s3dis import find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
-from torchrg.io.files import check_place, free_space, make_folder, mark_of, remove_leftovers
+from torchrg.io.files import check_writable, create_folder, free_space, remove_leftovers, run_mark
 from torchrg.plane_table import TABLE_SUFFIXES
 from torchrg.render.gallery import check_gallery, write_entry, write_index
 from torchrg.render.page import check_library
@@ -290,20 +290,20 @@ def run(argv: list[str]) -> int:
                 print_lines(f"remove {result.name}: {result.reason}")
         print(format_costs(plan, *resources, arguments.seconds_per_million))
         check_stale(stale, root, prune=arguments.prune)
-        check_room(plan)
+        check_free_space(plan)
         return 0
-    make_folder(out)
-    check_place(out / REPORT)
+    create_folder(out)
+    check_writable(out / REPORT)
     pages = _page_folder(arguments)
     if pages is not None:
-        make_folder(pages)
+        create_folder(pages)
         check_gallery(pages, [job.name for job in jobs])
     with lock_folder(out):
-        remove_leftovers(out, mark_of(REPORT))
+        remove_leftovers(out, run_mark(REPORT))
         stale = _find_stale(scans, arguments)
         check_stale(stale, root, prune=arguments.prune)
         plan = _plan_with_bar(jobs, arguments)
-        check_room(plan)
+        check_free_space(plan)
         _remove_stale(stale, scans)
         return _convert(plan, out, arguments)
 
@@ -365,7 +365,7 @@ def _remove_stale(stale: list[StaleResult], scans: list[Job]) -> None:
     source, out = scans[0].source, scans[0].out
     paths = {path for result in stale for path in result.paths}
     if paths:
-        source.write_lists(out, mark_of(REPORT), without=paths)
+        source.write_lists(out, run_mark(REPORT), without=paths)
     for result in stale:
         remove_stale(result)
         if result.files:
@@ -398,7 +398,7 @@ def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     code = _finish(report, out, unit=arguments.unit)
     if not report.disk_full:
-        plan.jobs[0].source.write_lists(out, mark_of(REPORT))
+        plan.jobs[0].source.write_lists(out, run_mark(REPORT))
     pages = _page_folder(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)

@@ -28,10 +28,10 @@ from torchrg.datasets.rgbd_files import (
     refuse_recording,
 )
 from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
-from torchrg.depth.camera import Pinhole, find_misfit, numbers_of, points_of_image
+from torchrg.depth.camera import Pinhole, format_intrinsics, reprojection_error, unproject_image
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
-from torchrg.io.files import check_place, make_folder
+from torchrg.io.files import check_writable, create_folder
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import color_planes, write_png
 from torchrg.result import PLANES_FILE, write_table
@@ -87,7 +87,7 @@ class Arguments:
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each image and write its result."""
     arguments = parse(Arguments, argv, prog="torchrg depth")
-    flags.use_threads(arguments.threads)
+    flags.limit_threads(arguments.threads)
     camera = flags.parse_intrinsics(arguments.intrinsics)
     frames = [_find_frame(arguments, camera, path) for path in arguments.inputs]
     sources = [camera if frame is None else frame for frame in frames]
@@ -96,7 +96,7 @@ def run(argv: list[str]) -> int:
         for path, frame in zip(arguments.inputs, frames, strict=True)
     ]
     if any(path.is_dir() for path in arguments.inputs) and not arguments.out.suffix:
-        make_folder(arguments.out)
+        create_folder(arguments.out)
     is_folder = arguments.out.is_dir() or (
         len(inputs) > 1 and arguments.out.suffix.lower() not in (".png", *FORMATS)
     )
@@ -113,9 +113,9 @@ def run(argv: list[str]) -> int:
     ]
     check_distinct([*targets, *sidecars], [*inputs, Path(arguments.intrinsics or "")])
     for path in sidecars:
-        check_place(path)
+        check_writable(path)
     for path in targets if is_folder else []:
-        check_place(path / PLANES_FILE if path.is_dir() else path)
+        check_writable(path / PLANES_FILE if path.is_dir() else path)
     folders = [is_folder] * len(inputs)
     return run_each(_label, arguments, inputs, sources, targets, folders, pictures, tables)
 
@@ -201,7 +201,7 @@ def _label(
     else:
         provenance = describe_run(source, arguments.depth) | {
             "config": {"depth": asdict(arguments.depth)},
-            "intrinsics": given and numbers_of(camera),
+            "intrinsics": given and format_intrinsics(camera),
             "depth_scale": scale,
             "orient": arguments.orient,
         }
@@ -237,7 +237,7 @@ def _is_png(path: Path) -> bool:
 def _read_image(frame: RGBDFrame) -> tuple[Cloud, Tensor, Tensor]:
     """Return the cloud of an image in camera coordinates, its depth ``(H, W)``, and its camera."""
     depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
-    points = points_of_image(depth, frame.intrinsics).view(-1, 3).float()
+    points = unproject_image(depth, frame.intrinsics).view(-1, 3).float()
     height, width = depth.shape
     cloud = Cloud(points.numpy(), grid_shape=(height, width), source=str(frame.depth))
     return cloud, depth, frame.intrinsics
@@ -260,7 +260,7 @@ def _read_cloud(path: Path, given: Pinhole | None) -> tuple[Cloud, Tensor, Tenso
         raise FormatError(
             f"{path}: expected points in the coordinates of a pinhole camera; use torchrg segment."
         )
-    off = 0.0 if given is None else find_misfit(points, camera)
+    off = 0.0 if given is None else reprojection_error(points, camera)
     if off > _MAX_MISFIT * max(height, width):
         raise FormatError(
             f"{path}: --intrinsics do not match the points: half of them are {off:.3g} pixels or "

@@ -168,7 +168,7 @@ class PlaneSettings:
             angle = float(values["--angle-deg"])
         except ValueError:  # Missing, or invalid and rejected by the parser.
             return cls(resolved=resolved)
-        return cls(resolved=resolved.at_angle(angle))
+        return cls(resolved=resolved.with_angle(angle))
 
 
 def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
@@ -294,7 +294,7 @@ def parse_intrinsics(text: str | None) -> Pinhole | None:
     )
 
 
-def use_threads(threads: int | None) -> None:
+def limit_threads(threads: int | None) -> None:
     """Set the number of threads of torch; None keeps its default."""
     if threads is None:
         return

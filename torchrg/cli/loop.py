@@ -12,9 +12,9 @@ from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.cli.ending import SOME_FAILED, fail, printable, warn
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
-from torchrg.io.fields import notes_on_results
-from torchrg.io.files import check_place, folded_name, make_folder
-from torchrg.io.npy import KEPT_FIELDS
+from torchrg.io.fields import describe_renamed_fields
+from torchrg.io.files import check_writable, create_folder, normalize_file_name
+from torchrg.io.npy import DISPLAYED_FIELDS
 from torchrg.render.page import check_library
 from torchrg.structures import Cloud
 
@@ -42,7 +42,7 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         raise FormatError("expected at least one input file, got none.")
     ending = out.suffix.lower()
     if suffix and len(inputs) == 1 and not out.is_dir():
-        check_place(out) if ending == suffix else check_output(out)
+        check_writable(out) if ending == suffix else check_output(out)
         return [out]
     if ending and ending in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(
@@ -52,15 +52,15 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
     results = [out / f"{path.stem}{suffix}" for path in inputs]
     first: dict[str, Path] = {}
     for result, source in zip(results, inputs, strict=True):
-        other = first.setdefault(folded_name(result.name), source)
+        other = first.setdefault(normalize_file_name(result.name), source)
         if other is not source:
             raise FormatError(
                 f"{source}: has the same name as {other}, so that both would be written to "
                 f"{out / result.name}; use different output directories."
             )
-    make_folder(out)
+    create_folder(out)
     for result in results if suffix else []:
-        check_place(result)
+        check_writable(result)
     return results
 
 
@@ -70,11 +70,11 @@ def check_distinct(results: Sequence[Path], inputs: Sequence[Path]) -> None:
     files = {_file_id(path) for path in inputs} - {None}
     for path in results:
         output = str(path.resolve())
-        if not taken.isdisjoint((output, folded_name(output))) or _file_id(path) in files:
+        if not taken.isdisjoint((output, normalize_file_name(output))) or _file_id(path) in files:
             raise FormatError(
                 f"{path}: would overwrite an input or another result; choose another output path."
             )
-        taken.add(folded_name(output))
+        taken.add(normalize_file_name(output))
 
 
 def _file_id(path: Path) -> tuple[int, int] | None:
@@ -103,10 +103,10 @@ def sidecar_paths(
             raise FormatError(
                 f"{output}: expected a directory for {len(results)} files, got a file name."
             )
-    make_folder(output)
+    create_folder(output)
     paths = [output / f"{path.stem}{suffixes[0]}" for path in results]
     for path in paths:
-        check_place(path)
+        check_writable(path)
     return paths
 
 
@@ -117,7 +117,7 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
         raise FormatError(
             f"{path}: expected a file ending in {endings}, got {path.suffix!r}; rename it."
         )
-    check_place(path)
+    check_writable(path)
     if is_viewer(path):
         check_library()
 
@@ -183,14 +183,14 @@ def note_input(
     source: str, cloud: Cloud, target: Path, results: Collection[str] = RESULT_FIELDS
 ) -> None:
     """Warn about assumptions made while reading, and about fields that results replace."""
-    replaced = () if is_archive(target) else notes_on_results(cloud.fields, results)
+    replaced = () if is_archive(target) else describe_renamed_fields(cloud.fields, results)
     for note in (*cloud.notes, *replaced):
         warn(f"{source}: {note}.")
 
 
 def dropped_fields_note(target: Path, fields: Collection[str]) -> str:
     """Describe the fields of a cloud that its result omits."""
-    names = [name for name in fields if name not in KEPT_FIELDS and is_archive(target)]
+    names = [name for name in fields if name not in DISPLAYED_FIELDS and is_archive(target)]
     return f" (without the input fields {', '.join(names)})" if names else ""
 
 

@@ -24,8 +24,8 @@ from torchrg.clouds import check_finite, note_on_copies
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
-from torchrg.io.fields import put_results
-from torchrg.io.npy import KEPT_FIELDS
+from torchrg.io.fields import add_result_fields
+from torchrg.io.npy import DISPLAYED_FIELDS
 from torchrg.neighbors import distinct_points, search_knn
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import find_directions
@@ -66,7 +66,7 @@ def run(argv: list[str]) -> int:
     if arguments.chunk_size < 1:
         raise ConfigError(f"expected --chunk-size >= 1, got {arguments.chunk_size}.")
     flags.check_viewpoint(arguments.viewpoint, arguments.orient)
-    flags.use_threads(arguments.threads)
+    flags.limit_threads(arguments.threads)
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
     flags.check_columns(arguments.columns, arguments.inputs)
@@ -105,8 +105,10 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     results = zip(RESULTS, (turned, fit.curvature, sharp, fit.valid), strict=True)
     keeps_fields = not is_archive(target)
-    fields = {name: v for name, v in cloud.fields.items() if keeps_fields or name in KEPT_FIELDS}
-    fields = put_results(fields, {name: values.numpy() for name, values in results})
+    fields = {
+        name: v for name, v in cloud.fields.items() if keeps_fields or name in DISPLAYED_FIELDS
+    }
+    fields = add_result_fields(fields, {name: values.numpy() for name, values in results})
     write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
     num_bad = len(cloud) - int(fit.valid.sum())
     if num_bad:

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from torchrg import scratch
-from torchrg.batch.memory import available_memory, memory_of_scan
+from torchrg.batch.memory import available_memory, scan_memory
 from torchrg.batch.records import Record, describe_run
 from torchrg.batch.run import REPORT, lock_folder
 from torchrg.cli import flags
@@ -44,7 +44,7 @@ from torchrg.io import (
     read_cloud,
     write_cloud,
 )
-from torchrg.io.files import check_space, mark_of
+from torchrg.io.files import check_space, run_mark
 from torchrg.merge import merge_clouds
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
@@ -128,7 +128,7 @@ def run(argv: list[str]) -> int:
             "expected --layout with --level, got none; leave --level out, since other files "
             "contain all levels."
         )
-    flags.use_threads(arguments.threads)
+    flags.limit_threads(arguments.threads)
     flags.limit_in_bytes(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
         raise ConfigError(f"expected --voxel > 0, got {arguments.voxel}.")
@@ -162,7 +162,7 @@ def _layout_lock(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None
     with lock_folder(arguments.out):
         check_lists(arguments.layout, _DATASET, arguments.out)
         yield
-        write_lists(arguments.layout, _DATASET, arguments.out, mark_of(REPORT))
+        write_lists(arguments.layout, _DATASET, arguments.out, run_mark(REPORT))
 
 
 def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
@@ -247,7 +247,7 @@ def _segment(
 
 def _check_limit(source: str, num_points: int, limit: int) -> None:
     """Raise if a cloud exceeds the memory limit even with its large arrays on disk."""
-    minimum = memory_of_scan(num_points, on_disk=True)
+    minimum = scan_memory(num_points, on_disk=True)
     if minimum > limit:
         raise ConfigError(
             f"{source}: expected --limit-memory of at least {minimum / 1e9:.2f} GB for about "
@@ -260,7 +260,7 @@ def _array_storage(
 ) -> contextlib.AbstractContextManager[None]:
     """Return the context for large arrays: memory, or disk if they exceed the limit."""
     _check_limit(source, num_points, limit)
-    if (needed := memory_of_scan(num_points)) <= limit:
+    if (needed := scan_memory(num_points)) <= limit:
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
     normals = arguments.settings.resolved.normals

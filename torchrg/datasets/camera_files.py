@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrg.datasets.folder import list_dir
 from torchrg.depth.camera import Pinhole, check_camera
 from torchrg.errors import DepthWarning, FormatError, TorchrgError
-from torchrg.io.files import DAMAGES, check_file, read_text, refusing
+from torchrg.io.files import PARSE_ERRORS, check_file, read_text, wrap_errors
 from torchrg.structures import FARTHEST
 
 Record = Mapping[str, Any]
@@ -139,7 +139,7 @@ def _read_any(path: Path) -> Record:
 def _read_array(path: Path) -> list[float]:
     """Return the numbers of a ``.npy`` file."""
     check_file(path)
-    with refusing(f"{path}: expected the numbers of a camera, got: ", OSError, *DAMAGES):
+    with wrap_errors(f"{path}: expected the numbers of a camera, got: ", OSError, *PARSE_ERRORS):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if array.dtype.kind not in "fiu" or array.size > max(_SHAPES):
             raise TypeError(f"shape {array.shape} and {array.dtype}")
@@ -166,7 +166,7 @@ def _colmap_camera(path: Path, rows: list[str]) -> Record:
             f"{path}: expected one camera, got {len(rows):,}; pass --intrinsics fx,fy,cx,cy."
         )
     _, model, *words = rows[0].split()
-    with refusing(f"{path}: expected numbers after {model}, got: ", ValueError):
+    with wrap_errors(f"{path}: expected numbers after {model}, got: ", ValueError):
         width, height, *numbers = map(float, words)
     values = numbers[:1] * (model in _ONE_FOCAL) + numbers
     named = dict(zip(_COLMAP_NAMES, values, strict=False))
@@ -179,7 +179,7 @@ def read_record(path: Path, *parts: str) -> dict[str, Any]:
 
     text = read_text(path)
     is_json = path.suffix.lower() == ".json" or text.lstrip()[:1] == "{"
-    with refusing(f"{path}: expected JSON or YAML, got: ", yaml.YAMLError, *DAMAGES):
+    with wrap_errors(f"{path}: expected JSON or YAML, got: ", yaml.YAMLError, *PARSE_ERRORS):
         if is_json:
             content = json.loads(text)
         else:

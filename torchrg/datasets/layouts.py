@@ -29,7 +29,7 @@ from torchrg.datasets.s3dis import CLASS_ORDERS
 from torchrg.datasets.scannet import NYU_IDS, read_objects
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.colors import narrow_colors
-from torchrg.io.files import folded_name
+from torchrg.io.files import normalize_file_name
 from torchrg.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints
 
@@ -159,7 +159,7 @@ def check_stems(layout: str, places: Mapping[str, str]) -> None:
     owners: dict[str, str] = {}
     for name, path in places.items() if layout != "pointcept" else ():
         stem = layout_stem(layout, name, path)
-        other = owners.setdefault(folded_name(stem), name)
+        other = owners.setdefault(normalize_file_name(stem), name)
         if other != name:
             raise FormatError(
                 f"file name collision in layout {layout}: {other} and {name} both use {stem}; "

@@ -18,7 +18,7 @@ from torchrg.datasets.s3dis import CLASS_ORDERS, ROOMS_PER_AREA
 from torchrg.datasets.scannet import CLASSES, NYU_IDS
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import make_folder, marked_parts, refusing, remove_leftovers
+from torchrg.io.files import create_folder, marked_parts, remove_leftovers, wrap_errors
 
 Entry = dict[str, Any]
 """List entry of a scan, by key."""
@@ -91,7 +91,7 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
     removed = {path.stem for path in _entry_files(out, folders, without)}
     for folder, scans in listed_in.items() if any(listed_in.values()) or removed else ():
         path = out / f"{folder}.txt"
-        with refusing(f"{path}: expected one name per line, got: ", ValueError):
+        with wrap_errors(f"{path}: expected one name per line, got: ", ValueError):
             text = path.read_text(encoding="utf-8") if path.is_file() else ""
         existing = [line.strip() for line in text.splitlines() if line.strip()]
         moved = removed.union(*listed_in.values()) - set(scans)
@@ -106,7 +106,7 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
 
 def _write(out: Path, name: str | Path, text: str) -> None:
     """Write a list atomically."""
-    make_folder((out / name).parent)
+    create_folder((out / name).parent)
     with atomic_path(out / name, within=out) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -124,7 +124,7 @@ def _read_entries(out: Path, folder: str, without: Collection[Path]) -> list[Ent
     entries = []
     for path in paths:
         message = f"{path}: expected an entry of a list, got: "
-        with refusing(message, ValueError, repair="; move it, and convert the scan again"):
+        with wrap_errors(message, ValueError, repair="; move it, and convert the scan again"):
             entry = json.loads(path.read_text(encoding="utf-8"))
         files = {key: str(out / entry[key]) for key in _FILES & entry.keys()}
         entries.append(entry | files)

@@ -25,7 +25,7 @@ from torchrg._checks import as_tensor
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.colors import narrow_colors, read_colors
-from torchrg.io.files import DAMAGES, make_folder
+from torchrg.io.files import PARSE_ERRORS, create_folder
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, describe_planes
 from torchrg.structures import Array, Segmentation
@@ -199,7 +199,7 @@ def write_files(
                 "directory."
             )
     for folder in {target, *(path.parent for path in paths.values())}:
-        make_folder(folder)
+        create_folder(folder)
     for name in torchrg_files - set(contents) - set(_protected.get()):
         (target / name).unlink(missing_ok=True)
     with ExitStack() as stack:
@@ -279,7 +279,7 @@ def _read_written(target: Path) -> list[str]:
         return sorted(map(str, set(written)))
     except (FileNotFoundError, NotADirectoryError):
         return []
-    except (OSError, *DAMAGES) as error:
+    except (OSError, *PARSE_ERRORS) as error:
         raise FormatError(
             f"{target / PLANES_FILE}: expected a plane table written by torchrg, got another file; "
             "move it."

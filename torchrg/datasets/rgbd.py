@@ -22,7 +22,7 @@ from torchrg.datasets.rgbd_files import (
     refuse_recording,
 )
 from torchrg.datasets.rgbd_layouts import LAYOUTS, find_layout, find_recordings
-from torchrg.depth.camera import Pinhole, check_camera, doubt_view
+from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.transforms.rows import SampleDict
 
@@ -293,4 +293,6 @@ def fit_camera(
     check_shapes(caller, intrinsics=(matrix, "3 3"))
     check_camera(caller, matrix)
     values = matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return matrix, doubt_view(caller, Pinhole(*values), size, name="--intrinsics") if size else ""
+    return matrix, describe_improbable_view(
+        caller, Pinhole(*values), size, name="--intrinsics"
+    ) if size else ""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io.colors import narrow_colors
-from torchrg.io.files import DAMAGES, check_available, check_file, read_text, refusing
+from torchrg.io.files import PARSE_ERRORS, check_available, check_file, read_text, wrap_errors
 from torchrg.structures import FARTHEST, Array
 
 Value = TypeVar("Value")
@@ -148,7 +148,7 @@ def _read_image(source: Path, kinds: str) -> Array:
             f"{source}: expected an image of at most {MAX_PIXELS:,} pixels, got {count:,} in its "
             "header; the file may be corrupt, or make it smaller."
         )
-    with refusing(f"{source}: expected a {kinds} image, got: ", Exception):
+    with wrap_errors(f"{source}: expected a {kinds} image, got: ", Exception):
         # Without a mode argument, the library detects bit depth and channels.
         return np.asarray(io.read_image(str(source)))
 
@@ -186,7 +186,7 @@ def image_size(path: Path) -> tuple[int, int] | None:
         if head.startswith(_PNG):
             width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
             return width, height
-    except (OSError, *DAMAGES):
+    except (OSError, *PARSE_ERRORS):
         return None
     header = _PGM.match(head)
     return (int(header[1]), int(header[2])) if header else None
@@ -200,7 +200,7 @@ def num_pixels(path: Path) -> int:
 def _read_npy(source: Path) -> NDArray[np.number]:
     """Return the array of a ``.npy`` file, shape ``(H, W)``."""
     check_file(source)
-    with refusing(f"{source}: expected an array of numbers, got: ", OSError, *DAMAGES):
+    with wrap_errors(f"{source}: expected an array of numbers, got: ", OSError, *PARSE_ERRORS):
         values: NDArray[np.number] = np.load(source, allow_pickle=False)
     if values.ndim != 2 or values.dtype.kind not in "fiu" or values.size == 0:
         raise FormatError(

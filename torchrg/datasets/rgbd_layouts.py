@@ -33,7 +33,7 @@ from torchrg.datasets.rgbd_files import (
 )
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, DepthWarning, FormatError
-from torchrg.io.files import refusing
+from torchrg.io.files import wrap_errors
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 _TUM_INTRINSICS = {
@@ -259,7 +259,7 @@ def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     ``lowres_wide.traj``.
     """
     images = [*_depth_images(folder, "lowres_depth/*")]
-    with refusing(
+    with wrap_errors(
         f"{folder / 'lowres_depth'}: expected seconds at the ends of names: ", ValueError
     ):
         times = [float(name.rpartition("_")[2]) for name, _ in images]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import read_cloud
-from torchrg.io.files import DAMAGES, read_text, refusing
+from torchrg.io.files import PARSE_ERRORS, read_text, wrap_errors
 from torchrg.plane_table import Arrays
 from torchrg.structures import Cloud
 from torchrg.transforms.rows import SampleDict
@@ -289,7 +289,7 @@ def _alignment(path: Path) -> Arrays:
         name, _, numbers = line.partition("=")
         if name.strip() == "axisAlignment":
             message = f"{path}: expected 16 finite numbers as axisAlignment, got: "
-            with refusing(message, *DAMAGES, repair="; the file may be corrupt"):
+            with wrap_errors(message, *PARSE_ERRORS, repair="; the file may be corrupt"):
                 matrix = np.array(numbers.split(), dtype=np.float64).reshape(4, 4)
                 if not np.isfinite(matrix).all():
                     raise ValueError(shortened(numbers.strip()))
@@ -427,7 +427,7 @@ def _warn_entries(path: Path, what: str, entries: Sequence[object]) -> None:
 def _read_list(path: Path, key: str) -> list[Any]:
     """Return the list at a key of a JSON file."""
     message = f"{path}: expected JSON with a list {key}, got: "
-    with refusing(message, *DAMAGES, repair="; the file may be corrupt"):
+    with wrap_errors(message, *PARSE_ERRORS, repair="; the file may be corrupt"):
         content = json.loads(read_text(path))
         if not isinstance(content, dict) or not isinstance(content.get(key), list):
             raise TypeError(shortened(content))
@@ -438,7 +438,7 @@ def _read_list(path: Path, key: str) -> list[Any]:
 def _to_int64(path: Path, what: str, values: Sequence[object]) -> NDArray[np.int64]:
     """Convert a list to int64, and raise FormatError for other values; ``what`` names the list."""
     message = f"{path}: expected {what} to be integers, got: "
-    with refusing(message, *DAMAGES, repair="; the file may be corrupt"):
+    with wrap_errors(message, *PARSE_ERRORS, repair="; the file may be corrupt"):
         if not set(map(type, values)) <= {int}:
             index = next(i for i, value in enumerate(values) if type(value) is not int)
             raise TypeError(f"{shortened(values[index])} as number {index:,}")
@@ -448,7 +448,7 @@ def _to_int64(path: Path, what: str, values: Sequence[object]) -> NDArray[np.int
 def _read_rows(path: Path, columns: tuple[str, ...], delimiter: str) -> Iterator[dict[str, str]]:
     """Yield the rows of a table that has the given columns."""
     message = f"{path}: expected a table with columns {', '.join(columns)}, got: "
-    with refusing(message, csv.Error, *DAMAGES, repair="; the file may be corrupt"):
+    with wrap_errors(message, csv.Error, *PARSE_ERRORS, repair="; the file may be corrupt"):
         rows = csv.DictReader(StringIO(read_text(path), newline=None), delimiter=delimiter)
         if missing := [name for name in columns if name not in (rows.fieldnames or ())]:
             raise LookupError(f"none called {missing[0]}")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes, has_values, is_tensor
+from torchrg._checks import as_tensor, check_floating, check_shapes, is_concrete, is_tensor
 from torchrg.errors import ConfigError, DepthWarning
 from torchrg.structures import FARTHEST
 
@@ -63,7 +63,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         poses=(poses, "B 4 4"),
     )
     check_floating("depth_to_points", depth=depth)
-    if has_values(intrinsics):
+    if is_concrete(intrinsics):
         check_view("depth_to_points", intrinsics, (depth.shape[2], depth.shape[1]))
     return _unproject(depth, intrinsics, poses)
 
@@ -100,10 +100,10 @@ def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa:
     """
     tensor = as_tensor(caller, "intrinsics", getattr(source, "camera_matrix", source))
     tensor = tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
-    if tensor.shape[-2:] == (3, 3) and has_values(tensor):
+    if tensor.shape[-2:] == (3, 3) and is_concrete(tensor):
         check_camera(caller, tensor)
     sides = [getattr(source, side, None) for side in ("height", "width")]
-    if all(is_tensor(side) and has_values(side) for side in sides):
+    if all(is_tensor(side) and is_concrete(side) for side in sides):
         height, width = (int(side.flatten()[0]) for side in sides if side is not None)
         if (height, width) != tuple(depth.shape[-2:]):
             warnings.warn(
@@ -152,11 +152,11 @@ def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
     """
     rows = intrinsics.detach().reshape(-1, 9)[:, [0, 4, 2, 5]].double().cpu().tolist()
     for row in dict.fromkeys(map(tuple, rows)):
-        if doubt := doubt_view(caller, Pinhole(*row), size):
+        if doubt := describe_improbable_view(caller, Pinhole(*row), size):
             warnings.warn(doubt, DepthWarning, stacklevel=3)
 
 
-def doubt_view(
+def describe_improbable_view(
     caller: str, camera: "Pinhole", size: tuple[int, int], *, name: str = "intrinsics"
 ) -> str:
     """Return a warning if a camera is improbable for an image size, otherwise "".
@@ -203,7 +203,7 @@ def _off_center(axis: tuple[float, ...], size: tuple[int, int]) -> float:
     return max((abs(c + 0.5 - side / 2) - 0.5) / side for c, side in zip(axis, size, strict=True))
 
 
-def points_of_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:
+def unproject_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = None) -> Tensor:
     """Apply :func:`depth_to_points` to one image ``(H, W)`` in float64: ``(H, W, 3)``.
 
     The camera must already be checked.
@@ -240,7 +240,7 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     return matrix
 
 
-def numbers_of(intrinsics: Tensor) -> str:
+def format_intrinsics(intrinsics: Tensor) -> str:
     """Return a camera matrix ``(3, 3)`` as ``fx,fy,cx,cy``."""
     values = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return ",".join(f"{value:.15g}" for value in values)
@@ -330,7 +330,7 @@ def find_intrinsics(points: Tensor) -> Tensor | None:
     return make_intrinsics(fx, fy, cx, cy)
 
 
-def find_misfit(points: Tensor, intrinsics: Tensor) -> float:
+def reprojection_error(points: Tensor, intrinsics: Tensor) -> float:
     """Return the median reprojection error of points, in pixels.
 
     ``points`` ``(H, W, 3)`` are in camera coordinates. It is 0 if no point is in front.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import places_of
+from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels
 from torchrg.linalg import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
@@ -51,7 +51,7 @@ def boundaries(labels: Tensor, steps: Iterable[tuple[int, int]]) -> Iterator[tup
     width, flat = labels.shape[1], labels.flatten().to(torch.int32)
     for down, right in steps:
         step = down * width + right
-        here = places_of(flat[: max(len(flat) - step, 0)] != flat[step:])
+        here = nonzero_rows(flat[: max(len(flat) - step, 0)] != flat[step:])
         column = here % width + right
         here = here[(column >= 0) & (column < width)]
         yield here, here + step

@@ -13,8 +13,8 @@ from torchrg.depth.faces import boundaries, hidden_contacts, join_strips
 from torchrg.depth.passes import has_kernels
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MAX_FITTED, RegionPlanes
-from torchrg.regions.growth import number_by_size
-from torchrg.regions.repair import absorb_points, merge_coplanar
+from torchrg.regions.growth import rank_by_size
+from torchrg.regions.repair import assign_unlabeled, merge_coplanar
 from torchrg.robust.scale import MAD_FACTOR
 
 _FORWARD_STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
@@ -77,7 +77,7 @@ def grow_pixels(
         of the regions' planes towards the camera, in space, ``(M, 3)``; and a mask of regions
         thicker than noise and a slight bend explain, ``(M,)``, bool.
     """
-    labels = number_by_size(connect_pixels(flat, *joins), config.min_size)
+    labels = rank_by_size(connect_pixels(flat, *joins), config.min_size)
     if not bool((labels >= 0).any()):
         return labels, cloud.points.new_empty(0, 3), flat.new_empty(0)
     labels, fit = _refine(cloud, labels, config)
@@ -156,38 +156,38 @@ def _refine(
     grid = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
         planes = fit_inverse_planes(cloud, labels)
-        reach = planes.times_thickness(_ABSORB_REACH)
-        labels = absorb_pixels(cloud, labels, planes, reach)
+        reach = planes.scale_thickness(_ABSORB_REACH)
+        labels = assign_unlabeled_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
         pairs = zip(grid.contacts(labels), hidden, strict=True)
         contacts, counts = (torch.cat(ends) for ends in pairs)
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
-        labels = number_by_size(merged, config.min_size)
+        labels = rank_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
     width, (x, y, _) = cloud.seen.shape[1], cloud.points.unbind(dim=1)
     tables = _ray_planes(planes), _normals_in_space(planes), planes.num_points
     joined = join_strips(labels, (x[:width], y[::width]), cloud.noise, *tables)
     if joined is not labels:
-        labels = number_by_size(joined, config.min_size)
+        labels = rank_by_size(joined, config.min_size)
         planes = fit_inverse_planes(cloud, labels)
-    reach = planes.times_thickness(_ABSORB_REACH)
+    reach = planes.scale_thickness(_ABSORB_REACH)
     moved = move_to_creases(cloud, labels, planes, reach)
-    labels = number_by_size(moved, config.min_size)
+    labels = rank_by_size(moved, config.min_size)
     return labels, fit_inverse_planes(cloud, labels)
 
 
-def absorb_pixels(
+def assign_unlabeled_pixels(
     cloud: InverseCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
-    """Apply :func:`torchrg.regions.repair.absorb_points` to the pixels of an image."""
+    """Apply :func:`torchrg.regions.repair.assign_unlabeled` to the pixels of an image."""
     seen = cloud.seen
     if not has_kernels(cloud.points):
         grid = PixelGrid(seen.shape)
-        return absorb_points(cloud.points, labels, grid, planes, reach, valid=seen.flatten())
+        return assign_unlabeled(cloud.points, labels, grid, planes, reach, valid=seen.flatten())
     image = labels.view(seen.shape).clone()
     buffers = [torch.empty_like(image) for _ in range(3)]
     tables = planes.normal, planes.center, reach
-    kernels.call("absorb_pixels", cloud.points.T, seen, image, *tables, *buffers)
+    kernels.call("assign_unlabeled_pixels", cloud.points.T, seen, image, *tables, *buffers)
     return image.flatten()
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import places_of
+from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import (
     CELL_SIZES,
@@ -145,7 +145,7 @@ def fit_pixels(
     for size in CELL_SIZES:
         first -= math.prod(squares[size].shape[1:])
         offer_windows(choice, image, squares[size], size, first)
-    pixels = places_of(image.seen & ~choice.flat)
+    pixels = nonzero_rows(image.seen & ~choice.flat)
     indices = torch.full_like(choice.window, -1)
     indices.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
     narrow = fit_narrow_windows(image, indices, pixels)
@@ -239,7 +239,7 @@ def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first:
         smooth = torch.where(windows.deviation <= windows.max_bend, itself, -1)
         offers.insert(1, (smooth, torch.full_like(reach, torch.inf)))
     for index, reach in offers:
-        pixels = places_of(image.seen & ~choice.flat)
+        pixels = nonzero_rows(image.seen & ~choice.flat)
         row, column = pixels // len(image.u), pixels % len(image.u)
         offered = index[row // size, column // size]
         is_taken = (offered >= 0) & _are_near(image, pixels, offered, table, reach)

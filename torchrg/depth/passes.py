@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import allowed_threads, chunks_of, map_tasks
+from torchrg._parallel import allowed_threads, map_tasks, split_rows
 
 _CPU = torch.device("cpu")
 
@@ -22,5 +22,5 @@ def pass_over_rows(name: str, num_rows: int, *arguments: Tensor | float) -> None
     # Two tasks per thread balance the load.
     size = max(-(-num_rows // (2 * allowed_threads())), _MIN_ROWS)
     # An even size keeps rows of cells twice as wide in one task.
-    rows = chunks_of(num_rows, size + size % 2)
+    rows = split_rows(num_rows, size + size % 2)
     map_tasks(lambda chunk: kernels.call(name, *arguments, chunk.start, chunk.stop), rows, _CPU)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import places_of
+from torchrg._parallel import nonzero_rows
 from torchrg.config import DepthConfig
 from torchrg.depth.normals import FLAT, PixelPlanes
 from torchrg.depth.passes import has_kernels, pass_over_rows
@@ -113,7 +113,7 @@ def _join(
     flat, indices, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
     length, joined = flat.shape[axis] - 1, torch.zeros_like(flat)
     both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
-    here = places_of(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
+    here = nonzero_rows(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
     there = here + (width, 1)[axis]
     row, column = here // width, here % width
     ours, theirs = planes.take(here), planes.take(there)

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes, of_clouds
-from torchrg._parallel import places_of, sequential_operations
+from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes, eager_only
+from torchrg._parallel import nonzero_rows, sequential_operations
 from torchrg.config import DepthConfig, settings_of
 from torchrg.depth.camera import check_view, has_depth, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
@@ -25,7 +25,7 @@ from torchrg.regions.table import measure_planes
 from torchrg.structures import Segmentation
 
 
-@of_clouds
+@eager_only
 @torch.no_grad()
 @sequential_operations()
 def segment_depth(
@@ -161,7 +161,7 @@ def _segment(
 def _inverse_cloud(image: Image, pixels: Pixels, x: Tensor, y: Tensor) -> InverseCloud:
     """Return the image as the cloud for region growing, from the rays ``(x, y, 1)``."""
     inverse, seen = image.values, image.seen
-    values = inverse.flatten()[places_of(seen)]
+    values = inverse.flatten()[nonzero_rows(seen)]
     unit = kth_smallest(values, (len(values) - 1) // 2) if len(values) else inverse.new_ones(())
     columns = [x.expand_as(inverse), y[:, None].expand_as(inverse), inverse / unit]
     points = torch.stack([column.flatten() for column in columns]).T

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import places_of
+from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
@@ -259,7 +259,7 @@ def _sample_windows(table: Tensor, size: int) -> Tensor:
     """
     step = max(_SAMPLE_STRIDE // size, 1)
     planes = table[:NUM_PLANE, ::step, ::step].flatten(1)
-    return planes.index_select(1, places_of(planes[3].isfinite()))
+    return planes.index_select(1, nonzero_rows(planes[3].isfinite()))
 
 
 def find_jitter(table: Tensor, size: int) -> float:

@@ -14,8 +14,8 @@ from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import FormatError
 from torchrg.io.columns import check_length
 from torchrg.io.e57 import count_e57, read_e57
-from torchrg.io.fields import convert_coordinates, put_results
-from torchrg.io.files import ARCHIVE_ERRORS, atomic_path, check_file, check_place
+from torchrg.io.fields import add_result_fields, convert_coordinates
+from torchrg.io.files import ARCHIVE_ERRORS, atomic_path, check_file, check_writable
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
@@ -219,10 +219,10 @@ def write_cloud(
         return
     fields = cloud.fields
     if superpoints is not None:
-        fields = put_results(fields, superpoints.by_level())
+        fields = add_result_fields(fields, superpoints.by_level())
     if segmentation is not None:
         results = {name: getattr(segmentation, name).numpy(force=True) for name in RESULT_FIELDS}
-        fields = put_results(fields, results)
+        fields = add_result_fields(fields, results)
     labeled = replace(cloud, fields=fields)
     if suffix == _PLANES_SUFFIX and segmentation is not None:
         table = planes_to_arrays(segmentation.planes, cloud.origin)
@@ -249,7 +249,7 @@ def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> No
     """
     target = Path(path)
     _get_writer(target)
-    check_place(path)
+    check_writable(path)
     fmt = FORMATS.get(target.suffix.lower())
     if fmt is not None and fmt.check is not None:
         fmt.check(target, cloud)

@@ -74,7 +74,7 @@ def read_colors(
     notes, dtype, white = list[str](), color.dtype, None
     if dtype.kind not in "fiu" or color.shape[-1:] != (3,):
         raise error(
-            f"{owner}: expected color to be three real numbers a point, got shape {color.shape} of "
+            f"{owner}: expected color of shape (N, 3), got shape {color.shape} of "
             f"{dtype}; convert it, or rename or remove that field."
         )
     if dtype.kind == "f":
@@ -144,7 +144,7 @@ def _range_notes(color: Array, white: int) -> list[str]:
         is_default = color.dtype == np.uint16
     if is_default or not (color > 0).any():
         return []
-    return [f"its colors are taken as 0..{white}, by their values"]
+    return [f"colors are read as 0..{white}, judging by their values"]
 
 
 def narrow_colors(color: NDArray[np.generic]) -> NDArray[np.uint8]:

@@ -25,7 +25,7 @@ from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN, read_colors
 from torchrg.io.fields import Values, assemble_cloud
-from torchrg.io.files import DAMAGES, check_available, refusing
+from torchrg.io.files import PARSE_ERRORS, check_available, wrap_errors
 from torchrg.io.headers import check_grid, distance_outside
 from torchrg.mesh import Fronts
 from torchrg.structures import FARTHEST, Cloud, bounding_box
@@ -109,9 +109,9 @@ def read_e57(path: Path, size: int) -> Cloud:
     _check_pages(path)
     _check_tree(path, size)
     message = f"{path}: expected an E57 file, got: "
-    errors = (pye57.libe57.E57Exception, *DAMAGES)
+    errors = (pye57.libe57.E57Exception, *PARSE_ERRORS)
     with (
-        refusing(message, *errors, repair="; the file may be corrupt, copy or write it again"),
+        wrap_errors(message, *errors, repair="; the file may be corrupt, copy or write it again"),
         pye57.E57(str(path)) as file,
     ):
         headers = [file.get_header(i) for i in range(file.scan_count)]

@@ -121,7 +121,7 @@ def assemble_cloud(
     if "color" in fields:
         color = fields["color"]
         _check_triples(path, "color", color)
-        if set(integers).issuperset(sources["color"]) and are_whole(color):
+        if set(integers).issuperset(sources["color"]) and are_integers(color):
             color = color.astype(np.int64)
         fields["color"], more = read_colors(path, color)
         notes += more
@@ -193,15 +193,17 @@ def backup_name(name: str) -> str:
     return f"{'label' if name == 'labels' else name}_input"
 
 
-def put_results(fields: Mapping[str, Values], results: Mapping[str, Values]) -> dict[str, Values]:
+def add_result_fields(
+    fields: Mapping[str, Values], results: Mapping[str, Values]
+) -> dict[str, Values]:
     """Return the fields of a cloud together with the fields of a result.
 
     A field with the name of a result is renamed as :func:`backup_name` returns. If that name is
     taken, the cloud is itself a result; then the input field is kept and the result is replaced.
 
     Example:
-        >>> first = put_results({"labels": np.array([7])}, {"labels": np.array([0])})
-        >>> again = put_results(first, {"labels": np.array([1])})
+        >>> first = add_result_fields({"labels": np.array([7])}, {"labels": np.array([0])})
+        >>> again = add_result_fields(first, {"labels": np.array([1])})
         >>> {name: values.tolist() for name, values in again.items()}
         {'label_input': [7], 'labels': [1]}
     """
@@ -210,15 +212,15 @@ def put_results(fields: Mapping[str, Values], results: Mapping[str, Values]) -> 
     return {**backups, **unchanged, **results}
 
 
-def notes_on_results(fields: Collection[str], results: Collection[str]) -> list[str]:
-    """Return notes on fields that :func:`put_results` renames or drops."""
+def describe_renamed_fields(fields: Collection[str], results: Collection[str]) -> list[str]:
+    """Return notes on fields that :func:`add_result_fields` renames or drops."""
     shown = {name: "label" if name == "labels" else name for name in results if name in fields}
     renamed = [name for name in shown if backup_name(name) not in fields]
     dropped = [name for name in shown if name not in renamed]
     notes = []
     if renamed:
         names = ", ".join(f"{shown[name]} as {backup_name(name)}" for name in renamed)
-        notes.append(f"its own fields are kept beside the result's: {names}")
+        notes.append(f"input fields are kept next to the result: {names}")
     if dropped:
         names = ", ".join(shown[name] for name in dropped)
         kept = ", ".join(map(backup_name, dropped))
@@ -263,14 +265,14 @@ def _guess_triple(three: Values) -> tuple[str, str, str] | None:
     lengths = squares[np.isfinite(squares) & (squares != 0)]
     if len(lengths) and (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
         return ("nx", "ny", "nz")
-    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= BYTE and are_whole(three))
+    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= BYTE and are_integers(three))
     return _COLOR if is_color else None
 
 
 def _is_wide_color(three: Values) -> bool:
     """Whether three columns can be a 16-bit color with every channel above the 8-bit maximum."""
     in_range = three.min() >= 0 and three.max() <= WORD and three.max(axis=0).min() > BYTE
-    return bool(in_range) and are_whole(three)
+    return bool(in_range) and are_integers(three)
 
 
 def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
@@ -299,7 +301,7 @@ def _check_table(path: Path, table: Values) -> None:
         )
 
 
-def are_whole(values: Values) -> bool:
+def are_integers(values: Values) -> bool:
     """Whether all values are finite integers."""
     if values.dtype.kind in "iub":
         return True
@@ -389,7 +391,7 @@ def _convert_labels(path: Path, labels: Values) -> NDArray[np.int64]:
     if flat.dtype.kind == "f":
         flat = np.where(np.isnan(flat), flat.dtype.type(UNLABELED), flat)
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
-    if not are_whole(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
+    if not are_integers(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
         raise FormatError(
             f"{path}: expected labels to be 64-bit integers, got fractions or larger values; "
             "rename or remove that field."

@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 from torchrg.errors import OUT_OF_MEMORY, FormatError, is_out_of_memory
 
-DAMAGES = (
+PARSE_ERRORS = (
     ValueError,
     LookupError,
     ArithmeticError,
@@ -35,7 +35,7 @@ DAMAGES = (
     struct.error,
 )
 """Exceptions that third-party readers raise on corrupt files, in addition to their own classes."""
-ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, *DAMAGES)
+ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, *PARSE_ERRORS)
 """Exceptions raised on corrupt archives."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk or an exceeded quota."""
@@ -80,7 +80,7 @@ def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> 
     target = Path(os.path.realpath(path))
     name = f".{target.stem}.{_mark.get() or make_mark()}{secrets.token_hex(4)}{target.suffix}"
     temporary = (target.parent if within is None else within) / name
-    check_place(path)
+    check_writable(path)
     try:
         yield temporary
         with temporary.open("rb+") as stream:
@@ -153,7 +153,7 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def check_place(path: str | os.PathLike[str]) -> None:
+def check_writable(path: str | os.PathLike[str]) -> None:
     """Check that a path can be written, before long work.
 
     The folder exists and is writable. An existing target is a writable file, not a directory or
@@ -163,23 +163,23 @@ def check_place(path: str | os.PathLike[str]) -> None:
     if target.is_dir():
         raise FormatError(f"{path}: expected a file to write, got a directory; name a file in it.")
     if not target.parent.is_dir():
-        raise FormatError(f"{path}: there is no folder {target.parent}; create it first.")
+        raise FormatError(f"{path}: folder {target.parent} not found; create it first.")
     if target.exists() and not target.is_file():
         raise FormatError(f"{path}: expected a file to write, got a device; use another path.")
     for item in (target.parent, target):
         if item.exists() and not os.access(item, os.W_OK):
             raise FormatError(
-                f"{path}: cannot be written: {item} is read-only; write to another place, or make "
+                f"{path}: cannot be written: {item} is read-only; write to another folder, or make "
                 "it writable."
             )
 
 
-def make_folder(path: Path) -> None:
+def create_folder(path: Path) -> None:
     """Create a folder and its parents if missing; raise FormatError on failure."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FormatError(f"{path}: cannot be made: {error.strerror or error}.") from error
+        raise FormatError(f"{path}: cannot be created: {error.strerror or error}.") from error
 
 
 def is_disk_full(error: BaseException | None) -> bool:
@@ -216,7 +216,7 @@ def check_file(path: Path) -> int:
     try:
         status = path.stat()
     except FileNotFoundError as error:
-        raise FormatError(f"{path}: no such file; check the spelling.") from error
+        raise FormatError(f"{path}: file not found; check the path.") from error
     except (OSError, ValueError) as error:  # ValueError: not a valid file name.
         raise FormatError(
             f"{path}: cannot be read: {getattr(error, 'strerror', error)}."
@@ -299,7 +299,7 @@ def raise_os_error(path: Path, *errors: type[BaseException]) -> Iterator[None]:
 
 
 @contextmanager
-def refusing(message: str, *errors: type[BaseException], repair: str = "") -> Iterator[None]:
+def wrap_errors(message: str, *errors: type[BaseException], repair: str = "") -> Iterator[None]:
     """Convert library errors to FormatError: the message, the error's first line, the repair.
 
     A FormatError, which is a ValueError, is raised unchanged.
@@ -319,27 +319,27 @@ def first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
-def mark_of(name: str) -> str:
+def run_mark(name: str) -> str:
     """Return the mark of the temporary files of a scan in an output directory.
 
     It is the same in every run, so that a run removes what a killed one left; see
     :func:`torchrg.io.files.marked_parts`.
 
     Example:
-        >>> mark_of("Area_1/office_1")
+        >>> run_mark("Area_1/office_1")
         '65d1ec9889e61d51'
     """
     return hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
 
 
-def folded_name(name: str) -> str:
+def normalize_file_name(name: str) -> str:
     """Normalize a name so that names which collide on some file systems become equal.
 
     The file systems of macOS and Windows ignore case and the composition of accented letters, and
     results are copied there.
 
     Example:
-        >>> folded_name("B\u00fcro") == folded_name("bu\u0308RO")
+        >>> normalize_file_name("B\u00fcro") == normalize_file_name("bu\u0308RO")
         True
     """
     return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from torchrg.errors import FormatError
 from torchrg.structures import FARTHEST
 
-LARGEST_INTEGER = 2**31 - 1
+MAX_INTEGER = 2**31 - 1
 """Largest stored integer coordinate, in steps of a scale from an offset."""
 _MIN_EXTENT = 2.0**-126
 """Minimum extent of all integers: the smallest normal float32, the type of points."""
@@ -28,7 +28,7 @@ def check_grid(path: Path, what: str, scales: ArrayLike, offsets: ArrayLike) -> 
     """
     scale, offset = np.abs(np.array([scales, offsets], np.float64))
     min_extent = np.maximum(np.spacing(offset), _MIN_EXTENT)
-    is_grid = (scale * LARGEST_INTEGER >= min_extent) & (scale <= FARTHEST) & (offset <= FARTHEST)
+    is_grid = (scale * MAX_INTEGER >= min_extent) & (scale <= FARTHEST) & (offset <= FARTHEST)
     if not is_grid.all():
         shown = ", ".join(map(str, np.ravel(scales))), ", ".join(map(str, np.ravel(offsets)))
         raise FormatError(

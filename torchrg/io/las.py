@@ -20,16 +20,16 @@ from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN
 from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
-from torchrg.io.fields import Columns, Values, are_whole, assemble_cloud
+from torchrg.io.fields import Columns, Values, are_integers, assemble_cloud
 from torchrg.io.files import (
-    DAMAGES,
+    PARSE_ERRORS,
     atomic_path,
     check_available,
     first_line,
     raise_os_error,
-    refusing,
+    wrap_errors,
 )
-from torchrg.io.headers import LARGEST_INTEGER, check_grid, distance_outside
+from torchrg.io.headers import MAX_INTEGER, check_grid, distance_outside
 from torchrg.structures import Cloud, bounding_box
 
 _FIELD_NAMES = FieldNames(
@@ -147,11 +147,11 @@ def _header_notes(header: Any, columns: Columns, size: int) -> tuple[str, ...]: 
 def _open_reader(laspy: ModuleType, path: Path) -> Iterator[Any]:
     """Open a reader, and convert its errors to errors that name the file."""
     message = f"{path}: expected a LAS or LAZ file, got: "
-    errors = (laspy.errors.LaspyException, *DAMAGES)
+    errors = (laspy.errors.LaspyException, *PARSE_ERRORS)
     try:
         # The parallel backend allocates as much memory as a corrupt chunk table requests.
         with (
-            refusing(message, *errors, repair=f"; {_REPAIR}"),
+            wrap_errors(message, *errors, repair=f"; {_REPAIR}"),
             laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
         ):
             yield reader
@@ -188,7 +188,7 @@ def write_las(path: Path, cloud: Cloud) -> None:
     columns = _add_dimensions(path, laspy, header, cloud, columns)
     errors = (laspy.errors.LaspyException, ValueError, ArithmeticError, RuntimeError)
     with (
-        refusing(f"{path}: cannot be written: ", *errors),
+        wrap_errors(f"{path}: cannot be written: ", *errors),
         atomic_path(path) as temporary,
         raise_os_error(temporary, *errors),
     ):
@@ -222,7 +222,7 @@ def _header(laspy: ModuleType, cloud: Cloud, *, colored: bool) -> Any:  # noqa: 
         step = max(float(np.spacing(np.abs(center)).max()), 1e-30)
         reach = max(float(np.abs([low - center, high - center]).max()), step)
         header.offsets = center
-        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / LARGEST_INTEGER)))
+        header.scales = np.full(3, 10.0 ** math.ceil(math.log10(reach / MAX_INTEGER)))
         return header
     number = stored.point_format.id
     number = _COLOR_FORMATS.get(number, number) if colored else number
@@ -415,7 +415,7 @@ def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
     if compressor == _POINTWISE:
         # LASzip ignores the chunk size then; lazrs interprets some values as variable chunks.
         data = bytearray(record.record_data)
-        struct.pack_into("<I", data, _CHUNK_SIZE_AT, LARGEST_INTEGER)
+        struct.pack_into("<I", data, _CHUNK_SIZE_AT, MAX_INTEGER)
         record.record_data = bytes(data)
         return
     with path.open("rb") as stream:
@@ -500,7 +500,7 @@ def _fits(values: Values, dtype: np.dtype[Any]) -> bool:
         with np.errstate(over="ignore"):
             return np.array_equal(values.astype(dtype), values, equal_nan=values.dtype.kind == "f")
     limits = np.iinfo(dtype)
-    return are_whole(values) and bool(values.min() >= limits.min and values.max() <= limits.max)
+    return are_integers(values) and bool(values.min() >= limits.min and values.max() <= limits.max)
 
 
 def _erase_date(path: Path) -> None:

@@ -32,11 +32,11 @@ from torchrg.io.fields import (
 )
 from torchrg.io.files import (
     ARCHIVE_ERRORS,
-    DAMAGES,
+    PARSE_ERRORS,
     atomic_path,
     check_available,
     check_file,
-    refusing,
+    wrap_errors,
 )
 from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
@@ -46,7 +46,7 @@ _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 _COORDINATES = ("points", "coord", "positions")
 POINT_RESULTS = ("labels", "normals", "curvature", "sharp", "valid")
 """Per-point arrays of a segmentation."""
-KEPT_FIELDS = ("color",)
+DISPLAYED_FIELDS = ("color",)
 """Cloud fields stored with a result, for viewers and images."""
 _NOT_PER_POINT = {
     *(f"plane_{name}" for name in (*(part.name for part in fields(Planes)), "of_superpoint")),
@@ -120,7 +120,7 @@ def read_npz(path: Path, size: int) -> Cloud:
             for member in skipped:
                 with _open_member(path, archive, member) as stream:
                     _drain(stream)
-    notes = (f"{', '.join(mismatched)} left out: not of {num_points:,} rows",) if mismatched else ()
+    notes = (f"{', '.join(mismatched)} skipped: not {num_points:,} rows",) if mismatched else ()
     if coordinates is not None and (names := layouts[coordinates][1].names) is not None:
         # pyntcloud writes a structured array, whose fields become columns.
         records = columns.pop(coordinates)
@@ -154,7 +154,7 @@ def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str |
     )
 
 
-def read_beside(path: Path) -> dict[str, Values]:
+def read_result_arrays(path: Path) -> dict[str, Values]:
     """Read the arrays of a ``.npz`` file that are not per point: plane table, provenance."""
     size = check_file(path)
     with _open_archive(path) as archive:
@@ -184,7 +184,7 @@ def write_npz(
                 raise FormatError(f"{path}: field {name} contains Python objects; remove it.")
             arrays[name] = values
     else:
-        arrays |= {name: cloud.fields[name] for name in KEPT_FIELDS if name in cloud.fields}
+        arrays |= {name: cloud.fields[name] for name in DISPLAYED_FIELDS if name in cloud.fields}
         arrays |= {name: getattr(segmentation, name).numpy(force=True) for name in POINT_RESULTS}
         arrays |= planes_to_arrays(segmentation.planes, cloud.origin)
     if superpoints is not None:
@@ -251,7 +251,7 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive, and convert errors to errors that name it."""
     message = f"{path}: expected an archive of NumPy arrays, got: "
     with (
-        refusing(message, *ARCHIVE_ERRORS, repair="; copy or write it again"),
+        wrap_errors(message, *ARCHIVE_ERRORS, repair="; copy or write it again"),
         zipfile.ZipFile(path) as archive,
     ):
         yield archive
@@ -264,7 +264,7 @@ def _open_member(
     """Open an archive member, and convert errors to errors that name both."""
     message = f"{path}: {member.filename!r}: "
     with (
-        refusing(message, *ARCHIVE_ERRORS, repair="; copy or write the file again"),
+        wrap_errors(message, *ARCHIVE_ERRORS, repair="; copy or write the file again"),
         archive.open(member) as stream,
     ):
         yield stream
@@ -322,7 +322,7 @@ def _check_array(path: Path, stream: IO[bytes], size: int, content: str) -> _Lay
     """Check an array header against the available ``size``, and return shape and type."""
     message = f"{path}: byte 0: expected the header of a NumPy array in {content}, got: "
     repair = "; write it again with numpy.save or numpy.savez"
-    with refusing(message, *DAMAGES, repair=repair):
+    with wrap_errors(message, *PARSE_ERRORS, repair=repair):
         head = io.BytesIO(stream.read(_MAX_HEADER_BYTES))
         is_old = npy_format.read_magic(head) == (1, 0)
         read = npy_format.read_array_header_1_0 if is_old else npy_format.read_array_header_2_0

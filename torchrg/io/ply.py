@@ -51,7 +51,7 @@ _MAX_HEADER_BYTES = 1 << 20
 """Maximum bytes of a header; a longer one counts as corrupt."""
 _VERTEX_LISTS = ("vertex_indices", "vertex_index")
 """Names of the vertex list of a face."""
-_BYTES_AT_ONCE = 1 << 19
+_BYTES_PER_READ = 1 << 19
 """Bytes of list records read together, more if one record is longer."""
 _MARGIN = 9
 """Zero bytes appended to a block: an 8-byte number may begin one byte after its end."""
@@ -82,7 +82,7 @@ def read_ply(path: Path, size: int) -> Cloud:
     ]
     if skipped:
         left = ", ".join(skipped)
-        notes += (f"elements left out, as only vertices and their faces are read: {left}",)
+        notes += (f"elements skipped (only vertices and faces are read): {left}",)
     if uneven:
         notes += (f"lists left out, as they are empty or differ in length: {', '.join(uneven)}",)
     cloud = assemble_cloud(path, columns, notes=notes)
@@ -422,7 +422,7 @@ def _read_binary(
     path: Path, stream: BinaryIO, element: _Element, order: str, size: int
 ) -> Iterator[_Records]:
     """Yield chunks of records of a binary list element, and leave the stream at their end."""
-    start, left, block_bytes = stream.tell(), element.num_records, _BYTES_AT_ONCE
+    start, left, block_bytes = stream.tell(), element.num_records, _BYTES_PER_READ
     while left:
         stream.seek(start)
         content = np.fromfile(stream, np.uint8, min(block_bytes, size - start))
@@ -441,14 +441,14 @@ def _read_binary(
         records = _find_records(content, element, order, starts)
         differ = np.flatnonzero(records.ends != starts + first)
         count = int(differ[0]) if len(differ) else len(starts)
-        if count < _MIN_EVEN_FRACTION * len(starts) and block_bytes == _BYTES_AT_ONCE:
+        if count < _MIN_EVEN_FRACTION * len(starts) and block_bytes == _BYTES_PER_READ:
             starts = _find_starts(content, element, order)[:left]
             count = len(starts)
         if len(differ):
             records = _find_records(content, element, order, starts[:count])
         yield records
         start += int(records.ends[-1])
-        left, block_bytes = left - count, _BYTES_AT_ONCE
+        left, block_bytes = left - count, _BYTES_PER_READ
     stream.seek(start)
 
 
@@ -464,7 +464,7 @@ def _read_lines(
     needed, what = 2 * left * len(element.properties) - 1, f"{left:,} records of {element.name}"
     check_available(path, start, needed, what, available=size - start, at_least=True)
     while left:
-        block = stream.read(_BYTES_AT_ONCE) + stream.readline()
+        block = stream.read(_BYTES_PER_READ) + stream.readline()
         if not block:
             raise FormatError(
                 f"{path}: line {line_number}: expected {left:,} more records of {element.name}, "
@@ -526,4 +526,4 @@ def _vertex_fronts(path: Path, header: _Header, index: int, size: int, cloud: Cl
             front = find_fronts(arrays, cloud.coordinates, cloud.finite)
             return front, header.check_end(path, stream, index)
     except FormatError as error:
-        return None, (f"its faces left out: {str(error).removeprefix(f'{path}: ').rstrip('.')}",)
+        return None, (f"faces skipped: {str(error).removeprefix(f'{path}: ').rstrip('.')}",)

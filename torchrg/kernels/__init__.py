@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import has_values
+from torchrg._checks import is_concrete
 
 MAX_NEIGHBORS = 512
 """Maximum number of values of a row in kernels, ``MAX_WIDTH`` in ``plain.h``. The torch definitions
@@ -40,14 +40,14 @@ SIGNATURES = {
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
-    "meet_others": "i[N] i[n] i[nk] b[nk]? -> b[n]",
+    "at_boundary": "i[N] i[n] i[nk] b[nk]? -> b[n]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
     "link_nodes": "i[L] i[L] b[L] I[N] B[N] B[N] -> ",
     "flatten_nodes": "I[N] B[N] B[N] -> ",
     "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",
-    "gather_borders": "i[e] i[e] d[e]? d[e] L[r] L[r] -> l[e] i[e] i[e] d[e] d[e] l[1]",
+    "aggregate_boundaries": "i[e] i[e] d[e]? d[e] L[r] L[r] -> l[e] i[e] i[e] d[e] d[e] l[1]",
     "merging_costs": "d[R] d[RF] d[Rc] d[Rc] i[E] i[E] d[E] d[E] x x -> d[E]",
-    "cheapest_borders": "i[E] i[E] d[E] D[R] -> l[R]",
+    "cheapest_boundaries": "i[E] i[E] d[E] D[R] -> l[R]",
     "neighbor_quantiles": "f[Nc] i[nk] b[nk]? x n -> f[nc]",
     "fit_pixel_windows": "d[hw] b[hw] d[w] d[h] D[5hw] D[mpq] x x n n -> ",
     "fit_cell_windows": "d[mhw] D[5hw] D[mpq] x x n n -> ",
@@ -58,12 +58,12 @@ SIGNATURES = {
     "describe_pixels": "d[hw] b[hw] d[w] d[h] d[w] d[h] l[hw] b[hw] d[N] d[M] l[n] D[hw3] D[hw] "
     "D[hw] B[hw] B[hw] B[hw] x x x x x x x x x n n -> ",
     "segment_rows": "l[n] n L[M] L[M] L[M] -> l[n]",
-    "outer_places": "d[n] d[n] l[M] x -> b[n]",
+    "hull_candidates": "d[n] d[n] l[M] x -> b[n]",
     "segment_coordinates": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
-    "absorb_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
+    "assign_unlabeled_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
     "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",
     "count_lines": "d[3P] b[hw] l[hw] d[M3] d[M3] d[M] l[p2] n x -> l[p] l[M] l[M]",
 }
@@ -103,7 +103,7 @@ def serve(*tensors: Tensor | None, k: int = 1) -> bool:
     return (
         _library() is not None
         and 0 < k <= MAX_NEIGHBORS
-        and has_values(*present)
+        and is_concrete(*present)
         and all(
             tensor.device.type == "cpu"
             and not tensor.requires_grad

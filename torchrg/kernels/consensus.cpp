@@ -31,7 +31,7 @@ INLINE void residuals(const Patch& patch, const Plane& plane, float* rests) {
   for (int j = 0; j < patch.width; j += LANES) store(rests + j, plane.residuals(patch, j));
 }
 
-// hypotheses._refitted
+// hypotheses._refit
 INLINE void refit(const Patch& patch, const float* weights, float reach, bool bisquare,
                   Plane& plane) {
   alignas(32) float shares[MAX_WIDTH];
@@ -78,7 +78,7 @@ Plane vote(const Patch& patch, const float* counted, float noise, const float* s
   return plane;
 }
 
-// hypotheses._beyond: the points off a surface, on the side with more; all of them count.
+// hypotheses._off_surface: the points off a surface, on the side with more; all of them count.
 INLINE void beyond(const Patch& patch, const float* rests, float gap, float* flags) {
   Lanes over{}, under{};
   for (int j = 0; j < patch.width; j += LANES) {

@@ -20,7 +20,7 @@ INLINE bool are_rows_of(int64_t from, int64_t to, int64_t height) {
   return from >= 0 && from <= to && to <= height && from % 2 == 0;
 }
 
-// windows._planes_of_sums: slopes, origin, deviation and mean of window j.
+// windows._planes_from_sums: slopes, origin, deviation and mean of window j.
 template <int N>
 INLINE void solve(const double (&s)[MOMENTS][N], int j, double min_count, double min_spread,
                   double (&to)[5][N]) {
@@ -508,8 +508,8 @@ INLINE bool are_labels(Longs labels, int64_t n, int64_t num) {
 
 }  // namespace
 
-// repair.absorb_points beside pixels; points are (3, h w).
-KERNEL absorb_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, Flagged seen,
+// repair.assign_unlabeled beside pixels; points are (3, h w).
+KERNEL assign_unlabeled_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, Flagged seen,
                      int64_t* labels, Doubles normals, Doubles centers, Doubles reach,
                      int64_t* rows, int64_t* marks, int64_t* chosen) {
   const int64_t n = h * w;

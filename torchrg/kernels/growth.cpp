@@ -32,7 +32,7 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
   return DONE;
 }
 
-// growth.grow_first_in_first_out, with a bit for each neighbour that joins, in words of 64.
+// growth.grow_fifo, with a bit for each neighbour that joins, in words of 64.
 //
 // A target becomes a seed by the bit of the edge, or where it is one itself. With `late` promotion
 // those that merely join do so when all seeds of the region are known. `roots` are -1 before the
@@ -71,8 +71,8 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   return DONE;
 }
 
-// torchrg.regions.adjacency._Border._meets_others: which rows have a neighbour of another region.
-KERNEL meet_others(int64_t num_points, int64_t num_rows, int64_t k, Ints labels, Ints own,
+// torchrg.regions.adjacency._RegionEdges._at_boundary: which rows have a neighbour of another region.
+KERNEL at_boundary(int64_t num_points, int64_t num_rows, int64_t k, Ints labels, Ints own,
                    Ints indices, Flagged mask, bool* meets) {
   for (int64_t i = 0; i < num_rows; i++) {
     meets[i] = false;

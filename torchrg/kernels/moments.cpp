@@ -203,7 +203,7 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
 
 // table._outer_places of each region: whether its points (x, y) are outside of the octagon of the
 // farthest ones.
-KERNEL outer_places(int64_t n, int64_t num, Doubles x, Doubles y, Longs counts, double rounding,
+KERNEL hull_candidates(int64_t n, int64_t num, Doubles x, Doubles y, Longs counts, double rounding,
                     bool* outer) {
   return visit_regions(n, num, counts, [&](int64_t, int64_t start, int64_t end) {
     int64_t farthest[8];

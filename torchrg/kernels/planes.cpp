@@ -68,7 +68,7 @@ INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_ref
 
 }  // namespace
 
-// torchrg.normals.consensus.noise._survey: deviations of all neighbours and of the `few` and the
+// torchrg.normals.consensus.noise._measure_neighborhoods: deviations of all neighbours and of the `few` and the
 // `more` nearest ones, from a plane, and where these look `layered` from two.
 KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
               Flagged mask, Floats normals, Flagged valid, int64_t few, int64_t more,

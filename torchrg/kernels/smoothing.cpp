@@ -9,7 +9,7 @@ constexpr int ROW = 8, NORMAL = 3, OFFSET = 6, NUMBER = 7;
 
 }  // namespace
 
-// smoothing._smoothed: normals and offsets of some rows; `numbers` of the table are the errors.
+// smoothing._smooth_rows: normals and offsets of some rows; `numbers` of the table are the errors.
 KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats table, Ints indices,
                      Flagged mask, Floats noise, Longs rows, double agreement, double reach,
                      double falloff, double ridge, double max_tilt, float* normals,
@@ -63,7 +63,7 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       s[0] += wu, s[1] += wv, s[2] += ww, s[3] += wu * u, s[4] += wu * v, s[5] += wu * w;
       s[6] += wv * v, s[7] += wv * w, s[8] += ww * w;
     }
-    // smoothing._balanced: Cramer's rule for the tilt that brings the mean position to the point.
+    // smoothing._recenter_weights: Cramer's rule for the tilt that brings the mean position to the point.
     const float added = float(ridge) * (total(s[3]) + total(s[6]) + total(s[8]));
     const float xx = total(s[3]) + added, xy = total(s[4]), xz = total(s[5]);
     const float yy = total(s[6]) + added, yz = total(s[7]), zz = total(s[8]) + added;

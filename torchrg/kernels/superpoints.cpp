@@ -55,9 +55,9 @@ KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floa
   return DONE;
 }
 
-// superpoints._gather_borders: rows by the smaller of their regions, equal ones added up, then those
+// superpoints._aggregate: rows by the smaller of their regions, equal ones added up, then those
 // of a region sorted by the larger.
-KERNEL gather_borders(int64_t num_rows, int64_t num_starts, Ints a, Ints b,
+KERNEL aggregate_boundaries(int64_t num_rows, int64_t num_starts, Ints a, Ints b,
                       const double* contacts, const double* differences, int64_t* starts,
                       int64_t* slots, int64_t* order, int32_t* first, int32_t* second,
                       double* sum_contacts, double* sum_differences, int64_t* count) {
@@ -88,7 +88,7 @@ KERNEL gather_borders(int64_t num_rows, int64_t num_starts, Ints a, Ints b,
   return DONE;
 }
 
-// superpoints._costs
+// superpoints._merge_costs
 KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, int64_t num_borders,
                      const double* size, const double* means, const double* low,
                      const double* high, Ints first, Ints second, const double* contacts,
@@ -112,8 +112,8 @@ KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, in
   return DONE;
 }
 
-// superpoints._cheapest_borders
-KERNEL cheapest_borders(int64_t num_borders, int64_t num_regions, Ints first, Ints second,
+// superpoints._cheapest
+KERNEL cheapest_boundaries(int64_t num_borders, int64_t num_regions, Ints first, Ints second,
                         const double* costs, double* least, int64_t* best) {
   for (int64_t r = 0; r < num_regions; r++) best[r] = num_borders;
   for (int64_t e = 0; e < num_borders; e++)

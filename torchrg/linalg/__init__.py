@@ -18,7 +18,7 @@ from torchrg.linalg.angles import (
 from torchrg.linalg.eigen import (
     coordinate_resolution,
     eigh3,
-    eigh3_of_few,
+    eigh3_lapack,
     flatness_tolerance,
     machine_epsilon,
     rank_tolerance,
@@ -34,7 +34,7 @@ __all__ = [
     "covariance",
     "deg_to_sq_chord",
     "eigh3",
-    "eigh3_of_few",
+    "eigh3_lapack",
     "flatness_tolerance",
     "machine_epsilon",
     "rank_tolerance",

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import check_floating, check_shapes, has_values, refuse_forward_mode
+from torchrg._checks import check_floating, check_shapes, is_concrete, raise_forward_mode
 
 _JACOBI_SWEEPS = 5
 """Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either
@@ -94,7 +94,7 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_shapes("eigh3", matrices=(matrices, "* 3 3"))
     check_floating("eigh3", matrices=matrices)
-    if not matrices.requires_grad and has_values(matrices):
+    if not matrices.requires_grad and is_concrete(matrices):
         return _jacobi(matrices)
     operation = _Eigh3 if torch.compiler.is_compiling() else _ReverseOnly
     values, vectors = operation.apply(matrices)  # type: ignore[no-untyped-call]
@@ -140,7 +140,7 @@ class _ReverseOnly(_Eigh3):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
-        refuse_forward_mode("eigh3")
+        raise_forward_mode("eigh3")
 
 
 def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,7 +162,7 @@ def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
     return values * safe.squeeze(-1), vectors
 
 
-def eigh3_of_few(matrices: Tensor) -> tuple[Tensor, Tensor]:
+def eigh3_lapack(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Variant of :func:`eigh3` by LAPACK, faster for fewer than a thousand matrices.
 
     Non-finite matrices give NaN.

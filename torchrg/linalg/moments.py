@@ -183,10 +183,10 @@ class Segments:
 
         ``vectors`` are ``(N, 3)``, ``axes`` ``(M, A, 3)``; returns A columns ``(n,)``, float64.
         """
-        if self.is_served(vectors) and centers.dtype == torch.float64:
+        if self.are_served(vectors) and centers.dtype == torch.float64:
             tables = self.rows, self.counts, centers, axes
             return list(kernels.call("segment_coordinates", *vectors.unbind(dim=1), *tables)[0])
-        about, columns = self.take_about(vectors, centers), []
+        about, columns = self.gather_centered(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
             # Separate products and sums: their rounding must not depend on block boundaries.
@@ -195,9 +195,9 @@ class Segments:
             columns.append(total)
         return columns
 
-    def take_about(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
+    def gather_centered(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Apply :meth:`take` to vectors ``(N, 3)``, relative to region centers ``(M, 3)``."""
-        if self.is_served(vectors) and centers.dtype == torch.float64:
+        if self.are_served(vectors) and centers.dtype == torch.float64:
             eye = torch.eye(3, dtype=torch.float64, device=centers.device)
             return self.along(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
@@ -222,7 +222,7 @@ class Segments:
 
         The columns are as returned by :meth:`take_columns`; if not ``centered``, the mean is zero.
         """
-        if self.is_served(weights):
+        if self.are_served(weights):
             numbers = self.counts, centered
             mean, covariance = kernels.call("segment_moments", *columns, weights, *numbers)
             return mean, covariance
@@ -245,7 +245,7 @@ class Segments:
         ``(M,)``. The weight is zero from the second factor times the scale. Returns weights
         ``(n,)``, median absolute residuals ``(M,)`` and mean squares ``(M,)``.
         """
-        if self.is_served(means):
+        if self.are_served(means):
             tables = self.counts, means, axes, least
             weights, medians, squares = kernels.call(
                 "reweigh_segments", *columns, *tables, *factors
@@ -262,7 +262,7 @@ class Segments:
         weights = (1 - ratio * ratio).clamp(min=0).square()
         return weights, medians, self.mean(residuals * residuals)
 
-    def is_served(self, values: Tensor) -> bool:
+    def are_served(self, values: Tensor) -> bool:
         """Return whether kernels support float64 values of these regions."""
         is_plain = values.device.type == "cpu" and values.dtype == torch.float64
         return is_plain and kernels.serve() and bool(self.counts.all())

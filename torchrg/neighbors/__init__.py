@@ -14,10 +14,10 @@ from torchrg.neighbors.order import (
     canonical_order,
     distinct_points,
     distinct_rows,
+    expand_to_points,
     finite_rows,
-    mark_first,
-    restore_points,
-    restore_rows,
+    mark_distinct,
+    scatter_rows,
 )
 from torchrg.neighbors.sampling import measure_sampling
 from torchrg.neighbors.voxels import Voxels, sample_voxels
@@ -30,15 +30,15 @@ __all__ = [
     "check_neighbors",
     "distinct_points",
     "distinct_rows",
+    "expand_to_points",
     "finite_rows",
     "gather_columns",
     "gather_patches",
-    "mark_first",
+    "mark_distinct",
     "measure_sampling",
     "prepare_search",
-    "restore_points",
-    "restore_rows",
     "sample_voxels",
+    "scatter_rows",
     "search_knn",
     "search_nearest",
 ]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of
+from torchrg._parallel import ROWS_AT_ONCE, split_rows
 from torchrg.neighbors.order import MORTON_BITS, morton_codes
 
 BLOCK_SIZE = 300_000
@@ -76,7 +76,7 @@ def near_boxes(
     is_near = np.zeros(len(boxes.low), dtype=bool)
     nearby = _near_bounding_box(boxes.low, boxes.high, boxes.low[chosen], boxes.high[chosen], reach)
     all_low, all_high = boxes.low[nearby], boxes.high[nearby]
-    for chunk in chunks_of(len(chosen), _BOXES_AT_ONCE):
+    for chunk in split_rows(len(chosen), _BOXES_AT_ONCE):
         low, high = boxes.low[chosen[chunk]], boxes.high[chosen[chunk]]
         near = _near_bounding_box(all_low, all_high, low, high, reach[chunk])
         within = _gaps(all_low[near], all_high[near], low, high) <= reach[chunk, None] * _ROUNDING
@@ -212,7 +212,7 @@ def _search_each(
     positions = points[queries].astype(np.float64)
     nearest = [np.empty(0, dtype=np.int64)] * len(queries)
     keys = [np.empty(0)] * len(queries)
-    for chunk in chunks_of(len(rows), ROWS_AT_ONCE):
+    for chunk in split_rows(len(rows), ROWS_AT_ONCE):
         indices = rows[chunk]
         candidates = points[indices].astype(np.float64)
         for i, (index, position) in enumerate(zip(queries, positions, strict=True)):

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._checks import as_tensor, check_floating, check_shapes, is_tensor, of_clouds
+from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only, is_tensor
 from torchrg._parallel import (
     ROWS_AT_ONCE,
     ROWS_IN_CACHE,
     allowed_threads,
-    chunks_of,
     map_chunks,
     map_tasks,
     sequential_operations,
+    split_rows,
 )
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors.blocks import search_blocks
-from torchrg.neighbors.order import canonical_order, distinct_rows, mark_first
+from torchrg.neighbors.order import canonical_order, distinct_rows, mark_distinct
 from torchrg.structures import MAX_POINTS, Neighbors, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
@@ -46,7 +46,7 @@ _MAX_CELLS_PER_POINT = 8
 """Maximum number of cells per point in the bounding box, including empty ones, 4 bytes each."""
 
 
-@of_clouds
+@eager_only
 @sequential_operations()
 def search_knn(
     points: Tensor | NDArray[np.floating],
@@ -178,7 +178,7 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
         )
 
 
-def keep_within(
+def restrict_to_groups(
     neighbors: Neighbors, groups: Tensor, chunk_size: int, places: Rows = slice(None)
 ) -> Neighbors:
     """Restrict the neighbors of each point to its group, nearest first.
@@ -193,10 +193,11 @@ def keep_within(
 
     Example:
         >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
-        >>> kept = keep_within(near, torch.tensor([4, 7, 4]), 3)
+        >>> kept = restrict_to_groups(near, torch.tensor([4, 7, 4]), 3)
         >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
         ([[0, 2, 0], [1, 1, 1], [2, 0, 2]], [2, 1, 2])
-        >>> kept = keep_within(near, torch.tensor([0, 0, 1, 1]), 4, torch.tensor([0, 1, 1, 2]))
+        >>> groups, index = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 1, 2])
+        >>> kept = restrict_to_groups(near, groups, 4, index)
         >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
         ([[0, 1, 0], [1, 0, 1], [2, 3, 2], [3, 2, 3]], [2, 2, 2, 2])
     """
@@ -247,7 +248,7 @@ def search_nearest(
     tree = cKDTree(points[first], balanced_tree=False, compact_nodes=False)
     # Consecutive close queries use the same cached parts of the tree.
     query_rows = canonical_order(queries).numpy()
-    for chunk in chunks_of(len(query_rows), ROWS_AT_ONCE):
+    for chunk in split_rows(len(query_rows), ROWS_AT_ONCE):
         distances, found = _query(tree, queries[query_rows[chunk]], 1)
         nearest[query_rows[chunk]] = np.where(distances <= max_distance, first[found], -1)[:, 0]
     return nearest
@@ -310,7 +311,7 @@ def _search_cloud(
 
     k = indices.shape[1]
     columns = as_tensor("search_knn", "points", points).unbind(dim=1)
-    starts = np.flatnonzero(mark_first(*columns).numpy())
+    starts = np.flatnonzero(mark_distinct(*columns).numpy())
     counts = np.diff(starts, append=len(points))
     positions = points[starts].astype(np.float64)
 
@@ -343,14 +344,14 @@ def _search_cloud(
             found, requested = np.empty((len(positions), k), dtype=np.int32), pending
             pending = search_cells(positions, requested, reach, found)
             resolved = np.setdiff1d(requested, pending, assume_unique=True)
-            for chunk in chunks_of(len(resolved), ROWS_IN_CACHE):
+            for chunk in split_rows(len(resolved), ROWS_IN_CACHE):
                 rows = resolved[chunk]
                 near = found[rows]
                 distances = np.broadcast_to(0.0, near.shape)
                 if is_far is not None:
                     distances = np.linalg.norm(positions[near] - positions[rows, None], axis=2)
                 store(rows, distances, near)
-    for chunk in chunks_of(len(pending), ROWS_AT_ONCE):
+    for chunk in split_rows(len(pending), ROWS_AT_ONCE):
         store(pending[chunk], *_query(tree, positions[pending[chunk]], width))
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of, places_of
+from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
 from torchrg.structures import UNLABELED, bounding_box
 
 MORTON_BITS = 21
@@ -80,15 +80,15 @@ def finite_rows(points: Tensor, ties: Sequence[Tensor] = ()) -> Tensor:
     is_finite = x & y & z
     if bool(is_finite.all()):
         return canonical_order(points, ties)
-    rows = places_of(is_finite)
+    rows = nonzero_rows(is_finite)
     return rows[canonical_order(points[rows], [column[rows] for column in ties])]
 
 
-def mark_first(*columns: Tensor) -> Tensor:
+def mark_distinct(*columns: Tensor) -> Tensor:
     """Return a mask of rows that differ from the previous row of columns ``(N,)``, shape ``(N,)``.
 
     Example:
-        >>> mark_first(torch.tensor([1.0, 1.0, 2.0, 2.0]), torch.tensor([0, 0, 0, 1])).tolist()
+        >>> mark_distinct(torch.tensor([1.0, 1.0, 2.0, 2.0]), torch.tensor([0, 0, 0, 1])).tolist()
         [True, False, True, True]
     """
     is_first = torch.ones_like(columns[0], dtype=torch.bool)
@@ -117,8 +117,8 @@ class DistinctPoints(NamedTuple):
         return int(torch.count_nonzero(self.inverse >= 0)) - len(self.rows)
 
     def restore(self, values: Tensor, *, fill: int = 0) -> Tensor:
-        """Expand values per position to all points; see :func:`restore_points`."""
-        return restore_points(values, self.inverse, fill=fill)
+        """Expand values per position to all points; see :func:`expand_to_points`."""
+        return expand_to_points(values, self.inverse, fill=fill)
 
 
 def distinct_points(points: Tensor, ties: Sequence[Tensor] = ()) -> DistinctPoints:
@@ -137,7 +137,7 @@ def distinct_points(points: Tensor, ties: Sequence[Tensor] = ()) -> DistinctPoin
     rows = finite_rows(points, ties)
     # Three times faster than indexing.
     ordered = points.index_select(0, rows)
-    is_first = mark_first(*ordered.detach().unbind(dim=1))
+    is_first = mark_distinct(*ordered.detach().unbind(dim=1))
     inverse = torch.full((len(points),), UNLABELED, device=points.device)
     inverse.index_copy_(0, rows, is_first.cumsum(0) - 1)
     if not bool(is_first.all()):
@@ -156,7 +156,7 @@ def distinct_rows(points: Tensor, *values: Tensor) -> Tensor:
     """
     rows = finite_rows(points, values)
     columns = points[rows].unbind(dim=1)
-    is_first = mark_first(*columns, *(column[rows] for column in values))
+    is_first = mark_distinct(*columns, *(column[rows] for column in values))
     return rows if bool(is_first.all()) else rows[is_first]
 
 
@@ -180,25 +180,25 @@ def ascending_rows(values: Tensor) -> Tensor:
     return torch.from_numpy(keys)
 
 
-def restore_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
+def scatter_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
     """Scatter values ``(n, ...)`` to their rows, with ``fill`` at all other rows.
 
     Example:
-        >>> restore_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist()
+        >>> scatter_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist()
         [8, -1, 7]
     """
     result = values.new_full((num_points, *values.shape[1:]), fill)
     return result.index_copy_(0, rows, values)
 
 
-def restore_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
+def expand_to_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
     """Return each point's value of its position or voxel, shape ``(N, ...)``.
 
     ``values`` has one row per position or voxel; ``inverse`` ``(N,)`` is the row of each point.
     Points with a negative row get ``fill``; for labels use :data:`torchrg.UNLABELED`.
 
     Example:
-        >>> restore_points(torch.tensor([7, 8]), torch.tensor([1, -1, 0, 1]), fill=-1).tolist()
+        >>> expand_to_points(torch.tensor([7, 8]), torch.tensor([1, -1, 0, 1]), fill=-1).tolist()
         [8, -1, 7, 8]
     """
     has_value = inverse >= 0
@@ -219,7 +219,7 @@ def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
     if extent == 0:
         return codes
     kernel = {"f4": "morton_codes", "f8": "morton_codes_double"}.get(coordinates.dtype.str[1:])
-    for rows in chunks_of(len(codes), ROWS_AT_ONCE):
+    for rows in split_rows(len(codes), ROWS_AT_ONCE):
         if kernel and kernels.serve():
             points = as_tensor("morton_codes", "coordinates", coordinates[rows])
             codes[rows] = kernels.call(kernel, points, *low.tolist(), extent)[0].numpy()

@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_points, of_clouds
+from torchrg._checks import as_tensor, check_points, eager_only
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
@@ -38,7 +38,7 @@ from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import Orientation, orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
 from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
-from torchrg.precision import warn_of_steps
+from torchrg.precision import warn_about_steps
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
 from torchrg.structures import Neighbors, NormalFit
 
@@ -80,7 +80,7 @@ WITHOUT_GRADIENT = {"consensus"}
 """Estimators without gradients, because they select and smooth planes in several steps."""
 
 
-@of_clouds
+@eager_only
 @sequential_operations()
 def estimate_normals(
     points: Tensor | NDArray[np.floating],
@@ -131,7 +131,7 @@ def estimate_normals(
     """
     tensor = as_tensor("estimate_normals", "points", points)
     check_points("estimate_normals", tensor)
-    warn_of_steps("estimate_normals", tensor)
+    warn_about_steps("estimate_normals", tensor)
     settings = settings_of("estimate_normals", NormalsConfig, config, changes)
     estimate = ESTIMATORS[settings.method]
     if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, places_of
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
@@ -64,7 +64,7 @@ def find_faces(
     unused.
     """
     faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
-    rows = places_of(labels >= 0)
+    rows = nonzero_rows(labels >= 0)
     label, axes = labels[rows].long(), axes.to(points)
     cosine = dot(normals[rows], axes[label])
     side, is_thin = _split_plates(points[rows], label, axes, max_thickness)
@@ -74,7 +74,7 @@ def find_faces(
     joined, signs = _join_patches(points, normals, near, faces, signs, _MIN_AGREEMENT)
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
     has_plane[joined[rows]] = True
-    rows = places_of(~has_plane[joined])
+    rows = nonzero_rows(~has_plane[joined])
     indices, patch = torch.unique(joined[rows], return_inverse=True)
     sums = normals.new_zeros(len(indices), 3)
     sums.index_add_(0, patch, normals[rows] * signs[rows, None])
@@ -142,7 +142,7 @@ def _join_patches(
         [1] H. Xie et al. Piecewise C1 continuous surface reconstruction of noisy point clouds via
         local implicit quadric regression. IEEE Visualization, 2003.
     """
-    rows, num_faces = places_of(faces < 0), int(faces.max()) + 1
+    rows, num_faces = nonzero_rows(faces < 0), int(faces.max()) + 1
     ranks = [rank for rank in _RANKS if rank < near.shape[1]]
     bend = _compare(points, normals, rows[::8], gather_lists(near, rows[::8], ranks))[1]
     typical = float(bend.median()) if bend.numel() else 0.0

@@ -13,7 +13,7 @@ from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
 from torchrg.linalg import second_moments
 from torchrg.linalg.eigen import principal_frame
-from torchrg.normals.consensus.noise import survey_noise
+from torchrg.normals.consensus.noise import estimate_noise
 from torchrg.normals.pca import (
     center_on_first,
     check_patches,
@@ -182,7 +182,7 @@ def estimate_irls(
     """
     fixed = points.detach()
     planes = fit_points(fixed, neighbors, fit_normals_pca, chunk_size=chunk_size)
-    noise = survey_noise(fixed, neighbors, planes, chunk_size=chunk_size).noise
+    noise = estimate_noise(fixed, neighbors, planes, chunk_size=chunk_size).noise
     fit = partial(fit_normals_irls, mu_decay=config.irls_decay)
     return fit_points(points, neighbors, fit, chunk_size=chunk_size, noise=noise)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import in_own_precision
+from torchrg._checks import disable_autocast
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root, square_root
 from torchrg.linalg.moments import Columns, along, sq_lengths, sum_neighbors
@@ -71,7 +71,7 @@ class JetFit(NamedTuple):
     residual_rms: Tensor
 
 
-@in_own_precision
+@disable_autocast
 def fit_jet(
     patches: Tensor, mask: Tensor | None = None, *, resolution: Tensor | None = None
 ) -> JetFit:

@@ -14,9 +14,9 @@ from torchrg._checks import (
     check_floating,
     check_points,
     check_shapes,
-    of_clouds,
+    eager_only,
 )
-from torchrg._parallel import places_of, sequential_operations
+from torchrg._parallel import nonzero_rows, sequential_operations
 from torchrg.errors import ConfigError
 from torchrg.neighbors import check_neighbors, distinct_points, distinct_rows, search_knn
 from torchrg.normals.faces import find_faces, find_surfaces
@@ -55,7 +55,7 @@ _AS_NEAR = 1 + 1e-6
 """Ratio of distances that differ by rounding only."""
 
 
-@of_clouds
+@eager_only
 @sequential_operations()
 def orient_normals(
     points: Points | Cloud,
@@ -128,7 +128,7 @@ def orient_normals(
         if neighbors is not None:
             return turn_faces(cloud, vectors, side, neighbors)
         upright = _upright(vectors)
-        usable = places_of((upright != 0).any(dim=-1) & cloud.isfinite().all(dim=-1))
+        usable = nonzero_rows((upright != 0).any(dim=-1) & cloud.isfinite().all(dim=-1))
         units = upright.detach()[usable]
         distinct = distinct_points(cloud[usable], units.unbind(dim=-1))
         turned = distinct.restore(turn_faces(distinct.points, units[distinct.rows], side))
@@ -232,7 +232,7 @@ def _turn_to_front(
 
     turned, is_known = turn_towards(normals, front), (front != 0).any(dim=-1)
     has_normal = (normals != 0).any(dim=-1)
-    lost = places_of(has_normal & ~is_known & points.isfinite().all(dim=-1))
+    lost = nonzero_rows(has_normal & ~is_known & points.isfinite().all(dim=-1))
     if len(lost) == 0:
         return turned
     # Copies with one normal and one front count once.
@@ -288,7 +288,7 @@ def _turn_inside(
     faces, signs = find_faces(points, normals, near, labels, axes, _THICKNESS * width)
     sizes = torch.bincount(faces)
     hashes = torch.arange(len(points)) * _HASH % _HASHES
-    rows = places_of(hashes * sizes[faces] < _NUM_VOTES * _HASHES)
+    rows = nonzero_rows(hashes * sizes[faces] < _NUM_VOTES * _HASHES)
     votes = vote_free_side(points, normals, near, rows, width) * signs[rows]
     total = torch.bincount(faces[rows], votes.double(), minlength=len(sizes))
     return torch.where(total[faces] < 0, -signs, signs)

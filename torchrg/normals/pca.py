@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._checks import check_floating, check_shapes, has_values
-from torchrg._parallel import CHUNK_SIZE, map_chunks, places_of
+from torchrg._checks import check_floating, check_shapes, is_concrete
+from torchrg._parallel import CHUNK_SIZE, map_chunks, nonzero_rows
 from torchrg.config import NormalsConfig
 from torchrg.linalg import (
     coordinate_resolution,
@@ -89,7 +89,7 @@ def _decompose(patches: Tensor, mask: Tensor | None) -> _Decomposition:
 
 def _decompose_for_normals(patches: Tensor, mask: Tensor | None) -> _Decomposition:
     """Decompose bit-identically to the kernels if only values and normals are needed."""
-    if patches.dtype != torch.float32 or patches.requires_grad or not has_values(patches, mask):
+    if patches.dtype != torch.float32 or patches.requires_grad or not is_concrete(patches, mask):
         return _decompose(patches, mask)
     columns = center_on_first(patches, mask)[1].unbind(dim=-1)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(patches.dtype)
@@ -142,7 +142,7 @@ def fit_points_pca(
     parts = map_chunks(work, len(points), chunk_size, points.device)
     normals, curvature, rms, valid, narrow = map(torch.cat, zip(*parts, strict=True))
     fit = NormalFit(normals, curvature, valid, rms)
-    rows = places_of(narrow)
+    rows = nonzero_rows(narrow)
     if len(rows) == 0:
         return fit
     refitted = fit_points(points, neighbors, _fit_normals, rows=rows, chunk_size=chunk_size)
@@ -171,7 +171,7 @@ def _spans_plane(
     lengths, widths = (square_root(values[..., axis].clamp(min=0)) for axis in (2, 1))
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
     narrow = widths < _MIN_RATIO * lengths
-    if not has_values(patches, mask, values):
+    if not is_concrete(patches, mask, values):
         widths = torch.where(narrow, _width(patches, mask), widths)
     elif bool(narrow.any()):
         widths = widths.double()

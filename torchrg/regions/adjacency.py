@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_IN_CACHE, Result, chunks_of, map_chunks, map_tasks, places_of
+from torchrg._parallel import ROWS_IN_CACHE, Result, map_chunks, map_tasks, nonzero_rows, split_rows
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
@@ -102,11 +102,11 @@ def find_adjacency(
     return PlaneAdjacency(pairs[meets], length[meets], angle[meets])
 
 
-class NearestPoints:
+class KnnAdjacency:
     """Adjacency of a point cloud: up to 8 nearest neighbors per point.
 
     Example:
-        >>> adjacency = NearestPoints(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
+        >>> adjacency = KnnAdjacency(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
         >>> adjacency.neighbor_rows(torch.tensor([2, 0])).tolist()
         [[1], [1]]
         >>> adjacency.contacts(torch.tensor([0, 1, 1]))
@@ -136,11 +136,11 @@ class NearestPoints:
         return candidates[is_changed[self.neighbor_rows(candidates)].any(dim=1)]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply :func:`find_contacts` to the nearest neighbors."""
-        return find_contacts(labels, self.neighbors)
+        """Apply :func:`find_region_pairs` to the nearest neighbors."""
+        return find_region_pairs(labels, self.neighbors)
 
 
-def find_contacts(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
+def find_region_pairs(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
     """Return pairs of adjacent regions and the number of edges between them.
 
     For labels ``(N,)``, negative if unlabeled: pairs ``(E, 2)``, smaller label first, ascending,
@@ -192,7 +192,7 @@ class _RegionEdges:
             meets[chunk] = self._at_boundary(chunk)
 
         map_chunks(mark, len(labels), ROWS_IN_CACHE, labels.device)
-        self._rows = places_of(meets).to(torch.int32)
+        self._rows = nonzero_rows(meets).to(torch.int32)
         # Keeping small tensors of every chunk would fragment the heap (glibc).
         counts: Counter[int] = Counter()
         for rows in torch.split(self._rows, ROWS_IN_CACHE):
@@ -211,7 +211,7 @@ class _RegionEdges:
         """Return which points have a neighbor in another region, shape ``(n,)``."""
         label, near = self._labels[rows], self._neighbors.at(rows)
         if kernels.serve(label, *near):
-            return kernels.call("meet_others", self._labels, label, *near)[0]
+            return kernels.call("at_boundary", self._labels, label, *near)[0]
         return self._crossing_neighbors(label, near)[0].any(dim=1)
 
     def _crossing_neighbors(self, label: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
@@ -225,7 +225,7 @@ class _RegionEdges:
         label, near = self._labels[rows], self._neighbors.at(rows)
         scratch.release()
         crosses, other = self._crossing_neighbors(label, near)
-        flat_index = places_of(crosses)
+        flat_index = nonzero_rows(crosses)
         first = label.index_select(0, flat_index // self._width)
         second = other.reshape(-1).index_select(0, flat_index)
         lower, higher = torch.minimum(first, second), torch.maximum(first, second)
@@ -242,7 +242,7 @@ class _RegionEdges:
             return work(_Contacts(pair, rows.index_select(0, source), targets, column))
 
         chunks = torch.split(self._rows, ROWS_IN_CACHE)
-        for batch in chunks_of(len(chunks), _CHUNKS_AT_ONCE):
+        for batch in split_rows(len(chunks), _CHUNKS_AT_ONCE):
             yield from map_tasks(find, chunks[batch], self._rows.device)
 
 
@@ -295,7 +295,7 @@ def _unique_cells(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distance to the last contact neighbor of each point, and their number."""
-    nearest = NearestPoints(neighbors).neighbors.at(rows)
+    nearest = KnnAdjacency(neighbors).neighbors.at(rows)
     count = nearest.counted().sum(dim=1)
     last = nearest.indices.gather(1, (count - 1).clamp(min=0)[:, None]).squeeze(1)
     return (points[last].double() - points[rows].double()).norm(dim=1), count

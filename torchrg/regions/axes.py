@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchrg._checks import made_on_cpu
+from torchrg._checks import default_device_cpu
 from torchrg.errors import ConfigError
-from torchrg.linalg import eigh3_of_few, unit_direction
+from torchrg.linalg import eigh3_lapack, unit_direction
 from torchrg.regions.fit import canonicalize_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
@@ -25,7 +25,7 @@ _MIN_FRACTION = 0.02
 """Minimum fraction of the plane area per direction: smaller ones are furniture, not a room."""
 
 
-@made_on_cpu()
+@default_device_cpu()
 def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -> Tensor:
     r"""Compute the rigid transform that makes a room upright and axis-aligned.
 
@@ -85,7 +85,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
     return motion
 
 
-def move_planes(planes: Planes, motion: Tensor) -> Planes:
+def transform_planes(planes: Planes, motion: Tensor) -> Planes:
     """Apply a rigid transform ``(4, 4)`` to a plane table.
 
     Normals keep the canonical sign of plane tables.
@@ -97,7 +97,7 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
         >>> table = summarize_planes(floor, up, torch.zeros(16, dtype=torch.int64))
         >>> motion = torch.eye(4, dtype=torch.float64)
         >>> motion[2, 3] = 5
-        >>> move_planes(table, motion).offset.tolist()
+        >>> transform_planes(table, motion).offset.tolist()
         [5.0]
     """
     dtype = planes.normal.dtype
@@ -130,7 +130,7 @@ def move_planes(planes: Planes, motion: Tensor) -> Planes:
     )
 
 
-def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
+def transform_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
     """Apply a rigid transform ``(4, 4)`` to the coordinates and normals of a cloud.
 
     Positions in the file header, such as a viewpoint or a coordinate system, are dropped.
@@ -139,7 +139,7 @@ def move_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
         >>> import numpy as np
         >>> cloud = Cloud(np.array([[1.0, 2, 3]]), {"normals": np.array([[1.0, 0, 0]])})
         >>> quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        >>> moved = move_cloud(cloud, quarter.double())
+        >>> moved = transform_cloud(cloud, quarter.double())
         >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
         ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
     """
@@ -163,7 +163,7 @@ def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
         # Without level planes, up is perpendicular to the wall normals.
         upright = (normals @ upwards).abs() <= math.sin(math.radians(_MAX_TILT_DEG))
         spread = (areas * upright)[:, None, None] * normals[:, :, None] * normals[:, None, :]
-        values, vectors = eigh3_of_few(spread.sum(dim=0))
+        values, vectors = eigh3_lapack(spread.sum(dim=0))
         if not bool(values[1] > _MIN_FRACTION * values[2]) or values[2] == 0:
             raise ConfigError(
                 "align_axes: expected a floor, a ceiling, or walls in two directions, got none "
@@ -177,7 +177,7 @@ def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
         flat, across = areas * _bisquare(lengths.acos()), areas * _bisquare(lengths.asin())
         spread = normals[:, :, None] * normals[:, None, :]
         matrix = ((across - flat)[:, None, None] * spread).sum(dim=0)
-        axis = eigh3_of_few(matrix)[1][:, 0]
+        axis = eigh3_lapack(matrix)[1][:, 0]
         axis = axis * torch.sign(axis @ upwards)
     return axis
 

@@ -25,7 +25,7 @@ from torchrg.robust import median, qn
 from torchrg.structures import Neighbors, Rows
 
 
-class GrowingCloud(NamedTuple):
+class GrowingInput(NamedTuple):
     """Input of region growing in canonical order, with contiguous columns for fast indexing.
 
     Attributes:
@@ -66,7 +66,7 @@ def has_late_promotion(config: GrowingConfig) -> bool:
 
 
 def mark_edges(
-    cloud: GrowingCloud, config: GrowingConfig, limit: Tensor, *, chunk_size: int
+    cloud: GrowingInput, config: GrowingConfig, limit: Tensor, *, chunk_size: int
 ) -> tuple[Tensor, Tensor | None]:
     """Return the neighbors that join and the edges that make seeds, packed into bits.
 
@@ -96,7 +96,7 @@ def _write_bits(target: NDArray[np.uint8], flags: Tensor) -> None:
 
 
 def _become_seeds(
-    cloud: GrowingCloud,
+    cloud: GrowingInput,
     config: GrowingConfig,
     rows: slice,
     limit: Tensor,
@@ -124,7 +124,7 @@ def _curvature_limits(curvature: Tensor, counted: Tensor, quantile: float) -> Te
 
 
 def accept_edges(
-    cloud: GrowingCloud,
+    cloud: GrowingInput,
     config: GrowingConfig,
     rows: Rows,
     connect: Callable[[Tensor], Tensor] | None,
@@ -181,7 +181,7 @@ def _connect(shared: SharedNeighbors | None, rows: slice) -> Callable[[Tensor], 
     return None if shared is None else partial(shared.connected, rows)
 
 
-def _shared_neighbors(cloud: GrowingCloud, config: GrowingConfig) -> SharedNeighbors | None:
+def _shared_neighbors(cloud: GrowingInput, config: GrowingConfig) -> SharedNeighbors | None:
     """Return the connectivity test, eq. (10), or None if disabled."""
     if config.connectivity is None:
         return None
@@ -230,7 +230,7 @@ def within_reach(
 
 
 def are_coplanar(
-    cloud: GrowingCloud,
+    cloud: GrowingInput,
     rows: Rows,
     mask: Tensor,
     compared: Tensor | None,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import places_of
+from torchrg._parallel import nonzero_rows
 from torchrg.linalg.moments import Segments, reduce_runs
 
 _REL_TOL = 1e-9
@@ -61,7 +61,7 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
         closed curve. Communications of the ACM 18(7), 1975.
     """
-    rectangles = [_min_rectangle(positions) for positions in outer_places(segments, u, v)]
+    rectangles = [_min_rectangle(positions) for positions in hull_candidates(segments, u, v)]
     cosine, sine, *ends = u.new_tensor(rectangles).view(-1, 6).unbind(dim=1)
     low, high = torch.stack(ends[:2], dim=1), torch.stack(ends[2:], dim=1)
     directions = torch.stack([cosine, sine, -sine, cosine], dim=1).view(-1, 2, 2)
@@ -116,24 +116,24 @@ def _hull_corners(positions: NDArray[np.float64]) -> NDArray[np.integer]:
     return corners
 
 
-def outer_places(segments: Segments, u: Tensor, v: Tensor) -> list[NDArray[np.float64]]:
+def hull_candidates(segments: Segments, u: Tensor, v: Tensor) -> list[NDArray[np.float64]]:
     """Return the points ``(n, 2)`` of each region that may be corners of its convex hull.
 
     Discards points inside the octagon of the extreme points in eight directions: S. Akl, G.
     Toussaint. A fast convex hull algorithm. Information Processing Letters 7(5), 1978.
     """
-    if not segments.is_served(u):
+    if not segments.are_served(u):
         regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
         return [_outside_octagon(positions.numpy().astype(np.float64)) for positions in regions]
-    (outer,) = kernels.call("outer_places", u, v, segments.counts, _ROUNDING)
-    chosen = places_of(outer)
+    (outer,) = kernels.call("hull_candidates", u, v, segments.counts, _ROUNDING)
+    chosen = nonzero_rows(outer)
     ends = torch.searchsorted(chosen, segments.counts.cumsum(0)).tolist()
     positions = torch.stack([u[chosen], v[chosen]], dim=1).numpy()
     return [positions[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
 
 def _outside_octagon(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Apply :func:`outer_places` to the points of one region."""
+    """Apply :func:`hull_candidates` to the points of one region."""
     # Avoids BLAS, which would start its own threads.
     along = _COMPASS[:, :1] * positions[:, 0] + _COMPASS[:, 1:] * positions[:, 1]
     ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
@@ -207,7 +207,7 @@ def _occupied_cells(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) 
     keys = (starts + widths + 1).index_select(0, owner) + row * widths.index_select(0, owner)
     grid = torch.zeros(int(ends[-1]) if num_regions else 0, dtype=torch.bool, device=owner.device)
     grid[keys + column] = True
-    keys = places_of(grid)
+    keys = nonzero_rows(grid)
     owner = torch.searchsorted(ends, keys, right=True)
     width = widths[owner]
     sides = torch.stack([keys - 1, keys + 1, keys - width, keys + width])

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_tasks
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, split_rows
 from torchrg.config import Auto, GrowingConfig
-from torchrg.linalg import coordinate_resolution, eigh3_of_few
+from torchrg.linalg import coordinate_resolution, eigh3_lapack
 from torchrg.linalg.moments import Segments
-from torchrg.regions.edges import GrowingCloud, neighborhood_radii
+from torchrg.regions.edges import GrowingInput, neighborhood_radii
 from torchrg.robust.scale import MAD_FACTOR
 
 POINTS_AT_ONCE = 2**18
@@ -93,7 +93,7 @@ class RegionPlanes(NamedTuple):
     @property
     def strips(self) -> Tensor:
         """Mask of flat regions narrower than the neighborhood radius, shape ``(M,)``, bool."""
-        width = (_SQ_WIDTH * eigh3_of_few(self.covariance)[0][:, 1].clamp(min=0)).sqrt()
+        width = (_SQ_WIDTH * eigh3_lapack(self.covariance)[0][:, 1].clamp(min=0)).sqrt()
         return ~self.curved & (width <= self.radius)
 
     @property
@@ -102,7 +102,7 @@ class RegionPlanes(NamedTuple):
         is_noise = self.reach.isfinite() & ~self.bent & ~self.curved
         return torch.where(is_noise, self.thickness, 0.0)
 
-    def times_thickness(self, factor: float) -> Tensor:
+    def scale_thickness(self, factor: float) -> Tensor:
         """Return ``factor`` times the thickness ``(M,)``, NaN for curved regions."""
         return torch.where(self.curved, torch.nan, factor * self.thickness)
 
@@ -117,7 +117,7 @@ class RegionPlanes(NamedTuple):
         """Return the distance of each point ``(n, 3)`` to the plane of a region ``(n,)``."""
         offset = points.new_zeros(len(points), dtype=torch.float64)
         columns = [values.unbind(dim=1) for values in (points, self.center, self.normal)]
-        for chunk in chunks_of(len(points), ROWS_AT_ONCE):
+        for chunk in split_rows(len(points), ROWS_AT_ONCE):
             owner = regions[chunk]
             for position, center, normal in zip(*columns, strict=True):
                 offset[chunk] += (position[chunk].double() - center[owner]) * normal[owner]
@@ -156,9 +156,9 @@ def fit_planes(
 
 def _mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean normal of each region, up to sign, and its spread in degrees."""
-    columns = segments.take_about(normals, normals.new_zeros(len(segments.counts), 3).double())
+    columns = segments.gather_centered(normals, normals.new_zeros(len(segments.counts), 3).double())
     _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
-    eigenvalues, directions = eigh3_of_few(squares)
+    eigenvalues, directions = eigh3_lapack(squares)
     return directions[:, :, 2], (1 - eigenvalues[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()
 
 
@@ -171,12 +171,12 @@ def _fit_chunk(
     else:
         mean_normal, spread = shared.double(), torch.zeros_like(shared[:, 0])
     origin = segments.first(points).double()
-    local = segments.take_about(points, origin)
+    local = segments.gather_centered(points, origin)
     weights = torch.ones_like(local[0])
     resolution = coordinate_resolution(segments.first(points)).double()
     for _ in range(_NUM_FITS):
         mean, covariance = segments.moments(local, weights)
-        variances, axes = eigh3_of_few(covariance)
+        variances, axes = eigh3_lapack(covariance)
         normal = canonicalize_sign(_plane_normals(variances, axes, mean_normal))
         factors = (MAD_FACTOR, BISQUARE_CUT)
         weights, median, squares = segments.reweigh(local, mean, normal, resolution, factors)
@@ -200,7 +200,7 @@ def _fit_chunk(
     )
 
 
-def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> RegionPlanes:
+def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> RegionPlanes:
     """Fit planes to the regions of a cloud in canonical order, using a sample of each.
 
     The floor of the thickness is a fraction of the median neighborhood radius, as in the
@@ -237,7 +237,7 @@ def fit_regions(cloud: GrowingCloud, labels: Tensor, config: GrowingConfig) -> R
 class RegionFits:
     """Cached region planes, refitted only when the labels change."""
 
-    def __init__(self, cloud: GrowingCloud, config: GrowingConfig) -> None:
+    def __init__(self, cloud: GrowingInput, config: GrowingConfig) -> None:
         self._cloud, self._config = cloud, config
         self._cached: tuple[Tensor, RegionPlanes] | None = None
 

@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._checks import as_tensor, check_floating, check_shapes, of_clouds
+from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
 from torchrg._parallel import (
     CHUNK_SIZE,
     ROWS_AT_ONCE,
-    chunks_of,
     sequential_operations,
+    split_rows,
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
-from torchrg.regions.adjacency import NearestPoints
-from torchrg.regions.edges import GrowingCloud, has_late_promotion, mark_edges, neighborhood_radii
+from torchrg.regions.adjacency import KnnAdjacency
+from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
@@ -32,7 +32,7 @@ _ROOTS_AT_ONCE = 1024
 lists."""
 
 
-@of_clouds
+@eager_only
 @sequential_operations()
 def grow_regions(
     points: Tensor | NDArray[np.floating],
@@ -124,7 +124,7 @@ def grow_regions(
     if order is not None:
         cloud = _reordered(cloud, order)
     if needs_sampling(settings):
-        settings = settings.at_sampling(measure_sampling(cloud.points, cloud.neighbors))
+        settings = settings.with_sampling(measure_sampling(cloud.points, cloud.neighbors))
     labels = label_regions(cloud, grow(cloud, settings, chunk_size), settings, chunk_size)
     return labels if order is None else torch.empty_like(labels).index_copy_(0, order, labels)
 
@@ -136,7 +136,7 @@ def needs_sampling(config: GrowingConfig) -> bool:
 
 
 def label_regions(
-    cloud: GrowingCloud, roots: Tensor, config: GrowingConfig, chunk_size: int
+    cloud: GrowingInput, roots: Tensor, config: GrowingConfig, chunk_size: int
 ) -> Tensor:
     """Return region labels after the enabled split and refinement steps."""
     min_points = int(config.min_size)
@@ -145,23 +145,23 @@ def label_regions(
         min_points = min(min_points, max(min_points // 2, MIN_FITTED))
     # Facets of any size can be merged into a large surface.
     fitted = min_points if config.facet_tolerance is None else min(min_points, MIN_FITTED)
-    labels, fits = number_by_size(roots, fitted), RegionFits(cloud, config)
+    labels, fits = rank_by_size(roots, fitted), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
         mixed = find_mixed_regions(cloud, labels, fits.get(labels), config, chunk_size)
         if mixed is not None:
-            cores = number_by_size(grow(mixed.part, config, chunk_size), int(config.min_size))
+            cores = rank_by_size(grow(mixed.part, config, chunk_size), int(config.min_size))
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
-            labels = number_by_size(labels, fitted)
+            labels = rank_by_size(labels, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
-        contacts = NearestPoints(cloud.neighbors).contacts(labels)
+        contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
         tolerance = float(config.facet_tolerance)
         labels = merge_facets(labels, contacts, fits.get(labels), tolerance=tolerance)
-        labels = number_by_size(labels, min_points)
+        labels = rank_by_size(labels, min_points)
     if config.cut_bridges and bool((labels >= 0).any()):
         split = split_levels(cloud, labels, fits.get(labels), config)
-        labels = labels if split is labels else number_by_size(split, 1)
+        labels = labels if split is labels else rank_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
-        labels = number_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
+        labels = rank_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
     return labels
 
 
@@ -173,7 +173,7 @@ def checked_cloud(
     neighbors: Neighbors,
     valid: Tensor | None,
     residual_rms: Tensor | NDArray[np.floating] | None,
-) -> GrowingCloud:
+) -> GrowingInput:
     """Validate the arguments of :func:`grow_regions`, keeping the point order."""
     caller = "grow_regions"
     points = as_tensor(caller, "points", points).detach()
@@ -206,13 +206,13 @@ def checked_cloud(
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid
-    columns = by_column(points), by_column(normals)
-    return GrowingCloud(*columns, curvature, neighbors, valid, reach)
+    columns = to_column_major(points), to_column_major(normals)
+    return GrowingInput(*columns, curvature, neighbors, valid, reach)
 
 
 def _add_colors(
-    cloud: GrowingCloud, colors: Tensor | NDArray[np.generic] | None, max_distance: float
-) -> GrowingCloud:
+    cloud: GrowingInput, colors: Tensor | NDArray[np.generic] | None, max_distance: float
+) -> GrowingInput:
     """Return the cloud with colors and the maximum color difference."""
     if colors is None or max_distance < 0:
         raise ConfigError(
@@ -221,32 +221,32 @@ def _add_colors(
         )
     colors = as_tensor("grow_regions", "colors", colors)
     check_shapes("grow_regions", points=(cloud.points, "N 3"), colors=(colors, "N C"))
-    colors = by_column(colors.to(cloud.points.dtype))
+    colors = to_column_major(colors.to(cloud.points.dtype))
     return cloud._replace(colors=colors, max_color_distance=max_distance)
 
 
-def _reordered(cloud: GrowingCloud, order: Tensor) -> GrowingCloud:
+def _reordered(cloud: GrowingInput, order: Tensor) -> GrowingInput:
     """Return the cloud in the order of old rows ``(N,)``, with neighbor indices remapped."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
     neighbors = cloud.neighbors.at(order)
     return cloud._replace(
-        points=by_column(cloud.points[order]),
-        normals=by_column(cloud.normals[order]),
+        points=to_column_major(cloud.points[order]),
+        normals=to_column_major(cloud.normals[order]),
         curvature=cloud.curvature[order],
         neighbors=neighbors._replace(indices=neighbors.of(row_of)),
         valid=cloud.valid[order],
         reach=None if cloud.reach is None else cloud.reach[order],
-        colors=None if cloud.colors is None else by_column(cloud.colors[order]),
+        colors=None if cloud.colors is None else to_column_major(cloud.colors[order]),
     )
 
 
-def by_column(vectors: Tensor) -> Tensor:
+def to_column_major(vectors: Tensor) -> Tensor:
     """Return vectors ``(N, C)`` in column-major layout."""
     return vectors.T.contiguous().T
 
 
-def number_by_size(regions: Tensor, min_size: int) -> Tensor:
+def rank_by_size(regions: Tensor, min_size: int) -> Tensor:
     """Number regions by descending size, ties by first point.
 
     ``regions`` ``(N,)`` holds one integer below N per region, -1 if unassigned. Regions smaller
@@ -269,14 +269,14 @@ def number_by_size(regions: Tensor, min_size: int) -> Tensor:
     return torch.from_numpy(np.repeat(numbers[run_labels], lengths)).to(regions.device)
 
 
-def number_by_count(labels: Tensor) -> Tensor:
+def rank_by_count(labels: Tensor) -> Tensor:
     """Return new region numbers by descending point count, ties in the old order.
 
     ``labels`` ``(N,)`` are per point, -1 if unlabeled. The last of the numbers ``(M + 1,)`` belongs
     to -1, so that labels can index them.
 
     Example:
-        >>> number_by_count(torch.tensor([0, 1, 1, -1])).tolist()
+        >>> rank_by_count(torch.tensor([0, 1, 1, -1])).tolist()
         [1, 0, -1]
     """
     counts = torch.bincount(labels + 1, minlength=1)[1:]
@@ -284,7 +284,7 @@ def number_by_count(labels: Tensor) -> Tensor:
     return torch.cat([numbers, numbers.new_tensor([UNLABELED])])
 
 
-def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
+def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
     """Return the root of each point's region ``(N,)``, i.e. its first point, or -1.
 
     Invalid points have none, nor do some points of regions below ``min_size``.
@@ -306,7 +306,7 @@ def grow(cloud: GrowingCloud, config: GrowingConfig, chunk_size: int) -> Tensor:
             kernels.call("grow_regions", *tables, batch, late, roots, queue)
             scratch.release()
     else:
-        roots = grow_first_in_first_out(*tables, order, late=late)
+        roots = grow_fifo(*tables, order, late=late)
     return roots.to(cloud.points.device)
 
 
@@ -317,7 +317,7 @@ def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
     return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
 
 
-def grow_first_in_first_out(
+def grow_fifo(
     neighbors: Tensor,
     joins: Tensor,
     makes_seed: Tensor | None,
@@ -379,6 +379,6 @@ def _unpack(
 
 def _unassigned(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
     """Yield points unassigned when their chunk starts; a full list takes 36 bytes each."""
-    for rows in chunks_of(len(order), ROWS_AT_ONCE):
+    for rows in split_rows(len(order), ROWS_AT_ONCE):
         chunk = order[rows]
         yield from chunk[free[chunk]].tolist()

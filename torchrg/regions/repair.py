@@ -7,17 +7,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_chunks, places_of
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, eigh3_of_few, sq_chords, unsigned_angle_deg
+from torchrg.linalg import deg_to_sq_chord, eigh3_lapack, sq_chords, unsigned_angle_deg
 from torchrg.linalg.moments import Segments
 from torchrg.regions.adjacency import (
     MIN_CONTACTS,
     PARALLEL_DEG,
-    NearestPoints,
-    find_contacts,
+    KnnAdjacency,
+    find_region_pairs,
 )
-from torchrg.regions.edges import GrowingCloud
+from torchrg.regions.edges import GrowingInput
 from torchrg.regions.fit import MIN_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -65,7 +65,7 @@ class Adjacency(Protocol):
 
 
 def refine_regions(
-    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, fits: RegionFits | None = None
+    cloud: GrowingInput, labels: Tensor, config: GrowingConfig, fits: RegionFits | None = None
 ) -> Tensor:
     """Apply the enabled refinement steps to a cloud in canonical order.
 
@@ -74,7 +74,7 @@ def refine_regions(
     """
     if not bool((labels >= 0).any()):
         return labels
-    fits, adjacency = fits or RegionFits(cloud, config), NearestPoints(cloud.neighbors)
+    fits, adjacency = fits or RegionFits(cloud, config), KnnAdjacency(cloud.neighbors)
     if config.max_plane_residual is not None:
         planes = fits.get(labels)
         limit, region = config.max_plane_residual * planes.thickness, labels.clamp(min=0)
@@ -82,12 +82,12 @@ def refine_regions(
         labels = torch.where(far, UNLABELED, labels)
     if config.absorb:
         planes = fits.get(labels)
-        labels = absorb_points(
+        labels = assign_unlabeled(
             cloud.points,
             _remove_inconsistent(cloud, labels, planes.normal, config),
             adjacency,
             planes,
-            planes.times_thickness(config.absorb_reach),
+            planes.scale_thickness(config.absorb_reach),
             valid=cloud.valid,
             normals=cloud.normals,
             # Facet normals say little about the surface; the distance decides.
@@ -103,20 +103,20 @@ def refine_regions(
         planes = fits.get(labels)
         # The plane of a bent region does not show where the region ends.
         vague = planes.bent | (planes.num_points < MIN_FITTED)
-        reach = torch.where(vague, torch.nan, planes.times_thickness(config.absorb_reach))
+        reach = torch.where(vague, torch.nan, planes.scale_thickness(config.absorb_reach))
         labels = refine_borders(cloud, labels, planes, reach)
         labels = assign_levels(cloud, labels, planes)
         if config.facet_tolerance is not None:
             # A gap narrower than a neighborhood may divide a faceted surface.
             near = cloud.neighbors if config.faceted is True else adjacency.neighbors
             tolerance = float(config.facet_tolerance)
-            contacts = find_contacts(labels, near)
+            contacts = find_region_pairs(labels, near)
             labels = merge_facets(labels, contacts, planes, tolerance=tolerance)
     return labels
 
 
 def _remove_inconsistent(
-    cloud: GrowingCloud, labels: Tensor, normal: Tensor, config: GrowingConfig
+    cloud: GrowingInput, labels: Tensor, normal: Tensor, config: GrowingConfig
 ) -> Tensor:
     """Remove small regions with inconsistent normals; the labels may then have gaps."""
     small = torch.bincount(labels + 1, minlength=1)[1:] < int(config.min_size)
@@ -145,7 +145,7 @@ def remap_labels(labels: Tensor, mapping: Tensor) -> Tensor:
     return table[labels]
 
 
-def absorb_points(
+def assign_unlabeled(
     points: Tensor,
     labels: Tensor,
     adjacency: Adjacency,
@@ -198,7 +198,7 @@ def _lowest(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pairs_to_merge(
-    labels: Tensor, adjacency: NearestPoints, planes: RegionPlanes, neighbors: Neighbors
+    labels: Tensor, adjacency: KnnAdjacency, planes: RegionPlanes, neighbors: Neighbors
 ) -> tuple[Tensor, Tensor]:
     """Return adjacent pairs of regions, possibly twice; between strips all K neighbors count.
 
@@ -208,7 +208,7 @@ def _pairs_to_merge(
     strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
     parts = (
         adjacency.contacts(labels),
-        find_contacts(torch.where(strips, labels, UNLABELED), neighbors),
+        find_region_pairs(torch.where(strips, labels, UNLABELED), neighbors),
     )
     pairs, counts = (torch.cat(values) for values in zip(*parts, strict=True))
     return pairs, counts
@@ -230,7 +230,7 @@ def merge_coplanar(
     thinner than the surface, or curved. Other curved regions are not merged.
 
     ``contacts`` are adjacent pairs ``(E, 2)`` and their edge counts, as returned by
-    :meth:`torchrg.regions.adjacency.NearestPoints.contacts`. A merged region takes the smallest
+    :meth:`torchrg.regions.adjacency.KnnAdjacency.contacts`. A merged region takes the smallest
     label of its parts.
     """
     pairs, num_contacts = contacts
@@ -284,7 +284,7 @@ class _Moments(NamedTuple):
 def _region_moments(planes: RegionPlanes) -> _Moments:
     normal = planes.normal
     variance = (normal[:, None] @ planes.covariance @ normal[:, :, None])[:, 0, 0]
-    values, axes = eigh3_of_few(planes.covariance)
+    values, axes = eigh3_lapack(planes.covariance)
     return _Moments(
         planes.num_points.double(),
         planes.center - planes.center[:1],
@@ -374,7 +374,7 @@ def _combined(a: _Moments, b: _Moments) -> _Moments:
         covariance = covariance + fraction[:, :, None] * spread
     noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
     scale = (fraction_a[:, 0] * a.scale.square() + fraction_b[:, 0] * b.scale.square()).sqrt()
-    values, axes = eigh3_of_few(covariance)
+    values, axes = eigh3_lapack(covariance)
     return _Moments(weight, mean, covariance, scale, noise, values[:, 0], axes[:, :, 0])
 
 
@@ -402,7 +402,7 @@ def _are_tilted(a: _Moments, b: _Moments, both: _Moments, max_tilt: float) -> Te
 
 
 def refine_borders(
-    cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
+    cloud: GrowingInput, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
     """Reassign boundary points to the region that explains them best.
 
@@ -418,7 +418,7 @@ def refine_borders(
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
     which are left unchanged.
     """
-    adjacency = NearestPoints(cloud.neighbors)
+    adjacency = KnnAdjacency(cloud.neighbors)
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
     labels = labels.clone()
     rows = _boundary_points(labels, adjacency)
@@ -442,7 +442,7 @@ def refine_borders(
     return labels
 
 
-def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> Tensor:
+def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> Tensor:
     """Reassign boundary points of parallel regions to the nearer plane.
 
     The planes must be 1.5 thicknesses apart at the point, so that parts of one surface are
@@ -450,7 +450,7 @@ def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> 
     both regions among its 8 nearest. A single residual is noise. Changed points and their neighbors
     are revisited in the next pass.
     """
-    adjacency = NearestPoints(cloud.neighbors)
+    adjacency = KnnAdjacency(cloud.neighbors)
     flat = ~planes.curved & (planes.num_points >= MIN_FITTED)
     flat = torch.cat([flat, flat.new_zeros(1)])
     labels = labels.clone()
@@ -487,20 +487,20 @@ def assign_levels(cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes) -> 
     return labels
 
 
-def _boundary_points(labels: Tensor, adjacency: NearestPoints) -> Tensor:
+def _boundary_points(labels: Tensor, adjacency: KnnAdjacency) -> Tensor:
     """Return the boundary points: points with a nearest neighbor in another region."""
     # int32 indexing is three times faster.
     narrow = labels.to(torch.int32)
     rows_of_chunks = []
-    for chunk in chunks_of(len(labels), ROWS_AT_ONCE):
+    for chunk in split_rows(len(labels), ROWS_AT_ONCE):
         near = Neighbors(adjacency.neighbor_rows(chunk)).of(narrow)
         is_adjacent = (near != narrow[chunk, None]) & (near >= 0)
-        rows_of_chunks.append(chunk.start + places_of(is_adjacent.any(dim=1)))
+        rows_of_chunks.append(chunk.start + nonzero_rows(is_adjacent.any(dim=1)))
     return torch.cat(rows_of_chunks)
 
 
 def _choose_regions(
-    cloud: GrowingCloud,
+    cloud: GrowingInput,
     labels: Tensor,
     planes: RegionPlanes,
     reach: Tensor,
@@ -539,7 +539,7 @@ def _choose_regions(
 
 
 def _overshoot(
-    cloud: GrowingCloud,
+    cloud: GrowingInput,
     labels: Tensor,
     planes: RegionPlanes,
     rows: Tensor,

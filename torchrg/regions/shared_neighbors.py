@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import chunks_of, map_tasks
+from torchrg._parallel import map_tasks, split_rows
 from torchrg.structures import Neighbors
 
 _BLOCK_SIZE = 64
@@ -71,7 +71,7 @@ class SharedNeighbors:
                 shared = self._count(first, first + len(result[block]))
                 result[block] &= shared >= self._min_shared
 
-        map_tasks(test, chunks_of(len(result), _BLOCK_SIZE), candidates.device)
+        map_tasks(test, split_rows(len(result), _BLOCK_SIZE), candidates.device)
         return result
 
     def _count(self, start: int, stop: int) -> Tensor:

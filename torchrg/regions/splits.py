@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, chunks_of, map_chunks, places_of
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, sq_chords, unsigned_angle_deg
 from torchrg.linalg.moments import Segments, sum_neighbors
-from torchrg.regions.adjacency import PARALLEL_DEG, NearestPoints
-from torchrg.regions.edges import GrowingCloud, accept_edges, within_angle
+from torchrg.regions.adjacency import PARALLEL_DEG, KnnAdjacency
+from torchrg.regions.edges import GrowingInput, accept_edges, within_angle
 from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
 from torchrg.regions.repair import pairwise_misfit, remap_labels
 from torchrg.robust.scale import MAD_FACTOR
@@ -113,7 +113,7 @@ class MixedRegions(NamedTuple):
     """
 
     rows: Tensor
-    part: GrowingCloud
+    part: GrowingInput
     near: Tensor
     aligned: Tensor
     on_plane: Tensor
@@ -129,7 +129,7 @@ class _InnerEdges(NamedTuple):
 
 
 def find_mixed_regions(
-    cloud: GrowingCloud,
+    cloud: GrowingInput,
     labels: Tensor,
     planes: RegionPlanes,
     config: GrowingConfig,
@@ -174,7 +174,7 @@ def find_mixed_regions(
 
 
 def cut_bridges(
-    cloud: GrowingCloud,
+    cloud: GrowingInput,
     labels: Tensor,
     mixed: MixedRegions,
     grown: Tensor,
@@ -222,7 +222,7 @@ def _add_plane_cores(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tupl
     return torch.cat([is_core.cumsum(0) - 1, cores.new_tensor([UNLABELED])])[cores], on_plane
 
 
-def _join_curved(cloud: GrowingCloud, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
+def _join_curved(cloud: GrowingInput, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
     """Merge the cores ``(N,)`` of each curved region, except its flat surfaces."""
     flat, owner = ~_fit_cores(cloud, cores).curved, _core_regions(labels, cores)
     num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
@@ -246,13 +246,13 @@ def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
     return labels.new_zeros(len(indices)).index_copy_(0, rows, labels[points])
 
 
-def _fit_cores(cloud: GrowingCloud, cores: Tensor) -> RegionPlanes:
+def _fit_cores(cloud: GrowingInput, cores: Tensor) -> RegionPlanes:
     """Fit planes to cores."""
     return fit_planes(Segments(cores, most=MAX_FITTED), cloud.points, cloud.normals)
 
 
 def _are_smooth(
-    cloud: GrowingCloud, regions: Tensor, max_angle_deg: float, chunk_size: int
+    cloud: GrowingInput, regions: Tensor, max_angle_deg: float, chunk_size: int
 ) -> Tensor:
     """Return a mask of points where the surface is as smooth as is typical for its region."""
     fractions = torch.zeros_like(cloud.curvature, dtype=torch.float64)
@@ -260,7 +260,7 @@ def _are_smooth(
         torch.arange(len(fractions), device=fractions.device),
         deg_to_sq_chord(max_angle_deg),
     )
-    for chunk in chunks_of(len(fractions), chunk_size):
+    for chunk in split_rows(len(fractions), chunk_size):
         near, counted = cloud.neighbors.at(chunk), cloud.neighbors.counted(chunk)
         smooth = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
         fractions[chunk] = smooth.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
@@ -270,7 +270,7 @@ def _are_smooth(
     return fractions >= _MIN_SMOOTH_RATIO * typical[regions]
 
 
-def _subset(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
+def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor) -> GrowingInput:
     """Return a subset of points as a cloud, with neighbors limited to the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
@@ -291,18 +291,18 @@ def _subset(cloud: GrowingCloud, labels: Tensor, rows: Tensor) -> GrowingCloud:
 
 
 def _find_edges(
-    cloud: GrowingCloud, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
+    cloud: GrowingInput, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _InnerEdges:
     """Return the edges of the given points."""
     near = cloud.neighbors.at(rows)
     inside = (near.of(labels) == labels[rows, None]) & near.counted()
     passed = torch.zeros_like(inside)
-    for chunk in chunks_of(len(rows), chunk_size):
+    for chunk in split_rows(len(rows), chunk_size):
         passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0]
     return _InnerEdges(rows, near.indices.long(), inside, passed & inside)
 
 
-def _join_cores(cloud: GrowingCloud, cores: Tensor, edges: _InnerEdges) -> Tensor:
+def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tensor:
     """Return the cores ``(N,)`` with cores of one surface merged."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -345,7 +345,7 @@ def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
 
 
 def split_levels(
-    cloud: GrowingCloud, labels: Tensor, planes: RegionPlanes, config: GrowingConfig
+    cloud: GrowingInput, labels: Tensor, planes: RegionPlanes, config: GrowingConfig
 ) -> Tensor:
     """Split off second, parallel levels of points outside the noise of a region.
 
@@ -383,18 +383,18 @@ def split_levels(
             break
         labels = torch.where(level >= 0, level + int(labels.max()) + 1, labels)
         # Only split regions are searched again.
-        rows = places_of(torch.isin(region, owner))
+        rows = nonzero_rows(torch.isin(region, owner))
         searched = torch.full_like(labels, UNLABELED)
         searched[rows] = torch.unique(labels[rows], return_inverse=True)[1]
     return labels
 
 
 def _find_levels(
-    cloud: GrowingCloud, region: Tensor, planes: RegionPlanes, config: GrowingConfig
+    cloud: GrowingInput, region: Tensor, planes: RegionPlanes, config: GrowingConfig
 ) -> tuple[Tensor, Tensor]:
     """Return the second level of each point ``(N,)``, -1 for none, and the region of each level."""
     residual, average, noise = _measure_residuals(cloud, region, planes)
-    adjacency = NearestPoints(cloud.neighbors)
+    adjacency = KnnAdjacency(cloud.neighbors)
     limit = _SEED_NOISE_FACTOR * torch.cat([noise, noise.new_tensor([torch.inf])])
     level = _components(average.abs() > limit[region], 2 * region + (average > 0), adjacency)
     step = _median_steps(level, residual)
@@ -417,7 +417,7 @@ def _compact_indices(kept: Tensor) -> Tensor:
 
 
 def _measure_residuals(
-    cloud: GrowingCloud, region: Tensor, planes: RegionPlanes
+    cloud: GrowingInput, region: Tensor, planes: RegionPlanes
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return residuals from the main level, their local average, and their standard deviation.
 
@@ -460,12 +460,12 @@ def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
     return (middle + total / segments.sum(near.double()).clamp(min=1)).float()
 
 
-def _components(chosen: Tensor, groups: Tensor, adjacency: NearestPoints) -> Tensor:
+def _components(chosen: Tensor, groups: Tensor, adjacency: KnnAdjacency) -> Tensor:
     """Label the connected components of chosen points within each group, -1 for other points."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    rows = places_of(chosen & (groups >= 0))
+    rows = nonzero_rows(chosen & (groups >= 0))
     index = torch.full_like(groups, UNLABELED).index_copy_(
         0, rows, torch.arange(len(rows), device=rows.device)
     )
@@ -486,10 +486,10 @@ def _median_steps(level: Tensor, residual: Tensor) -> Tensor:
 
 
 def _have_valleys(
-    level: Tensor, step: Tensor, average: Tensor, region: Tensor, adjacency: NearestPoints
+    level: Tensor, step: Tensor, average: Tensor, region: Tensor, adjacency: KnnAdjacency
 ) -> Tensor:
     """Return a mask of levels with fewer points halfway to them than on them, in rings around."""
-    ring = places_of(level >= 0)
+    ring = nonzero_rows(level >= 0)
     owner, side = level.clone(), Segments(level).first(average).sign()
     for _ in range(_NUM_RINGS):
         near = adjacency.neighbor_rows(ring).long()
@@ -500,7 +500,7 @@ def _have_valleys(
         first = torch.full_like(owner, len(step)).scatter_reduce_(0, target, source, "amin")
         ring = torch.unique(target)
         owner[ring] = first[ring]
-    rows = places_of(owner >= 0)
+    rows = nonzero_rows(owner >= 0)
     owner = owner[rows]
     height = average[rows] * side[owner] / step[owner]
     halfway, top = (

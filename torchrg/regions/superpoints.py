@@ -12,14 +12,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrg import kernels
-from torchrg._parallel import ROWS_AT_ONCE, chunks_of, map_chunks, places_of
+from torchrg._parallel import ROWS_AT_ONCE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import SuperpointsConfig
 from torchrg.linalg import sq_chords
-from torchrg.linalg.eigen import eigh3_of_few
+from torchrg.linalg.eigen import eigh3_lapack
 from torchrg.linalg.moments import Segments, reduce_runs
 from torchrg.neighbors import DistinctPoints, distinct_points, finite_rows, search_knn
-from torchrg.regions.adjacency import NUM_CONTACTS, NearestPoints
-from torchrg.regions.growth import number_by_count
+from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
+from torchrg.regions.growth import rank_by_count
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
 _NUM_NEIGHBORS = 1 + NUM_CONTACTS
@@ -113,7 +113,7 @@ def partition_points(
         [7] J. Walczak et al. Normal grouping density separation (NGDS): a novel object-driven
         indoor point cloud partition method. ICCS, 2020.
     """
-    distinct, unique_colors = merge_copies(points, normals, labels, colors)
+    distinct, unique_colors = merge_duplicates(points, normals, labels, colors)
     edges = None
     if faces is not None:
         edges = _mesh_edges(faces.cpu(), distinct.inverse.cpu())
@@ -129,11 +129,11 @@ def partition_points(
     levels = []
     for level in partitions:
         of_points = distinct.restore(level.to(points.device), fill=UNLABELED)
-        levels.append(number_by_count(of_points)[of_points])
-    return Superpoints(levels[0], main_planes(levels[0], labels), tuple(levels[1:]))
+        levels.append(rank_by_count(of_points)[of_points])
+    return Superpoints(levels[0], majority_planes(levels[0], labels), tuple(levels[1:]))
 
 
-def merge_copies(
+def merge_duplicates(
     points: Tensor, normals: Tensor, labels: Tensor, colors: Tensor | None
 ) -> tuple[DistinctPoints, Tensor | None]:
     """Return the distinct points of a cloud, and their colors.
@@ -178,7 +178,7 @@ def _partition_distinct(
     normals = _blend_with_planes(normals, labels)
     if colors is not None:
         colors = math.sqrt(_COLOR_WEIGHT) * colors
-    nearest = NearestPoints(neighbors).neighbors.indices
+    nearest = KnnAdjacency(neighbors).neighbors.indices
     nearest = nearest if edges is None else _edge_lists(edges, len(positions))
     regions = torch.arange(len(positions))
     if config.planes == "whole":
@@ -212,7 +212,7 @@ def _blend_with_planes(normals: Tensor, labels: Tensor) -> Tensor:
     inputs = normals[rows].double()
     segments, columns = Segments(plane), inputs.unbind(dim=1)
     products = [segments.mean(segments.take(a * b)) for a in columns for b in columns]
-    values, axes = eigh3_of_few(torch.stack(products, dim=1).view(-1, 3, 3))
+    values, axes = eigh3_lapack(torch.stack(products, dim=1).view(-1, 3, 3))
     flat = values[:, 2] >= math.cos(math.radians(_MAX_SPREAD_DEG)) ** 2
     shared = torch.where(flat[:, None], axes[:, :, 2], 0.0)[plane]
     shared = torch.where((inputs * shared).sum(dim=1, keepdim=True) < 0, -shared, shared)
@@ -403,10 +403,10 @@ def _aggregate(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor
     width = int(torch.maximum(a.max(), b.max())) + 1
     if kernels.serve():
         buffers = torch.empty(2, width + 1, dtype=torch.int64)
-        rows = kernels.call("gather_borders", a, b, contacts, difference, *buffers)
+        rows = kernels.call("aggregate_boundaries", a, b, contacts, difference, *buffers)
         return _Boundaries(*(column[: int(rows[-1])] for column in rows[1:-1]))
     contacts = torch.ones_like(difference) if contacts is None else contacts
-    different = places_of(a != b)
+    different = nonzero_rows(a != b)
     a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
     if len(a) == 0:
         return _Boundaries(a, b, contacts, difference)
@@ -501,7 +501,7 @@ def _merge_costs(regions: _Regions, boundaries: _Boundaries, bound: float) -> Te
         limits = _MIN_DIFFERENCE, bound
         return kernels.call("merging_costs", regions.size, means, *boxes, *boundaries, *limits)[0]
     cost = torch.empty_like(boundaries.contacts)
-    for rows in chunks_of(len(cost), ROWS_AT_ONCE):
+    for rows in split_rows(len(cost), ROWS_AT_ONCE):
         a, b = boundaries.first[rows], boundaries.second[rows]
         difference = boundaries.difference[rows] / boundaries.contacts[rows] + _MIN_DIFFERENCE
         for step in (means[a] - means[b]).unbind(dim=1):
@@ -548,7 +548,7 @@ def _cheapest(boundaries: _Boundaries, cost: Tensor, num_regions: int) -> tuple[
     min_cost = cost.new_full((num_regions,), math.inf)
     if kernels.serve():
         (best,) = kernels.call(
-            "cheapest_borders", boundaries.first, boundaries.second, cost, min_cost
+            "cheapest_boundaries", boundaries.first, boundaries.second, cost, min_cost
         )
         return min_cost, best
     ends, costs = torch.cat([boundaries.first, boundaries.second]).long(), cost.repeat(2)
@@ -577,7 +577,7 @@ def _merge(
     return _merged_regions(regions, new), merged, new
 
 
-def main_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
+def majority_planes(superpoints: Tensor, labels: Tensor) -> Tensor:
     """Return the plane ID of more than half of each superpoint's points, or -1."""
     is_assigned = superpoints >= 0
     count = int(superpoints.max()) + 1 if bool(is_assigned.any()) else 0

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._parallel import map_tasks, places_of
+from torchrg._parallel import map_tasks, nonzero_rows
 from torchrg.config import Auto
 from torchrg.errors import ShapeError
-from torchrg.linalg import eigh3_of_few, unit_direction
+from torchrg.linalg import eigh3_lapack, unit_direction
 from torchrg.linalg.moments import Segments
-from torchrg.neighbors import check_neighbors, distinct_rows, mark_first
+from torchrg.neighbors import check_neighbors, distinct_rows, mark_distinct
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.extents import covered_areas, fit_rectangles
@@ -98,9 +98,9 @@ def summarize_planes(
 def _distinct_rows(points: Tensor, labels: Tensor, *, canonical: bool) -> Rows:
     """Return the rows of the distinct points of each region, in canonical order."""
     if canonical:
-        is_first = mark_first(*points.unbind(dim=1), labels)
-        return slice(None) if bool(is_first.all()) else places_of(is_first)
-    members = places_of(labels >= 0)
+        is_first = mark_distinct(*points.unbind(dim=1), labels)
+        return slice(None) if bool(is_first.all()) else nonzero_rows(is_first)
+    members = nonzero_rows(labels >= 0)
     num_nonfinite = int(torch.count_nonzero(~points[members].isfinite().all(dim=1)))
     if num_nonfinite:
         raise ShapeError(
@@ -166,7 +166,7 @@ def _measure(
 
 def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
     """Return two unit directions that span each plane, the first along the region."""
-    first = _reject(eigh3_of_few(fit.covariance)[1][:, :, 2], fit.normal)
+    first = _reject(eigh3_lapack(fit.covariance)[1][:, :, 2], fit.normal)
     # A region at a single position has no direction: any direction in the plane will do.
     min_axis = fit.normal.abs().argmin(dim=1)
     other = _reject(torch.eye(3, dtype=first.dtype, device=first.device)[min_axis], fit.normal)

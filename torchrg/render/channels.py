@@ -101,7 +101,7 @@ def make_channels(
         legend = [(colors[0].tolist(), "smooth"), (colors[1].tolist(), "sharp")]
         yield Channel("sharp", fields["sharp"].numpy().astype(np.uint8), colors, legend)
     if "labels" in fields and "labels" in truth:
-        values = outcomes_of(fields["labels"], truth["labels"]).numpy().astype(np.uint8)
+        values = point_outcomes(fields["labels"], truth["labels"]).numpy().astype(np.uint8)
         meanings = [(list(color), meaning) for color, meaning in OUTCOMES.values()]
         colors = np.array([color for color, _ in meanings], dtype=np.uint8)
         yield Channel("error", values, colors, meanings)
@@ -158,7 +158,7 @@ def _angle_channel(angles_deg: Tensor) -> Channel:
     return _scale_channel("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
 
 
-def outcomes_of(
+def point_outcomes(
     labels: Tensor | NDArray[np.integer], truth: Tensor | NDArray[np.integer]
 ) -> Tensor:
     """Return the outcome of each point as an index of :data:`OUTCOMES`.
@@ -176,10 +176,10 @@ def outcomes_of(
         ShapeError: If a shape or dtype is invalid.
 
     Example:
-        >>> outcomes_of(torch.tensor([0, 0, 0, 1, 2, -1]), torch.tensor([5, 5, 5, 5, 6, 6]))
+        >>> point_outcomes(torch.tensor([0, 0, 0, 1, 2, -1]), torch.tensor([5, 5, 5, 5, 6, 6]))
         tensor([0, 0, 0, 1, 0, 3])
     """
-    regions, faces = check_labels("outcomes_of", labels=labels, truth=truth)
+    regions, faces = check_labels("point_outcomes", labels=labels, truth=truth)
     table = contingency_table(regions, faces)
     pairs = match_regions(table)
     partner = torch.full_like(table.region_labels, UNLABELED - 1)

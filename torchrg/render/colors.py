@@ -12,7 +12,7 @@ from torchrg.metrics.contingency import check_labels, contingency_table, number_
 from torchrg.metrics.labels import match_regions
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.voxels import sample_voxels
-from torchrg.regions.adjacency import NUM_CONTACTS, NearestPoints
+from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
 
 
 def rgb_to_lab(colors: Tensor) -> Tensor:
@@ -351,4 +351,4 @@ def _adjacent_planes(points: Tensor, labels: Tensor, num_voxels: int) -> Tensor:
         return labels.new_zeros((0, 2))
     sample = sample_voxels(points, extent / num_voxels).rows
     neighbors = search_knn(points[sample], min(NUM_CONTACTS + 1, len(sample)))
-    return NearestPoints(neighbors).contacts(labels[sample])[0]
+    return KnnAdjacency(neighbors).contacts(labels[sample])[0]

@@ -92,7 +92,7 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
         nothing = torch.zeros(0, dtype=torch.uint8, device=centers.device)
         return Sides(centers, nothing, nothing, _heading(centers, nothing, up))
     if labels is None:
-        config = load_config("classic").at_angle(_ANGLE_DEG)
+        config = load_config("classic").with_angle(_ANGLE_DEG)
         # Otherwise a few voxels at a corner join two walls to a region that is no wall.
         config = replace(config, growing=replace(config.growing, cut_bridges=True))
         labels = segment_planes(centers, config).labels[surface.voxel_of]

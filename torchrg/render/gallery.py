@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torchrg.errors import FormatError
-from torchrg.io.files import atomic_path, check_place
+from torchrg.io.files import atomic_path, check_writable
 from torchrg.render.colors import color_planes
 from torchrg.render.page import check_library, load_template, make_page, write_page
 from torchrg.render.pictures import render_cloud, write_png
@@ -65,7 +65,7 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
         MissingDependencyError: If viewers cannot be created.
     """
     check_library()
-    check_place(folder / INDEX)
+    check_writable(folder / INDEX)
     for name in names:
         page = folder / f"{name}.html"
         if page.parent == folder and page.name.lower() == INDEX:
@@ -73,7 +73,7 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
                 f"{page}: the viewer of {name} would overwrite the index; rename the scan."
             )
         if page.parent.is_dir():
-            check_place(page)
+            check_writable(page)
 
 
 def write_entry(folder: Path, name: str, result: Result, *, words: str = "") -> Entry:

@@ -30,7 +30,7 @@ from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
 from torchrg.linalg import unit_direction
-from torchrg.neighbors.order import restore_rows
+from torchrg.neighbors.order import scatter_rows
 from torchrg.plane_table import encode_csv
 from torchrg.render.channels import MODES, encode_directions, make_channels
 from torchrg.render.colors import palette_of_planes
@@ -235,7 +235,7 @@ def _describe_cloud(
     palettes = _palettes(result, shown, reference)
     channels = list(make_channels(shown.fields, true_fields, palettes))
     planes = page_planes(result, shown, frame)
-    covered = restore_rows(shown.sides.of_points, shown.surface.rows, len(shown.rows))
+    covered = scatter_rows(shown.sides.of_points, shown.surface.rows, len(shown.rows))
     if planes:
         labels = shown.fields["labels"]
         sides = covered.new_zeros(len(planes)).index_put_(
@@ -248,7 +248,7 @@ def _describe_cloud(
     arrays: dict[str, NDArray[np.generic]] = {"positions": steps.numpy().astype(np.uint16)}
     arrays["covered"] = covered.numpy()
     radii = encode_radii(shown)
-    arrays["radii"] = restore_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
+    arrays["radii"] = scatter_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
     if planes:
         arrays["table"] = np.frombuffer(encode_csv(displayed_table(result, frame)), np.uint8)
     if "normals" in shown.fields:

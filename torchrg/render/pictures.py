@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.io.files import atomic_path, refusing
+from torchrg.io.files import atomic_path, wrap_errors
 from torchrg.linalg import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
@@ -339,7 +339,10 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic])
     from kornia_rs import io
 
     repair = "; rename it, image file names must be valid UTF-8"
-    with atomic_path(path) as temporary, refusing(f"{path}: ", UnicodeEncodeError, repair=repair):
+    with (
+        atomic_path(path) as temporary,
+        wrap_errors(f"{path}: ", UnicodeEncodeError, repair=repair),
+    ):
         if is_picture:
             io.write_image_png_u8(str(temporary), np.ascontiguousarray(values), "rgb")
         else:

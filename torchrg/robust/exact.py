@@ -8,7 +8,7 @@ from math import comb
 import torch
 from torch import Tensor
 
-from torchrg._parallel import chunks_of
+from torchrg._parallel import split_rows
 from torchrg.robust.lanes import covariance_entries, dot, eigenvectors, sum_squares, take_lanes
 from torchrg.robust.scale import sum_points
 
@@ -39,7 +39,7 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Ten
     """
     parts = [
         _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)
-        for lanes in chunks_of(len(tolerance), _LANES)
+        for lanes in split_rows(len(tolerance), _LANES)
     ]
     dimensions, members = zip(*parts, strict=True)
     return torch.cat(dimensions), torch.cat(members, dim=1)

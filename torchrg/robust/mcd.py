@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices
-from torchrg._parallel import chunks_of
+from torchrg._parallel import split_rows
 from torchrg.errors import ConfigError
 from torchrg.robust.lanes import (
     Ellipsoid,
@@ -367,7 +367,7 @@ def _first_occurrences(members: Tensor, indices: Tensor, shape: tuple[int, int])
         return torch.arange(len(indices), device=indices.device)
     digits = 2.0 ** (torch.arange(len(members), device=members.device) % _DIGITS)
     weighted = members * digits.to(members.dtype)[:, None]
-    parts = [sum_points(weighted[chunk]) for chunk in chunks_of(len(members), _DIGITS)]
+    parts = [sum_points(weighted[chunk]) for chunk in split_rows(len(members), _DIGITS)]
     numbers = members.new_zeros(len(parts), num_starts * num_lanes)
     numbers[:, indices] = torch.stack(parts)
     numbers = numbers.reshape(-1, num_starts, num_lanes)

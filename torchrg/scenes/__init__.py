@@ -7,7 +7,7 @@
 
 from torchrg.scenes.geometry import Array, Frame, unit
 from torchrg.scenes.parts import block, passage, room_walls
-from torchrg.scenes.rooms import RoomLayout, build_room, free_places, furnish, make_room
+from torchrg.scenes.rooms import RoomLayout, build_room, furnish, make_room, scanner_positions
 from torchrg.scenes.scene import Part, Scene, SceneModel, label_points, sample_scene
 from torchrg.scenes.surfaces import Flat, Solid, Surface, rectangle
 
@@ -23,7 +23,6 @@ __all__ = [
     "Surface",
     "block",
     "build_room",
-    "free_places",
     "furnish",
     "label_points",
     "make_room",
@@ -31,5 +30,6 @@ __all__ = [
     "rectangle",
     "room_walls",
     "sample_scene",
+    "scanner_positions",
     "unit",
 ]

@@ -166,7 +166,7 @@ def build_room(seed: int = 0, *, layout: RoomLayout | None = None) -> SceneModel
     rng = seeded_generator(seed, _ROOM)
     room = Frame.upright(np.zeros(3), layout.heading_deg)
     parts = furnish(layout, room, rng)
-    return SceneModel(parts, free_places(layout, room, parts, rng))
+    return SceneModel(parts, scanner_positions(layout, room, parts, rng))
 
 
 def furnish(
@@ -329,7 +329,7 @@ def _has_coplanar_face(part: Part, others: Sequence[Part], min_gap: float) -> bo
     return bool((parallel & near).any())
 
 
-def free_places(
+def scanner_positions(
     layout: RoomLayout, room: Frame, parts: Sequence[Part], rng: np.random.Generator
 ) -> Array:
     """Return scanner positions, spread along a room, shape ``(num_viewpoints, 3)``.

@@ -13,7 +13,7 @@ next transform, see :class:`torchrg.transforms.sample.NeighborSearch`.
 cameras applies kornia's augmentations to them.
 """
 
-from torchrg.neighbors import restore_points, sample_voxels
+from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
 from torchrg.transforms.planes import (
     AlignAxes,
@@ -37,7 +37,7 @@ __all__ = [
     "SampleVoxels",
     "SegmentDepth",
     "SegmentPlanes",
+    "expand_to_points",
     "fuse_depth",
-    "restore_points",
     "sample_voxels",
 ]

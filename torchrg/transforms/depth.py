@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_choices, of_clouds
+from torchrg._checks import as_tensor, check_choices, eager_only
 from torchrg.config import settings_of
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
 from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import restore_points, sample_voxels
+from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.normals import Orientation
 from torchrg.structures import UNLABELED
 from torchrg.transforms.rows import Entries, SampleDict, check_sample
@@ -94,7 +94,7 @@ class DepthToCloud(DepthTransform):
         ([[0.0, 0.0, 2.0], [0.0, 2.0, 2.0], [2.0, 2.0, 2.0]], [0, 2, 3])
     """
 
-    @of_clouds
+    @eager_only
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with the cloud."""
         depth, intrinsics, poses = self.read_images(sample)
@@ -175,7 +175,7 @@ class SegmentDepth(DepthTransform):
         """Return the configuration."""
         return f"{super().extra_repr()}, orient={self.orient!r}"
 
-    @of_clouds
+    @eager_only
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)
@@ -232,7 +232,7 @@ class FusedFrames(NamedTuple):
             raise ShapeError(
                 f"to_frames: expected values of {len(self.coord)} points, got {len(values)}."
             )
-        each = restore_points(values, self.inverse)
+        each = expand_to_points(values, self.inverse)
         images = [values.new_full((*seen.shape, *values.shape[1:]), fill) for seen in self.seen]
         parts = torch.split(each, [int(seen.sum()) for seen in self.seen])
         for image, seen, pixels in zip(images, self.seen, parts, strict=True):

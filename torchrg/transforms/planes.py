@@ -36,7 +36,7 @@ from torchrg.normals.orient import (
 )
 from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
-from torchrg.regions.growth import number_by_count
+from torchrg.regions.growth import rank_by_count
 from torchrg.structures import UNLABELED
 from torchrg.transforms.rows import Sample, cloud_rows
 from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
@@ -252,7 +252,7 @@ class GrowRegions(CloudTransform):
             canonical=True,
         )
         plane = distinct.restore(grown, fill=UNLABELED)
-        return {"plane": number_by_count(plane)[plane]}
+        return {"plane": rank_by_count(plane)[plane]}
 
     def extra_repr(self) -> str:
         """Return the configuration."""

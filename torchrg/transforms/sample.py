@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrg._checks import as_tensor, check_shapes, of_clouds
+from torchrg._checks import as_tensor, check_shapes, eager_only
 from torchrg.errors import ConfigError
 from torchrg.neighbors import sample_voxels, search_knn
 from torchrg.structures import UNLABELED, Neighbors
@@ -82,7 +82,7 @@ class SampleTransform(nn.Module):
         """Return the configuration."""
         return "" if self.config is None else repr(self.config)
 
-    @of_clouds
+    @eager_only
     def forward(self, sample: Sample) -> Sample:
         """Return a new sample; the input is not changed."""
         check_sample(type(self).__name__, sample, "{'coord': points}")
@@ -314,7 +314,7 @@ class SampleVoxels(SampleTransform):
     """Keep one point per voxel, and store the voxel of every point.
 
     Reads ``coord`` ``(N, 3)``; reduces every per-point entry to ``(V, ...)``, and adds ``inverse``
-    ``(N,)``, int64, negative for none: ``restore_points`` copies voxel labels to all points. It
+    ``(N,)``, int64, negative for none: ``expand_to_points`` copies voxel labels to all points. It
     contains rows of the complete sample, also in a batch; in a PyG ``Data`` it is
     ``inverse_index``, which PyG offsets when batching. An existing ``inverse`` is composed with
     it. Voxels never contain points of several clouds of a batch. See ``sample_voxels``.

@@ -11,7 +11,7 @@ from torchrg._parallel import ROWS_IN_CACHE
 from torchrg.config import NormalsConfig
 from torchrg.neighbors import measure_sampling, search_knn
 from torchrg.normals.consensus import constants
-from torchrg.normals.consensus.noise import Survey, regional_noise, survey_noise
+from torchrg.normals.consensus.noise import NoiseEstimate, estimate_noise, regional_noise
 from torchrg.normals.consensus.smoothing import (
     choose_planes,
     describe_inliers,
@@ -32,7 +32,7 @@ def estimate_consensus(
     Every point gets the simplest surface that explains its neighbors, given their noise:
 
     1. *Noise.* PCA at every point, and the noise ``s`` from small neighborhoods; see
-       :func:`torchrg.normals.consensus.noise.survey_noise`. No sensor model is assumed.
+       :func:`torchrg.normals.consensus.noise.estimate_noise`. No sensor model is assumed.
     2. *Flat.* If the deviation from the plane is at most 1.05 s, the PCA normal is kept.
     3. *Curved.* Other points get a paraboloid. Its normal is kept if its deviation ``J`` is at most
        1.2 s, or at most 0.15 of the deviation of the plane; a symmetric edge has 0.27.
@@ -67,16 +67,16 @@ def estimate_consensus(
     fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
     if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
         return fit._replace(sharp=torch.zeros_like(fit.valid))
-    survey = survey_noise(points, neighbors, fit, chunk_size=size)
+    survey = estimate_noise(points, neighbors, fit, chunk_size=size)
     if config.adaptive_k is not None:
         count = adapted_count(_noise_fraction(survey), neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
             fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
-            survey = survey_noise(points, neighbors, fit, chunk_size=size)
+            survey = estimate_noise(points, neighbors, fit, chunk_size=size)
     noise = survey.noise
     if config.noise_scope == "auto":
-        config = config.at_sampling(measure_sampling(points, neighbors))
+        config = config.with_sampling(measure_sampling(points, neighbors))
     if config.noise_scope == "regional":
         fraction = constants.REGIONAL_FRACTION
         noise = torch.minimum(noise, fraction * regional_noise(noise, neighbors))
@@ -96,7 +96,7 @@ def estimate_consensus(
     return NormalFit(planes.normals, curvature, fit.valid, residual_rms, sharp)
 
 
-def _noise_fraction(survey: Survey) -> Tensor:
+def _noise_fraction(survey: NoiseEstimate) -> Tensor:
     """Return the ratio of noise to neighborhood radius, shape ``(N,)``; NaN if unknown."""
     is_known = survey.noise.isfinite() & (survey.radius > 0)
     return torch.where(is_known, survey.noise / survey.radius, torch.nan)

@@ -10,7 +10,7 @@ MIN_NEIGHBORS = 12
 points keep the PCA normal."""
 
 NOISE_QUANTILE = 0.35
-"""Share. The noise is this quantile of the deviations at the neighbors. It is low because most
+"""Fraction. The noise is this quantile of the deviations at the neighbors. It is low because most
 neighborhoods near an edge contain the edge, and deviate by their shape."""
 NOISE_COUNTS = (8, 16)
 """Neighbors. Sizes of the small neighborhoods that measure deviations: at edges and corners enough
@@ -25,15 +25,15 @@ NOISE_LIMITS = (0.3425, 0.398)
 """Radii. On planes, as the true noise grows, the noise from each neighborhood size tends to this
 fraction of the radius. Larger noise cannot be measured."""
 COMMON_QUANTILE = 0.15
-"""Share. Quantile of the neighbors' noise that is their common noise. It is used at corners, where
-no neighborhood is flat."""
+"""Fraction. Quantile of the neighbors' noise that is their common noise, for corners, where no
+neighborhood is flat."""
 MAX_ABOVE_COMMON = 3.0
 """Factor. Noise that exceeds the common noise by this factor is treated as shape."""
 REGIONAL_STEPS = 4
 """Steps. Neighbor-to-neighbor steps that define the region of the regional noise, if requested:
 fewer merge small faces of fused meshes with the one behind them."""
 REGIONAL_QUANTILE = 0.1
-"""Share. Quantile over the neighbors in each of these steps. Higher quantiles do not leave the
+"""Fraction. Quantile over the neighbors in each of these steps. Higher quantiles do not leave the
 slope of a step, because a neighborhood at its end lies mostly on it."""
 REGIONAL_FRACTION = 0.8
 """Ratio. Fraction of the regional noise that is used. Both faces at a mesh step deviate from one
@@ -71,11 +71,11 @@ drawn more often."""
 VOTE_REACH = 2.0
 """s. A neighbor with a residual larger than this votes against a plane."""
 VOTE_FALLOFF = 0.9
-"""Share. Reduction of the vote of the farthest neighbor relative to the nearest one."""
+"""Fraction. Reduction of the vote of the farthest neighbor relative to the nearest one."""
 FIT_REACH = 3.5
 """s. Reach of the bisquare weights of the last fit, which includes nearly all points of a face."""
 FIT_FALLOFF = 0.5
-"""Share. Reduction of the weight of the farthest neighbor, in the last fit and in smoothing."""
+"""Fraction. Reduction of the weight of the farthest neighbor, in the last fit and in smoothing."""
 NUM_REFITS = 2
 """Fits. Number of fits with each of the two reaches, for the vote and the last fit, and of the two
 faces of a plate."""
@@ -114,9 +114,9 @@ SMOOTHING_REACH = 2.5
 SMOOTHING_AGREEMENT = 4.2
 """Standard errors. Two normals differ if the chord between them is longer than this."""
 MAX_TILT = 0.95
-"""Share. Maximum change of a weight by the position balance, up or down."""
+"""Fraction. Maximum change of a weight by the position balance, up or down."""
 TILT_RIDGE = 0.01
-"""Share of the trace. Added to the diagonal so that the position balance can be solved for
+"""Fraction of the trace. Added to the diagonal so that the position balance can be solved for
 collinear points."""
 CHOICE_STEP = 3
 """Ranks. Every third neighbor offers its plane, to save time."""

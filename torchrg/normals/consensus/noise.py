@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, places_of
+from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, nonzero_rows
 from torchrg.linalg import above, coordinate_resolution
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
@@ -27,7 +27,7 @@ from torchrg.structures import Neighbors, NormalFit
 _LAYER_PARAMETERS = 4
 
 
-class Survey(NamedTuple):
+class NoiseEstimate(NamedTuple):
     """Plane residuals and noise of each neighborhood, each of shape ``(N,)``.
 
     Fields: the distance of the plane from the point along the normal; the standard deviation of the
@@ -41,9 +41,9 @@ class Survey(NamedTuple):
     radius: Tensor
 
 
-def survey_noise(
+def estimate_noise(
     points: Tensor, neighbors: Neighbors, fit: NormalFit, *, chunk_size: int = CHUNK_SIZE
-) -> Survey:
+) -> NoiseEstimate:
     """Estimate the local noise, also at edges and on curved surfaces.
 
     The deviation ``T_m`` of the ``m`` nearest points from their plane is noise if these points lie
@@ -67,10 +67,10 @@ def survey_noise(
 
     def work(block: slice) -> None:
         near = neighbors.at(block)
-        offsets[block], radius[block], single, layered, repeats, *nearest = _survey(
+        offsets[block], radius[block], single, layered, repeats, *nearest = _measure_neighborhoods(
             points, near, fit.normals[block], fit.valid[block]
         )
-        if len(rows := places_of(repeats)):
+        if len(rows := nonzero_rows(repeats)):
             patches, counted = _move_duplicates(points, near.at(rows))
             for values, size in zip(nearest, constants.NOISE_COUNTS, strict=True):
                 values[rows] = _small_deviations(patches, counted, size)
@@ -100,7 +100,9 @@ def survey_noise(
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
     common = _neighbor_quantiles(noise[:, None], neighbors, constants.COMMON_QUANTILE)[:, 0]
     noise = torch.minimum(noise, constants.MAX_ABOVE_COMMON * common)
-    return Survey(offsets, deviations[:, 0].contiguous(), torch.maximum(noise, floor), radius)
+    return NoiseEstimate(
+        offsets, deviations[:, 0].contiguous(), torch.maximum(noise, floor), radius
+    )
 
 
 def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
@@ -126,7 +128,9 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
     return noise
 
 
-def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
+def _measure_neighborhoods(
+    points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor
+) -> tuple[Tensor, ...]:
     """Return survey parts, deviations from two layers, a duplicate mask, and small deviations.
 
     The last ones are those of the nearest neighbors, for each of the counts.
@@ -148,7 +152,7 @@ def _survey(points: Tensor, near: Neighbors, normals: Tensor, valid: Tensor) -> 
         )
     offsets, radius, single, looks_layered, repeats = _deviations(points, *near, normals, valid)
     layered = torch.full_like(single, torch.inf)
-    if len(rows := places_of(looks_layered)):
+    if len(rows := nonzero_rows(looks_layered)):
         layered[rows] = _layered_deviations(points, near.at(rows), normals[rows], single[rows])
     nearest = [_nearest_deviations(points, near, count) for count in counts]
     return offsets, radius, single, layered, repeats, *nearest

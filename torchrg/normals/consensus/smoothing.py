@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import ROWS_IN_CACHE, map_chosen, map_chunks
+from torchrg._parallel import ROWS_IN_CACHE, map_chunks, map_selected
 from torchrg.linalg import signs
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
@@ -19,7 +19,7 @@ from torchrg.linalg.moments import (
 from torchrg.neighbors import gather_columns
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores
-from torchrg.normals.consensus.noise import Survey
+from torchrg.normals.consensus.noise import NoiseEstimate
 from torchrg.normals.consensus.surfaces import TangentPlanes
 from torchrg.structures import Neighbors, NormalFit
 
@@ -47,8 +47,8 @@ def smooth_planes(
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     parts = planes.normals.T.contiguous()
-    is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
-    table = _table(points, planes, errors) if is_served else points
+    are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
+    table = _table(points, planes, errors) if are_served else points
     parameters = (
         constants.SMOOTHING_AGREEMENT,
         constants.SMOOTHING_REACH,
@@ -59,12 +59,12 @@ def smooth_planes(
 
     def work(block: slice) -> None:
         chosen = rows[block]
-        if is_served:
+        if are_served:
             normals[chosen], offsets[chosen] = kernels.call(
                 "smooth_planes", table, *neighbors, noise, chosen, *parameters
             )
             return
-        normals[chosen], offsets[chosen] = _smoothed(
+        normals[chosen], offsets[chosen] = _smooth_rows(
             points, *neighbors, parts, planes.offsets, noise, errors, chosen
         )
 
@@ -77,7 +77,7 @@ def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
     return torch.cat([points, planes.normals, planes.offsets[:, None], values[:, None]], dim=1)
 
 
-def _smoothed(
+def _smooth_rows(
     points: Tensor,
     indices: Tensor,
     valid: Tensor | None,
@@ -104,7 +104,7 @@ def _smoothed(
     weights *= _distance_weights(columns, constants.FIT_FALLOFF)
     if near.valid is not None:
         weights *= near.valid
-    weights = _balanced(columns, weights) * sign
+    weights = _recenter_weights(columns, weights) * sign
     mean = torch.stack([sum_neighbors(weights * column) for column in (x, y, z)], dim=-1)
     length = square_root(dot(mean, mean))
     has_mean = length > 0
@@ -134,9 +134,9 @@ def choose_planes(
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
 
-    is_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
-    is_served = is_served and len(rows) > 0
-    table = _table(points, planes, noise) if is_served else points
+    are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
+    are_served = are_served and len(rows) > 0
+    table = _table(points, planes, noise) if are_served else points
     parameters = (
         constants.CHOICE_STEP,
         constants.VOTE_REACH,
@@ -147,7 +147,7 @@ def choose_planes(
 
     def work(block: slice) -> None:
         chosen = rows[block]
-        if is_served:
+        if are_served:
             normals[chosen], offsets[chosen] = kernels.call(
                 "choose_planes", table, *neighbors, points, chosen, *parameters
             )
@@ -156,7 +156,7 @@ def choose_planes(
             points, *neighbors, *planes, noise, chosen, ranks
         )
 
-    size = max(min(chunk_size, ROWS_IN_CACHE // (1 if is_served else len(ranks))), 1)
+    size = max(min(chunk_size, ROWS_IN_CACHE // (1 if are_served else len(ranks))), 1)
     map_chunks(work, len(rows), size, rows.device)
     return TangentPlanes(normals, offsets)
 
@@ -200,7 +200,7 @@ def standard_errors(
     points: Tensor,
     neighbors: Neighbors,
     planes: TangentPlanes,
-    survey: Survey,
+    survey: NoiseEstimate,
     sharp: Tensor,
     *,
     chunk_size: int,
@@ -222,7 +222,7 @@ def standard_errors(
         error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
         errors[rows] = torch.maximum(errors[rows], error)
 
-    map_chosen(work, sharp, chunk_size)
+    map_selected(work, sharp, chunk_size)
     return errors
 
 
@@ -246,7 +246,7 @@ def describe_inliers(
         curvature[rows] = bent / torch.where(total > 0, total, 1.0)
         residual_rms[rows] = smallest.sqrt()
 
-    map_chosen(work, sharp, chunk_size)
+    map_selected(work, sharp, chunk_size)
     return curvature, residual_rms
 
 
@@ -277,7 +277,7 @@ def _distance_weights(columns: Columns, fraction: float) -> Tensor:
     return 1 - fraction * sq_distances / torch.where(farthest > 0, farthest, 1.0)
 
 
-def _balanced(columns: Columns, weights: Tensor) -> Tensor:
+def _recenter_weights(columns: Columns, weights: Tensor) -> Tensor:
     """Return weights tilted so that the weighted mean position is nearly the point."""
     radius = square_root(sq_lengths(columns).amax(dim=1, keepdim=True))
     x, y, z = (column / torch.where(radius > 0, radius, 1.0) for column in columns)

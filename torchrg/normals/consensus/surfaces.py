@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import map_chosen, map_chunks
+from torchrg._parallel import map_chunks, map_selected
 from torchrg.linalg.moments import Columns, split_columns
 from torchrg.neighbors import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
@@ -16,7 +16,7 @@ from torchrg.normals.consensus.hypotheses import (
     fit_meeting_planes,
     vote_planes,
 )
-from torchrg.normals.consensus.noise import Survey
+from torchrg.normals.consensus.noise import NoiseEstimate
 from torchrg.normals.jet import FLAT_PIVOT, fit_paraboloids
 from torchrg.structures import Neighbors, NormalFit
 
@@ -31,7 +31,7 @@ class TangentPlanes(NamedTuple):
 
 
 def fit_surfaces(
-    points: Tensor, neighbors: Neighbors, fit: NormalFit, survey: Survey, *, chunk_size: int
+    points: Tensor, neighbors: Neighbors, fit: NormalFit, survey: NoiseEstimate, *, chunk_size: int
 ) -> tuple[TangentPlanes, Tensor, Tensor]:
     r"""Select the plane, paraboloid or meeting planes that explain each neighborhood best.
 
@@ -59,7 +59,7 @@ def fit_surfaces(
         normals[rows], offsets[rows], deviations[rows] = fitted
 
     not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
-    map_chosen(fit_curved, not_flat, chunk_size)
+    map_selected(fit_curved, not_flat, chunk_size)
     broken = not_flat & (deviations > constants.CURVED_LIMIT * noise)
     broken &= deviations > constants.CURVED_FRACTION * survey.deviations
     far_off = deviations > constants.FAR_OFF * noise
@@ -85,7 +85,7 @@ def fit_surfaces(
 
     candidates = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
     for group in _group_by_count(candidates, neighbors):
-        map_chosen(split, group, chunk_size)
+        map_selected(split, group, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meets = broken & explained & (gain > constants.MIN_GAIN) & (pooled > constants.MIN_POOLED_GAIN)
     voted = broken & ~meets & far_off
