@@ -42,6 +42,7 @@ SIGNATURES = {
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
     "at_boundary": "i[N] i[n] i[nk] b[nk]? -> b[n]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
+    "compare_links": "f[N3] f[N3] l[n] i[nk] -> f[nk] f[nk]",
     "link_nodes": "i[L] i[L] b[L] I[N] B[N] B[N] -> ",
     "flatten_nodes": "I[N] B[N] B[N] -> ",
     "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",
