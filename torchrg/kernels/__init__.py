@@ -229,9 +229,15 @@ def _library() -> ctypes.CDLL | None:
         except OSError as error:
             warnings.warn(f"torchrg cannot load its kernels: {error}", stacklevel=2)
             return None
-        for name in SIGNATURES:
-            getattr(library, name).restype = ctypes.c_int64
-        return library
+        if all(hasattr(library, name) for name in SIGNATURES):
+            for name in SIGNATURES:
+                getattr(library, name).restype = ctypes.c_int64
+            return library
+        warnings.warn(
+            "torchrg runs without its kernels, which are of another version; install it again.",
+            stacklevel=2,
+        )
+        return None
     warnings.warn(
         "torchrg runs without its kernels, several times slower: install it where a C++ compiler "
         "is, or with TORCHRG_KERNELS set as the guide says.",
