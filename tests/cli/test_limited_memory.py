@@ -39,8 +39,8 @@ def test_the_disk_and_memory_write_the_same_bytes(rooms, tmp_path, run, monkeypa
     files = (rooms / "a.npz", "--preset", "classic", *flags)
     if "--layout" in flags:
         files = (rooms / "b.npz", *files[1:])  # without missing points, which layouts refuse
-    limit = WITH_SUPERPOINTS if {"--superpoints", "--layout"} & {*flags} else LIMIT
-    for folder, limit, said in (("whole", "9", False), ("disk", limit, True)):
+    smallest = WITH_SUPERPOINTS if {"--superpoints", "--layout"} & {*flags} else LIMIT
+    for folder, limit, said in (("whole", "9", False), ("disk", smallest, True)):
         (tmp_path / folder).mkdir()
         done = run("segment", *files, "--out", tmp_path / folder / name, "--limit-memory", limit)
         assert ("moving the largest arrays to disk" in done.out) == said
