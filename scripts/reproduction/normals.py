@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from matplotlib import pyplot as plt
 from matplotlib import ticker
-from torch import Tensor
 
 from reproduction.clouds import Run
 from reproduction.pictures import settings, write_tiles
@@ -27,19 +26,13 @@ from reproduction.records import (
     table,
     text,
 )
-from tests.made import SHAPES, make_shape
+from tests.made import make_shape
 from torchrg.config import NormalsConfig, load_config
-from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_normals
-from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals
 from torchrg.render import color_normals, color_sharp, render_cloud
-from torchrg.scenes import Scene
 
 K = 50
-EDGE_DEG = 20.0
-"""Angle between the true normals of neighbors from which a point is near an edge."""
-
 _NUM_DRAWN, _DRAWN_POINTS = 6, 100_000
 
 
@@ -167,8 +160,7 @@ def _warm_up(variant: str) -> None:
 def _blocks(run: Run, records: list[Record]) -> list[Block]:
     """Return tables and figures."""
     draw_errors(run.folder.path_of("figures/figure4.png"), records, PAPERS)
-    shapes = [shape for shape in (*PAPERS, *_OTHERS) if shape in SHAPES][:_NUM_DRAWN]
-    draw_sharp_points(run.folder.path_of("figures/figure3.png"), _sharp_clouds(shapes))
+    draw_sharp_points(run.folder.path_of("figures/figure3.png"), (*PAPERS, *_OTHERS)[:_NUM_DRAWN])
     return [
         text(
             "Shapes with known normals and Gaussian noise; its standard deviation is in percent "
@@ -191,15 +183,11 @@ def _blocks(run: Run, records: list[Record]) -> list[Block]:
 def _measure(shape: str, noise: float, num_points: int, seed: int, variant: str) -> Record:
     """Evaluate one estimator on one cloud."""
     scene = make_shape(shape, num_points, noise / 100, seed)
-    at_edges = _near_edges(scene)
     _warm_up(variant)
     begin = time.perf_counter()
     fit = estimate_normals(scene.points, config=VARIANTS[variant])
     seconds = time.perf_counter() - begin
     score = score_normals(fit.normals, scene.normals, valid=fit.valid)._asdict()
-    for name, chosen in (("sharp", at_edges), ("regular", ~at_edges)):
-        errors = score_normals(fit.normals[chosen], scene.normals[chosen], valid=fit.valid[chosen])
-        score |= {f"{name}_{index}": value for index, value in errors._asdict().items()}
     return {
         "shape": shape,
         "noise_percent": noise,
@@ -210,23 +198,6 @@ def _measure(shape: str, noise: float, num_points: int, seed: int, variant: str)
         "seconds": seconds,
         "score": score,
     }
-
-
-def _near_edges(scene: Scene) -> Tensor:
-    """Return the points with clearly different true normals in their neighborhood."""
-    indices = search_knn(scene.points, K).indices.long()
-    angles = unsigned_angle_deg(scene.normals[:, None], scene.normals[indices])
-    return angles.amax(dim=1) > EDGE_DEG
-
-
-def _sharp_clouds(shapes: list[str]) -> list[tuple[str, Scene, Tensor]]:
-    """Return shapes with low noise, and their sharp feature points."""
-    clouds = []
-    for shape in shapes:
-        scene = make_shape(shape, _DRAWN_POINTS, 0.0002)
-        sharp = estimate_normals(scene.points, config=VARIANTS["paper"]).sharp
-        clouds.append((shape, scene, sharp))
-    return clouds
 
 
 def mean_score(records: Iterable[Record], field: str, **fields: object) -> float | None:
@@ -279,8 +250,9 @@ def normal_claims(records: list[Record], *, with_times: bool) -> list[Block]:
         records: Records of all clouds and estimators.
         with_times: Whether the clouds are large enough to compare run times.
     """
-    papers = [record for record in records if record["shape"] in PAPERS]
-    others = [record for record in records if record not in papers]
+    places = _by_place(records)
+    papers = {place: some for place, some in places.items() if some[0]["shape"] in PAPERS}
+    others = {place: some for place, some in places.items() if place not in papers}
     claims = []
     for ours, name in OURS.items():
         every = f"DetMM, weighted PCA and {name} have a smaller"
@@ -289,24 +261,18 @@ def normal_claims(records: list[Record], *, with_times: bool) -> list[Block]:
             ("beyond", "mean angle than PCA and jets.", papers, "mean", True),
             ("II.A", "MSAE than PCA and jets on other shapes.", others, "msae", False),
         ):
-            means = _means_by_place(some, ours, field)
+            means = _means(some, ours, field)
             found = _robust_below(some, ours, field, means)
             why = functools.partial(why_not_below, means)
             claims.append(
                 claim(where_, f"{every} {words}", found, _MEANS, why, quick_tells=quick_tells)
             )
-        orders = {
-            place: sorted(by, key=by.__getitem__)
-            for place, by in _means_by_place(papers, ours, "msae").items()
-        }
-        claims.append(
-            claim(
-                "II.A, Figure 4",
-                f"{name[0].upper()}{name[1:]} has the second-smallest MSAE of the five.",
-                {place: (o.index(ours) <= 1, " < ".join(o)) for place, o in orders.items()},
-                _MEANS,
-            )
-        )
+        words = f"{name[0].upper()}{name[1:]} has the second-smallest MSAE of the five."
+        found = {}
+        for place, by in _means(papers, ours, "msae").items():
+            order = sorted(by, key=by.__getitem__)
+            found[place] = (order.index(ours) <= 1, " < ".join(order))
+        claims.append(claim("II.A, Figure 4", words, found, _MEANS))
     if with_times:
         words = "The two-stage method takes at most a tenth of DetMM's time."
         claims.append(claim("II.A, Table 1", words, _tenth(where(records, shape="cuboid"))))
@@ -321,22 +287,24 @@ def why_not_below(means: Means, fails: list[str]) -> str:
         for name, mean in means[place].items()
         if name not in PLAIN and mean > min(means[place][plain] for plain in PLAIN)
     )
-    listed = ", ".join(f"{name} on {count}" for name, count in above.items())
-    return f"Above the better of PCA and jets, on the {len(fails)} shapes and noises: {listed}."
+    listed = ", ".join(f"{name} {count}" for name, count in above.most_common())
+    return f"Above the better of PCA and jets, in {len(fails)} failures: {listed or 'none'}."
 
 
-def _means_by_place(records: list[Record], ours: str, field: str) -> Means:
-    """Return the means of the paper's five estimators, by shape and noise."""
+def _means(places: Mapping[str, list[Record]], ours: str, field: str) -> Means:
+    """Return the means of the paper's five estimators by place."""
     return {
         place: {name: mean_score(some, field, variant=name) for name in (*PLAIN, *ROBUST, ours)}
-        for place, some in _by_place(records).items()
+        for place, some in places.items()
     }
 
 
-def _robust_below(records: list[Record], ours: str, field: str, means: Means) -> dict[str, Outcome]:
+def _robust_below(
+    places: Mapping[str, list[Record]], ours: str, field: str, means: Means
+) -> dict[str, Outcome]:
     """Return where all robust estimators are below all plain ones, for every seed."""
     form, found = ".1f" if field == "msae" else ".2f", {}
-    for place, some in _by_place(records).items():
+    for place, some in places.items():
         below = all(
             max(_scores(one, field, (*ROBUST, ours))) < min(_scores(one, field, PLAIN))
             for one in (where(some, seed=seed) for seed in values(some, "seed"))
@@ -423,22 +391,18 @@ def _draw_panel(axis: plt.Axes, records: list[Record]) -> None:
     axis.set_xticks(range(len(noises)), [f"{noise:g}" for noise in noises])
 
 
-def draw_sharp_points(path: Path, clouds: list[tuple[str, Scene, Tensor]]) -> None:
-    """Render true normals (top) and sharp feature points (bottom) of shapes.
-
-    Args:
-        path: Image to write.
-        clouds: Name, scene and mask of sharp points of each shape.
-    """
-    images = [
-        render_cloud(
-            scene.points, paint, normals=scene.normals, view="outside", width=_WIDTH, height=_WIDTH
-        )
-        for paints in (
-            [color_normals(scene.normals) for _, scene, _ in clouds],
-            [color_sharp(sharp) for _, _, sharp in clouds],
-        )
-        for paint, (_, scene, _) in zip(paints, clouds, strict=True)
-    ]
-    titles = [*(name.replace("_", " ") for name, _, _ in clouds), *("" for _ in clouds)]
-    write_tiles(path, list(zip(titles, images, strict=True)), columns=len(clouds))
+def draw_sharp_points(path: Path, shapes: Sequence[str]) -> None:
+    """Render true normals (top) and sharp feature points (bottom) of shapes with low noise."""
+    size, rows = {"width": _WIDTH, "height": _WIDTH}, ([], [])
+    for shape in shapes:
+        scene = make_shape(shape, _DRAWN_POINTS, 0.0002)
+        sharp = estimate_normals(scene.points, config=VARIANTS["paper"]).sharp
+        for row, paint, title in zip(
+            rows,
+            (color_normals(scene.normals), color_sharp(sharp)),
+            (shape.replace("_", " "), ""),
+            strict=True,
+        ):
+            image = render_cloud(scene.points, paint, normals=scene.normals, view="outside", **size)
+            row.append((title, image))
+    write_tiles(path, [*rows[0], *rows[1]], columns=len(shapes))

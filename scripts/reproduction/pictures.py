@@ -48,12 +48,11 @@ def settings() -> AbstractContextManager[None]:
 
 def write_tiles(
     path: Path,
-    images: Mapping[str, Tensor] | Sequence[tuple[str, Tensor]],
+    tiles: Sequence[tuple[str, Tensor]],
     columns: int,
     legend: Iterable[tuple[tuple[int, ...], str]] = (),
 ) -> None:
-    """Write images ``(H, W, 3)`` side by side, each below its title, with a legend of colors."""
-    tiles = list(images.items() if isinstance(images, Mapping) else images)
+    """Write titled images ``(H, W, 3)`` side by side, with a legend of colors."""
     rows = -(-len(tiles) // columns)
     height, width = tiles[0][1].shape[:2]
     size = (_INCHES * columns, rows * (_INCHES * height / width + 0.25))
@@ -137,5 +136,5 @@ def _tile(
     height, width = next(iter(images.values())).shape[:2]
     columns = 2 if width > _LONG * height or len(images) == 4 else 3
     file = f"figures/{name}.png"
-    write_tiles(folder.path_of(file), images, min(columns, len(images)), legend)
+    write_tiles(folder.path_of(file), list(images.items()), min(columns, len(images)), legend)
     return file

@@ -87,7 +87,18 @@ F1_LARGE = Metric(
 )
 F1_OBJECTS = Metric("F1 of objects", ".1f", lambda record: record["faces"].get("f1_objects"))
 BEST_IOU = Metric("mean best IoU", ".3f", lambda record: record["labels"]["mean_best_iou"])
-LABELED = Metric("labeled", ".3f", lambda record: record["fraction_labeled"])
+LABELED = Metric("fraction labeled", ".3f", lambda record: record["fraction_labeled"])
+RIGHT = Metric("right at edges", ".3f", lambda record: record["faces"]["right_at_edges"])
+REASONS = {
+    F1.name: Metric(
+        "F1 with 0 for unmatched surfaces", ".1f", lambda record: record["faces"]["f1_of_every"]
+    ),
+    F1_OBJECTS.name: Metric(
+        "F1 of the ground-truth surfaces", ".1f", lambda r: r["faces"].get("f1_objects_exact")
+    ),
+}
+"""Metrics that explain why another one does not rise."""
+
 COLUMNS = (
     ARI,
     F1,
@@ -96,7 +107,7 @@ COLUMNS = (
     LABELED,
     BEST_IOU,
     Metric("detected", ".3f", lambda record: record["labels"]["recall_iou50"]),
-    Metric("right at edges", ".3f", lambda record: record["faces"]["right_at_edges"]),
+    RIGHT,
 )
 
 
@@ -274,81 +285,123 @@ def segmentation_claims(
     """
     usual = {key: found for key, found in scores.items() if key not in HARD}
     hard = {key: found for key, found in scores.items() if key in HARD}
-    unlike = " on clouds unlike the paper's"
+    curved = {key: found for key, found in hard.items() if key == "curved"}
+    edges = "Fractions of the points near edges: classic, DetMM, paper."
+    elsewhere = partial(listed, "In other regions", _values(usual, _in_other_regions), ".3f")
+    f1 = [F1.take(scores[key]["paper"]) if key in scores else None for key in INDICES]
     return [
         *(_rise("Table 2, V", metric, usual) for metric in (ARI, F1_LARGE, F1, F1_OBJECTS)),
         printed_best(),
         *_sphere_claims(sphere),
-        *_edge_claims(usual),
-        _tutorial_below_hallway(scores),
+        claim(
+            "IV",
+            "The paper's method assigns more points near edges and corners to their surface than "
+            "the other two.",
+            _tried(_values(usual, RIGHT.take), ".3f", lambda row: row[2] > max(row[:2])),
+            edges,
+            quick_tells=False,
+        ),
+        claim(
+            "IV",
+            "Classic leaves more points near edges unlabeled than the other two.",
+            _tried(_values(usual, _unlabeled), ".3f", lambda row: row[0] > max(row[1:])),
+            edges,
+            elsewhere,
+            quick_tells=False,
+        ),
+        claim(
+            "IV",
+            "DetMM makes more regions than the paper's method (over-segmentation).",
+            _tried(_values(usual, lambda r: r["regions"]), "d", lambda row: row[1] > row[2]),
+            "Classic, DetMM, paper.",
+        ),
+        claim(
+            "IV",
+            "F1 of the tutorial's cloud is below that of the hallway (paper's method).",
+            {"all surfaces": rising(f1, ".1f")},
+        ),
         _five_degrees(angles),
-        *([_curved(scores["curved"])] if "curved" in scores else []),
+        claim(
+            "IV, V",
+            "Regular curved surfaces are segmented as well as planes.",
+            _tried(
+                _faces(curved, "found_flat", "found_curved"), ".2f", lambda row: row[0] <= row[1]
+            ),
+            f"Fractions detected of planes and of curved surfaces of at least {LARGE:,} points.",
+            quick_tells=False,
+        ),
         claim(
             "V",
             "The paper's method cannot segment small objects.",
-            _rising(
-                {
-                    title: [
-                        found["paper"]["faces"][name] for name in ("found_small", "found_large")
-                    ]
-                    for title, found in _titled(usual).items()
-                },
-                ".2f",
-            ),
+            _tried(_faces(usual, "found_small", "found_large"), ".2f"),
             f"Fractions detected of surfaces below {LARGE:,} points, and of larger ones.",
         ),
-        *(_rise("beyond", metric, hard, unlike) for metric in (ARI, F1_LARGE)),
-        *(_ahead("algorithm2", "paper", metric, scores) for metric in (ARI, F1_LARGE)),
-        *(_ahead("paper", "consensus", metric, scores) for metric in (ARI, F1_LARGE, BEST_IOU)),
+        *(_rise("beyond", metric, hard) for metric in (ARI, F1_LARGE)),
+        *(
+            claim(
+                "beyond",
+                f"{low} < {high} by {metric.name}.",
+                _tried(_values(scores, metric.take, (low, high)), metric.form),
+            )
+            for low, high, metrics in (
+                ("algorithm2", "paper", (ARI, F1_LARGE)),
+                ("paper", "consensus", (ARI, F1_LARGE, BEST_IOU)),
+            )
+            for metric in metrics
+        ),
     ]
 
 
-def _titled(scores: Scores) -> Scores:
-    return {found["paper"]["title"]: found for found in scores.values()}
-
-
-def _values(scores: Scores, take: Callable[[Record], float | None]) -> Values:
-    """Return a value of the paper's three methods, by the title of the cloud."""
+def _values(
+    scores: Scores, take: Callable[[Record], float | None], methods: Sequence[str] = PAPERS
+) -> Values:
+    """Return a value of several methods, by the title of the cloud."""
     return {
-        title: [take(found[method]) for method in PAPERS]
-        for title, found in _titled(scores).items()
+        found["paper"]["title"]: [take(found[method]) for method in methods]
+        for found in scores.values()
     }
 
 
-def _rising(values: Values, form: str) -> dict[str, Outcome | None]:
-    return {title: rising(row, form) for title, row in values.items()}
-
-
-def _ahead(low: str, high: str, metric: Metric, scores: Scores) -> Block:
-    """Return where a method is better than another one."""
-    values = {
-        title: [metric.take(found[low]), metric.take(found[high])]
-        for title, found in _titled(scores).items()
+def _faces(scores: Scores, *names: str) -> Values:
+    """Return metrics of the paper's method, by the title of the cloud."""
+    return {
+        found["paper"]["title"]: [found["paper"]["faces"].get(name) for name in names]
+        for found in scores.values()
     }
-    return claim("beyond", f"{low} < {high} by {metric.name}.", _rising(values, metric.form))
 
 
-def _rise(where: str, metric: Metric, scores: Scores, on: str = "") -> Block:
+def _tried(
+    values: Values, form: str, test: Callable[[Sequence[float]], bool] | None = None
+) -> dict[str, Outcome | None]:
+    """Return where values rise, or pass a test."""
+    found = {title: rising(row, form) for title, row in values.items()}
+    if test is None:
+        return found
+    return {
+        title: outcome and (test(values[title]), outcome[1].replace(" <", ","))
+        for title, outcome in found.items()
+    }
+
+
+def _unlabeled(record: Record) -> float:
+    return record["faces"]["none_at_edges"]
+
+
+def _in_other_regions(record: Record) -> float:
+    return 1 - record["faces"]["none_at_edges"] - record["faces"]["right_at_edges"]
+
+
+def _rise(where: str, metric: Metric, scores: Scores) -> Block:
     """Return where a metric rises from classic over DetMM to the paper's method."""
-    values = _values(scores, metric.take)
-    if metric is F1:
-        more = "F1 with 0 for unmatched surfaces", lambda r: r["faces"]["f1_of_every"], ".1f"
-    elif metric is F1_OBJECTS:
-        more = "F1 of objects of the ground-truth surfaces", _exact_objects, ".1f"
-    else:
-        more = "Fractions of labeled points", LABELED.take, ".2f"
-    label, take, form = more
+    more = REASONS.get(metric.name, LABELED)
+    on = " on clouds unlike the paper's" if where == "beyond" else ""
     return claim(
         where,
         f"Classic < DetMM < the paper's method by {metric.name}{on}.",
-        _rising(values, metric.form),
-        why=partial(listed, label, _values(scores, take), form),
+        _tried(_values(scores, metric.take), metric.form),
+        why=partial(listed, more.name.capitalize(), _values(scores, more.take), more.form),
         quick_tells=metric is not F1,
     )
-
-
-def _exact_objects(record: Record) -> float | None:
-    return record["faces"].get("f1_objects_exact")
 
 
 def listed(label: str, values: Values, form: str, fails: list[str]) -> str:
@@ -402,13 +455,9 @@ def _sphere_claims(sphere: Scores) -> list[Block]:
 
 def why_not_ordered(merged: Mapping[str, str], dvi: Iterable[float], fails: list[str]) -> str:
     """Return SP and DBI with one cluster per direction, and the note on DVI if it fails."""
-    rows = [f"{title}: {merged[title]}" for title in fails if title in merged]
-    directions = (
-        "Parallel walls have the same center on the sphere. With one cluster per direction: "
-        f"{'; '.join(rows)}."
-    )
-    is_dvi = any(title.startswith("DVI") for title in fails)
-    return " ".join([directions] * bool(rows) + [dvi_note(dvi)] * is_dvi)
+    rows = "; ".join(f"{title}: {merged[title]}" for title in fails if title in merged)
+    words = f"With one cluster per direction: {rows}. " if rows else ""
+    return words + (dvi_note(dvi) if any(title.startswith("DVI") for title in fails) else "")
 
 
 def dvi_note(ours: Iterable[float]) -> str:
@@ -438,65 +487,6 @@ def _order(values: Mapping[str, float], name: str) -> list[str]:
     return sorted(values, key=values.__getitem__, reverse=higher)
 
 
-def _edge_claims(scores: Scores) -> list[Block]:
-    """Return the claims about points near edges and corners, and about the number of regions."""
-    rows: dict[str, dict[str, list[float]]] = {"right": {}, "none": {}, "wrong": {}}
-    regions = {}
-    for title, found in _titled(scores).items():
-        right, none = (
-            [found[method]["faces"][f"{name}_at_edges"] for method in PAPERS]
-            for name in ("right", "none")
-        )
-        wrong = [1 - sum(both) for both in zip(right, none, strict=True)]
-        for name, row in zip(rows, (right, none, wrong), strict=True):
-            rows[name][title] = row
-        counts = [found[method]["regions"] for method in PAPERS]
-        words = f"{', '.join(map(str, counts))} for {found['paper']['labels']['faces']} surfaces"
-        regions[title] = (counts[1] > counts[2], words)
-    note = "Fractions of the points near edges: classic, DetMM, paper."
-    return [
-        claim(
-            "IV",
-            "The paper's method assigns more points near edges and corners to their surface than "
-            "the other two.",
-            {t: (row[2] > max(row[:2]), _printed(row)) for t, row in rows["right"].items()},
-            note,
-            quick_tells=False,
-        ),
-        claim(
-            "IV",
-            "Classic leaves more points near edges unlabeled than the other two.",
-            {t: (row[0] > max(row[1:]), _printed(row)) for t, row in rows["none"].items()},
-            note,
-            partial(listed, "In the region of another surface", rows["wrong"], ".3f"),
-            quick_tells=False,
-        ),
-        claim(
-            "IV",
-            "DetMM makes more regions than the paper's method (over-segmentation).",
-            regions,
-            "Classic, DetMM, paper.",
-        ),
-    ]
-
-
-def _printed(row: Iterable[float]) -> str:
-    return ", ".join(f"{value:.3f}" for value in row)
-
-
-def _tutorial_below_hallway(scores: Scores) -> Block:
-    """Return whether F1 is lower on the tutorial's cloud than on the hallway."""
-    both = [scores[key]["paper"] for key in INDICES if key in scores]
-    f1 = [F1.take(record) for record in both]
-    aris = rising(map(ARI.take, both), ".3f")
-    return claim(
-        "IV",
-        "F1 of the tutorial's cloud is below that of the hallway (paper's method).",
-        {"all surfaces": rising(f1, ".1f") if len(both) == len(INDICES) else None},
-        why=lambda _: f"ARI of the two: {aris[1]}." if aris else "",
-    )
-
-
 def _five_degrees(angles: Mapping[str, Record]) -> Block:
     """Return whether 5 degrees is the best angle."""
     found = {}
@@ -508,16 +498,3 @@ def _five_degrees(angles: Mapping[str, Record]) -> Block:
             found[record["title"]] = (best == "5", f"ARI {words}; best: {best} deg")
     words = "The best segmentation is at 5 degrees."
     return claim("II.B, IV, Figure 9", words, found, quick_tells=False)
-
-
-def _curved(scores: Mapping[str, Record]) -> Block:
-    """Return whether curved surfaces are detected as often as planes."""
-    flat, curved = (scores["paper"]["faces"][name] for name in ("found_flat", "found_curved"))
-    known = None not in (flat, curved)
-    return claim(
-        "IV, V",
-        "Regular curved surfaces are segmented as well as planes.",
-        {title_of("curved"): (curved >= flat, f"{flat:.2f}, {curved:.2f}") if known else None},
-        f"Fractions detected of planes and of curved surfaces of at least {LARGE:,} points.",
-        quick_tells=False,
-    )
