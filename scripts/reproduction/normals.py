@@ -288,7 +288,7 @@ def why_not_below(means: Means, fails: list[str]) -> str:
         if name not in PLAIN and mean > min(means[place][plain] for plain in PLAIN)
     )
     listed = ", ".join(f"{name} {count}" for name, count in above.most_common())
-    return f"Cases of {len(fails)} above the better of PCA and jets: {listed or 'none'}."
+    return f"Above the better of PCA and jets in these {len(fails)} cases: {listed or 'none'}."
 
 
 def _means(places: Mapping[str, list[Record]], ours: str, field: str) -> Means:
