@@ -158,18 +158,15 @@ def _make_figure5(run: Run) -> tuple[list[Block], Record]:
         _test("a gap, from above", torch.cat([floor, beyond]), (0, 1)),
     ]
     _draw_cases(run.folder.path_of("figures/figure5.png"), cases)
-    counts = {
-        case.title: {
-            "both": int((case.coplanar & case.connective).sum()),
-            "coplanar": int(case.coplanar.sum()),
-            "connective": int(case.connective.sum()),
+    counts, listed = {}, []
+    for case in cases:
+        found = case.coplanar, case.connective, case.coplanar & case.connective
+        kinds = ("coplanar", "connective", "both")
+        counts[case.title] = {
+            kind: int(mask.sum()) for kind, mask in zip(kinds, found, strict=True)
         }
-        for case in cases
-    }
-    listed = "; ".join(
-        f"{title}: {n['coplanar']} coplanar, {n['connective']} connective, {n['both']} both"
-        for title, n in counts.items()
-    )
+        numbers = ", ".join(f"{count} {kind}" for kind, count in counts[case.title].items())
+        listed.append(f"{case.title}: {numbers}")
     k = load_config("paper").normals.k
     caption = (
         "**Figure 5**: neighbors of a point (black ring) near an edge, a step and a gap on "
@@ -181,7 +178,7 @@ def _make_figure5(run: Run) -> tuple[list[Block], Record]:
             "A neighbor is connective if it shares 75 % of its neighbors with the point (eq. 10). "
             "It is coplanar if its distance to the plane of the point is at most median + 2 Qn of "
             "the distances in the neighborhood (eq. 11). Normals are the paper's. Counts of "
-            f"{k} neighbors: {listed}."
+            f"{k} neighbors: {'; '.join(listed)}."
         ),
     ], counts
 

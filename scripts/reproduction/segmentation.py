@@ -89,6 +89,7 @@ F1_OBJECTS = Metric("F1 of objects", ".1f", lambda record: record["faces"].get("
 BEST_IOU = Metric("mean best IoU", ".3f", lambda record: record["labels"]["mean_best_iou"])
 LABELED = Metric("fraction labeled", ".3f", lambda record: record["fraction_labeled"])
 RIGHT = Metric("right at edges", ".3f", lambda record: record["faces"]["right_at_edges"])
+UNLABELED = Metric("unlabeled at edges", ".3f", lambda r: r["faces"]["none_at_edges"])
 REASONS = {
     F1.name: Metric(
         "F1 with 0 for unmatched surfaces", ".1f", lambda record: record["faces"]["f1_of_every"]
@@ -287,7 +288,11 @@ def segmentation_claims(
     hard = {key: found for key, found in scores.items() if key in HARD}
     curved = {key: found for key, found in hard.items() if key == "curved"}
     edges = "Fractions of the points near edges: classic, DetMM, paper."
-    elsewhere = partial(listed, "In other regions", _values(usual, _in_other_regions), ".3f")
+    right, unlabeled = _values(usual, RIGHT.take), _values(usual, UNLABELED.take)
+    other = {
+        title: [1 - sum(both) for both in zip(row, unlabeled[title], strict=True)]
+        for title, row in right.items()
+    }
     f1 = [F1.take(scores[key]["paper"]) if key in scores else None for key in INDICES]
     return [
         *(_rise("Table 2, V", metric, usual) for metric in (ARI, F1_LARGE, F1, F1_OBJECTS)),
@@ -297,16 +302,16 @@ def segmentation_claims(
             "IV",
             "The paper's method assigns more points near edges and corners to their surface than "
             "the other two.",
-            _tried(_values(usual, RIGHT.take), ".3f", lambda row: row[2] > max(row[:2])),
+            _tried(right, ".3f", lambda row: row[2] > max(row[:2])),
             edges,
             quick_tells=False,
         ),
         claim(
             "IV",
             "Classic leaves more points near edges unlabeled than the other two.",
-            _tried(_values(usual, _unlabeled), ".3f", lambda row: row[0] > max(row[1:])),
+            _tried(unlabeled, ".3f", lambda row: row[0] > max(row[1:])),
             edges,
-            elsewhere,
+            partial(listed, "In other regions", other, ".3f"),
             quick_tells=False,
         ),
         claim(
@@ -383,14 +388,6 @@ def _tried(
     }
 
 
-def _unlabeled(record: Record) -> float:
-    return record["faces"]["none_at_edges"]
-
-
-def _in_other_regions(record: Record) -> float:
-    return 1 - record["faces"]["none_at_edges"] - record["faces"]["right_at_edges"]
-
-
 def _rise(where: str, metric: Metric, scores: Scores) -> Block:
     """Return where a metric rises from classic over DetMM to the paper's method."""
     more = REASONS.get(metric.name, LABELED)
@@ -420,7 +417,7 @@ def printed_best() -> Block:
         best = [
             name.upper()
             for column, name in enumerate(INTERNAL)
-            if _order({method: row[column] for method, row in printed.items()}, name)[0] == "paper"
+            if _ranked({m: row[column] for m, row in printed.items()}, name)[0][0] == "paper"
         ]
         found[title_of(key)] = (len(best) >= 3, f"best in {len(best)}: {', '.join(best)}")
     words = "The paper's method is best in at least three of the four internal indices, as printed."
@@ -432,7 +429,7 @@ def _sphere_claims(sphere: Scores) -> list[Block]:
     best, order, merged = {}, {}, {}
     for key, printed in INDICES.items():
         for column, name in enumerate(INTERNAL):
-            theirs = _order({method: printed[method][column] for method in PAPERS}, name)
+            theirs, _ = _ranked({method: printed[method][column] for method in PAPERS}, name)
             title = f"{name.upper()} of {sphere[key]['paper']['title']}"
             ours, words = _ranked({method: sphere[key][method][name] for method in PAPERS}, name)
             order[title] = (theirs == ours, words)
@@ -477,14 +474,9 @@ def dvi_note(ours: Iterable[float]) -> str:
 
 def _ranked(values: Mapping[str, float], name: str) -> tuple[list[str], str]:
     """Return methods from best to worst by an internal index, and the same with values."""
-    order = _order(values, name)
-    return order, ", ".join(f"{method} {values[method]:.3g}" for method in order)
-
-
-def _order(values: Mapping[str, float], name: str) -> list[str]:
-    """Return methods from best to worst by an internal index."""
     higher = bool(METRICS["clusters"][name].higher_is_better)
-    return sorted(values, key=values.__getitem__, reverse=higher)
+    order = sorted(values, key=values.__getitem__, reverse=higher)
+    return order, ", ".join(f"{method} {values[method]:.3g}" for method in order)
 
 
 def _five_degrees(angles: Mapping[str, Record]) -> Block:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 from matplotlib import pyplot as plt
 from matplotlib.ticker import MaxNLocator
-from torch import Tensor
 
 from reproduction.clouds import Run
 from reproduction.evaluation import count_regions, regrow
@@ -28,7 +27,10 @@ def reproduce(run: Run) -> Record:
     cloud = run.cloud(KEY).cloud
     records = [_measure(run, method, angle) for method in STUDIED for angle in ANGLES_DEG]
     _draw(run.folder.path_of("figures/study.png"), records)
-    labelings = {f"paper, {angle:g} degrees": _labels(run, "paper", angle) for angle in DRAWN_DEG}
+    labelings = {
+        f"paper, {angle:g} degrees": regrow(run, KEY, "paper", angle, QUANTILES[0])
+        for angle in DRAWN_DEG
+    }
     image = draw_side_by_side(
         run.folder, "study_angles", cloud, labelings, with_input=cloud.labels is None
     )
@@ -46,16 +48,12 @@ def reproduce(run: Run) -> Record:
     return section("Section II.B: limits of angle and curvature", blocks, records, _claims(records))
 
 
-def _labels(run: Run, method: str, angle: float, quantile: float = QUANTILES[0]) -> Tensor:
-    return regrow(run, KEY, method, angle, quantile)
-
-
 def _measure(run: Run, method: str, angle: float) -> Record:
     """Evaluate both percentiles at an angle, and compare them."""
     cloud = run.cloud(KEY).cloud
 
     def compute() -> Record:
-        both = [_labels(run, method, angle, quantile) for quantile in QUANTILES]
+        both = [regrow(run, KEY, method, angle, quantile) for quantile in QUANTILES]
         found = []
         for labels in both:
             found.append(count_regions(labels))
