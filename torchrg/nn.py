@@ -44,7 +44,7 @@ from torchrg.robust import (
     qn,
 )
 from torchrg.robust.mm import Target
-from torchrg.robust.starts import Starts
+from torchrg.robust.starts import MCDStarts, Starts
 from torchrg.robust.weights import Inliers, Scaling
 from torchrg.structures import NormalFit
 
@@ -156,7 +156,7 @@ class DetMCD(_Function):
     support_fraction: float = 0.5
     _: KW_ONLY
     quantile: float = 0.975
-    starts: Starts = "paper"
+    starts: MCDStarts = "paper"
     small_sample: bool = False
     scaling: Scaling = "consistency"
     inliers: Inliers = "raw"
