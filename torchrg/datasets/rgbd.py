@@ -143,8 +143,8 @@ class RGBDFrames(SceneDataset):
             root: The folder of one recording, or of several.
             layout: A key of :data:`~torchrg.datasets.rgbd_layouts.FRAME_LAYOUTS`: ``tum``,
                 ``icl-nuim``, ``scannet``, ``7-scenes``, ``nerfstudio``, ``arkitscenes``,
-                ``replica``, ``scannetpp``, ``3rscan``, or ``images`` for any folder of depth images. Default:
-                detected from the folder.
+                ``replica``, ``scannetpp``, ``3rscan``, or ``images`` for any folder of depth
+                images. Default: detected from the folder.
             intrinsics: Camera matrix, shape ``(3, 3)``, or a camera of images of another size.
                 Default: from the frames or a camera file next to them, else the built-in camera of
                 ``tum``, ``icl-nuim`` and ``7-scenes``.
