@@ -155,7 +155,7 @@ class Cloud:
 
     @cached_property
     def origin(self) -> NDArray[np.float64]:
-        """Origin of :attr:`points`, shape ``(3,)``; see :func:`local_origin`."""
+        """Origin of :attr:`points`, shape ``(3,)``; see ``local_origin``."""
         finite = self.coordinates[self.finite]
         if len(finite) == 0:
             return np.zeros(3)

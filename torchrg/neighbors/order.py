@@ -1,7 +1,5 @@
 """Canonical point order along a Morton curve, independent of the input order."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

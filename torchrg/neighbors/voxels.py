@@ -1,7 +1,5 @@
 """Voxel sampling with the inverse map to all points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
