@@ -105,10 +105,10 @@ def fit_detmcd(
         exact fits.
 
         The published starts use the coordinate axes: rotating a patch changes the final set of
-            every second one, and a compact minority can mislead all six. On synthetic patches near
-            edges of 90 degrees, the fraction of normals more than 10 degrees off is 21 % with them,
-            4.6 % with ``"planes"`` and 4.8 % with ``"more"``; with 30 % of outliers in one cluster
-            54 %, 0 and 0.
+        every second one, and a compact minority can mislead all six. On synthetic patches near
+        edges of 90 degrees, the fraction of normals more than 10 degrees off is 21 % with them,
+        4.6 % with ``"planes"`` and 4.8 % with ``"more"``; with 30 % of outliers in one cluster
+        54 %, 0 and 0.
 
     Args:
         patches: Points of each neighborhood, shape ``(*, K, P)``; see :class:`RobustFit`.
