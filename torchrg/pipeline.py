@@ -51,8 +51,6 @@ from torchrg.structures import (
 )
 
 __all__ = [
-    "BYTES_PER_POINT",
-    "BYTES_PER_POINT_ON_DISK",
     "make_superpoints",
     "segment_mesh",
     "segment_planes",
