@@ -48,6 +48,21 @@ from torchrg.robust.starts import MCDStarts, Starts
 from torchrg.robust.weights import Inliers, Scaling
 from torchrg.structures import NormalFit
 
+__all__ = [
+    "MVE",
+    "Covariance",
+    "DetMCD",
+    "DetMM",
+    "DetS",
+    "Eigen",
+    "Eigh",
+    "FastMCD",
+    "Normal",
+    "PatchNormals",
+    "Qn",
+]
+__dir__ = __all__.copy
+
 
 @dataclass(eq=False, repr=False)
 class _Function(nn.Module):
