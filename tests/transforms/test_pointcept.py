@@ -23,6 +23,12 @@ from torchrg.errors import MissingDependencyError
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
 
+if "TORCHRG_POINTCEPT" not in os.environ:
+    pytest.skip(
+        "needs TORCHRG_POINTCEPT, a clone of https://github.com/Pointcept/Pointcept (d74c646)",
+        allow_module_level=True,
+    )
+
 OURS = "torchrg.transforms.pointcept"
 SIZES = {"office_1": 2500, "office_2": 2000, "office_3": 1500}
 GRID = {"type": "GridSample", "grid_size": 0.1, "mode": "train", "return_grid_coord": True}
@@ -38,10 +44,6 @@ TAIL = [
 @pytest.fixture(scope="module")
 def datasets():
     """Pointcept's ``datasets`` with our transforms registered; the test removes it again."""
-    if "TORCHRG_POINTCEPT" not in os.environ:
-        pytest.skip(
-            "needs TORCHRG_POINTCEPT, a clone of https://github.com/Pointcept/Pointcept (d74c646)"
-        )
     folder = Path(os.environ["TORCHRG_POINTCEPT"]).absolute()
     ours = sys.modules.pop(OURS, None)
     imported = pointcept_clone.import_datasets(folder)
