@@ -41,7 +41,7 @@ from torchrg.structures import UNLABELED, Cloud, Neighbors, Rows, Segmentation, 
 BYTES_PER_POINT = 900
 """Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
 that of :func:`torchrg.depth.segment_depth`, which takes half of it."""
-BYTES_PER_POINT_ON_DISK = 350
+BYTES_PER_POINT_ON_DISK = 400
 """Memory that a point adds where lists of neighbours are on a disk; see :mod:`torchrg.scratch`."""
 
 _STRENGTH_OF_K = 100.0

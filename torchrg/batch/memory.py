@@ -26,7 +26,7 @@ def scan_memory(num_points: int, *, on_disk: bool = False) -> int:
 
     Example:
         >>> scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)
-        (1300000000, 3900000000)
+        (1300000000, 4400000000)
     """
     return PROCESS_BYTES + (BYTES_PER_POINT_ON_DISK if on_disk else BYTES_PER_POINT) * num_points
 
