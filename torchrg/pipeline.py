@@ -38,12 +38,6 @@ from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.superpoints import merge_duplicates
 from torchrg.structures import UNLABELED, Cloud, Neighbors, Rows, Segmentation, Superpoints
 
-BYTES_PER_POINT = 900
-"""Memory that a point adds at the peak of :func:`segment_planes` with any preset, or a pixel at
-that of :func:`torchrg.depth.segment_depth`, which takes half of it."""
-BYTES_PER_POINT_ON_DISK = 400
-"""Memory that a point adds where lists of neighbours are on a disk; see :mod:`torchrg.scratch`."""
-
 _STRENGTH_OF_K = 100.0
 """Strength of superpoints for a threshold of 1 of ScanNet's Segmentator. At its usual 0.01 there
 shall be about as many superpoints as it makes segments of meshed depth frames."""

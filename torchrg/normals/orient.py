@@ -177,8 +177,8 @@ def find_directions(
         return places, directions
     if orient == "viewpoint":
         raise ConfigError(
-            f"{caller}: expected poses of scanners, as an E57 file may have, or a viewpoint, to "
-            "orient normals by viewpoint, got none; use interior."
+            f"{caller}: expected a viewpoint, or scanner poses as in an E57 file, got none; pass "
+            "the viewpoint (--viewpoint X Y Z), or use interior."
         )
     return places, None
 
