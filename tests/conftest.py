@@ -14,9 +14,8 @@ from torchrg.io import write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
-SCANS = Path(__file__).parents[2] / "shared" / "data"
-ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
-POINTCEPT = Path(__file__).parents[2] / "shared" / "pointcept"
+collect_ignore = ["scripts/first_batch.py"]  # Imports a deprecated function of torch.
+ORACLES = Path(__file__).parent / "oracles"
 
 
 def pytest_addoption(parser):
@@ -26,11 +25,13 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
+    """Leave out slow tests; a skipped test is one that this machine cannot run."""
     if config.getoption("--run-slow"):
         return
-    for item in items:
-        if "slow" in item.keywords:
-            item.add_marker(pytest.mark.skip(reason="slow; run with --run-slow"))
+    slow = [item for item in items if "slow" in item.keywords]
+    if slow:
+        items[:] = [item for item in items if "slow" not in item.keywords]
+        config.hook.pytest_deselected(items=slow)
 
 
 def pytest_collection_finish():
@@ -68,31 +69,14 @@ def set_threads():
 
 @pytest.fixture
 def scan():
-    """Path of a real scan by name; the test is skipped where the scans are absent."""
-
-    def path_of(name):
-        path = SCANS / name
-        if not path.exists():
-            pytest.skip(f"needs the real scan {name}")
-        return path
-
-    return path_of
+    """``scan(name)``: path of a real scan."""
+    return (ORACLES / "scans").joinpath
 
 
 @pytest.fixture
 def oracles_folder():
-    """Folder of reference values; the test is skipped where it is absent."""
-    if not ORACLES.exists():
-        pytest.skip("needs the reference values of other implementations")
+    """Folder of reference values of other implementations."""
     return ORACLES
-
-
-@pytest.fixture(scope="session")
-def pointcept_folder():
-    """Folder of Pointcept's own data pipeline; the test is skipped where it is absent."""
-    if not POINTCEPT.exists():
-        pytest.skip("needs the data pipeline of Pointcept")
-    return POINTCEPT
 
 
 @functools.cache

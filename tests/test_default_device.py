@@ -47,7 +47,6 @@ EVERYTHING = {name: lambda name=name: CALLS[name](ARGUMENTS[name]) for name in C
 EVERYTHING |= {
     f"preset {name}": lambda name=name: torchrg.segment_planes(POINTS, name)
     for name in preset_names()
-    if name != "rgbd"
 }
 EVERYTHING |= {
     "make_room": lambda: torchrg.scenes.make_room(num_points=500, noise=0.01, seed=3),

@@ -56,7 +56,7 @@ if hasattr(os, "register_at_fork"):
 def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Move large arrays to the disk of a folder, with identical results and bounded memory.
 
-    Segmenting a cloud then takes about 350 bytes of memory per point, including file pages not yet
+    Segmenting a cloud then takes about 400 bytes of memory per point, including file pages not yet
     released by the system. It takes up to nine bytes of disk per neighbor of a point. Results
     contain no such array and can be used afterwards. The folder should be on a disk; some systems
     keep ``/tmp`` in memory.

@@ -166,7 +166,8 @@ def test_box_in_a_room_looks_outwards(rng):
     assert share_right(oriented, truth) > 0.995
 
 
-def test_few_points_that_noise_has_tilted_follow_the_floor_they_are_part_of(rng):
+@pytest.mark.parametrize("tilt_deg", [13, 70])
+def test_few_points_that_noise_has_tilted_follow_the_floor_they_are_part_of(rng, tilt_deg):
     # Under a shelf 10 cm high they see less above than below, where another storey lies.
     storeys = [box_room((4.0, 3.0, 2.5), (0.0, 0.0, z), rng, count=3000) for z in (0.0, -2.7)]
     points, inwards = (torch.cat(parts) for parts in zip(*storeys, strict=True))
@@ -174,7 +175,7 @@ def test_few_points_that_noise_has_tilted_follow_the_floor_they_are_part_of(rng)
     shelf += torch.tensor([1.5, 1.2, 0.1])
     off_middle = (points - torch.tensor([1.8, 1.5, 0])).norm(dim=1)
     few = off_middle.argsort()[:6]
-    tilt = math.radians(13)
+    tilt = math.radians(tilt_deg)
     inwards[few] = torch.tensor([math.sin(tilt), 0, math.cos(tilt)])
     normals = torch.cat([inwards, torch.tensor([0.0, 0, 1]).expand(400, 3)])
     oriented = orient_normals(torch.cat([points, shelf]), shuffled_signs(normals))

@@ -51,16 +51,21 @@ def scale_of(fit):
 
 
 def test_dets_is_that_of_rrcov_and_of_the_reference(oracles_folder):
+    compared = {"rrcov": 0, "ours": 0}
     for name, fit, rrcov, ours in regular_fits(oracles_folder, fit_dets, ["r_rrcov", "ref_numpy"]):
         if "cov" in rrcov["dets"] and name not in WRONG_RRCOV:
             assert_same_scatter(fit, rrcov["dets"]["cov"], 1e-6, name)
             assert scale_of(fit) == pytest.approx(rrcov["dets"]["crit"], rel=1e-8), name
+            compared["rrcov"] += 1
         if "s_cov" in ours.get("dets_mm", {}):
             assert_same_scatter(fit, ours["dets_mm"]["s_cov"], 1e-6, name)
+            compared["ours"] += 1
+    assert compared == {"rrcov": 60, "ours": 62}
 
 
 @pytest.mark.parametrize(("target", "short"), [("shape", "shape"), ("location", "loc")])
 def test_detmm_is_that_of_rrcov_and_of_the_reference(oracles_folder, target, short):
+    compared = 0
     for name, fit, rrcov, ours in regular_fits(
         oracles_folder,
         fit_detmm if target == "shape" else fit_for_location,
@@ -74,6 +79,8 @@ def test_detmm_is_that_of_rrcov_and_of_the_reference(oracles_folder, target, sho
                 assert_same_scatter(fit, expected, 1e-5, name)
                 angle = angle_deg(normal_of(fit.covariance), normal_of(expected))
                 assert angle < 1e-4, name
+                compared += 1
+    assert compared == 122
 
 
 def test_detmm_agrees_with_statsmodels_where_the_scales_do(oracles_folder):
@@ -89,6 +96,7 @@ def test_detmm_agrees_with_statsmodels_where_the_scales_do(oracles_folder):
 
 
 def test_float32_agrees(oracles_folder):
+    compared = 0
     for fit, key, tolerance in ((fit_dets, "s_cov", 1e-4), (fit_detmm, "mm_shape_cov", 1e-3)):
         for name, found, ours in regular_fits(
             oracles_folder, fit, ["ref_numpy"], local_float32, FLAT_IN_FLOAT32
@@ -99,9 +107,11 @@ def test_float32_agrees(oracles_folder):
             if name == "planar_very_fine":
                 tolerance = 1e-3  # its noise is a hundred times the rounding of a coordinate
             assert_same_scatter(found, expected, tolerance, name)
+            compared += 1
             if name != "line_noisy":
                 angle = angle_deg(normal_of(found.covariance), normal_of(expected))
                 assert angle < 0.02, name
+    assert compared == 122
 
 
 def test_tuning_constants_are_those_of_the_literature():

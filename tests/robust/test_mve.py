@@ -10,6 +10,7 @@ from torchrg.robust import fit_mve
 
 def test_exhaustive_search_finds_the_least_volume(oracles_folder):
     patches, cases, ours, mass = load_oracles(oracles_folder, "ref_numpy", "r_mass")
+    compared = compared_with_mass = 0
     for name in (f"small_n{n:02d}" for n in (7, 8, 9, 10, 11, 12, 13, 15)):
         for level, fraction in FRACTIONS.items():
             answer = ours[name].get(f"mve_exhaustive_{level}")
@@ -27,16 +28,22 @@ def test_exhaustive_search_finds_the_least_volume(oracles_folder):
             theirs = mass[name].get("mve", {})
             if level == "50" and mass[name].get("mve_exact") and "crit" in theirs:
                 assert abs(fit.log_det.item() - theirs["crit"] + 3 * log(3)) < 1e-7, name
+                compared_with_mass += 1
+            compared += 1
+    assert (compared, compared_with_mass) == (16, 8)
 
 
 def test_random_search_comes_near(oracles_folder):
     patches, cases, ours = load_oracles(oracles_folder, "ref_numpy")
+    compared = 0
     for name, patch in patches.items():
         answer = ours[name].get("mve_exhaustive_50")
         if cases[name]["group"] not in ("planar", "edge", "curved") or not answer:
             continue
         fit = fit_mve(torch.from_numpy(patch), num_starts=3000)
         assert -1e-7 < fit.log_det.item() - answer["log_objective"] < 1.0, name
+        compared += 1
+    assert compared == 20
 
 
 def test_covers_h_points_and_leaves_out_a_cluster(dtype, rng):

@@ -28,6 +28,7 @@ def assert_close(found, expected, tolerance):
 
 def test_qn_agrees_with_other_implementations(oracles_folder):
     patches, _, ours, robustbase = load_oracles(oracles_folder, "ref_numpy", "r_robustbase")
+    assert len(patches) == 75
     for name, patch in patches.items():
         columns = torch.from_numpy(patch)
         raw = qn(columns, dim=0) / 2.2219
@@ -41,6 +42,7 @@ def test_qn_agrees_with_other_implementations(oracles_folder):
 
 def test_qn_of_float32_agrees_after_centering(oracles_folder):
     patches, _, ours = load_oracles(oracles_folder, "ref_numpy")
+    compared = 0
     for name, patch in patches.items():
         if name.endswith(("utm", "off1e4")):
             continue
@@ -48,6 +50,8 @@ def test_qn_of_float32_agrees_after_centering(oracles_folder):
         found = qn(local_float32(patch), dim=0).double().numpy() / 2.2219
         rounding = 2e-7 * np.abs(patch - patch[0]).max(axis=0)
         assert (np.abs(found - expected) <= 1e-6 * expected + rounding).all(), name
+        compared += 1
+    assert compared == 71
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 9, 12, 13, 36, 37, 49, 50, 51, 52, 53, 64])

@@ -173,7 +173,7 @@ def programs(workplace):
     """The same with checkouts of the programs; the test is skipped where they are absent."""
     folder, environment = workplace
     if "TORCHRG_CLIENTS" not in os.environ:
-        pytest.skip("needs TORCHRG_CLIENTS, a folder of the programs' repositories")
+        pytest.skip("needs TORCHRG_CLIENTS, a folder of `git clone --bare` of each program")
     return folder, environment | {"FIRST_BATCH": str(FIRST_BATCH)}
 
 

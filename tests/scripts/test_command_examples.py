@@ -47,7 +47,7 @@ def write_stations(points):
 
 
 def write_frames():
-    """Depth images of a wall, alone, in a folder, and in a capture; and an organised cloud."""
+    """Depth images of a wall, alone, in a folder and in a capture; a camera; an organized cloud."""
     rows, columns = np.mgrid[0:480, 0:640]
     depth = 2000.0 + 0.5 * columns
     image = depth.astype(np.uint16)
@@ -55,6 +55,7 @@ def write_frames():
         Path(path).parent.mkdir(exist_ok=True)
         write_png(Path(path), image)
     camera = {"fl_x": 525, "fl_y": 525, "cx": 320, "cy": 240, "w": 640, "h": 480}
+    Path("camera.json").write_text(json.dumps(camera))
     frame = {"depth_file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
     content = camera | {"frames": [frame | {"file_path": "0.jpg"}]}
     Path("capture/transforms.json").write_text(json.dumps(content))

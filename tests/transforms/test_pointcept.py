@@ -4,9 +4,11 @@ What a point's label must be is looked up by its coordinates in a table of the w
 """
 
 import importlib
+import os
 import random
 import sys
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,14 +16,20 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from tests.transforms import pointcept_clone
 from torchrg.config import load_config
 from torchrg.datasets import write_pointcept_scene
 from torchrg.errors import MissingDependencyError
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
 
+if "TORCHRG_POINTCEPT" not in os.environ:
+    pytest.skip(
+        "needs TORCHRG_POINTCEPT, a clone of https://github.com/Pointcept/Pointcept (d74c646)",
+        allow_module_level=True,
+    )
+
 OURS = "torchrg.transforms.pointcept"
-STAND_INS = ("real", "pointcept", "torch_scatter", "torchvision", "termcolor", OURS)
 SIZES = {"office_1": 2500, "office_2": 2000, "office_3": 1500}
 GRID = {"type": "GridSample", "grid_size": 0.1, "mode": "train", "return_grid_coord": True}
 CROP = {"type": "SphereCrop", "sample_rate": 0.6, "mode": "random"}
@@ -34,17 +42,17 @@ TAIL = [
 
 
 @pytest.fixture(scope="module")
-def datasets(pointcept_folder):
-    """Pointcept's ``datasets`` with ours made known; nothing of it stays behind."""
+def datasets():
+    """Pointcept's ``datasets`` with our transforms registered; the test removes it again."""
+    folder = Path(os.environ["TORCHRG_POINTCEPT"]).absolute()
     ours = sys.modules.pop(OURS, None)
-    sys.path.insert(0, str(pointcept_folder))
-    importlib.import_module("real")
+    imported = pointcept_clone.import_datasets(folder)
     importlib.import_module(OURS)
-    yield importlib.import_module("pointcept.datasets")
-    for name in [name for name in sys.modules if name.startswith(STAND_INS)]:
-        if name.startswith(STAND_INS[:2]) or getattr(sys.modules[name], "__file__", None) is None:
+    yield imported
+    for name in [name for name in sys.modules if name.startswith((*pointcept_clone.NAMES, OURS))]:
+        if name.startswith("pointcept") or getattr(sys.modules[name], "__file__", None) is None:
             del sys.modules[name]
-    sys.path[:] = [folder for folder in sys.path if folder != str(pointcept_folder)]
+    sys.path.remove(str(folder))
     sys.modules.pop(OURS, None)
     if ours is not None:
         sys.modules[OURS] = ours

@@ -5,7 +5,7 @@ from pathlib import Path
 
 PROCESS_BYTES = 400_000_000
 """Memory of a process without points: Python, torch, scipy."""
-_BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 350, (True, True): 600}
+_BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 400, (True, True): 600}
 """Peak memory per point or pixel with any preset, by whether there are superpoints and whether the
 large arrays are on disk."""
 _CGROUP = Path("/sys/fs/cgroup")
@@ -27,7 +27,7 @@ def scan_memory(num_points: int, *, superpoints: bool = False, on_disk: bool = F
 
     Example:
         >>> scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)
-        (900000000, 3900000000)
+        (900000000, 4400000000)
     """
     return PROCESS_BYTES + _BYTES_PER_POINT[superpoints, on_disk] * num_points
 

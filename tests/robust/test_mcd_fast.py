@@ -34,8 +34,11 @@ def test_objective_reaches_the_best_known(oracles_folder):
 
 def test_objective_of_float32_reaches_the_best_known(oracles_folder):
     groups = ("edge", "corner", "outliers", "curved")
+    seen = 0
     for name, gap, _ in gaps(oracles_folder, local_float32, lambda c: c["group"] in groups):
         assert -1e-3 <= gap <= 0.051, name
+        seen += 1
+    assert seen == 42
 
 
 def test_finds_the_subset_of_robustbase_where_the_objectives_agree(oracles_folder):

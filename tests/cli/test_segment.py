@@ -67,7 +67,7 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path, run
 @pytest.mark.parametrize(
     ("limit", "message"),
     [
-        ("0.1", r"a.npz: expected --limit-memory of at least 0.407 GB for about 20,000"),
+        ("0.1", r"a.npz: expected --limit-memory of at least 0.408 GB for about 20,000"),
         ("-1", "expected --limit-memory above 0 and at most 1,000,000 GB, got -1"),
     ],
 )

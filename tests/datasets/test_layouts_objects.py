@@ -15,7 +15,7 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.datasets import FolderOfClouds, ScanNet
-from torchrg.datasets.layouts import LAYOUTS, LayoutScan
+from torchrg.datasets.layouts import LAYOUTS, LayoutScan, _boxes
 from torchrg.datasets.scannet import read_objects, read_scannet_scan
 from torchrg.errors import ConfigError, FormatError
 from torchrg.scenes import make_room
@@ -190,6 +190,13 @@ def test_the_first_object_of_a_scan_has_a_box(release, root):
             expected.append([*(low + high) / 2, *(high - low), WORDS[word][0]])
     assert len(boxes) == 3
     assert np.allclose(boxes, expected, atol=1e-6)
+
+
+def test_the_category_of_a_box_is_that_of_most_of_its_points():
+    chair, table = WORDS["office chair"][0], WORDS["table"][0]
+    for few, most in ((chair, table), (table, chair)):
+        boxes = _boxes(np.eye(3), np.array([few, most, most]), np.array([1, 1, 1]))
+        assert boxes.tolist() == [[0.5, 0.5, 0.5, 1, 1, 1, most]]
 
 
 def test_pointcepts_classes_of_scannet_become_categories_of_nyu40(release, root):

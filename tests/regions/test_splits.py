@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.regions.test_refine import flat_cloud, scattered, with_settings
+from tests.regions.test_repair import flat_cloud, scattered, with_settings
 from torchrg import load_config, segment_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.fit import RegionPlanes, fit_regions

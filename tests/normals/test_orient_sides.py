@@ -68,6 +68,19 @@ def test_few_points_without_a_front_follow_the_nearest_that_have_one(scanned):
     assert torch.equal(orient_normals(moved, -normals[order]), turned[order])
 
 
+@pytest.mark.parametrize("odd", range(4))
+def test_all_of_the_nearest_points_decide_where_a_point_without_a_front_looks(odd):
+    # Four points as near as one another: three of them were seen from above, one from below.
+    near = torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    far = torch.cartesian_prod(torch.arange(20.0) + 9, torch.arange(20.0), torch.zeros(1))
+    points = torch.cat([torch.zeros(1, 3), near, far])
+    front = torch.tensor([0.0, 0, 1]).repeat(len(points), 1)
+    front[0], front[1 + odd] = 0, -front[1 + odd]
+    normals = torch.tensor([0.0, 0, -1]).repeat(len(points), 1)
+    turned = orient_normals(Cloud(points.numpy(), front=front.numpy()), normals)
+    assert turned[0].tolist() == [0, 0, 1]
+
+
 def test_many_points_without_a_front_look_into_the_room(scanned):
     cloud, normals, _ = scanned
     front = cloud.front.copy()

@@ -162,17 +162,20 @@ def test_float32_finds_the_same_subset(oracles_folder, starts):
         for name, points in patches.items()
         if name not in FLAT_IN_FLOAT32
     }
-    key = f"detmcd_{starts}_{{}}"
+    key, seen = f"detmcd_{starts}_{{}}", 0
     for name, _, fit, answer in regular_fits(local, cases, ours, key, starts=starts):
         assert points_of(fit.raw_support) == set(answer["best"]), name
+        seen += 1
         if name in ("planar_very_fine", "line_noisy"):
             continue  # thinner than a matrix of float32 can hold
         assert abs(fit.log_det.item() - answer["logdet"]) < 1e-3, name
         assert angle_deg(normal_of(fit.covariance), normal_of(answer["cov"])) < 0.01, name
+    assert seen == {"robustbase": 123, "paper": 119}[starts]
 
 
 def test_size_of_the_subset_is_that_of_robustbase(oracles_folder):
     _, _, robustbase = load_oracles(oracles_folder, "r_robustbase")
+    seen = 0
     for answers in robustbase.values():
         for level, fraction in FRACTIONS.items():
             answer = answers[f"detmcd_{level}"]
@@ -181,6 +184,8 @@ def test_size_of_the_subset_is_that_of_robustbase(oracles_folder):
                 assert answer["raw_cnp2"][0] == pytest.approx(
                     consistency_factor(answer["h"] / answers["n"], 3), rel=1e-12
                 )
+                seen += 1
+    assert seen == 129
     assert subset_size(50, 3, 1.0) == 50
 
 
