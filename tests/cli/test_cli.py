@@ -354,14 +354,17 @@ def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
         with np.load(out) as result:
             labels.append(result["labels"])
     assert np.array_equal(np.load(out)["points"], far, equal_nan=True)
-    told = "4 of 6,000 points are not finite or beyond 1e+12; they stay in place, unlabelled"
+    told = "4 of 6,000 points are not finite or beyond 1e+12; they stay unlabeled"
     assert told in done.err
     assert (labels[1][[3, 5, 9, 11]] == -1).all()
     assert (labels[1] != labels[0]).sum() < 60
     assert labels[1].max() == labels[0].max() >= 3
     np.save(tmp_path / "huge.npy", far * 1e20)
     line = run("segment", tmp_path / "huge.npy", "--out", tmp_path / "a.npz").error
-    assert "huge.npy: expected finite points, got none in 6,000 points; those beyond 1e+12" in line
+    assert (
+        "huge.npy: expected finite points, got none in 6,000 points; coordinates beyond 1e+12"
+        in line
+    )
 
 
 def test_single_points_far_off_that_cost_precision_are_told(room_file, tmp_path, run):

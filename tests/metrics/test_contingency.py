@@ -125,9 +125,9 @@ def test_arguments_are_left_alone():
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        (torch.zeros(4), "labels of integers, got float32; convert with .long"),
-        (torch.zeros(4, dtype=torch.bool), "labels of integers, got bool"),
-        (np.zeros(4), "labels of integers, got float64"),
+        (torch.zeros(4), "integer labels, got float32; convert with .long"),
+        (torch.zeros(4, dtype=torch.bool), "integer labels, got bool"),
+        (np.zeros(4), "integer labels, got float64"),
         (torch.zeros(3, dtype=torch.int64), r"truth of shape \(N\) with N=3, got \(4,\)"),
         (torch.zeros(2, 2, dtype=torch.int64), r"labels of shape \(N\), got \(2, 2\)"),
         ([0, 0, 0, 0], "labels to be a tensor or a NumPy array, got list"),

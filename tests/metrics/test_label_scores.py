@@ -149,7 +149,7 @@ def test_labels_that_do_not_fit_are_refused():
     whole = torch.zeros(4, dtype=torch.int64)
     with pytest.raises(ShapeError, match=r"score_labels: expected truth of shape \(N\) with N=4"):
         score_labels(whole, whole[:3])
-    with pytest.raises(ShapeError, match="score_labels: expected labels of integers, got float32"):
+    with pytest.raises(ShapeError, match="score_labels: expected integer labels, got float32"):
         score_labels(whole.float(), whole)
     with pytest.raises(ConfigError, match="score_labels: expected min_size >= 1, got 0"):
         score_labels(whole, whole, min_size=0)

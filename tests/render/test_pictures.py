@@ -228,7 +228,7 @@ def test_input_that_needs_gradients_is_drawn(room):
         ({"colors": torch.zeros(4, 3, dtype=torch.uint8)}, ShapeError, "expected colors of shape"),
         ({"normals": torch.zeros(4, 3)}, ShapeError, "expected normals of shape"),
         ({"labels": torch.zeros(4).long()}, ShapeError, "expected labels of shape"),
-        ({"labels": torch.zeros(5)}, ShapeError, "expected labels of integers, got float32"),
+        ({"labels": torch.zeros(5)}, ShapeError, "expected integer labels, got float32"),
         ({"points": torch.zeros(5, 3).long()}, ShapeError, "points of float32 or float64"),
         ({"view": "inside"}, ConfigError, "view to be one of cutaway, above, outside, sensor"),
         ({"up": (0.0, 0.0, 0.0)}, ConfigError, "up to be a direction"),

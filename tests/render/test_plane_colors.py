@@ -153,7 +153,7 @@ def test_curvature_scale_ends_where_it_is_told():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: color_planes(torch.zeros(3)), ShapeError, "labels of integers"),
+        (lambda: color_planes(torch.zeros(3)), ShapeError, "integer labels"),
         (lambda: color_planes(torch.zeros(3).long(), torch.rand(4, 3)), ShapeError, "points of"),
         (
             lambda: color_planes(torch.zeros(3).long(), reference=torch.zeros(2).long()),

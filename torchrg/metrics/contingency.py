@@ -132,7 +132,7 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
         if tensor.dtype not in INTEGERS:
             dtype = str(tensor.dtype).removeprefix("torch.")
             raise ShapeError(
-                f"{caller}: expected {name} of integers, got {dtype}; convert with .long()."
+                f"{caller}: expected integer {name}, got {dtype}; convert with .long()."
             )
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
     check_same_device(caller, **tensors)
