@@ -1,14 +1,13 @@
-"""Make the tables and figures of the paper again, with every method of torchrg.
+"""Reproduce the tables and figures of the paper with every method of torchrg.
 
     python scripts/reproduce_paper.py --out DIR                 # everything
-    python scripts/reproduce_paper.py --out DIR --quick         # the same, small, in minutes
-    python scripts/reproduce_paper.py --out DIR normals times   # some parts
+    python scripts/reproduce_paper.py --out DIR --quick         # small clouds, in minutes
+    python scripts/reproduce_paper.py --out DIR normals times   # selected parts
 
-Open DIR/report.html. Each result is kept in a file of its own under DIR; what the same commit made
-is not computed again, so a run that was interrupted goes on where it stopped; delete DIR/cells to
-measure once more. At full size the tree
-must be clean: a report is of one commit. Quick results are apart, in DIR/quick. Clouds of the paper
-that are not given are replaced by made ones with known truth.
+Open DIR/report.html. Each result is stored in a separate file under DIR and reused by the same
+commit, so rerunning the command resumes an interrupted run; delete DIR/cells to measure again. A
+full report needs a clean working tree, because it documents one commit. Quick results go to
+DIR/quick. Missing clouds of the paper are replaced by synthetic ones with known ground truth.
 """
 
 import argparse
@@ -36,11 +35,11 @@ PARTS: dict[str, tuple[Callable[[Run], Record], str]] = {
     "segmentation": (segmentation.reproduce, "Table 2, Figures 7 to 9"),
     "times": (times.reproduce, "Table 3: times"),
 }
-"""Parts by name: what makes them, and what they are."""
+"""Parts by name: function and description."""
 
 
 def main() -> None:
-    """Make the parts that are asked for, and the report of all parts that are there."""
+    """Compute the selected parts and write the report of all available parts."""
     arguments = _parse()
     mpl.use("agg")
     if arguments.threads is not None:
@@ -48,8 +47,8 @@ def main() -> None:
     commit = made_with()["commit"]
     if not arguments.quick and not is_committed(commit):
         sys.exit(
-            "reproduce_paper.py: expected committed code for a report at full size, got commit "
-            f"{commit}; commit the changes, or take --quick."
+            "reproduce_paper.py: expected committed code for a full report, got commit "
+            f"{commit}; commit the changes, or use --quick."
         )
     path = arguments.out / "quick" if arguments.quick else arguments.out
     folder = Folder(path)
@@ -61,7 +60,7 @@ def main() -> None:
         folder.write(f"parts/{name}.json", json.dumps(part, indent=1))
         print(f"== {name}: {time.perf_counter() - begin:.0f} s", flush=True)
     report = write_report(folder, list(PARTS), quick=arguments.quick)
-    print(f"Look at {folder.path / 'report.html'} (also .json)")
+    print(f"Report: {folder.path / 'report.html'} (also .json)")
     if arguments.keep:
         try:
             summary.keep(report)
@@ -80,12 +79,12 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the report")
     parser.add_argument("--quick", action="store_true", help="small clouds, a few minutes")
-    parser.add_argument("--threads", type=int, help="threads of torch; default: as torch decides")
+    parser.add_argument("--threads", type=int, help="torch threads; default: chosen by torch")
     parser.add_argument(
-        "--keep", action="store_true", help="keep the main numbers for the documentation"
+        "--keep", action="store_true", help="store the main results for the documentation"
     )
     for key, title in TITLES.items():
-        words = f"the paper's {title}; labels and normals in the file are its truth"
+        words = f"the paper's {title}; its labels and normals are the ground truth"
         parser.add_argument(f"--{key}", type=Path, metavar="PATH", help=words)
     return parser.parse_args()
 
@@ -94,4 +93,4 @@ if __name__ == "__main__":
     try:
         main()
     except KeyboardInterrupt:
-        sys.exit("Interrupted; the same command goes on from here.")
+        sys.exit("Interrupted; rerun the same command to resume.")

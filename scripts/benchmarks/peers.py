@@ -1,10 +1,9 @@
-"""torchrg beside PCL, CGAL and Open3D on the same clouds: seconds of stages, memory, ratios.
+"""Speed and memory of torchrg, PCL, CGAL and Open3D on the same clouds.
 
-FOLDER of ``--programs`` holds ``pclrg`` (PCL's normals and region growing) and ``cgaln`` (CGAL's
-PCA and jet normals); what is missing there, or not installed, is left out. ``torchrg-*`` and
-``open3d-*`` are warm calls in one process, ``*-command`` the whole command, which is compared with
-PCL's whole process. Contenders run one after the other, round by round; ratios are those within a
-round.
+FOLDER of ``--programs`` contains ``pclrg`` (PCL's normals and region growing) and ``cgaln`` (CGAL's
+PCA and jet normals); missing programs are skipped. ``torchrg-*`` and ``open3d-*`` are warm calls in
+one process; ``*-command`` is the complete command, compared with PCL's complete process. Contenders
+run in turn, round by round; ratios are medians of the ratios within a round.
 
     python scripts/bench.py peers --programs FOLDER --out peers.json
     python scripts/bench.py peers --programs FOLDER --sizes 100000 --only pclrg torchrg-classic
@@ -35,11 +34,11 @@ from benchmarks.harness import (
 )
 
 K, MAX_ANGLE_DEG, CURVATURE_PERCENTILE, MIN_SIZE = 50, 5, 95, 50
-"""Settings of PCL's region growing: those of ``classic``."""
+"""Settings of PCL's region growing, as in ``classic``."""
 PRESETS = ("classic", "paper", "consensus")
 SEED, NOISE = 7, 0.003
 WARM_UP = 5000
-"""Points, about, on which a contender runs once before it is timed."""
+"""Approximate number of points for the warm-up run."""
 
 
 def pcl_command(program: Path, cloud: Path, labels: Path, min_size: int = MIN_SIZE) -> list[object]:
@@ -53,9 +52,9 @@ class Case(Benchmark):
     programs: Path | None = None
     """Folder of the programs pclrg and cgaln."""
     scans: tuple[Path, ...] = ()
-    """Scans to run on too."""
+    """Additional scans."""
     sizes: tuple[int, ...] = (100_000, 1_000_000, 4_000_000)
-    """Points of made rooms, in random order and in that of a space-filling curve."""
+    """Numbers of points of synthetic rooms, in random order and along a space-filling curve."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
         rooms = [f"room {size} {order}" for size in self.sizes for order in ("random", "sorted")]
@@ -77,7 +76,7 @@ class Case(Benchmark):
         return runs
 
     def report(self, results: Results) -> str:
-        """Return seconds, memory, and ratios of like to like; above 1 torchrg is slower."""
+        """Return seconds, memory, and ratios of comparable runs; above 1 torchrg is slower."""
         rows = []
         for cloud, by_name in results.items():
             for name, runs in by_name.items():
@@ -90,7 +89,7 @@ class Case(Benchmark):
                     for other in ("pclrg", "open3d-pca")
                 ]
                 rows.append([cloud, name, *(found[key] for key in FIELDS), *ratios])
-        return markdown(["cloud", "what", *FIELDS.values(), "to PCL", "to Open3D"], rows)
+        return markdown(["cloud", "contender", *FIELDS.values(), "to PCL", "to Open3D"], rows)
 
 
 FIELDS = {
@@ -99,19 +98,19 @@ FIELDS = {
     "whole": "whole process, s",
     "peak_mib": "peak MiB",
 }
-"""Figures of a run, and their columns."""
+"""Figures of a run and their column titles."""
 
 
 @contextlib.contextmanager
 def cloud_files(cloud: str) -> Iterator[Path]:
-    """Write a cloud as ``cloud.npy`` and ``cloud.f32``, in a process of its own."""
+    """Write a cloud as ``cloud.npy`` and ``cloud.f32`` in a separate process."""
     with tempfile.TemporaryDirectory() as folder:
         run_program(serve_command("benchmarks.peers:write_cloud", cloud, folder))
         yield Path(folder)
 
 
 def write_cloud(cloud: str, folder: str) -> None:
-    """Read a scan or make a room, and write its points for all contenders."""
+    """Read a scan or generate a room, and write its points for all contenders."""
     import numpy as np
     import torch
 
@@ -140,7 +139,7 @@ def _figures(seconds: dict[str, float], whole: float, peak_bytes: int) -> Figure
 
 
 def _run_warm(work: str, folder: Path) -> Figures:
-    """Run a call of a Python library, warm, in a process of its own."""
+    """Run a warm call of a Python library in a separate process."""
     command = serve_command("benchmarks.peers:prepare", work, str(folder / "cloud.npy"))
     text, whole, peak = run_program(command, stdin="\n")
     return _figures(json.loads(text.splitlines()[-1])["stages"], whole, peak)
@@ -156,9 +155,9 @@ def _run_command(preset: str, folder: Path) -> Figures:
 
 
 def _run_peer(program: Path, folder: Path) -> Figures:
-    """Run a program, which prints the seconds of its stages."""
+    """Run a program that prints the seconds of its stages."""
     cloud = folder / "cloud.f32"
-    # CGAL adds the point itself.
+    # CGAL adds the point itself to its neighbors.
     command = [program, cloud, K - 1]
     if program.name == "pclrg":
         command = pcl_command(program, cloud, folder / "labels.i32")
@@ -169,7 +168,7 @@ def _run_peer(program: Path, folder: Path) -> Figures:
 
 
 def prepare(work: str, file: str) -> Callable[[], Figures]:
-    """Return what times a library on a file of points, run once already on few of them."""
+    """Return a timed call of a library on a file of points, after a warm-up run."""
     import numpy as np
 
     points = np.load(file)
