@@ -26,7 +26,7 @@ def flags_of(kind: type) -> list[Flag]:
     """Return the arguments of a command; defaults of settings come from the preset."""
     start = None
     if "settings" in {field.name for field in dataclasses.fields(kind)}:
-        start = {"settings": PlaneSettings.asked_for([])}
+        start = {"settings": PlaneSettings.from_arguments([])}
     return list(list_flags(kind, start))
 
 

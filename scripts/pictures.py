@@ -82,7 +82,7 @@ def segment_room() -> Result:
     room = torchrg.scenes.make_room(NUM_POINTS, noise=NOISE, seed=SEED)
     upright = dataclasses.replace(torchrg.load_config(), planes=PlanesConfig(up="z"))
     seg = torchrg.segment_planes(room.points, upright)
-    return Result.of(torchrg.Cloud(room.points.numpy(), source="room.ply"), seg)
+    return Result.from_segmentation(torchrg.Cloud(room.points.numpy(), source="room.ply"), seg)
 
 
 def draw_page(path: Path, result: Result) -> bool:

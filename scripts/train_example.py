@@ -95,7 +95,7 @@ class Sample(NamedTuple):
         superpoint: Shape ``(N,)``; a point without a plane is a separate superpoint.
         target: Classes, shape ``(N,)``.
         inverse: Row in the finest level of each point of the scan, shape ``(P,)``.
-        truth: Classes of all points of the scan, shape ``(P,)``.
+        ground_truth: Classes of all points of the scan, shape ``(P,)``.
     """
 
     levels: list[Level]
@@ -104,7 +104,7 @@ class Sample(NamedTuple):
     superpoint: Tensor
     target: Tensor
     inverse: Tensor
-    truth: Tensor
+    ground_truth: Tensor
 
 
 def draw_room(seed: int, num_points: int) -> Scene:
@@ -138,16 +138,16 @@ def prepare(room: Scene) -> Sample:
     """Segment the scan, then downsample it to voxels."""
     seg = segment_planes(room.points)
     voxels = sample_voxels(room.points, VOXELS[0])
-    rows, truth = voxels.rows, classes_of(room)
+    rows, ground_truth = voxels.rows, classes_of(room)
     plane, singleton = seg.labels[rows], len(seg.planes) + torch.arange(len(rows))
     return Sample(
         make_levels(room.points[rows]),
         seg.normals[rows],
         seg.curvature[rows],
         torch.where(plane >= 0, plane, singleton).unique(return_inverse=True)[1],
-        truth[rows],
+        ground_truth[rows],
         voxels.inverse,
-        truth,
+        ground_truth,
     )
 
 
@@ -271,10 +271,10 @@ def draw_turn(rng: np.random.Generator) -> Tensor:
     return torch.from_numpy(scale * turn).float()
 
 
-def class_ious(predicted: Sequence[Tensor], truth: Sequence[Tensor]) -> Tensor:
+def class_ious(predicted: Sequence[Tensor], ground_truth: Sequence[Tensor]) -> Tensor:
     """Return the intersection over union of each class over all rooms, in percent."""
     size = len(CLASSES)
-    pairs = torch.cat(list(truth)) * size + torch.cat(list(predicted))
+    pairs = torch.cat(list(ground_truth)) * size + torch.cat(list(predicted))
     counts = pairs.bincount(minlength=size * size).reshape(size, size).double()
     both = counts.diagonal()
     return 100 * both / (counts.sum(dim=0) + counts.sum(dim=1) - both).clamp(min=1)
@@ -285,7 +285,7 @@ def score(model: PointUNet, rooms: Sequence[Sample], variant: Variant) -> Tensor
     """Return the IoU of each class over all points of the rooms."""
     labels = [predict(model, room, variant, torch.eye(3)).argmax(dim=1) for room in rooms]
     restored = [expand_to_points(of, room.inverse) for of, room in zip(labels, rooms, strict=True)]
-    return class_ious(restored, [room.truth for room in rooms])
+    return class_ious(restored, [room.ground_truth for room in rooms])
 
 
 def score_lookup(train_rooms: Sequence[Scene], test_rooms: Sequence[Scene]) -> Tensor:

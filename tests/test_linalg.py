@@ -238,7 +238,7 @@ def test_quantiles_of_small_and_large_regions_are_those_of_sorted_values(size: i
     values = torch.rand(len(labels), generator=generator)
     segments = Segments(labels)
     for fraction in (0.0, 0.33, 0.5, 1.0):
-        found = segments.quantile(segments.take(values), fraction)
+        found = segments.quantile(segments.gather(values), fraction)
         expected = []
         for label in range(40):
             ascending = values[labels == label].sort().values

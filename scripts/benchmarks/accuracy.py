@@ -106,7 +106,9 @@ class LabeledCloud(NamedTuple):
     """Point cloud with ground truth."""
 
     points: Tensor  # shape ``(N, 3)``
-    truth: Tensor  # shape ``(N,)``, -1 for points of no plane, VOID for those that do not count
+    ground_truth: (
+        Tensor  # shape ``(N,)``, -1 for points of no plane, VOID for those that do not count
+    )
     # Minimum region size, unless the preset measures it.
     min_size: int = MIN_SIZE
     # Source depth image; points are in the order of its pixels with depth.
@@ -199,8 +201,8 @@ def _frames(sensor: str, scale: float) -> Clouds:
         points = depth_to_points(frame.depth[None], camera.intrinsics[None])[0].view(-1, 3)
         # Columns and balls are not planar.
         planar = torch.cat([frame.planar, torch.tensor([False])])
-        truth = torch.where(planar[frame.labels], frame.labels, -1).flatten()
-        clouds.append(LabeledCloud(points[seen].float(), truth[seen], frame=frame))
+        ground_truth = torch.where(planar[frame.labels], frame.labels, -1).flatten()
+        clouds.append(LabeledCloud(points[seen].float(), ground_truth[seen], frame=frame))
     return clouds
 
 
@@ -223,15 +225,15 @@ def _read_room(path: Path) -> Clouds:
     """Read a room; points of surfaces too small to be detected are ignored."""
     sizes = (size for kind, size in ROOMS_MIN_SIZES.items() if kind in path.stem)
     with np.load(path) as room:
-        truth = _large_faces(torch.as_tensor(room["labels"]).long(), next(sizes, MIN_SIZE))
-        return [LabeledCloud(torch.as_tensor(room["points"]).float(), truth)]
+        ground_truth = _large_faces(torch.as_tensor(room["labels"]).long(), next(sizes, MIN_SIZE))
+        return [LabeledCloud(torch.as_tensor(room["points"]).float(), ground_truth)]
 
 
-def _large_faces(truth: Tensor, min_size: int) -> Tensor:
+def _large_faces(ground_truth: Tensor, min_size: int) -> Tensor:
     """Return ground truth in which points of smaller surfaces are ignored."""
-    is_face = truth >= 0
-    sizes = torch.bincount(truth[is_face])
-    return truth.where(~is_face | (sizes[truth.clamp(min=0)] >= min_size), VOID)
+    is_face = ground_truth >= 0
+    sizes = torch.bincount(ground_truth[is_face])
+    return ground_truth.where(~is_face | (sizes[ground_truth.clamp(min=0)] >= min_size), VOID)
 
 
 def _summary(runs: Sequence[Sequence[Figures] | None]) -> str:
@@ -312,11 +314,11 @@ def _mean_scores(run: Callable[[LabeledCloud], Tensor], clouds: Clouds) -> Figur
 
 def _score(cloud: LabeledCloud, labels: Tensor) -> Figures:
     """Return the metrics of all protocols."""
-    counts = cloud.truth != VOID
-    cloud, labels = LabeledCloud(cloud.points[counts], cloud.truth[counts]), labels[counts]
-    found = score_labels(labels, cloud.truth)
-    voxels = score_voxels(cloud.points, labels, cloud.truth, voxel_size=VOXEL_SIZE)
-    table = contingency_table(labels, cloud.truth)
+    counts = cloud.ground_truth != VOID
+    cloud, labels = LabeledCloud(cloud.points[counts], cloud.ground_truth[counts]), labels[counts]
+    found = score_labels(labels, cloud.ground_truth)
+    voxels = score_voxels(cloud.points, labels, cloud.ground_truth, voxel_size=VOXEL_SIZE)
+    table = contingency_table(labels, cloud.ground_truth)
     evops = score_evops(table)
     return {
         **{name: getattr(found, name) for name in ("regions", "faces", "mean_best_iou")},

@@ -59,7 +59,7 @@ class Case(Benchmark):
 
 
 def _angles(fit: Callable[[Tensor], Tensor], cloud: tuple[Tensor, Tensor]) -> Figures:
-    patches, truth = cloud
+    patches, ground_truth = cloud
     normals = eigh3(fit(patches).double())[1][..., 0]
-    angles = unsigned_angle_deg(normals, truth.double())
+    angles = unsigned_angle_deg(normals, ground_truth.double())
     return {"median": float(angles.median()), "p90": float(angles.quantile(0.9))}

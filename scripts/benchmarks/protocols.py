@@ -66,7 +66,7 @@ class VoxelScore(NamedTuple):
 def score_voxels(
     points: Tensor | NDArray[np.floating],
     labels: Tensor | NDArray[Any],
-    truth: Tensor | NDArray[Any],
+    ground_truth: Tensor | NDArray[Any],
     *,
     voxel_size: float,
     threshold: float = 0.5,
@@ -85,7 +85,7 @@ def score_voxels(
     Args:
         points: Points, shape ``(N, 3)``.
         labels: Predicted label of each point, shape ``(N,)``, integers, -1 for none.
-        truth: Ground-truth label of each point, shape ``(N,)``, integers, -1 for none.
+        ground_truth: Ground-truth label of each point, shape ``(N,)``, integers, -1 for none.
         voxel_size: Voxel size, in the unit of the points; [2] uses 5 to 13 cm.
         threshold: Minimum fraction of a region in its face. Default: 0.5.
 
@@ -104,26 +104,30 @@ def score_voxels(
 
     Example:
         >>> line = torch.arange(6.0)[:, None] * torch.tensor([1.0, 0, 0])
-        >>> labels, truth = torch.tensor([0, 0, 0, 0, 1, -1]), torch.tensor([0, 0, 0, 1, 1, 1])
-        >>> score_voxels(line, labels, truth, voxel_size=1.0)
+        >>> labels = torch.tensor([0, 0, 0, 0, 1, -1])
+        >>> ground_truth = torch.tensor([0, 0, 0, 1, 1, 1])
+        >>> score_voxels(line, labels, ground_truth, voxel_size=1.0)
         VoxelScore(precision=0.8, recall=0.6666666666666666, f1=0.7272727272727273)
     """
     positions = as_tensor("score_voxels", "points", points)
-    labels, truth = check_labels("score_voxels", labels=labels, truth=truth)
+    labels, ground_truth = check_labels("score_voxels", labels=labels, ground_truth=ground_truth)
     check_shapes(
-        "score_voxels", points=(positions, "N 3"), labels=(labels, "N"), truth=(truth, "N")
+        "score_voxels",
+        points=(positions, "N 3"),
+        labels=(labels, "N"),
+        ground_truth=(ground_truth, "N"),
     )
     voxels = sample_voxels(positions, voxel_size).inverse
     seen = voxels >= 0
-    voxels, labels, truth = voxels[seen], labels[seen], truth[seen]
-    table = count_overlaps("score_voxels", labels, truth, 1, None)
+    voxels, labels, ground_truth = voxels[seen], labels[seen], ground_truth[seen]
+    table = count_overlaps("score_voxels", labels, ground_truth, 1, None)
     face_of = _face_of_region(table, threshold)
     # Points without a region use the last entry.
     row = torch.searchsorted(table.region_labels, labels)
     row[labels == UNLABELED] = len(face_of) - 1
-    face = torch.searchsorted(table.face_labels, truth)
+    face = torch.searchsorted(table.face_labels, ground_truth)
     width = len(table.face_labels) + 1
-    found, true = face_of[row] >= 0, truth != UNLABELED
+    found, true = face_of[row] >= 0, ground_truth != UNLABELED
     keys = voxels[found] * width + face_of[row][found]
     right = keys[torch.isin(keys, voxels[true] * width + face[true])] // width
     num_right = len(torch.unique(right))
@@ -181,8 +185,9 @@ def count_segcomp(table: ContingencyTable, *, threshold: float = 0.8) -> SegComp
 
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
-        >>> labels, truth = torch.tensor([0, 0, 1, 1, 2, 2]), torch.tensor([5, 5, 5, 5, 6, 6])
-        >>> table = contingency_table(labels, truth)
+        >>> labels = torch.tensor([0, 0, 1, 1, 2, 2])
+        >>> ground_truth = torch.tensor([5, 5, 5, 5, 6, 6])
+        >>> table = contingency_table(labels, ground_truth)
         >>> count_segcomp(table)
         SegCompCounts(correct=1, over_segmented=1, under_segmented=0, missed=0, noise=0)
     """

@@ -176,8 +176,10 @@ def _run_ours(points: Tensor, voxel: float | None) -> tuple[list[Tensor], list[f
 
 def _score(cloud: LabeledCloud, partitions: Sequence[Tensor], seconds: list[float]) -> Figures:
     """Return the metrics of each partition."""
-    points, truth, _ = cloud
-    levels = [score_partition(partition, truth, points)._asdict() for partition in partitions]
+    points, ground_truth, _ = cloud
+    levels = [
+        score_partition(partition, ground_truth, points)._asdict() for partition in partitions
+    ]
     return {"points": len(points), "seconds": seconds, "levels": levels}
 
 

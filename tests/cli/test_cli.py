@@ -266,7 +266,7 @@ def test_a_run_without_kernels_says_once_and_in_one_line_how_to_get_them(
         code, _, err = run(command[0], room_file, *command[1:])
         (line,) = (line for line in err.splitlines() if "kernels" in line)
         assert line.startswith("torchrg: warning: torchrg runs without its kernels")
-        assert line.endswith("with TORCHRG_KERNELS set as the guide says.")
+        assert line.endswith("or set TORCHRG_KERNELS (see the guide Install).")
         assert (code, "_library()" in err) == (0, False)
 
 
@@ -373,5 +373,5 @@ def test_single_points_far_off_that_cost_precision_are_told(room_file, tmp_path,
     np.save(tmp_path / "zero.npy", far)
     done = run("segment", tmp_path / "zero.npy", "--out", tmp_path / "a.npz", *CLASSIC)
     first, second = done.err.splitlines()
-    assert "zero.npy: half of its points lie within " in first
+    assert "zero.npy: half of the points lie within " in first
     assert "no plane found" in second

@@ -205,7 +205,7 @@ def test_convert_keeps_planes_within_objects_in_every_kind_of_folder(scans, tmp_
 @pytest.mark.parametrize(
     ("field", "message"),
     [
-        ("object", "room.npz: expected the field object of --within, got height, instance; name"),
+        ("object", "room.npz: expected the field object of --within, got height, instance; choose"),
         ("height", "each of 5,000 points, got float32 of shape (5000,); number the objects."),
         ("few", "got height, instance (few skipped: not 5,000 rows); choose one of these"),
     ],

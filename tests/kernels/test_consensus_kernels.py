@@ -55,12 +55,14 @@ def assert_same_planes(found, expected, unit, fraction=1.0, rows=slice(None)):
 def test_broken_planes(points, near, survey):
     fit, (_, _, noise, _) = survey
     # The kernel is for points of equally many neighbours.
-    count = near.counted().sum(dim=1)
+    count = near.mask().sum(dim=1)
     rows = (fit.valid & noise.isfinite() & (count == count.mode().values)).nonzero().squeeze(1)
     (voted, meeting), (voted_too, meeting_too) = (
-        both(broken_planes, points, near.at(rows), noise[rows], fit.normals[rows])
+        both(broken_planes, points, near.select(rows), noise[rows], fit.normals[rows])
         if near.valid is None
-        else both(broken_planes, points, type(near)(*near.at(rows)), noise[rows], fit.normals[rows])
+        else both(
+            broken_planes, points, type(near)(*near.select(rows)), noise[rows], fit.normals[rows]
+        )
     )
     # To the bit: rounding would decide between planes that are as good.
     for found, expected in zip((*voted, *meeting), (*voted_too, *meeting_too), strict=True):
@@ -71,7 +73,7 @@ def test_paraboloids(points, near, survey):
     fit, (_, _, _, radius) = survey
     rows = fit.valid.nonzero().squeeze(1)
     found, expected = both(_paraboloids, points, *near, fit.normals, rows)
-    enough = near.counted()[rows].sum(dim=1) > 6
+    enough = near.mask()[rows].sum(dim=1) > 6
     assert_same_planes(found[:2], expected[:2], radius[rows], ALIKE, enough)
     error = ((found[2] - expected[2]).abs() / radius[rows])[enough]
     assert (error < 1e-3).float().mean() >= ALIKE

@@ -97,7 +97,7 @@ def tab(browser, room, tmp_path_factory):
         room.fields, labels=np.where(room.fields["labels"] == 0, -1, room.fields["labels"])
     )
     other = Cloud(room.coordinates, fields, source="other.npz")
-    write_page(path, make_page(Result(room), beside=Result(other), title=EVIL))
+    write_page(path, make_page(Result(room), compare=Result(other), title=EVIL))
     return Tab(browser, path)
 
 

@@ -92,8 +92,8 @@ def test_discs_do_not_color_the_face_beyond_an_edge(rng, eye):
     picture = render_points(points, colors[faces].byte(), camera, normals=normals, supersampling=1)
     hue = picture.float() / picture.amax(dim=-1, keepdim=True).clamp(min=1)
     seen = (hue[:, :, None] - colors.float() / 250).square().sum(dim=-1).argmin(dim=-1)
-    truth = face_of_box(eye, pose, size, focal)
-    assert float((seen != truth)[truth >= 0].float().mean()) < most
+    ground_truth = face_of_box(eye, pose, size, focal)
+    assert float((seen != ground_truth)[ground_truth >= 0].float().mean()) < most
 
 
 @pytest.mark.parametrize("view", ["cutaway", "sensor"])

@@ -90,7 +90,7 @@ class FrameLayout(NamedTuple):
         camera: Camera of a recording without a camera file; None if unknown or per frame.
         depth_scale: Depth units per meter; None if unknown or per frame.
         no_depth: See :class:`torchrg.datasets.RGBDFrame`.
-        places: Path patterns of recordings below a folder of several.
+        locations: Path patterns of recordings below a folder of several.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
             ``("",)`` if the mark is enough, empty if the layout cannot be detected.
     """

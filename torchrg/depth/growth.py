@@ -198,24 +198,24 @@ def _ray_planes(fit: RegionPlanes) -> Tensor:
 
 
 def fit_inverse_planes(
-    cloud: InverseCloud, labels: Tensor, *, most: int = MAX_FITTED
+    cloud: InverseCloud, labels: Tensor, *, max_pixels: int = MAX_FITTED
 ) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, the only noisy one.
 
     A second fit uses Tukey's bisquare weights, as in :func:`torchrg.regions.fit.fit_planes`. The
     thickness, along the normals, is at least the mean noise of the region. Regions thicker than
-    noise and a slight bend explain are curved. Each fit uses up to ``most`` evenly spaced pixels
-    per region.
+    noise and a slight bend explain are curved. Each fit uses up to ``max_pixels`` evenly spaced
+    pixels per region.
     """
-    chunks = Segments(labels, most=most).chunks(len(labels) + 1)
+    chunks = Segments(labels, max_points=max_pixels).chunks(len(labels) + 1)
     parts = map_tasks(lambda chunk: _fit_chunk(cloud, chunk), chunks, labels.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _fit_chunk(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
     """Fit planes to one chunk of regions; see :func:`fit_inverse_planes`."""
-    noise = segments.mean(segments.take(cloud.noise))
-    columns = segments.take_columns(cloud.points)
+    noise = segments.mean(segments.gather(cloud.noise))
+    columns = segments.gather_columns(cloud.points)
     weights = torch.ones_like(columns[0])
     for _ in range(_NUM_FITS):
         center, covariance = segments.moments(columns, weights)

@@ -232,7 +232,7 @@ def _library() -> ctypes.CDLL | None:
             getattr(library, name).restype = ctypes.c_int64
         return library
     warnings.warn(
-        "torchrg runs several times slower without its kernels; install a C++ compiler and "
+        "torchrg runs without its kernels, several times slower; install a C++ compiler and "
         "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install).",
         stacklevel=2,
     )

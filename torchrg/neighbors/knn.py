@@ -209,13 +209,13 @@ def restrict_to_groups(
     def work(rows: slice) -> None:
         if isinstance(places, slice) or keys is None:
             near = neighbors.indices[rows]
-            same = neighbors.of(groups, rows) == groups[rows, None]
-            same &= neighbors.counted(rows)
+            same = neighbors.gather(groups, rows) == groups[rows, None]
+            same &= neighbors.mask(rows)
         else:
             at = places[rows]
             requested = neighbors.indices[at].long() * width + groups[rows, None]
             near = torch.searchsorted(keys, requested).clamp(max=len(keys) - 1)
-            same = (keys[near] == requested) & neighbors.counted(at)
+            same = (keys[near] == requested) & neighbors.mask(at)
         order = same.byte().argsort(dim=1, descending=True, stable=True)
         near, same = near.gather(1, order), same.gather(1, order)
         indices[rows] = torch.where(same, near, near[:, :1]).numpy(force=True)

@@ -229,12 +229,12 @@ def _reordered(cloud: GrowingInput, order: Tensor) -> GrowingInput:
     """Return the cloud in the order of old rows ``(N,)``, with neighbor indices remapped."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
-    neighbors = cloud.neighbors.at(order)
+    neighbors = cloud.neighbors.select(order)
     return cloud._replace(
         points=to_column_major(cloud.points[order]),
         normals=to_column_major(cloud.normals[order]),
         curvature=cloud.curvature[order],
-        neighbors=neighbors._replace(indices=neighbors.of(row_of)),
+        neighbors=neighbors._replace(indices=neighbors.gather(row_of)),
         valid=cloud.valid[order],
         reach=None if cloud.reach is None else cloud.reach[order],
         colors=None if cloud.colors is None else to_column_major(cloud.colors[order]),

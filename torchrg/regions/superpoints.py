@@ -211,7 +211,7 @@ def _blend_with_planes(normals: Tensor, labels: Tensor) -> Tensor:
     plane = torch.unique(labels[rows], return_inverse=True)[1]
     inputs = normals[rows].double()
     segments, columns = Segments(plane), inputs.unbind(dim=1)
-    products = [segments.mean(segments.take(a * b)) for a in columns for b in columns]
+    products = [segments.mean(segments.gather(a * b)) for a in columns for b in columns]
     values, axes = eigh3_lapack(torch.stack(products, dim=1).view(-1, 3, 3))
     flat = values[:, 2] >= math.cos(math.radians(_MAX_SPREAD_DEG)) ** 2
     shared = torch.where(flat[:, None], axes[:, :, 2], 0.0)[plane]
