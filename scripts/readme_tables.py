@@ -33,6 +33,12 @@ WORK = {
     "planes, `paper`": ("torchrg-paper", "pclrg", "open3d-planes"),
     "planes, `consensus` (default)": ("torchrg-consensus", "pclrg", "open3d-planes"),
     "normals, `pca`": ("torchrg-pca", "pclrg normals", "open3d-pca"),
+    "from file to file, `classic`": ("torchrg-classic-command", "pclrg whole", "open3d-command"),
+    "from file to file, `consensus`": (
+        "torchrg-consensus-command",
+        "pclrg whole",
+        "open3d-command",
+    ),
 }
 """Rows of the time table: the contender of each column."""
 KINDS = {
@@ -99,6 +105,8 @@ def partitions_of(superpoints: Figures) -> Figures:
 def _time(by: Figures, name: str) -> float:
     """Return the median seconds of a contender, or of one of its stages."""
     contender, _, stage = name.partition(" ")
+    if stage == "whole":
+        return median(run["whole"] for run in by[contender])
     return median(run["seconds"][stage] if stage else run["total"] for run in by[contender])
 
 

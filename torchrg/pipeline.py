@@ -38,12 +38,6 @@ from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.superpoints import merge_duplicates
 from torchrg.structures import UNLABELED, Cloud, Neighbors, Rows, Segmentation, Superpoints
 
-BYTES_PER_POINT = 900
-"""Peak memory per point of :func:`segment_planes` with any preset, in bytes. It also bounds a pixel
-of :func:`torchrg.depth.segment_depth`, which takes half of it."""
-BYTES_PER_POINT_ON_DISK = 350
-"""Peak memory per point if neighbor lists spill to disk, in bytes; see :mod:`torchrg.scratch`."""
-
 _STRENGTH_OF_K = 100.0
 """Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
 meshed depth frames get about the same number of superpoints as Segmentator's segments."""

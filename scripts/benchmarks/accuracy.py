@@ -33,7 +33,7 @@ from torch import Tensor
 
 import torchrg
 from benchmarks.harness import Benchmark, Figures, Results, markdown, medians, run_program, table
-from benchmarks.peers import MIN_SIZE, pcl_command
+from benchmarks.peers import MIN_SIZE, OPEN3D, pcl_command
 from benchmarks.protocols import count_segcomp, score_evops, score_voxels
 from tests.made import DepthFrame, cameras_around, render_depth
 from torchrg.depth import segment_depth
@@ -86,29 +86,12 @@ PUBLISHED = """Correct to noise: fractions of surfaces, SegComp at 80 %. Publish
 | PCL region growing | EVOPS | precision .21, recall .67, mean IoU .25 |
 | CAPE | EVOPS | precision about .5, recall about .2, mean IoU .67 |"""
 
-OPEN3D = """
-import sys, numpy as np, open3d
-points = np.load(sys.argv[1]).astype(np.float64)
-cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
-boxes = cloud.detect_planar_patches(search_param=open3d.geometry.KDTreeSearchParamKNN(30))
-labels, closest = np.full(len(points), -1), np.full(len(points), 0.05)
-for number, box in enumerate(boxes):
-    away = np.abs((points - box.center) @ box.R) - np.asarray(box.extent) / 2
-    distance = np.linalg.norm(np.maximum(away, 0), axis=1)
-    nearer = distance < closest
-    labels[nearer], closest[nearer] = number, distance[nearer]
-np.save(sys.argv[2], labels)
-"""
-
 
 class LabeledCloud(NamedTuple):
     """Point cloud with ground truth."""
 
     points: Tensor  # shape ``(N, 3)``
-    ground_truth: (
-        Tensor  # shape ``(N,)``, -1 for points of no plane, VOID for those that do not count
-    )
+    ground_truth: Tensor  # shape ``(N,)``, -1 for no plane, VOID for ignored points
     # Minimum region size, unless the preset measures it.
     min_size: int = MIN_SIZE
     # Source depth image; points are in the order of its pixels with depth.

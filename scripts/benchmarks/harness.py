@@ -167,6 +167,7 @@ class Finished(NamedTuple):
     text: str
     seconds: float
     peak_bytes: int
+    cpu_seconds: float
 
 
 def run_program(command: Sequence[object], stdin: str = "") -> Finished:
@@ -193,12 +194,13 @@ def run_program(command: Sequence[object], stdin: str = "") -> Finished:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise RuntimeError(f"{command[0]}: exit code {process.returncode}: {text}")
-    return Finished(text, seconds, usage.ru_maxrss * 1024)
+    cpu_seconds = usage.ru_utime + usage.ru_stime
+    return Finished(text, seconds, usage.ru_maxrss * 1024, cpu_seconds)
 
 
-def serve_command(target: str, *arguments: object) -> list[str]:
+def serve_command(target: str, *arguments: object, python: str = sys.executable) -> list[str]:
     """Return the command that serves a function; see :func:`serve`."""
-    return [sys.executable, str(BENCH), "--serve", target, json.dumps(arguments)]
+    return [python, str(BENCH), "--serve", target, json.dumps(arguments)]
 
 
 def serve(target: str, arguments: Sequence[Any]) -> None:

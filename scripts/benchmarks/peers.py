@@ -25,6 +25,7 @@ from pathlib import Path
 from benchmarks.harness import (
     Benchmark,
     Figures,
+    Finished,
     Results,
     markdown,
     medians,
@@ -35,6 +36,21 @@ from benchmarks.harness import (
 
 K, MAX_ANGLE_DEG, CURVATURE_PERCENTILE, MIN_SIZE = 50, 5, 95, 50
 """Settings of PCL's region growing, as in ``classic``."""
+OPEN3D = """
+import sys, numpy as np, open3d
+points = np.load(sys.argv[1]).astype(np.float64)
+cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
+boxes = cloud.detect_planar_patches(search_param=open3d.geometry.KDTreeSearchParamKNN(30))
+labels, closest = np.full(len(points), -1), np.full(len(points), 0.05)
+for number, box in enumerate(boxes):
+    away = np.abs((points - box.center) @ box.R) - np.asarray(box.extent) / 2
+    distance = np.linalg.norm(np.maximum(away, 0), axis=1)
+    nearer = distance < closest
+    labels[nearer], closest[nearer] = number, distance[nearer]
+np.save(sys.argv[2], labels)
+"""
+"""Open3D's planar patches: script from a point file to a label file."""
 PRESETS = ("classic", "paper", "consensus")
 SEED, NOISE = 7, 0.003
 WARM_UP = 5000
@@ -51,6 +67,8 @@ class Case(Benchmark):
     rounds: int = 3
     programs: Path | None = None
     """Folder of the programs pclrg and cgaln."""
+    open3d_python: str | None = None
+    """Python executable with Open3D. Default: this one, if it has Open3D."""
     scans: tuple[Path, ...] = ()
     """Additional scans."""
     sizes: tuple[int, ...] = (100_000, 1_000_000, 4_000_000)
@@ -66,9 +84,11 @@ class Case(Benchmark):
             f"torchrg-{preset}": partial(_run_warm, f"preset {preset}") for preset in PRESETS
         }
         runs["torchrg-pca"] = partial(_run_warm, "normals")
-        if find_spec("open3d"):
-            runs["open3d-pca"] = partial(_run_warm, "open3d normals")
-            runs["open3d-planes"] = partial(_run_warm, "open3d planes")
+        python = self.open3d_python or (sys.executable if find_spec("open3d") else None)
+        if python is not None:
+            runs["open3d-pca"] = partial(_run_warm, "open3d normals", python=python)
+            runs["open3d-planes"] = partial(_run_warm, "open3d planes", python=python)
+            runs["open3d-command"] = partial(_run_open3d, python)
         runs |= {f"torchrg-{preset}-command": partial(_run_command, preset) for preset in PRESETS}
         for name in ("pclrg", "cgaln"):
             if self.programs is not None and (self.programs / name).exists():
@@ -96,6 +116,7 @@ FIELDS = {
     "total": "seconds",
     "seconds": "stages",
     "whole": "whole process, s",
+    "cpu": "CPU of the process, s",
     "peak_mib": "peak MiB",
 }
 """Figures of a run and their column titles."""
@@ -129,29 +150,35 @@ def write_cloud(cloud: str, folder: str) -> None:
     points.numpy().tofile(Path(folder) / "cloud.f32")
 
 
-def _figures(seconds: dict[str, float], whole: float, peak_bytes: int) -> Figures:
+def _figures(seconds: dict[str, float], done: Finished) -> Figures:
     return {
         "seconds": seconds,
         "total": sum(seconds.values()),
-        "whole": whole,
-        "peak_mib": peak_bytes / 2**20,
+        "whole": done.seconds,
+        "cpu": done.cpu_seconds,
+        "peak_mib": done.peak_bytes / 2**20,
     }
 
 
-def _run_warm(work: str, folder: Path) -> Figures:
+def _run_warm(work: str, folder: Path, *, python: str = sys.executable) -> Figures:
     """Run a warm call of a Python library in a separate process."""
-    command = serve_command("benchmarks.peers:prepare", work, str(folder / "cloud.npy"))
-    text, whole, peak = run_program(command, stdin="\n")
-    return _figures(json.loads(text.splitlines()[-1])["stages"], whole, peak)
+    arguments = work, str(folder / "cloud.npy")
+    command = serve_command("benchmarks.peers:prepare", *arguments, python=python)
+    done = run_program(command, stdin="\n")
+    return _figures(json.loads(done.text.splitlines()[-1])["stages"], done)
 
 
 def _run_command(preset: str, folder: Path) -> Figures:
     """Run ``torchrg segment``."""
     files = [folder / "cloud.npy", "--out", folder / f"{preset}.npz"]
-    _, whole, peak = run_program(
-        [sys.executable, "-m", "torchrg", "segment", *files, "--preset", preset]
-    )
-    return _figures({"command": whole}, whole, peak)
+    done = run_program([sys.executable, "-m", "torchrg", "segment", *files, "--preset", preset])
+    return _figures({"command": done.seconds}, done)
+
+
+def _run_open3d(python: str, folder: Path) -> Figures:
+    """Run Open3D's planar patches from file to file."""
+    done = run_program([python, "-c", OPEN3D, folder / "cloud.npy", folder / "labels.npy"])
+    return _figures({"command": done.seconds}, done)
 
 
 def _run_peer(program: Path, folder: Path) -> Figures:
@@ -161,10 +188,10 @@ def _run_peer(program: Path, folder: Path) -> Figures:
     command = [program, cloud, K - 1]
     if program.name == "pclrg":
         command = pcl_command(program, cloud, folder / "labels.i32")
-    text, whole, peak = run_program(command)
-    stages = re.findall(r"([a-z][a-z ]*?) (\d+\.\d+) s", text)
+    done = run_program(command)
+    stages = re.findall(r"([a-z][a-z ]*?) (\d+\.\d+) s", done.text)
     seconds = {stage.replace("region growing", "regions"): float(value) for stage, value in stages}
-    return _figures(seconds, whole, peak)
+    return _figures(seconds, done)
 
 
 def prepare(work: str, file: str) -> Callable[[], Figures]:

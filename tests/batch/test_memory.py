@@ -27,12 +27,14 @@ from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 points = make_room(num_points, noise=0.003, seed=0).points
 config = load_config(preset)
-from torchrg.pipeline import segment_planes
+from torchrg.pipeline import make_superpoints, segment_planes
 from contextlib import nullcontext
 from torchrg import scratch
 reset_peak_memory()
-with scratch.on_disk(folder) if what == "disk" else nullcontext():
-    segment_planes(points, config)
+with scratch.on_disk(folder) if "disk" in what else nullcontext():
+    seg = segment_planes(points, config, keep_neighbors="superpoints" in what)
+    if "superpoints" in what:
+        make_superpoints(points, seg)
 print(peak_memory())
 """
 
@@ -44,12 +46,15 @@ print(peak_memory())
         ("frame", "classic", 640 * 480),
         *(("scan", preset, 300_000) for preset in ("classic", "paper", "consensus")),
         *(("disk", preset, 1_000_000) for preset in ("classic", "paper", "consensus")),
+        ("superpoints", "consensus", 300_000),
+        ("disk superpoints", "consensus", 1_000_000),
     ],
 )
 def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, what, preset, num_points):
     command = [sys.executable, "-c", MEASURE, what, preset, str(num_points), str(tmp_path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    promised = scan_memory(num_points, on_disk=what == "disk")
+    options = {"superpoints": "superpoints" in what, "on_disk": "disk" in what}
+    promised = scan_memory(num_points, **options)
     assert 0.5 * promised < int(done.stdout) < promised
 
 

@@ -120,7 +120,7 @@ def test_bad_points_stay_in_place(tmp_path, normals):
         (["--normals.k", "2"], "expected k >= 3, got 2"),
         (
             ["--orient", "viewpoint"],
-            "expected a viewpoint, or scanner poses as in an E57 file",
+            "got none; pass the viewpoint (--viewpoint X Y Z), or use interior",
         ),
         (["--viewpoint", "0", "0", "0"], "--viewpoint X Y Z with --orient viewpoint"),
         (["--threads", "0"], "expected --threads from 1 to 1,024, got 0"),

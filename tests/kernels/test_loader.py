@@ -122,3 +122,9 @@ def test_a_library_that_is_older_than_its_sources_is_not_used(tmp_path):
     assert not kernels._is_stale(library)
     os.utime(source, (3, 3))
     assert kernels._is_stale(library)
+
+
+def test_a_library_without_one_of_the_kernels_is_not_used(monkeypatch):
+    monkeypatch.setitem(kernels.SIGNATURES, "kernel_of_tomorrow", "f[n] -> f[n]")
+    with pytest.warns(UserWarning, match="of another version; install it again"):
+        assert kernels._library.__wrapped__() is None

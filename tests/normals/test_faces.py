@@ -12,7 +12,7 @@ from tests.kernels.clouds import definitions, needs_library
 from torchrg import scratch
 from torchrg.neighbors import finite_rows, search_knn
 from torchrg.normals import orient_normals
-from torchrg.normals.faces import _Components, find_faces, find_surfaces
+from torchrg.normals.faces import _compare, _Components, find_faces, find_surfaces
 from torchrg.normals.free_space import _free_paths
 from torchrg.normals.orient import turn_faces
 from torchrg.scenes import make_room
@@ -80,6 +80,20 @@ def test_kernels_and_definition_find_the_same_components(rng, wrong):
             expected = components_of(count, *parts)
         assert torch.equal(found[0], expected[0])
         assert torch.equal(found[1], expected[1])
+
+
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+def test_kernel_of_links_equals_the_definition(rng):
+    points = make_room(3000, noise=0.003, seed=0).points
+    points[:9] = points[0]
+    normals = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=rng), dim=1)
+    rows = torch.arange(0, len(points), 2)
+    arguments = points, normals, rows, search_knn(points, 7).indices[rows]
+    found = _compare(*arguments)
+    with definitions():
+        expected = _compare(*arguments)
+    for values, others in zip(found, expected, strict=True):
+        assert torch.equal(values, others)
 
 
 @pytest.mark.parametrize("labeled", [True, False])

@@ -91,7 +91,9 @@ def test_points_without_normals_or_place_need_no_front(scanned):
 def test_a_viewpoint_that_is_not_known_is_refused_with_the_repair(scanned):
     cloud, normals, _ = scanned
     named = replace(cloud, source="a.ply")
-    message = r"^a\.ply: expected a viewpoint, or scanner poses .* got none; use interior\.$"
+    message = (
+        r"^a\.ply: expected a viewpoint, .* got none; pass the viewpoint .*, or use interior\.$"
+    )
     with pytest.raises(ConfigError, match=message):
         orient_normals(named, normals, orient="viewpoint")
     # A front by poses is one of scanners.

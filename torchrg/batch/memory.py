@@ -3,10 +3,11 @@
 import os
 from pathlib import Path
 
-from torchrg.pipeline import BYTES_PER_POINT, BYTES_PER_POINT_ON_DISK
-
 PROCESS_BYTES = 400_000_000
 """Memory of a process without points: Python, torch, scipy."""
+_BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 350, (True, True): 600}
+"""Peak memory per point or pixel with any preset, by whether there are superpoints and whether the
+large arrays are on disk."""
 _CGROUP = Path("/sys/fs/cgroup")
 """Linux control groups, which limit containers."""
 _CGROUP_FILES = (
@@ -19,16 +20,16 @@ _MEMORY_FRACTION = 0.8
 programs."""
 
 
-def scan_memory(num_points: int, *, on_disk: bool = False) -> int:
+def scan_memory(num_points: int, *, superpoints: bool = False, on_disk: bool = False) -> int:
     """Return the memory that a process needs for a cloud or a depth image, in bytes.
 
-    ``on_disk``: large arrays are spilled to disk.
+    ``superpoints``: the cloud is also partitioned; ``on_disk``: large arrays are spilled to disk.
 
     Example:
         >>> scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)
-        (1300000000, 3900000000)
+        (900000000, 3900000000)
     """
-    return PROCESS_BYTES + (BYTES_PER_POINT_ON_DISK if on_disk else BYTES_PER_POINT) * num_points
+    return PROCESS_BYTES + _BYTES_PER_POINT[superpoints, on_disk] * num_points
 
 
 def spare_memory() -> int:

@@ -45,6 +45,8 @@ class Source:
     root: Path
     settings: PipelineConfig | DepthConfig
     table: str | None
+    has_superpoints = False
+    """Whether conversion also partitions clouds into superpoints."""
     bytes_per_point: ClassVar[int]
     """Disk space of the results per point, to check the free space in advance."""
 
@@ -95,7 +97,7 @@ class Job:
     @property
     def memory(self) -> int:
         """Maximum memory of a process with this scan, in bytes."""
-        return scan_memory(self.scan.num_points)
+        return scan_memory(self.scan.num_points, superpoints=self.source.has_superpoints)
 
     @property
     def folder(self) -> Path:

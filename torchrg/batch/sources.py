@@ -69,6 +69,11 @@ class CloudSource(Source):
         """The directory of the data set."""
         return self.data.root
 
+    @property
+    def has_superpoints(self) -> bool:  # type: ignore[override]
+        """Whether conversion also partitions clouds into superpoints."""
+        return self.superpoint or self.layout != "pointcept"
+
     def list_scans(self, out: Path) -> list[SceneFiles]:
         """Return the scenes in natural order; their results go to ``out``."""
         self.data.check_output(self.layout, out)
@@ -99,12 +104,11 @@ class CloudSource(Source):
         with collecting_notes() as notes:
             cloud = self.data.read_scene(scan)
         notes += cloud.notes
-        has_superpoints = self.superpoint or self.layout != "pointcept"
         seg, superpoints = segment_cloud(
             cloud,
             self.settings,
             orient=self.orient,
-            partition=self.partition if has_superpoints else None,
+            partition=self.partition if self.has_superpoints else None,
             within=self.within,
             begin=begin,
             warn=notes.append,

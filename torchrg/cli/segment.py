@@ -201,7 +201,8 @@ def _segment(
     """Segment a cloud with a progress bar, and print one line about the result."""
     begin, source = time.perf_counter(), display_name(sources)
     limit = flags.limit_in_bytes(arguments.limit_memory, available_memory() // 2)
-    _check_limit(source, sum(map(estimate_points, sources)), limit)  # Before reading.
+    num_points = sum(map(estimate_points, sources))
+    _check_limit(arguments, source, num_points, limit)  # Before reading.
     clouds = [
         read_cloud(path, columns=flags.file_columns(path, arguments.columns)) for path in sources
     ]
@@ -245,13 +246,13 @@ def _segment(
     _report(source, seg, cloud, destination, reason, time.perf_counter() - begin)
 
 
-def _check_limit(source: str, num_points: int, limit: int) -> None:
+def _check_limit(arguments: Arguments, source: str, num_points: int, limit: int) -> None:
     """Raise if a cloud exceeds the memory limit even with its large arrays on disk."""
-    minimum = scan_memory(num_points, on_disk=True)
+    minimum = scan_memory(num_points, superpoints=arguments.superpoints, on_disk=True)
     if minimum > limit:
         raise ConfigError(
-            f"{source}: expected --limit-memory of at least {minimum / 1e9:.2f} GB for about "
-            f"{num_points:,} points, got {limit / 1e9:.2f} GB; raise it, or split the cloud."
+            f"{source}: expected --limit-memory of at least {minimum / 1e9:.3g} GB for about "
+            f"{num_points:,} points, got {limit / 1e9:.3g} GB; raise it, or split the cloud."
         )
 
 
@@ -259,8 +260,9 @@ def _array_storage(
     arguments: Arguments, source: str, target: Path, num_points: int, limit: int
 ) -> contextlib.AbstractContextManager[None]:
     """Return the context for large arrays: memory, or disk if they exceed the limit."""
-    _check_limit(source, num_points, limit)
-    if (needed := scan_memory(num_points)) <= limit:
+    _check_limit(arguments, source, num_points, limit)
+    needed = scan_memory(num_points, superpoints=arguments.superpoints)
+    if needed <= limit:
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
     normals = arguments.settings.resolved.normals

@@ -42,6 +42,7 @@ SIGNATURES = {
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
     "at_boundary": "i[N] i[n] i[nk] b[nk]? -> b[n]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
+    "compare_links": "f[N3] f[N3] l[n] i[nk] -> f[nk] f[nk]",
     "link_nodes": "i[L] i[L] b[L] I[N] B[N] B[N] -> ",
     "flatten_nodes": "I[N] B[N] B[N] -> ",
     "contact_differences": "f[N3] f[N3] l[N] l[n] i[nk] x x -> d[nk]",
@@ -228,9 +229,15 @@ def _library() -> ctypes.CDLL | None:
         except OSError as error:
             warnings.warn(f"torchrg cannot load its kernels: {error}", stacklevel=2)
             return None
-        for name in SIGNATURES:
-            getattr(library, name).restype = ctypes.c_int64
-        return library
+        if all(hasattr(library, name) for name in SIGNATURES):
+            for name in SIGNATURES:
+                getattr(library, name).restype = ctypes.c_int64
+            return library
+        warnings.warn(
+            "torchrg runs without its kernels, which are of another version; install it again.",
+            stacklevel=2,
+        )
+        return None
     warnings.warn(
         "torchrg runs without its kernels, several times slower; install a C++ compiler and "
         "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install).",

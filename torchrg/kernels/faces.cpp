@@ -1,4 +1,4 @@
-// Connected components of a signed graph: torchrg/normals/faces.py.
+// Links between normals, and connected components of their graph: torchrg/normals/faces.py.
 #include "plain.h"
 
 namespace {
@@ -22,6 +22,31 @@ struct Forest {
 };
 
 }  // namespace
+
+// faces._compare: agreement of normals along links, and the bend of links.
+KERNEL compare_links(int64_t num_points, int64_t num_rows, int64_t k, Floats points,
+                     Floats normals, Longs rows, Ints ends, float* cosines, float* bends) {
+  if (!are_rows(ends, num_rows * k, num_points)) return NO_SUCH_ROW;
+  for (int64_t i = 0; i < num_rows; i++) {
+    if (rows[i] < 0 || rows[i] >= num_points) return NO_SUCH_ROW;
+    const float *point = points + 3 * rows[i], *normal = normals + 3 * rows[i];
+    for (int64_t link = i * k; link < (i + 1) * k; link++) {
+      const int64_t neighbor = 3 * int64_t(ends[link]);
+      const float *end = points + neighbor, *other = normals + neighbor;
+      float cosine = 0, here = 0, there = 0, square = 0;
+      for (int axis = 0; axis < 3; axis++) {
+        const float arm = end[axis] - point[axis];
+        cosine += other[axis] * normal[axis], here += arm * normal[axis];
+        there += arm * other[axis], square += arm * arm;
+      }
+      if (!(square > 0)) square = 1;
+      cosine -= 2 * here * there / square;
+      cosines[link] = cosine;
+      bends[link] = 1 - size_of(cosine) + (here * here + there * there) / square;
+    }
+  }
+  return DONE;
+}
 
 KERNEL link_nodes(int64_t num_links, int64_t num_nodes, Ints starts, Ints ends, Flagged flips,
                   int32_t* parents, bool* is_flipped, bool* is_contradictory) {

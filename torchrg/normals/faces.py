@@ -182,7 +182,9 @@ def _join_patches(
 def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cosine of normals, one of them mirrored, and the bend of links ``(n, K)``."""
 
-    def compare(chunk: slice) -> tuple[Tensor, Tensor]:
+    def compare(chunk: slice) -> tuple[Tensor, ...]:
+        if kernels.serve(points, normals):
+            return kernels.call("compare_links", points, normals, rows[chunk], ends[chunk].int())
         at, shape = rows[chunk], ends[chunk].shape
         cosine, here, there, squares = (points.new_zeros(shape) for _ in range(4))
         for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):

@@ -178,8 +178,8 @@ def find_directions(
         return positions, directions
     if orient == "viewpoint":
         raise ConfigError(
-            f"{caller}: expected a viewpoint, or scanner poses as in an E57 file, for orient="
-            "'viewpoint', got none; use interior."
+            f"{caller}: expected a viewpoint, or scanner poses as in an E57 file, got none; pass "
+            "the viewpoint (--viewpoint X Y Z), or use interior."
         )
     return positions, None
 
