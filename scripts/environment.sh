@@ -19,7 +19,7 @@ if [ ! -e "$stamp" ] || [ -n "$(find torchrg/kernels/*.{cpp,h} -newer "$stamp")"
   [ -z "$kind" ] || site=
   [ -x "$venv/bin/python" ] || "$python" -m venv $site "$venv"
   install=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check)
-  # Whoever has no compiler gets one for the build alone, a package of 100 MB, or no kernels.
+  # Without a compiler, download one for the build only (100 MB), or build no kernels.
   target=$("$python" -c 'import platform; print(platform.machine() + {"Linux": "-linux-gnu.2.17"}.get(platform.system(), "-macos.11.0"))')
   install_torchrg() {
     if [ -n "${TORCHRG_KERNELS+set}" ] || ${CXX:-c++} --version > /dev/null 2>&1; then

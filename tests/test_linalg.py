@@ -107,7 +107,7 @@ def test_normal_beside_a_near_double_root_is_right(rng, gap):
     values[::2, 2] *= 20
     found, vectors = smallest_eigenvector3((turn * values[:, None]) @ turn.mT)
     off = torch.linalg.cross(vectors, turn[..., 0]).norm(dim=1)
-    assert off.max() < 3e-14 / gap**2  # rounding, as of any root beside another
+    assert off.max() < 3e-14 / gap**2  # rounding, as of any root next to another
     assert (found[:, 1] / found[:, 0] - 1 - gap).abs().max() < 1e-6
 
 

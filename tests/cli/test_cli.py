@@ -243,7 +243,7 @@ def test_info_says_what_a_file_holds_and_where_it_is(room_file, tmp_path, run):
 
 @pytest.fixture
 def leica(room_file, tmp_path):
-    """Points, intensity, colour and no names, and what the colours are."""
+    """Points, intensity, color and no names, and what the colors are."""
     cloud = read_cloud(room_file)
     values = np.random.default_rng(0).integers(0, 256, (len(cloud), 4))
     (tmp_path / "in").mkdir()
@@ -354,8 +354,8 @@ def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
         with np.load(out) as result:
             labels.append(result["labels"])
     assert np.array_equal(np.load(out)["points"], far, equal_nan=True)
-    told = "4 of 6,000 points are not finite or beyond 1e+12; they stay unlabeled"
-    assert told in done.err
+    reported = "4 of 6,000 points are not finite or beyond 1e+12; they stay unlabeled"
+    assert reported in done.err
     assert (labels[1][[3, 5, 9, 11]] == -1).all()
     assert (labels[1] != labels[0]).sum() < 60
     assert labels[1].max() == labels[0].max() >= 3

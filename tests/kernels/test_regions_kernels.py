@@ -1,4 +1,4 @@
-"""Neighbours, edges and growth by kernels are those of the definitions to the bit."""
+"""Neighbors, edges and growth by kernels are those of the definitions to the bit."""
 
 import dataclasses
 

@@ -102,7 +102,7 @@ def test_arguments_are_checked():
 
 
 def row_of_points(count):
-    """Points a metre apart: those that have a border within four places are at it."""
+    """Points a meter apart: those that have a border within four places are at it."""
     return torch.arange(float(count))[:, None] * torch.tensor([1.0, 0, 0])
 
 

@@ -24,7 +24,7 @@ def square(depth, color, half=1.0, count=60):
 
 
 def hue_share(picture, color):
-    """Share of pixels whose largest channel is that of a colour."""
+    """Share of pixels whose largest channel is that of a color."""
     chosen = picture.float()
     drawn = chosen.amin(dim=-1) < 200
     channel = torch.tensor(color).argmax()
@@ -60,7 +60,7 @@ def test_surfaces_are_closed_at_every_distance(rng):
 
 
 def face_of_box(eye, pose, size, focal):
-    """The face of the unit cube that each pixel sees, by rays; -1 beside it."""
+    """The face of the unit cube that each pixel sees, by rays; -1 next to it."""
     places = torch.arange(size) - (size - 1) / 2
     rows, columns = torch.meshgrid(places, places, indexing="ij")
     rays = torch.stack([columns / focal, rows / focal, torch.ones(size, size)], dim=-1)
@@ -72,7 +72,7 @@ def face_of_box(eye, pose, size, focal):
 
 @pytest.mark.parametrize("eye", [(2.5, 2.0, 1.8), (2.5, 0.9, 1.5)])
 def test_discs_do_not_color_the_face_beyond_an_edge(rng, eye):
-    """Colours of the nearest discs, which reach past edges, are wrong in three times as many."""
+    """Colors of the nearest discs, which reach past edges, are wrong in three times as many."""
     count, most = 600, 0.03
     points = torch.rand(6 * count, 3, generator=rng)
     faces = torch.arange(6 * count) % 6

@@ -47,7 +47,7 @@ def write_stations(points):
 
 
 def write_frames():
-    """Depth images of a wall, alone, in a folder, and in a capture; and an organised cloud."""
+    """Depth images of a wall, alone, in a folder, and in a capture; and an organized cloud."""
     rows, columns = np.mgrid[0:480, 0:640]
     depth = 2000.0 + 0.5 * columns
     image = depth.astype(np.uint16)

@@ -26,8 +26,8 @@ DEPTH_SUFFIXES = (".png", ".npy", ".pgm")
 _CONVERTERS = {
     ".bag": "save its frames by Open3D's RGBDVideoReader",
     ".mkv": "save its frames by Open3D's azure_kinect_mkv_reader.py",
-    ".r3d": "unzip it, and save what pyliblzfse reads of its .depth files as .npy, in metres",
-    ".exr": "save what OpenEXR reads of it as .npy, usually in metres",
+    ".r3d": "unzip it, and save what pyliblzfse reads of its .depth files as .npy, in meters",
+    ".exr": "save what OpenEXR reads of it as .npy, usually in meters",
 }
 """How to convert unsupported recordings and images to frames, by suffix."""
 _PNG = b"\x89PNG"

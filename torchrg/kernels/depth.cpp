@@ -394,9 +394,9 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
     const double turned =
         square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
     if (turned <= max_sq_chord) return true;
-    const bool alike = u_slope * u_slope + v_slope * v_slope <=
+    const bool similar = u_slope * u_slope + v_slope * v_slope <=
                        sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs);
-    return (alike || turned <= wider_sq_chord) && here.window.holds(r + is_down, c + !is_down) &&
+    return (similar || turned <= wider_sq_chord) && here.window.holds(r + is_down, c + !is_down) &&
            other.window.holds(r, c);
   };
   for (int64_t r = from; r < to; r++)
