@@ -158,14 +158,14 @@ def find_objects(cloud: Cloud, name: str | None) -> NDArray[np.int64] | None:
     if name is None:
         return None
     fields: Mapping[str, NDArray[Any]] = cloud.fields
-    values, wanted = fields.get(name, fields.get(f"{name}20")), f"the field {name} of --within"
+    values, field = fields.get(name, fields.get(f"{name}20")), f"the field {name} of --within"
     if values is None:
         names = ", ".join(sorted(fields)) or "none"
         names += "".join(f" ({note})" for note in cloud.notes if name in note)
-        raise FormatError(f"{cloud.source}: expected {wanted}, got {names}; choose one of these.")
+        raise FormatError(f"{cloud.source}: expected {field}, got {names}; choose one of these.")
     if values.dtype.kind not in "iubf" or len(values) != len(cloud) or not are_integers(values):
         raise FormatError(
-            f"{cloud.source}: expected {wanted} to have one integer for each of {len(cloud):,} "
+            f"{cloud.source}: expected {field} to have one integer for each of {len(cloud):,} "
             f"points, got {values.dtype} of shape {values.shape}; number the objects."
         )
     return values.reshape(len(values), -1)[:, 0].astype(np.int64)

@@ -389,8 +389,8 @@ class SuperpointsConfig:
 
     strengths: tuple[float, ...] = (0.5, 1.5, 4.0, 12.0)
     """Regularization strength per level, ascending. Two adjacent regions merge if the cost is at
-    most this, measured in points on opposite sides of a right angle. Doubling it leaves about 0.6
-    times as many superpoints."""
+    most this, measured in points on opposite sides of a right angle. Doubling it leaves about 60 %
+    of the superpoints."""
     counts: tuple[int, ...] | None = None
     """Number of superpoints per level, descending; overrides strengths. Actual counts can be lower
     or higher, depending on connectivity and the minimum size. None: set by strengths."""

@@ -1,4 +1,4 @@
-"""Scripts are found by who reads README and guides, and use public names alone."""
+"""README and guides name all scripts, and scripts use only public names."""
 
 import ast
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
 BEHIND = {"environment.sh": "test.sh", "docs.py": "docs.sh"}
-"""Scripts that others start, and these."""
+"""Scripts started by other scripts, and the latter."""
 
 
 def commands():

@@ -113,7 +113,7 @@ class SceneDataset(Dataset[Sample]):
         return estimate_points(scene.path / "coord.npy" if scene.path.is_dir() else scene.path)
 
     def describe(self) -> dict[str, Any]:
-        """Return the JSON-serializable parameters that affect what is read."""
+        """Return the JSON-serializable parameters that affect the samples."""
         return {}
 
     def check_output(self, layout: str, out: Path) -> None:
@@ -202,7 +202,7 @@ class FolderOfClouds(SceneDataset):
         return SceneFiles(inside.as_posix(), path, files, "ScanNet" if is_known else "")
 
     def describe(self) -> dict[str, Any]:
-        """Return the JSON-serializable parameters that affect what is read."""
+        """Return the JSON-serializable parameters that affect the samples."""
         return {} if self.columns is None else {"columns": list(self.columns)}
 
     def check_output(self, layout: str, out: Path) -> None:

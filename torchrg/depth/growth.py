@@ -25,7 +25,7 @@ _ALL_STEPS = (*_FORWARD_STEPS, *((-down, -right) for down, right in _FORWARD_STE
 _NUM_PASSES = 2
 """Passes of boundary assignment and merging: assigned pixels may make regions adjacent."""
 
-_ABSORB_REACH = 3.0
+_ASSIGN_REACH = 3.0
 """Maximum distance of a pixel to the plane of the adjacent flat region, in standard deviations of
 the noise: 99.7 % of its pixels are within."""
 
@@ -156,7 +156,7 @@ def _refine(
     grid = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
         planes = fit_inverse_planes(cloud, labels)
-        reach = planes.scale_thickness(_ABSORB_REACH)
+        reach = planes.scale_thickness(_ASSIGN_REACH)
         labels = assign_unlabeled_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
         pairs = zip(grid.contacts(labels), hidden, strict=True)
@@ -170,7 +170,7 @@ def _refine(
     if joined is not labels:
         labels = rank_by_size(joined, config.min_size)
         planes = fit_inverse_planes(cloud, labels)
-    reach = planes.scale_thickness(_ABSORB_REACH)
+    reach = planes.scale_thickness(_ASSIGN_REACH)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = rank_by_size(moved, config.min_size)
     return labels, fit_inverse_planes(cloud, labels)

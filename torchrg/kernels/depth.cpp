@@ -10,7 +10,7 @@ typedef const double* Doubles;
 constexpr int REACH = 2, SIDE = 5, NUM_SIZES = 4, MOMENTS = 10, COLUMNS = 9;
 constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns fitted together
 constexpr int LONG = 9, SHORT = 3;  // sides of narrow windows in pixels
-constexpr double FLAT = 1.35, OWN_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
+constexpr double FLAT = 1.35, SELF_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
 constexpr double BEND = 0.005, MAX_BEND = 0.03, STEEPEST = 4;
 constexpr double NONE = __builtin_inf();
 
@@ -238,7 +238,7 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
             return size_of(values[pixel] - (on_plane + table[ORIGIN * step + k])) <= reach;
           };
           int64_t taken = -1;
-          if (relative[here] < NONE && is_near(here, OWN_REACH * tolerance[here])) taken = here;
+          if (relative[here] < NONE && is_near(here, SELF_REACH * tolerance[here])) taken = here;
           if (taken < 0 && size == 1 &&
               table[DEVIATION * step + here] <= table[STRONGEST * step + here] &&
               is_near(here, NONE))
@@ -253,7 +253,7 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
                     lowest = relative[at], flattest = at;
             }
             const double reach =
-                larger(OWN_REACH * table[NOISE * step + flattest], tolerance[flattest]);
+                larger(SELF_REACH * table[NOISE * step + flattest], tolerance[flattest]);
             if (relative[flattest] < NONE && is_near(flattest, reach))
               taken = flattest, edge[pixel] = true;
           }
@@ -313,7 +313,7 @@ KERNEL choose_narrow(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u,
     const auto is_near = [&](int64_t k) {
       const double on_plane = at(U_SLOPE, k) * u[column] + at(V_SLOPE, k) * v[row];
       return size_of(values[pixel] - (on_plane + at(ORIGIN, k))) <=
-             larger(OWN_REACH * at(NOISE, k), at(TOLERANCE, k));
+             larger(SELF_REACH * at(NOISE, k), at(TOLERANCE, k));
     };
     const int64_t flatter = at(RELATIVE, n + number) < at(RELATIVE, number) ? n + number : number;
     if (at(RELATIVE, flatter) < NONE && is_near(flatter)) {
@@ -464,7 +464,7 @@ struct Front {
   }
   // The eight neighbors of a pixel, clamped to the image.
   template <class Visit>
-  INLINE_MEMBER void visit_around(int64_t pixel, const Visit& visit) const {
+  INLINE_MEMBER void visit_neighbors(int64_t pixel, const Visit& visit) const {
     const int64_t row = pixel / w, column = pixel % w;
     for (int64_t r = row - 1; r <= row + 1; r++)
       for (int64_t c = column - 1; c <= column + 1; c++)
@@ -486,7 +486,7 @@ struct Front {
         const int64_t pixel = rows[f];
         double lowest = NONE;
         int64_t best = -1;
-        visit_around(pixel, [&](int64_t other) {
+        visit_neighbors(pixel, [&](int64_t other) {
           const double away = cost(pixel, other);
           if (away < lowest || (away == lowest && labels[other] < best))
             lowest = away, best = labels[other];
@@ -498,7 +498,7 @@ struct Front {
       const auto add_next = [&](int64_t pixel) {
         if (follows(pixel)) add(pixel);
       };
-      for (int64_t f = 0; f < moved; f++) add_next(chosen[f]), visit_around(chosen[f], add_next);
+      for (int64_t f = 0; f < moved; f++) add_next(chosen[f]), visit_neighbors(chosen[f], add_next);
     }
   }
 };

@@ -45,15 +45,15 @@ typedef Pair<int32_t, FourFlags> Flags;
   INLINE Result operator operation(Operand a, Operand b) {                               \
     return Result(a.low operation b.low, a.high operation b.high);                       \
   }
-#define ON_BOTH_IN_PLACE(operation, Operand)                                             \
+#define ON_BOTH_ASSIGN(operation, Operand)                                             \
   ON_BOTH(Operand, operation, Operand)                                                   \
   INLINE Operand& operator operation##=(Operand& a, Operand b) { return a = a operation b; }
-ON_BOTH_IN_PLACE(+, Lanes)
-ON_BOTH_IN_PLACE(-, Lanes)
-ON_BOTH_IN_PLACE(*, Lanes)
-ON_BOTH_IN_PLACE(/, Lanes)
-ON_BOTH_IN_PLACE(+, Flags)
-ON_BOTH_IN_PLACE(-, Flags)
+ON_BOTH_ASSIGN(+, Lanes)
+ON_BOTH_ASSIGN(-, Lanes)
+ON_BOTH_ASSIGN(*, Lanes)
+ON_BOTH_ASSIGN(/, Lanes)
+ON_BOTH_ASSIGN(+, Flags)
+ON_BOTH_ASSIGN(-, Flags)
 ON_BOTH(Flags, &, Flags)
 ON_BOTH(Flags, ^, Flags)
 ON_BOTH(Flags, >>, Flags)

@@ -117,11 +117,11 @@ def score_normals(
 def _angle_errors(normals: Tensor, ground_truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return errors in degrees, and masks of evaluated points and of ground truth, ``(N,)``."""
     blocks = []
-    for estimates, truths in zip(
+    for estimates, references in zip(
         torch.split(normals, _CHUNK), torch.split(ground_truth, _CHUNK), strict=True
     ):
         estimated, has_estimate = unit_vectors(estimates)
-        true, has_ground_truth = unit_vectors(truths)
+        true, has_ground_truth = unit_vectors(references)
         blocks.append(
             (unsigned_angle_deg(estimated, true), has_estimate & has_ground_truth, has_ground_truth)
         )

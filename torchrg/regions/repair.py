@@ -90,7 +90,7 @@ def refine_regions(
             planes.scale_thickness(config.absorb_reach),
             valid=cloud.valid,
             normals=cloud.normals,
-            # Facet normals say little about the surface; the distance decides.
+            # Facet normals are unreliable; the distance decides.
             max_angle_deg=90.0 if config.faceted is True else config.absorb_angle_deg,
         )
         labels = _remove_small(labels, int(config.min_size))

@@ -15,7 +15,7 @@ matrix products."""
 
 _MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
 """Maximum number of neighbors for which the kernel is faster: a block of the kernel has at most
-eight times as many members."""
+eight times this number of members."""
 
 
 def min_shared_neighbors(connectivity: float, k: int) -> int:

@@ -27,7 +27,7 @@ NUM_STRATA = 8
 slow machines draw only the first strata; sorting compresses positions to two thirds."""
 PAGE_EXTENT = 10.0
 """Longest side of a cloud in a viewer; independent of the unit."""
-_OUTLINE_POINTS = 200_000
+_POLYGON_POINTS = 200_000
 """Number of points from which polygons are traced; enough for display."""
 _OMITTED_COLUMNS = ("id", "centroid", "axes", "center", "outline")
 """Columns of the plane table that a viewer draws or omits."""
@@ -185,7 +185,7 @@ def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, .
     outlines: list[tuple[Tensor, ...]] = [() for _ in planes.count]
     if find_spec("shapely") is None:
         return outlines
-    rows = rows[:_OUTLINE_POINTS]
+    rows = rows[:_POLYGON_POINTS]
     numbers, labels = number_labels(result.labels[rows])
     points = result.cloud.points[rows]
     normals = result.fields.get("normals", torch.zeros_like(result.cloud.points))[rows]

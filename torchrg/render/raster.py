@@ -2,8 +2,8 @@
 
 The first pass finds the nearest disc of each pixel. Discs extend beyond the edge of their surface
 and hide the surface behind it. The second pass therefore chooses, for each pixel, the disc with the
-nearest center in the image, among those that the nearest disc may wrongly hide. Such a disc is at
-most a disc diameter behind. Unlike for a real occluder, the center of the nearest disc is not in
+nearest center in the image, among the discs that the nearest disc may wrongly hide. Such a disc is
+at most a disc diameter behind. Unlike for a real occluder, the center of the nearest disc is not in
 front of its plane. Ties are broken by color, not by the order of the points.
 """
 

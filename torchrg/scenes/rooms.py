@@ -310,7 +310,7 @@ def _floor_cells(size: Triple) -> list[tuple[float, float]]:
 
 
 def _cell_centers(length: float, cell: float) -> list[float]:
-    """Return the centers of as many equal cells of at least ``cell`` as fit into a length."""
+    """Split a length into equal cells of at least ``cell`` and return their centers."""
     count = max(int(length / cell), 0)
     return [length * (number + 0.5) / count for number in range(count)]
 
