@@ -35,7 +35,7 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
 
     Raises:
         FormatError: If there are no clouds, two clouds have different coordinate reference systems,
-        or LAS files have different kinds of GPS times.
+            or LAS files have different kinds of GPS times.
 
     Example:
         >>> clouds = [Cloud(np.eye(3), {"labels": np.arange(3)}), Cloud(np.zeros((1, 3)))]

@@ -273,7 +273,7 @@ class NormalFit(NamedTuple):
         curvature: Surface variation in [0, 1/3], shape ``(*)``; 0 where not ``valid``.
         valid: Whether there is a plane, shape ``(*)``, bool.
         residual_rms: RMS distance of the fitted points to the plane, shape ``(*)``, in units of the
-        cloud; 0 where not ``valid``.
+            cloud; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(*)``, bool; None for methods of one stage.
     """
 

@@ -46,7 +46,7 @@ class PlaneMetric(Metric):
         index: A part of :data:`torchrg.metrics.METRICS`, for a dict of all its metrics, or the name
             of a metric, such as ``"f1"``.
         **settings: Settings of the evaluation function, such as ``min_size=50``, and of
-        :class:`torchmetrics.Metric`.
+            :class:`torchmetrics.Metric`.
 
     Attributes:
         part: The part of ``METRICS``.

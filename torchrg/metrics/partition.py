@@ -27,10 +27,10 @@ class PartitionScore(NamedTuple):
 
     Attributes:
         asa: Achievable segmentation accuracy: fraction of points that are correct if every
-        superpoint takes its most frequent object.
+            superpoint takes its most frequent object.
         oracle_miou: Mean IoU over the objects of that labeling.
         boundary_recall: Fraction of ground-truth boundary points with a superpoint boundary point
-        within ``boundary_distance``. None without coordinates, as the next two.
+            within ``boundary_distance``. None without coordinates, as the next two.
         boundary_precision: The same fraction with the roles exchanged.
         boundary_distance: Maximum distance of matching boundaries, in units of the cloud.
         count: Number of superpoints, including those without an evaluated point.

@@ -110,7 +110,7 @@ def estimate_normals(
         max_distance: See :func:`torchrg.search_knn`.
         chunk_size: Points processed at a time; bounds memory, does not change the result.
         **changes: Individual parameters, as in ``method="pca", k=20``: see
-        :class:`torchrg.config.NormalsConfig`.
+            :class:`torchrg.config.NormalsConfig`.
 
     Returns:
         The fit in the order of the points.

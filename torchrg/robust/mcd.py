@@ -105,10 +105,10 @@ def fit_detmcd(
         exact fits.
 
         The published starts use the coordinate axes: rotating a patch changes the final set of
-            every second one, and a compact minority can mislead all six. On synthetic patches near
-            edges of 90 degrees, the fraction of normals more than 10 degrees off is 21 % with them,
-            4.6 % with ``"planes"`` and 4.8 % with ``"more"``; with 30 % of outliers in one cluster
-            54 %, 0 and 0.
+        every second one, and a compact minority can mislead all six. On synthetic patches near
+        edges of 90 degrees, the fraction of normals more than 10 degrees off is 21 % with them,
+        4.6 % with ``"planes"`` and 4.8 % with ``"more"``; with 30 % of outliers in one cluster
+        54 %, 0 and 0.
 
     Args:
         patches: Points of each neighborhood, shape ``(*, K, P)``; see :class:`RobustFit`.
@@ -116,19 +116,20 @@ def fit_detmcd(
         support_fraction: Fraction of points to trust, from 0.5 (h = 27 of 50) to 1.
         quantile: Level of the chi-square distribution within which points are inliers.
         starts: ``"paper"``: sets of ceil(K / 2) points, as published. ``"robustbase"``: of h
-        points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes through P
-        points; a third of the cost, rotation invariant, and robust against clusters. ``"more"``:
-        these, and the published six in the principal axes of the patch.
+            points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes
+            through P points; a third of the cost, rotation invariant, and robust against clusters.
+            ``"more"``: these, and the published six in the principal axes of the patch.
         small_sample: Apply the small-sample factors (P = 3 only).
         scaling: Factors of the scatters. ``"consistency"``: consistent for normal points.
-        ``"quantile"``: ``d2_(h) / chi2inv(h/n)`` for the raw scatter, that is the h-th smallest
-        squared distance over its expected quantile, and 1 for the final one. The cutoff is wider,
-        the less the h points resemble the inner part of a normal sample. 1 if h is all points.
+            ``"quantile"``: ``d2_(h) / chi2inv(h/n)`` for the raw scatter, that is the h-th smallest
+            squared distance over its expected quantile, and 1 for the final one. The cutoff is
+            wider, the less the h points resemble the inner part of a normal sample. 1 if h is all
+            points.
         inliers: Distances to which the cutoff applies. ``"raw"``: distances to the raw fit.
-        ``"reweighted"``: first these, then the distances to the reweighted fit, which become
-        ``sq_distances``; location and covariance stay the same.
+            ``"reweighted"``: first these, then the distances to the reweighted fit, which become
+            ``sq_distances``; location and covariance stay the same.
         min_dimension: Minimum dimension of a flat that is an exact fit: 0 for a point, 1 for a
-        line, 2 for a plane. Points on smaller flats are excluded; see :class:`RobustFit`.
+            line, 2 for a plane. Points on smaller flats are excluded; see :class:`RobustFit`.
         chunk_size: Number of patches processed at a time.
 
     Returns:
