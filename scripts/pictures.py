@@ -99,7 +99,7 @@ def draw_page(path: Path, result: Result) -> bool:
         browser = driver.chromium.launch(executable_path=chromium, args=flags)
         tab = browser.new_page(viewport=PAGE)
         tab.goto(page.as_uri())
-        ready = "globalThis.torchrg?.page?.ready && torchrg.state.share === 1"
+        ready = "globalThis.torchrg?.page?.ready && torchrg.state.fraction === 1"
         for _ in range(600):
             tab.wait_for_timeout(200)
             if tab.evaluate(ready):

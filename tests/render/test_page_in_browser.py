@@ -58,7 +58,7 @@ class Tab:
 
     def settle(self):
         self.wait_for(
-            "!torchrg.state.moving && torchrg.state.share === 1 && !torchrg.deck().needsRedraw()"
+            "!torchrg.state.moving && torchrg.state.fraction === 1 && !torchrg.deck().needsRedraw()"
         )
         self.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
