@@ -1,4 +1,4 @@
-"""A source whose input files say what must go wrong, importable by worker processes."""
+"""A source whose input files say what goes wrong, importable by worker processes."""
 
 import errno
 import os

@@ -37,7 +37,7 @@ for line in sys.stdin:
 
 @pytest.fixture(scope="module")
 def server():
-    """A process which permissions hold, and that runs one command after another."""
+    """A process that is subject to permissions and runs commands in sequence."""
     with subprocess.Popen(
         [sys.executable, "-c", SERVER],
         stdin=subprocess.PIPE,

@@ -144,7 +144,7 @@ def write_scannetpp(root):
 
 
 def write_3rscan(root):
-    """Write a sequence of 3RScan, with a rendered image next to one."""
+    """Write a sequence of 3RScan, with one rendered image."""
     folder = root / "0988ea72" / "sequence"
     fx, fy, cx, cy = camera_of_depth(0)
     info = f"""m_sensorName = Tango

@@ -280,7 +280,7 @@ def test_what_is_done_is_kept_and_layouts_share_a_directory(root, room, tmp_path
     path.write_bytes(b"")
     assert len(convert(root, tmp_path, "npy", only=f"*{SCAN}")) == 1
     assert path.read_bytes() == before
-    # A file of a user else is never replaced.
+    # A file of another user is never replaced.
     path = tmp_path / "other" / "superpoints" / f"{SCAN}.npy"
     path.parent.mkdir(parents=True)
     path.write_bytes(b"theirs")

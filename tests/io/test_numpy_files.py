@@ -125,7 +125,7 @@ def test_structured_arrays_are_read_by_name(tmp_path):
 
 
 class Bomb:
-    """Says so if any user unpickles it."""
+    """Fails if it is unpickled."""
 
     def __reduce__(self):
         return (pytest.fail, ("a pickle was loaded",))

@@ -11,7 +11,7 @@ BEHIND = {"environment.sh": "test.sh", "docs.py": "docs.sh"}
 
 
 def commands():
-    """Return the scripts that a user starts."""
+    """Return the scripts for users."""
     found = [*SCRIPTS.glob("*.sh"), *SCRIPTS.glob("*.py")]
     return sorted(
         path.name for path in found if path.suffix == ".sh" or "__main__" in path.read_text()
