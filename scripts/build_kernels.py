@@ -91,4 +91,4 @@ class KernelsHook(BuildHookInterface[Any]):
         if REQUESTED not in ("", "0"):
             self.app.abort(f"torchrg cannot be built with the requested kernels: {error}")
         if not REQUESTED:
-            self.app.display_warning(f"torchrg is built without kernels, so slower: {error}")
+            self.app.display_warning(f"torchrg is built without kernels and slower: {error}")
