@@ -34,6 +34,8 @@ ZIG = "ziglang==0.17.1"
 WHEELS = {
     "x86_64-linux-gnu.2.17": "manylinux_2_17_x86_64",
     "aarch64-linux-gnu.2.17": "manylinux_2_17_aarch64",
+    "x86_64-linux-musl": "musllinux_1_2_x86_64",
+    "aarch64-linux-musl": "musllinux_1_2_aarch64",
     "aarch64-macos.11.0": "macosx_11_0_arm64",
 }
 """Wheel platform tags of ziglang targets."""

@@ -20,6 +20,8 @@ from sphinx.ext.apidoc import main as write_reference
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "torchrg"
 BUILD = Path("build")
+PRIVATE = ("__main__.py", "cli", "kernels", "merge.py", "mesh.py", "precision.py", "version.py")
+"""Modules that users do not import, in addition to those with an underscore."""
 
 
 def write_pages(folder: Path) -> None:
@@ -32,8 +34,8 @@ def write_pages(folder: Path) -> None:
 
 
 def write_modules(folder: Path) -> None:
-    """Write a page for each public module except the command line."""
-    hidden = [str(PACKAGE / name) for name in ("cli", "__main__.py")]
+    """Write a page for each module except private ones and the command line."""
+    hidden = [str(PACKAGE / name) for name in PRIVATE]
     options = ["-q", "--separate", "--module-first", "--no-toc"]
     write_reference([*options, "-o", str(folder / "reference"), str(PACKAGE), *hidden])
 

@@ -2,8 +2,9 @@
 
 ``python`` blocks share their names within a page; ``bash`` blocks contain commands of torchrg and
 ``mkdir``. Both run in a separate folder per page. ``python hidden`` blocks run and are not shown,
-and the output of ``python page`` blocks is part of the page. Other blocks (``console``, ``yaml``,
-``text``) are only shown. Output lacks the times and paths of the machine that builds the pages.
+and the output of ``python page`` blocks is part of the page. ``script`` blocks name a file of this
+folder that is shown. Other blocks (``console``, ``yaml``, ``text``) are only shown. Output lacks
+the times and paths of the machine that builds the pages.
 """
 
 import contextlib
@@ -57,6 +58,9 @@ def make_page(guide: Path, folder: Path) -> Path:
                 printed = _run(kind, lines, names, where)
         if role == " page":
             parts.append(printed)
+        elif kind == "script":
+            shown = (GUIDES.parent / lines.strip()).read_text(encoding="utf-8")
+            parts.append(f"```py\n{shown}```")
         elif role is None:
             parts.append(block[0])
             parts.append(_shown(printed) if printed else "")

@@ -1,13 +1,13 @@
 """Reproduce the tables and figures of the paper with every method of torchrg.
 
     python scripts/reproduce_paper.py --out DIR                 # everything
-    python scripts/reproduce_paper.py --out DIR --quick         # small clouds, in minutes
-    python scripts/reproduce_paper.py --out DIR normals times   # selected parts
+    python scripts/reproduce_paper.py --out DIR --quick         # small clouds, minutes
+    python scripts/reproduce_paper.py --out DIR normals times   # some parts
 
-Open DIR/report.html. Each result is stored in a separate file under DIR and reused by the same
-commit, so rerunning the command resumes an interrupted run; delete DIR/cells to measure again. A
-full report needs a clean working tree, because it documents one commit. Quick results go to
-DIR/quick. Missing clouds of the paper are replaced by synthetic ones with known ground truth.
+Open DIR/report.html. Results are stored under DIR and not computed again by the same commit, so an
+interrupted run resumes; delete DIR/cells to measure again. A full run needs a clean working tree,
+because a report describes one commit. Quick results are in DIR/quick. Synthetic clouds with
+ground truth replace the paper's clouds that are not passed.
 """
 
 import argparse
@@ -20,13 +20,12 @@ from pathlib import Path
 import matplotlib as mpl
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # The scenes of tests.made.
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the scenes of tests.made
 
-from reproduction import method, normals, segmentation, study, summary, times
-from reproduction.cells import Folder, Record, is_committed, made_with
-from reproduction.clouds import TITLES
-from reproduction.report import write_report
-from reproduction.runs import Run
+from reproduction import method, normals, segmentation, study, times
+from reproduction.clouds import TITLES, Run
+from reproduction.records import Folder, Record, is_committed, made_with
+from reproduction.report import keep, write_report
 
 PARTS: dict[str, tuple[Callable[[Run], Record], str]] = {
     "method": (method.reproduce, "Figures 1, 2, 5 and 6: the method and its indices"),
@@ -35,11 +34,11 @@ PARTS: dict[str, tuple[Callable[[Run], Record], str]] = {
     "segmentation": (segmentation.reproduce, "Table 2, Figures 7 to 9"),
     "times": (times.reproduce, "Table 3: times"),
 }
-"""Parts by name: function and description."""
+"""Function and description of each part."""
 
 
 def main() -> None:
-    """Compute the selected parts and write the report of all available parts."""
+    """Make the requested parts, and the report of all parts in the folder."""
     arguments = _parse()
     mpl.use("agg")
     if arguments.threads is not None:
@@ -47,8 +46,8 @@ def main() -> None:
     commit = made_with()["commit"]
     if not arguments.quick and not is_committed(commit):
         sys.exit(
-            "reproduce_paper.py: expected committed code for a full report, got commit "
-            f"{commit}; commit the changes, or use --quick."
+            "reproduce_paper.py: expected committed code for a report at full size, got commit "
+            f"{commit}; commit the changes, or pass --quick."
         )
     path = arguments.out / "quick" if arguments.quick else arguments.out
     folder = Folder(path)
@@ -60,16 +59,16 @@ def main() -> None:
         folder.write(f"parts/{name}.json", json.dumps(part, indent=1))
         print(f"== {name}: {time.perf_counter() - begin:.0f} s", flush=True)
     report = write_report(folder, list(PARTS), quick=arguments.quick)
-    print(f"Report: {folder.path / 'report.html'} (also .json)")
+    print(f"Wrote {folder.path / 'report.html'} and report.json")
     if arguments.keep:
         try:
-            summary.keep(report)
+            keep(report)
         except ValueError as error:
             sys.exit(f"reproduce_paper.py: {error}")
 
 
 def _parse() -> argparse.Namespace:
-    """Return the arguments."""
+    """Parse the command line."""
     listed = "; ".join(f"{name}: {what}" for name, (_, what) in PARTS.items())
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -77,11 +76,13 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "parts", nargs="*", choices=[*PARTS, []], metavar="part", help=f"{listed}. Default: all"
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
-    parser.add_argument("--quick", action="store_true", help="small clouds, a few minutes")
-    parser.add_argument("--threads", type=int, help="torch threads; default: chosen by torch")
+    parser.add_argument("--out", type=Path, required=True, help="output folder")
+    parser.add_argument("--quick", action="store_true", help="use small clouds (a few minutes)")
     parser.add_argument(
-        "--keep", action="store_true", help="store the main results for the documentation"
+        "--threads", type=int, help="number of torch threads; default: chosen by torch"
+    )
+    parser.add_argument(
+        "--keep", action="store_true", help="replace the results shown in the documentation"
     )
     for key, title in TITLES.items():
         words = f"the paper's {title}; its labels and normals are the ground truth"
@@ -93,4 +94,4 @@ if __name__ == "__main__":
     try:
         main()
     except KeyboardInterrupt:
-        sys.exit("Interrupted; rerun the same command to resume.")
+        sys.exit("Interrupted; run the same command to resume.")

@@ -58,6 +58,11 @@ else:
         "result": ("read_result",),
         "structures": ("UNLABELED", "Cloud", "Plane"),
     }
+    # Public modules that a star import omits, because names such as io hide other modules.
+    _PACKAGES = (
+        "batch", "clouds", "config", "errors", "io", "linalg", "neighbors", "pipeline",
+        "plane_table", "regions", "render", "result", "scratch", "structures",
+    )  # fmt: skip
     _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
     def __getattr__(name):  # noqa: ANN001, ANN202
@@ -81,8 +86,8 @@ else:
         return globals()[name]
 
     def __dir__():  # noqa: ANN202
-        """Return all names, loaded or not."""
-        return sorted({*globals(), *__all__})
+        """Return the public names, loaded or not."""
+        return sorted([*__all__, *_PACKAGES, "__version__"])
 
 
 def _load_display() -> "ModuleType":

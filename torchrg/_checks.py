@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg.errors import ConfigError, ShapeError
 
 Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+Returned = TypeVar("Returned")
 
 
 def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
@@ -193,7 +193,7 @@ def default_device_cpu() -> Iterator[None]:
         yield
 
 
-def eager_only(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def eager_only(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:
     """Exclude a function of clouds from compilation, and reject tensors without data.
 
     A compiler breaks its graph there and compiles the remaining model. Tensors are created on the
@@ -201,10 +201,10 @@ def eager_only(function: Callable[Arguments, Result]) -> Callable[Arguments, Res
     """
 
     @wraps(function)
-    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Returned:
         if torch.compiler.is_compiling():
             uncompiled = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
-            result: Result = uncompiled(*args, **kwargs)
+            result: Returned = uncompiled(*args, **kwargs)
             return result
         if not is_concrete(*(value for value in (*args, *kwargs.values()) if is_tensor(value))):
             raise ShapeError(
@@ -212,17 +212,17 @@ def eager_only(function: Callable[Arguments, Result]) -> Callable[Arguments, Res
                 "torch.func or the meta device; call it outside of them."
             )
         with default_device_cpu():
-            plain: Callable[..., Result] = function
+            plain: Callable[..., Returned] = function
             return plain(*map(_plain, args), **{name: _plain(kwargs[name]) for name in kwargs})
 
     return call
 
 
-def disable_autocast(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def disable_autocast(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:
     """Disable ``torch.autocast`` in a function that multiplies matrices."""
 
     @wraps(function)
-    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Returned:
         kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
         if not kinds:
             return function(*args, **kwargs)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import Arguments, Result, is_concrete, is_tensor, raise_forward_mode
+from torchrg._checks import Arguments, Returned, is_concrete, is_tensor, raise_forward_mode
 from torchrg.errors import ConfigError
 
 
@@ -32,7 +32,7 @@ _FUNCTIONS: dict[str, _Function] = {}
 
 def opaque(
     outputs: Callable[[Tensor], Any], *, differentiable: Collection[int] = (0,)
-) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+) -> Callable[[Callable[Arguments, Returned]], Callable[Arguments, Returned]]:
     """Return a decorator for a function of patches with shared leading axes.
 
     The first argument is a tensor, the only differentiable one; the others are tensors or literals.
@@ -41,7 +41,7 @@ def opaque(
     outputs.
     """
 
-    def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    def decorate(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:
         name = function.__name__
         parameters = tuple(inspect.signature(function).parameters)
         kind: Any = inspect.signature(function).return_annotation
@@ -49,7 +49,7 @@ def opaque(
         _FUNCTIONS[name] = _Function(function, outputs, differentiable)
 
         @wraps(function)
-        def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Returned:
             # Compilers of torch 2.5 support neither a zip of unequal lengths nor a union of dicts.
             arguments: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
             arguments = {**arguments, **kwargs}
@@ -62,7 +62,7 @@ def opaque(
                     _check_literal(name, key, value)
                     parts.append(f"{key}={value!r}")
             outputs_of_call = _apply("|".join(parts), list(tensors.values()))
-            result: Result = make(*outputs_of_call)
+            result: Returned = make(*outputs_of_call)
             return result
 
         return call

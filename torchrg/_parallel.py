@@ -23,7 +23,7 @@ from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 Task = TypeVar("Task")
-Result = TypeVar("Result")
+Returned = TypeVar("Returned")
 
 CACHE_BYTES = 2**22
 """Size of one array processed at a time by a thread, in bytes, so that it stays in the cache."""
@@ -79,13 +79,13 @@ def split_rows(num_rows: int, chunk_size: int) -> list[slice]:
 
 
 def map_chunks(
-    work: Callable[[slice], Result],
+    work: Callable[[slice], Returned],
     num_rows: int,
     chunk_size: int,
     device: torch.device,
     *,
     min_rows: int = _MIN_ROWS,
-) -> list[Result]:
+) -> list[Returned]:
     """Call ``work`` on slices that cover all rows, in order; see :func:`map_tasks`.
 
     Without rows it is called once, on an empty slice. ``min_rows`` is the minimum number of rows
@@ -126,15 +126,17 @@ def map_rows(
     return [torch.cat(same) for same in parts] if more else list(first)
 
 
-def map_selected(work: Callable[[Tensor], Result], chosen: Tensor, chunk_size: int) -> list[Result]:
+def map_selected(
+    work: Callable[[Tensor], Returned], chosen: Tensor, chunk_size: int
+) -> list[Returned]:
     """Call ``work`` on chunks of the row indices of the chosen points; see :func:`map_chunks`."""
     rows = nonzero_rows(chosen)
     return map_chunks(lambda chunk: work(rows[chunk]), len(rows), chunk_size, rows.device)
 
 
 def map_tasks(
-    work: Callable[[Task], Result], tasks: Sequence[Task], device: torch.device
-) -> list[Result]:
+    work: Callable[[Task], Returned], tasks: Sequence[Task], device: torch.device
+) -> list[Returned]:
     """Return the result of ``work`` for each task; on a CPU, multi-threaded.
 
     Every task writes different rows, so the result does not depend on the number of threads.

@@ -18,6 +18,9 @@ from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
 
+__all__ = ["check_finite", "find_objects", "note_on_copies", "segment_cloud"]
+__dir__ = __all__.copy
+
 _SAMPLE_SIZE = 10_000
 """Number of points from which the quantiles of coordinates are estimated."""
 _QUARTILES = (0.25, 0.75)

@@ -22,6 +22,24 @@ from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
+__all__ = [
+    "DEFAULT_PRESET",
+    "AnyConfig",
+    "Auto",
+    "DepthConfig",
+    "GrowingConfig",
+    "NormalMethod",
+    "NormalsConfig",
+    "PipelineConfig",
+    "PlanesConfig",
+    "SelectionConfig",
+    "SuperpointsConfig",
+    "Up",
+    "load_config",
+    "preset_names",
+]
+__dir__ = __all__.copy
+
 Settings = TypeVar("Settings")
 NormalMethod = Literal[
     "pca", "jet", "irls", "fastmcd", "mve", "detmcd", "detmm", "paper", "consensus"

@@ -4,6 +4,17 @@ All exceptions derive from :class:`TorchrgError`; messages contain the requireme
 the fix.
 """
 
+__all__ = [
+    "ConfigError",
+    "DepthWarning",
+    "FormatError",
+    "MissingDependencyError",
+    "PrecisionWarning",
+    "ShapeError",
+    "TorchrgError",
+]
+__dir__ = __all__.copy
+
 OUT_OF_MEMORY = "out of memory; use a machine with more memory, or a smaller part of the data."
 """Message of any out-of-memory error."""
 

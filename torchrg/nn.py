@@ -44,9 +44,24 @@ from torchrg.robust import (
     qn,
 )
 from torchrg.robust.mm import Target
-from torchrg.robust.starts import Starts
+from torchrg.robust.starts import MCDStarts, Starts
 from torchrg.robust.weights import Inliers, Scaling
 from torchrg.structures import NormalFit
+
+__all__ = [
+    "MVE",
+    "Covariance",
+    "DetMCD",
+    "DetMM",
+    "DetS",
+    "Eigen",
+    "Eigh",
+    "FastMCD",
+    "Normal",
+    "PatchNormals",
+    "Qn",
+]
+__dir__ = __all__.copy
 
 
 @dataclass(eq=False, repr=False)
@@ -156,7 +171,7 @@ class DetMCD(_Function):
     support_fraction: float = 0.5
     _: KW_ONLY
     quantile: float = 0.975
-    starts: Starts = "paper"
+    starts: MCDStarts = "paper"
     small_sample: bool = False
     scaling: Scaling = "consistency"
     inliers: Inliers = "raw"

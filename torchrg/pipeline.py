@@ -1,5 +1,7 @@
 """Plane segmentation and superpoint partition of a point cloud."""
 
+from __future__ import annotations
+
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import scratch
@@ -30,13 +31,31 @@ from torchrg.neighbors import (
 )
 from torchrg.neighbors.knn import restrict_to_groups
 from torchrg.normals import ESTIMATORS
-from torchrg.normals.orient import Orientation, Points, choose_side, find_directions, turn_faces
+from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.precision import warn_about_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
 from torchrg.regions.growth import needs_sampling, rank_by_count
 from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.superpoints import merge_duplicates
-from torchrg.structures import UNLABELED, Cloud, Neighbors, Rows, Segmentation, Superpoints
+from torchrg.structures import (
+    UNLABELED,
+    Cloud,
+    Colors,
+    FilePath,
+    Labels,
+    Neighbors,
+    Points,
+    Rows,
+    Segmentation,
+    Superpoints,
+)
+
+__all__ = [
+    "make_superpoints",
+    "segment_mesh",
+    "segment_planes",
+]
+__dir__ = __all__.copy
 
 _STRENGTH_OF_K = 100.0
 """Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
@@ -46,14 +65,14 @@ meshed depth frames get about the same number of superpoints as Segmentator's se
 @eager_only
 @sequential_operations()
 def segment_planes(
-    points: Points | Cloud | str | os.PathLike[str],
+    points: Points | Cloud | FilePath,
     config: AnyConfig | None = None,
     *,
     orient: Orientation = "auto",
     viewpoint: Points | Sequence[float] | None = None,
     front: Points | None = None,
     voxel: float | None = None,
-    within: Tensor | NDArray[np.integer] | None = None,
+    within: Labels | None = None,
     keep_neighbors: bool = False,
     on_stage: Callable[[str], None] | None = None,
     **changes: Any,  # noqa: ANN401
@@ -305,11 +324,11 @@ def _has_auto(config: PipelineConfig) -> bool:
 @eager_only
 @sequential_operations()
 def make_superpoints(
-    points: Tensor | NDArray[np.floating],
+    points: Points,
     seg: Segmentation | None = None,
     config: SuperpointsConfig | Mapping[str, Any] | None = None,
     *,
-    colors: Tensor | NDArray[np.generic] | None = None,
+    colors: Colors | None = None,
     voxel: float | None = None,
     **changes: Any,  # noqa: ANN401
 ) -> Superpoints:
@@ -391,7 +410,7 @@ def make_superpoints(
 def _unit_colors(
     caller: str,
     points: Tensor,
-    colors: Tensor | NDArray[np.generic] | None,
+    colors: Colors | None,
     *,
     num_decorators: int,
 ) -> Tensor | None:
@@ -415,12 +434,12 @@ def _unit_colors(
 
 @eager_only
 def segment_mesh(
-    vertices: Tensor | NDArray[np.floating],
-    faces: Tensor | NDArray[np.integer] | None = None,
+    vertices: Points,
+    faces: Labels | None = None,
     k_thresh: float = 0.01,
     seg_min_verts: int = 20,
     *,
-    colors: Tensor | NDArray[np.generic] | None = None,
+    colors: Colors | None = None,
     config: AnyConfig | None = None,
 ) -> Tensor:
     """Return superpoints of mesh vertices, a drop-in replacement for ScanNet's Segmentator.

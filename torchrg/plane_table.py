@@ -16,6 +16,17 @@ from torch import Tensor
 
 from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Array, PlaneAdjacency, Planes
 
+__all__ = [
+    "CSV_COLUMNS",
+    "TABLE_SUFFIXES",
+    "describe_planes",
+    "encode_csv",
+    "planes_from_arrays",
+    "planes_to_arrays",
+    "tabulate_planes",
+]
+__dir__ = __all__.copy
+
 Arrays = dict[str, Array]
 """Arrays of a plane table by their names in ``.npz``."""
 Json = dict[str, Any]

@@ -4,8 +4,9 @@ Written by :func:`torchrg.write_cloud`, ``torchrg convert`` and ``torchrg depth`
 :func:`read_result`.
 """
 
+from __future__ import annotations
+
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -38,12 +39,16 @@ from torchrg.regions.superpoints import majority_planes
 from torchrg.structures import (
     UNLABELED,
     Cloud,
+    FilePath,
     Neighbors,
     PlaneAdjacency,
     Planes,
     Segmentation,
     Superpoints,
 )
+
+__all__ = ["Result", "read_result", "write_table"]
+__dir__ = __all__.copy
 
 PLANES_FILE, RECORD = "planes.json", "provenance.json"
 """Files of the plane table and the provenance in a folder of arrays. The provenance is written
@@ -104,7 +109,7 @@ class Result:
     @classmethod
     def from_segmentation(
         cls, cloud: Cloud, segmentation: Segmentation, superpoints: Superpoints | None = None
-    ) -> "Result":
+    ) -> Result:
         """Create the result of segmenting a cloud, or a depth image with its pixels as points.
 
         Input fields with the names of results are renamed, as in files.
@@ -281,7 +286,7 @@ def write_table(path: Path, described: Json) -> None:
         temporary.write_bytes(content)
 
 
-def read_result(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Result:
+def read_result(path: FilePath, *, columns: Sequence[str] | None = None) -> Result:
     """Read a saved result, or a plain point cloud.
 
     Args:

@@ -22,6 +22,9 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 
+__all__ = ["empty", "is_active", "on_disk", "release"]
+__dir__ = __all__.copy
+
 _MIN_BYTES = 2**24
 """Minimum size of an array on disk, in bytes; all smaller arrays together take little memory."""
 BYTES_PER_NEIGHBOR = 9

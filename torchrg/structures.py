@@ -1,6 +1,7 @@
 """Data structures passed between pipeline stages."""
 
 import operator
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,29 @@ from torchrg import _display
 from torchrg.errors import PrecisionWarning, ShapeError
 from torchrg.precision import describe_steps
 
+__all__ = [
+    "FARTHEST",
+    "MAX_POINTS",
+    "PLANE_KINDS",
+    "UNLABELED",
+    "Cloud",
+    "Colors",
+    "FilePath",
+    "Labels",
+    "Neighbors",
+    "NormalFit",
+    "Plane",
+    "PlaneAdjacency",
+    "PlaneKind",
+    "Planes",
+    "Points",
+    "Sampling",
+    "Segmentation",
+    "Superpoints",
+    "Values",
+]
+__dir__ = __all__.copy
+
 UNLABELED = -1
 """Label of points without a region."""
 FARTHEST = 1e12
@@ -29,6 +53,16 @@ Array = NDArray[Any]
 """Array of numbers or text of any shape."""
 Rows = slice | Tensor
 """A block of points, or row indices."""
+Points = Tensor | NDArray[np.floating]
+"""Coordinates or vectors, shape ``(N, 3)``, as a tensor or an array."""
+Values = Tensor | NDArray[np.floating]
+"""Numbers, shape ``(N,)``, as a tensor or an array."""
+Labels = Tensor | NDArray[np.integer]
+"""Integers, as a tensor or an array."""
+Colors = Tensor | NDArray[np.generic]
+"""Colors, shape ``(N, 3)``, as a tensor or an array."""
+FilePath = str | os.PathLike[str]
+"""Path of a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +155,7 @@ class Cloud:
 
     @cached_property
     def origin(self) -> NDArray[np.float64]:
-        """Origin of :attr:`points`, shape ``(3,)``; see :func:`local_origin`."""
+        """Origin of :attr:`points`, shape ``(3,)``; see ``local_origin``."""
         finite = self.coordinates[self.finite]
         if len(finite) == 0:
             return np.zeros(3)

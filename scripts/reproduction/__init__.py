@@ -1,1 +1,1 @@
-"""The parts of ``reproduce_paper.py``."""
+"""Reproduction of the paper's tables and figures, and the report on its claims."""

@@ -1,7 +1,8 @@
-"""The clouds: the paper's four, or made ones in their place, and others with known truth."""
+"""Clouds: the paper's four or their synthetic substitutes, and others with ground truth."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from reproduction.paper_numbers import POINTS
+from reproduction.records import Folder
 from tests.made import (
     CURVED_LAYOUT,
     HALL_LAYOUT,
@@ -22,19 +23,30 @@ from tests.made import (
     quantised_frame,
     scan_scene,
 )
+from torchrg import estimate_normals, load_config, search_knn, segment_planes
 from torchrg.batch.records import hash_file
+from torchrg.config import NormalsConfig
 from torchrg.io import read_cloud
 from torchrg.scenes import Scene, build_room, make_room
-from torchrg.structures import UNLABELED
+from torchrg.structures import UNLABELED, Neighbors, NormalFit
+
+POINTS = {"tutorial": 108_104, "hallway": 579_313, "cory": 1_097_901, "kinect": 968_520}
+"""Sizes of the paper's clouds (Table 3)."""
 
 QUICK_POINTS = 30_000
-"""Most points of a file in a quick run."""
+"""Maximum number of points of a file in a quick run."""
 
 SMALLEST = 50
-"""Points of the smallest region that the paper draws, and of the smallest colour that is a face."""
+"""Minimum number of points of a region that the paper draws, and of a color that is a surface."""
 
 SHELL = ("floor", "ceiling", "wall")
-"""Faces that are objects of their own where objects are annotated, as in S3DIS."""
+"""Surfaces that are objects of their own, as in the annotations of S3DIS."""
+
+_WARM_UP = 2000
+"""Number of points of the cloud that warms up a method."""
+
+_CHUNK = 100_000
+"""Number of points whose neighbors are looked up at a time."""
 
 TITLES = {
     "tutorial": "region_growing_tutorial",
@@ -45,11 +57,11 @@ TITLES = {
 """The paper's names of its clouds."""
 
 OTHERS = {"room": "a room", "hall": "a second hall"}
-"""Clouds on which its claims are tried as well."""
+"""Other clouds on which the claims are tried."""
 
 HARD = {
     "exact": "exact planes",
-    "quantised": "depth in centimetres",
+    "quantised": "depth in centimeters",
     "stepped": "depth in steps of a Kinect",
     "frames": "raw frames of a Kinect",
     "thinned": "thinned to voxels",
@@ -59,23 +71,23 @@ HARD = {
 
 
 class EvalCloud(NamedTuple):
-    """A cloud to segment."""
+    """A cloud to segment, with its ground truth if known."""
 
     key: str  # a key of :data:`TITLES`, :data:`OTHERS` or :data:`HARD`
-    name: str  # of its cells: another name for other points
+    name: str  # name in records, unique for the points
     points: Tensor  # finite points, shape ``(N, 3)``
-    labels: Tensor | None  # true faces, shape ``(N,)``, or None
-    normals: Tensor | None  # true normals, shape ``(N, 3)``, or None
-    origin: str  # what the cloud is, and how it differs from the paper's
+    labels: Tensor | None  # true surfaces, shape ``(N,)``
+    normals: Tensor | None  # true normals, shape ``(N, 3)``
+    origin: str  # description, and how it differs from the paper's
     is_papers: bool = False  # whether it is the paper's own
-    objects: Tensor | None = None  # true objects, shape ``(N,)``, or None
-    curved: Tensor | None = None  # labels of the faces that are not planes, or None
+    objects: Tensor | None = None  # true objects, shape ``(N,)``
+    curved: Tensor | None = None  # labels of the curved surfaces
 
     @property
     def title(self) -> str:
-        """Its name in tables, with * where it stands in for the paper's."""
-        stands_in = self.key in TITLES and not self.is_papers
-        return f"{title_of(self.key)}*" if stands_in else title_of(self.key)
+        """Name in tables, with * for a substitute of the paper's cloud."""
+        is_substitute = self.key in TITLES and not self.is_papers
+        return f"{title_of(self.key)}*" if is_substitute else title_of(self.key)
 
 
 def title_of(key: str) -> str:
@@ -84,22 +96,21 @@ def title_of(key: str) -> str:
 
 
 def load_cloud(key: str, path: Path | None, *, quick: bool) -> EvalCloud:
-    """Read a cloud of the paper, or make one.
+    """Read a cloud of the paper, or generate its substitute.
 
     Args:
         key: A key of :data:`TITLES`, :data:`OTHERS` or :data:`HARD`.
-        path: The paper's cloud, if it is there.
-        quick: Whether a small piece will do.
+        path: File of the paper's cloud, if available.
+        quick: Whether to use a small part.
 
     Returns:
-        The cloud. Of a file the finite points, in quick runs those nearest to its middle.
+        The cloud. A file gives its finite points, in quick runs the ones nearest to its center.
     """
-    return _made_cloud(key, quick) if path is None else _read_cloud(key, path, quick)
+    return _synthetic_cloud(key, quick) if path is None else _read_cloud(key, path, quick)
 
 
-def _made_cloud(key: str, quick: bool) -> EvalCloud:
-    """Return a made cloud with exact truth."""
-    make, what = MADE[key]
+def _synthetic_cloud(key: str, quick: bool) -> EvalCloud:
+    make, what = SYNTHETIC[key]
     scene = make(quick)
     return EvalCloud(
         key,
@@ -107,14 +118,14 @@ def _made_cloud(key: str, quick: bool) -> EvalCloud:
         scene.points,
         scene.labels,
         scene.normals,
-        f"{len(scene.points):,} points, made with exact truth: {what}",
+        f"{len(scene.points):,} synthetic points with exact ground truth: {what}",
         objects=_objects(scene),
         curved=(~scene.planar).nonzero().squeeze(1),
     )
 
 
 def _objects(scene: Scene) -> Tensor:
-    """Return the object of each point, as people annotate them: a table is one, a wall is one."""
+    """Return the object of each point: a table is one object, and so is a wall."""
     is_shell = torch.tensor([kind in SHELL for kind in scene.kinds])
     num_objects = int(scene.objects.max()) + 1
     faces = torch.arange(len(is_shell)) + num_objects
@@ -122,7 +133,6 @@ def _objects(scene: Scene) -> Tensor:
 
 
 def _read_cloud(key: str, path: Path, quick: bool) -> EvalCloud:
-    """Return a cloud of the paper."""
     cloud = read_cloud(path)
     kept = torch.from_numpy(cloud.finite).nonzero().squeeze(1)
     origin = f"{len(kept):,} points of {path.name}"
@@ -130,25 +140,25 @@ def _read_cloud(key: str, path: Path, quick: bool) -> EvalCloud:
         points = cloud.points[kept]
         distances = (points - points.median(dim=0).values).square().sum(dim=1)
         kept = kept[distances.topk(QUICK_POINTS, largest=False).indices.sort().values]
-        origin = f"{len(kept):,} points around the middle of {path.name}"
+        origin = f"{len(kept):,} points around the center of {path.name}"
     fields = {name: values[kept.numpy()] for name, values in cloud.fields.items()}
     labels, normals = (
         torch.from_numpy(fields[field]) if field in fields else None
         for field in ("labels", "normals")
     )
     if key == "tutorial" and labels is None and "color" in fields:
-        labels = faces_of_colors(fields["color"])
-        origin += ", its colours taken for faces (somebody's segmentation, not a measured truth)"
+        labels = labels_of_colors(fields["color"])
+        origin += ", its colors used as ground truth (a published segmentation, not a measurement)"
     digest = hash_file(path)[:8]
     return EvalCloud(
         key, f"{key}-{digest}", cloud.points[kept], labels, normals, origin, is_papers=not quick
     )
 
 
-def faces_of_colors(colors: NDArray[np.uint8]) -> Tensor:
-    """Return a label for each colour, ``(N,)``; none for those of fewer than 50 points.
+def labels_of_colors(colors: NDArray[np.uint8]) -> Tensor:
+    """Return a label for each color of at least 50 points, shape ``(N,)``.
 
-    The file of PCL's tutorial shows a segmentation: 124 colours of 50 points and more.
+    The file of PCL's tutorial shows a segmentation: 124 colors of at least 50 points.
     """
     _, labels, counts = np.unique(colors, axis=0, return_inverse=True, return_counts=True)
     labels = labels.ravel()
@@ -158,33 +168,33 @@ def faces_of_colors(colors: NDArray[np.uint8]) -> Tensor:
 _SHORT_HALL = replace(HALL_LAYOUT, size=(10.0, 2.4, 2.7), num_doors=5, num_cabinets=1, num_panels=2)
 _PIECE = replace(HALL_LAYOUT, size=(6.0, 2.4, 2.7), num_doors=2, num_cabinets=0, num_panels=1)
 _NOISE = 0.003
-"""Metres."""
+"""Meters."""
 _VOXEL = 0.03
-"""Metres."""
+"""Meters."""
 _DISPARITY_SCALE = 525 * 0.075 * 8
-"""Depth times this many eighths of a pixel, of a Kinect, in metres."""
+"""Product of depth, in meters, and disparity, in eighths of a pixel, of a Kinect."""
 
 
 def _laser_hall(quick: bool) -> Scene:
-    """Return a hallway as a laser scanner sees it, in the place of the tutorial's."""
+    """Return a laser scan of a hallway, the substitute for the tutorial's cloud."""
     layout, size = (_PIECE, 30_000) if quick else (_SHORT_HALL, POINTS["tutorial"])
     return scan_scene(build_room(2, layout=layout), size, noise=_NOISE)
 
 
 def _depth_room(quick: bool, quantise: Callable[[Tensor], Tensor]) -> Scene:
-    """Return a depth frame without noise, its depth replaced."""
+    """Return a noise-free depth frame with quantized depth."""
     model = build_room(layout=KINECT_LAYOUT)
     return quantised_frame(model, quantise, 30_000 if quick else 250_000)
 
 
-def _room(quick: bool, num_points: int = 1, noise: float = _NOISE) -> Scene:
-    """Return a furnished room, with so many times the usual number of points."""
+def _room(quick: bool, multiple: int = 1, noise: float = _NOISE) -> Scene:
+    """Return a furnished room, with a multiple of the default number of points."""
     if quick:
-        return make_room(30_000 * num_points, noise, layout=KINECT_LAYOUT)
-    return make_room(200_000 * num_points, noise)
+        return make_room(30_000 * multiple, noise, layout=KINECT_LAYOUT)
+    return make_room(200_000 * multiple, noise)
 
 
-MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
+SYNTHETIC: dict[str, tuple[Callable[[bool], Scene], str]] = {
     "tutorial": (_laser_hall, "a laser scan of a hallway with doors, noise 3 mm"),
     "hallway": (
         lambda quick: (
@@ -206,7 +216,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
             if quick
             else make_mapped_room(POINTS["kinect"])
         ),
-        "an office as mapped from frames of a Kinect v2 at known places, the mean of each voxel",
+        "an office mapped from frames of a Kinect v2 with known poses, the mean of each voxel",
     ),
     "room": (_room, "a furnished room, noise 3 mm"),
     "hall": (
@@ -220,7 +230,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
     "exact": (lambda quick: _room(quick, noise=0.0), "a furnished room without noise"),
     "quantised": (
         lambda quick: _depth_room(quick, lambda depth: (100 * depth).round() / 100),
-        "one depth frame without noise, in whole centimetres",
+        "one depth frame without noise, in whole centimeters",
     ),
     "stepped": (
         lambda quick: _depth_room(
@@ -235,7 +245,7 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
         "an office from 16 depth frames of a first Kinect, noise and steps, not averaged",
     ),
     "thinned": (
-        lambda quick: on_voxels(_room(quick, num_points=5), _VOXEL),
+        lambda quick: on_voxels(_room(quick, multiple=5), _VOXEL),
         "a furnished room, noise 3 mm, one point of each voxel of 3 cm",
     ),
     "curved": (
@@ -243,4 +253,78 @@ MADE: dict[str, tuple[Callable[[bool], Scene], str]] = {
         "a small room with columns, balls, a lamp, a round table, two bent walls, noise 3 mm",
     ),
 }
-"""What makes each cloud, given whether it may be small, and what it is."""
+"""Function that generates each cloud, small in a quick run, and its description."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One call of the script.
+
+    Args:
+        folder: Output folder.
+        quick: Whether to use small clouds.
+        paths: Files of the paper's own clouds, by key.
+    """
+
+    folder: Folder
+    quick: bool
+    paths: Mapping[str, Path | None] = field(default_factory=dict)
+    _clouds: dict[str, "LoadedCloud"] = field(default_factory=dict)
+    _warm: set[str] = field(default_factory=set)
+
+    def cloud(self, key: str) -> "LoadedCloud":
+        """Return a cloud, loaded once."""
+        if key not in self._clouds:
+            # The neighbors of a million points are large: keep only one cloud's.
+            for other in self._clouds.values():
+                other.forget()
+            cloud = load_cloud(key, self.paths.get(key), quick=self.quick)
+            self._clouds[key] = LoadedCloud(cloud)
+        return self._clouds[key]
+
+    def warm_up(self, method: str) -> None:
+        """Segment a small cloud first, so that no run time includes the loading of code."""
+        if method not in self._warm:
+            segment_planes(make_room(_WARM_UP).points, load_config(method))
+            self._warm.add(method)
+
+
+@dataclass(frozen=True)
+class LoadedCloud:
+    """A cloud, with its neighbors and normals computed on demand."""
+
+    cloud: EvalCloud
+    _fits: dict[NormalsConfig, NormalFit] = field(default_factory=dict)
+
+    @cached_property
+    def neighbors(self) -> Neighbors:
+        """Neighbors used by all methods."""
+        return search_knn(self.cloud.points, load_config().normals.k)
+
+    @cached_property
+    def at_edges(self) -> Tensor:
+        """Points near an edge of the true surfaces, shape ``(N,)``."""
+        return find_edges(self.cloud.labels, self.neighbors)
+
+    def fit(self, settings: NormalsConfig) -> NormalFit:
+        """Return normals, and keep only the last ones."""
+        if settings not in self._fits:
+            self._fits.clear()
+            self._fits[settings] = estimate_normals(
+                self.cloud.points, config=settings, neighbors=self.neighbors
+            )
+        return self._fits[settings]
+
+    def forget(self) -> None:
+        """Free large values that can be computed again."""
+        self.__dict__.pop("neighbors", None)
+        self._fits.clear()
+
+
+def find_edges(truth: Tensor, neighbors: Neighbors) -> Tensor:
+    """Return the points of a surface with a neighbor on another surface, shape ``(N,)``."""
+    crossed = [
+        ((truth[some.long()] != own[:, None]) & (truth[some.long()] != UNLABELED)).any(dim=1)
+        for some, own in zip(neighbors.indices.split(_CHUNK), truth.split(_CHUNK), strict=True)
+    ]
+    return torch.cat(crossed) & (truth != UNLABELED)

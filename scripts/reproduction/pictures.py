@@ -1,4 +1,4 @@
-"""How plots look, pictures of clouds side by side, and of what is wrong with segmentations."""
+"""Style of plots, and images of segmentations side by side."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -10,8 +10,8 @@ from matplotlib import pyplot as plt
 from matplotlib.patches import Patch
 from torch import Tensor
 
-from reproduction.cells import Folder
 from reproduction.clouds import EvalCloud
+from reproduction.records import Folder
 from torchrg.render import color_planes, render_cloud
 from torchrg.render.channels import OUTCOMES, point_outcomes
 
@@ -32,28 +32,27 @@ SETTINGS = {
     "savefig.pad_inches": 0.04,
 }
 _GRAY = 190
-"""Of the cloud itself."""
+"""Gray value of the input cloud."""
 _WIDTH = 1000
-"""Of a picture, in pixels."""
+"""Width of an image, in pixels."""
 _INCHES = 4.0
-"""Width of a picture among others."""
+"""Width of a tile."""
 _LONG = 2.2
-"""Width over height of a picture that takes the place of two."""
+"""Aspect ratio from which tiles are placed in two columns."""
 
 
 def settings() -> AbstractContextManager[None]:
-    """Return a context in which plots look like those of a paper."""
+    """Return a context with the style of plots."""
     return mpl.rc_context(SETTINGS)
 
 
 def write_tiles(
     path: Path,
-    pictures: Mapping[str, Tensor] | Sequence[tuple[str, Tensor]],
+    tiles: Sequence[tuple[str, Tensor]],
     columns: int,
     legend: Iterable[tuple[tuple[int, ...], str]] = (),
 ) -> None:
-    """Write pictures ``(H, W, 3)`` side by side, each below its title, over what colours mean."""
-    tiles = list(pictures.items() if isinstance(pictures, Mapping) else pictures)
+    """Write titled images ``(H, W, 3)`` side by side, with a legend of colors."""
     rows = -(-len(tiles) // columns)
     height, width = tiles[0][1].shape[:2]
     size = (_INCHES * columns, rows * (_INCHES * height / width + 0.25))
@@ -63,8 +62,8 @@ def write_tiles(
         )
         for axis in axes.flat:
             axis.set_axis_off()
-        for axis, (title, picture) in zip(axes.flat, tiles, strict=False):
-            axis.imshow(picture.numpy())
+        for axis, (title, image) in zip(axes.flat, tiles, strict=False):
+            axis.imshow(image.numpy())
             axis.set_title(title)
         patches = [
             Patch(facecolor=[value / 255 for value in color], edgecolor="#888888", label=meaning)
@@ -84,24 +83,24 @@ def draw_side_by_side(
     *,
     with_input: bool = True,
 ) -> str:
-    """Draw the input, the true faces if they are known, and segmentations of one cloud.
+    """Render the input, the ground truth if known, and segmentations of one cloud.
 
     Args:
-        folder: Where the picture goes.
-        name: Of the picture.
+        folder: Output folder.
+        name: Name of the image.
         cloud: The cloud.
-        labelings: Labels by title. The same face has one colour in all pictures.
-        with_input: Whether the cloud itself is the first picture.
+        labelings: Labels by title. A surface has the same color in all images.
+        with_input: Whether the first image is the cloud itself.
 
     Returns:
-        The name of the file.
+        The path of the image in the folder.
     """
     reference = cloud.labels if cloud.labels is not None else list(labelings.values())[-1]
     paints = {}
     if with_input:
         paints["input"] = torch.full((len(cloud.points), 3), _GRAY, dtype=torch.uint8)
     if cloud.labels is not None:
-        paints["true faces"] = color_planes(cloud.labels, cloud.points)
+        paints["ground truth"] = color_planes(cloud.labels, cloud.points)
     for title, labels in labelings.items():
         paints[title] = color_planes(labels, cloud.points, reference=reference)
     return _tile(folder, name, cloud, paints)
@@ -110,9 +109,9 @@ def draw_side_by_side(
 def draw_outcomes(
     folder: Folder, name: str, cloud: EvalCloud, labelings: Mapping[str, Tensor]
 ) -> str:
-    """Draw what became of every point of a cloud with truth, in the colours of :data:`OUTCOMES`."""
+    """Render the outcome of every point of a cloud with ground truth, as in :data:`OUTCOMES`."""
     if cloud.labels is None:
-        raise ValueError("draw_outcomes: expected a cloud with truth.")
+        raise ValueError("draw_outcomes: expected a cloud with ground truth.")
     colors = torch.tensor([color for color, _ in OUTCOMES.values()], dtype=torch.uint8)
     paints = {
         title: colors[point_outcomes(labels, cloud.labels)] for title, labels in labelings.items()
@@ -127,15 +126,15 @@ def _tile(
     paints: Mapping[str, Tensor],
     legend: Iterable[tuple[tuple[int, ...], str]] = (),
 ) -> str:
-    """Render a cloud in several colourings, and write them as one picture."""
-    pictures = {
+    """Render a cloud in several colorings into one image."""
+    images = {
         title: render_cloud(
             cloud.points, paint, normals=cloud.normals, labels=cloud.labels, width=_WIDTH
         )
         for title, paint in paints.items()
     }
-    height, width = next(iter(pictures.values())).shape[:2]
-    columns = 2 if width > _LONG * height or len(pictures) == 4 else 3
+    height, width = next(iter(images.values())).shape[:2]
+    columns = 2 if width > _LONG * height or len(images) == 4 else 3
     file = f"figures/{name}.png"
-    write_tiles(folder.place(file), pictures, min(columns, len(pictures)), legend)
+    write_tiles(folder.path_of(file), list(images.items()), min(columns, len(images)), legend)
     return file

@@ -16,7 +16,7 @@ from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config
 from torchrg.datasets import S3DIS, FolderOfClouds
-from torchrg.datasets.rgbd_layouts import LAYOUTS
+from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS
 from torchrg.datasets.s3dis import find_areas
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole
@@ -29,7 +29,7 @@ CLASSIC = load_config("classic")
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")
 def test_the_command_knows_every_kind_and_layout(tmp_path):
-    assert {*get_args(get_type_hints(RGBDArguments)["layout"])} == {"auto", *LAYOUTS}
+    assert {*get_args(get_type_hints(RGBDArguments)["layout"])} == {"auto", *FRAME_LAYOUTS}
     settings, camera = DepthConfig(), Pinhole(5.0, 5.0, 2.0, 1.0)
     assert RGBDSource(tmp_path, settings, "images", camera, 9.0).describe() == {
         "kind": "rgbd",

@@ -15,7 +15,7 @@ SIXTEEN = RNG.integers(0, 65536, (100, 3))
 DARK = RNG.integers(0, 2, (100, 3))
 UNIT = EIGHT / 255
 CLIPPED = "color values beyond 0..{} are clipped: {} of 300"
-TAKEN = "its colors are taken as 0..{}, by their values"
+TAKEN = "colors are read as 0..{}, judging by their values"
 
 
 def changed(colors, value, rows=1):

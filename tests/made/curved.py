@@ -19,7 +19,7 @@ from torchrg.scenes import (
 )
 from torchrg.scenes.parts import TABLE_HEIGHT
 from torchrg.scenes.rooms import Furniture
-from torchrg.scenes.surfaces import Hole, Plane
+from torchrg.scenes.surfaces import Hole, PlaneEquation
 
 AngleRange = tuple[float, float]
 """First and last angle, in radians."""
@@ -50,7 +50,7 @@ class Cone(Surface):
     sector: AngleRange = (0.0, FULL_CIRCLE)
 
     @property
-    def plane(self) -> Plane | None:
+    def plane(self) -> PlaneEquation | None:
         """Normal and offset of the plane of a disc or an annulus; None if it is curved."""
         if self.start[1] != self.end[1]:
             return None

@@ -24,7 +24,7 @@ from torchrg.scenes import (
 )
 from torchrg.scenes.geometry import box_around
 from torchrg.scenes.scene import NoiseDirection
-from torchrg.scenes.surfaces import Plane, append_zero
+from torchrg.scenes.surfaces import PlaneEquation, append_zero
 
 _HERE = Frame.upright(np.zeros(3))
 _QUARTER = np.pi / 2
@@ -157,7 +157,7 @@ class Sheet(Surface):
     outline: Outline
 
     @property
-    def plane(self) -> Plane:
+    def plane(self) -> PlaneEquation:
         """Normal and offset of its plane."""
         return self.frame.axes[2], float(np.vecdot(self.frame.axes[2], self.frame.origin))
 

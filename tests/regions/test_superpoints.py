@@ -364,7 +364,7 @@ def test_colours_tell_flat_things_apart():
     for same in (shade.double() / 255 * (1 + 1e-9), shade.long(), shade.half(), shade.double()):
         found = make_superpoints(floor, seg, config, colors=same)
         assert torch.equal(colored.labels, found.labels)
-    with pytest.warns(UserWarning, match="^make_superpoints: its colors are taken as 0..65535, by"):
+    with pytest.warns(UserWarning, match="^make_superpoints: colors are read as 0..65535"):
         found = make_superpoints(floor, seg, config, colors=shade.long() * 257)
     assert torch.equal(colored.labels, found.labels)
     with pytest.raises(ConfigError, match=r"^make_superpoints: expected color in 0\.\.255, got -"):

@@ -212,6 +212,21 @@ def test_more_starts_withstand_a_cluster_that_draws_the_published_ones(rng):
     assert more.log_det.mean() < paper.log_det.mean() - 0.5
 
 
+def test_more_starts_reach_most_of_the_best_known_minima(oracles_folder):
+    patches, cases, best = load_oracles(oracles_folder, "best_known_mcd")
+    known = {
+        name: points
+        for name, points in patches.items()
+        if "__" not in name and not cases[name]["exact_fit_50"]
+    }
+    fits = fit_all(known, lambda batch: fit_detmcd(batch, starts="more"))
+    reached = [
+        name for name, fit in fits.items() if fit.log_det - best[name]["a50"]["logdet"] < 1e-6
+    ]
+    assert len(fits) == 53
+    assert len(reached) >= 45, set(fits) - set(reached)
+
+
 @pytest.mark.parametrize("num_coordinates", [1, 2, 4, 5])
 @pytest.mark.parametrize("starts", ["paper", "robustbase", "planes", "more"])
 def test_any_number_of_coordinates(num_coordinates, starts, rng):

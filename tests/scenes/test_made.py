@@ -22,7 +22,7 @@ from tests.made.rays import solve_quadratic
 from torchrg.neighbors import search_knn
 from torchrg.scenes import RoomLayout, build_room, make_room
 from torchrg.scenes.geometry import unit
-from torchrg.scenes.scene import is_occupied, plane_table
+from torchrg.scenes.scene import is_occupied, plane_equations
 from torchrg.structures import UNLABELED
 
 CURVED = CurvedLayout(
@@ -276,7 +276,7 @@ def test_camera_projects_by_its_intrinsics_and_pose():
 
 def test_depth_frame_lies_on_the_faces_it_names():
     model = build_room(4)
-    planes, offsets = (torch.from_numpy(values) for values in plane_table(model.surfaces))
+    planes, offsets = (torch.from_numpy(values) for values in plane_equations(model.surfaces))
     frame = render_depth(model, cameras_around(model, 1, width=160, height=120)[0])
     rays, pose = torch.from_numpy(frame.camera.rays()), frame.camera.pose
     world = (rays * frame.depth.double()[..., None]) @ pose[:3, :3].T + pose[:3, 3]

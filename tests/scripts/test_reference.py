@@ -44,6 +44,7 @@ def test_examples_run_share_names_and_show_what_they_print(tmp_path):
     guide.write_text(
         "# A guide\n\n```python hidden\nnumber = 1\n```\n\n```python\nprint(number < 2)\n```\n\n"
         "```bash\ntorchrg sample \\\n  room.npz --num-points 500  # small\n```\n"
+        "```script\nexamples/pyg_superpoints.py\n```\n"
         "Then `torchrg.segment_planes`: ![it](a.png)\n\n"
         "```python page\nprint(f'## {number}')\n```\n"
     )
@@ -51,6 +52,7 @@ def test_examples_run_share_names_and_show_what_they_print(tmp_path):
     assert "print(number < 2)\n```\n\n```{code-block} text\n:class: printed\n\nTrue\n```" in text
     assert "room.npz: 500 points" in text
     assert "number = 1" not in text
+    assert '```py\n"""Average point features over superpoints' in text
     assert "{py:obj}`torchrg.segment_planes`: ![it](made/guide/a.png)" in text
     assert text.endswith("\n\n## 1\n")
 

@@ -1,4 +1,4 @@
-"""The script that makes the paper's tables and figures again: small, resumed, complete."""
+"""Reproduction of the paper: small runs, resumed runs, claims and kept results."""
 
 import html
 import json
@@ -29,7 +29,7 @@ def _scripts_on_the_path(monkeypatch):
 @pytest.fixture
 def normals(monkeypatch):
     """The part ``normals`` with a grid that takes seconds."""
-    from reproduction import normal_figures, normals
+    from reproduction import normals
 
     small = (
         normals.Grid(60, ("cuboid", "dodecahedron"), (0.25,), (0,), VARIANTS),
@@ -38,18 +38,18 @@ def normals(monkeypatch):
     monkeypatch.setattr(normals, "QUICK", small)
     monkeypatch.setattr(normals, "_DRAWN_POINTS", 500)
     monkeypatch.setattr(normals, "_warm_up", lambda variant: None)
-    monkeypatch.setattr(normal_figures, "_WIDTH", 60)
+    monkeypatch.setattr(normals, "_WIDTH", 60)
     return normals
 
 
 @pytest.fixture
 def small(monkeypatch):
-    """Everything small: clouds of a thousand points, pictures of some pixels."""
-    from reproduction import clouds, pictures, runs, study
+    """Small clouds and images."""
+    from reproduction import clouds, pictures, study
 
     room = make_room(600)
-    made = {key: (lambda quick: room, "a small room") for key in clouds.MADE}
-    monkeypatch.setattr(clouds, "MADE", made)
+    synthetic = {key: (lambda quick: room, "a small room") for key in clouds.SYNTHETIC}
+    monkeypatch.setattr(clouds, "SYNTHETIC", synthetic)
     for table, keys in (
         (clouds.OTHERS, clouds.OTHERS),
         (clouds.HARD, set(clouds.HARD) - {"curved"}),
@@ -57,15 +57,15 @@ def small(monkeypatch):
         for key in tuple(keys):
             monkeypatch.delitem(table, key)
     monkeypatch.setattr(pictures, "_WIDTH", 60)
-    monkeypatch.setattr(runs, "_WARM_UP", 50)
+    monkeypatch.setattr(clouds, "_WARM_UP", 50)
     monkeypatch.setattr(study, "ANGLES_DEG", (2.0, 5.0, 8.0))
     return clouds
 
 
 @pytest.fixture
 def run(small, tmp_path):
-    from reproduction.cells import Folder
-    from reproduction.runs import Run
+    from reproduction.clouds import Run
+    from reproduction.records import Folder
 
     return Run(Folder(tmp_path), quick=True)
 
@@ -78,7 +78,7 @@ def call_script(monkeypatch, *arguments):
 
 
 def test_growth_from_kept_normals_gives_the_labels_of_the_pipeline(run):
-    from reproduction.segmentations import read_segmented, regrow
+    from reproduction.evaluation import read_segmented, regrow
 
     method = "consensus"
     limits = load_config(method).growing
@@ -112,28 +112,31 @@ def test_one_call_makes_the_whole_report(small, normals, tmp_path, monkeypatch):
     assert len(files) >= 14
     for file in files:
         assert (folder / file).read_bytes().startswith(b"\x89PNG"), file
+    kept = {claim["text"] for claim in kept_results()["claims"]}
     for claim in report["claims"]:
         assert f"<td>{html.escape(claim['text'], quote=False)}</td>" in page.replace("&#39;", "'")
-        assert claim["numbers"] or "1,000" in claim["text"], claim["text"]
+        assert claim["text"] in kept, claim["text"]
+        assert claim["fails"] or not claim["why"], claim["text"]
+    assert sum(bool(claim["numbers"]) for claim in report["claims"]) >= 24
     assert page.count("<b>another</b>") == 4
 
     # A second call computes nothing again, and one that was interrupted goes on.
     def refuse(*arguments, **settings):
         raise AssertionError("computed twice")
 
-    from reproduction import segmentations
+    from reproduction import evaluation
 
     monkeypatch.setattr(normals, "_measure", refuse)
-    for name in ("segment_planes", "score_labels", "score_clusters", "score_faces"):
-        monkeypatch.setattr(segmentations, name, refuse)
+    for name in ("segment_planes", "score_labels", "score_clusters", "evaluate_surfaces"):
+        monkeypatch.setattr(evaluation, name, refuse)
     call_script(monkeypatch, "--out", tmp_path, "--quick", "normals", "segmentation", "times")
     assert json.loads((folder / "report.json").read_text()) == report
 
 
 def test_results_of_another_commit_or_without_their_file_are_computed_again(run, monkeypatch):
-    from reproduction import cells
+    from reproduction import records
 
-    made, target = [], run.folder.place("picture.png")
+    made, target = [], run.folder.path_of("image.png")
 
     def work():
         made.append(1)
@@ -141,7 +144,7 @@ def test_results_of_another_commit_or_without_their_file_are_computed_again(run,
         return {}
 
     for commit in ("a", "a", "b"):
-        monkeypatch.setattr(cells, "made_with", lambda commit=commit: {"commit": commit})
+        monkeypatch.setattr(records, "made_with", lambda commit=commit: {"commit": commit})
         run.folder.cell("a", work, needs=target)
     assert len(made) == 2
     target.unlink()
@@ -161,9 +164,9 @@ def test_file_of_the_paper_is_used_where_it_is_given(small, tmp_path):
     assert load_cloud("hallway", None, quick=True).name != cloud.name
 
 
-def test_faces_are_scored_by_size_and_at_edges():
-    from reproduction.clouds import EvalCloud
-    from reproduction.faces import find_edges, score_faces
+def test_surfaces_are_evaluated_by_size_and_at_edges():
+    from reproduction.clouds import EvalCloud, find_edges
+    from reproduction.evaluation import evaluate_surfaces
 
     truth = torch.tensor([0] * 2000 + [1] * 1000 + [2] * 10 + [3] * 10)
     labels = truth.clone()
@@ -173,7 +176,7 @@ def test_faces_are_scored_by_size_and_at_edges():
     cloud = EvalCloud("", "", torch.zeros(3020, 3), truth, None, "", curved=torch.tensor([1]))
     at_edges = torch.zeros(3020, dtype=torch.bool)
     at_edges[[0, 1500, 2999, 3005]] = True
-    scores = score_faces(labels, cloud, at_edges)
+    scores = evaluate_surfaces(labels, cloud, at_edges)
     precision = (100 * 1000 / 1010 + 100) / 2
     assert scores["f1_large"] == pytest.approx(2 * precision * 50 / (precision + 50))
     assert (scores["found_large"], scores["found_small"]) == (0, 0.5)
@@ -184,20 +187,86 @@ def test_faces_are_scored_by_size_and_at_edges():
 
 
 def test_claims_hold_only_where_the_numbers_say_so():
-    from reproduction.sections import claim, mark_best, rising, verdict
+    from reproduction.records import claim, mark_best, rising, verdict
 
     found = {"a": rising([0.1, 0.2, 0.3], ".1f"), "b": rising([0.1, 0.3, 0.2], ".1f")}
     made = claim("IV", "It rises.", {**found, "c": rising([0.1, None], ".1f")})
-    assert (made["holds"], made["fails"]) == (["a"], ["b", "c"])
-    assert made["numbers"] == {"a": "0.1 < 0.2 < 0.3", "b": "0.1, 0.3, 0.2", "c": "0.1, -"}
-    assert verdict(made) == "holds on 1 of 3: a"
+    assert (made["holds"], made["fails"]) == (["a"], ["b"])
+    assert made["numbers"] == {"a": "0.1 < 0.2 < 0.3", "b": "0.1, 0.3, 0.2"}
+    assert verdict(made) == "holds on 1 of 2: a"
     assert mark_best([3.0, 1.0, None], ".1f", higher=True) == ["**3.0**", "1.0", "-"]
     assert mark_best([3.0, 1.0], ".1f", higher=False) == ["3.0", "**1.0**"]
     assert mark_best([3.0, 3.0], ".1f", higher=True) == ["3.0", "3.0"]
 
 
+def test_reasons_are_computed_from_the_places_where_a_claim_fails():
+    from reproduction.records import claim
+
+    def why(fails):
+        return f"It falls on {', '.join(fails)}."
+
+    mixed = claim("IV", "It rises.", {"a": (True, "1"), "b": (False, "2")}, why=why)
+    assert mixed["why"] == "It falls on b."
+    assert claim("IV", "It rises.", {"a": (True, "1")}, why=why)["why"] == ""
+
+
+@pytest.mark.parametrize("found", [{}, {"a": None}])
+def test_claims_tried_on_nothing_are_not_tried(found):
+    from reproduction.records import claim, verdict
+    from reproduction.report import to_html, to_markdown
+
+    made = claim("IV", "It rises.", found, why=lambda fails: "A reason.")
+    assert verdict(made) == "not tried"
+    report = {"title": "", "intro": "", "made_with": "", "parts": {}, "claims": [made]}
+    assert "<td class=note><b>not tried</b></td>" in to_html(report)
+    page = to_markdown({"scores": [], "claims": [made]})
+    assert "IV: **not tried**." in page
+    assert "tried on" not in page
+    assert "A reason" not in page
+
+
+def kept_results():
+    from reproduction.report import RESULTS
+
+    return json.loads(RESULTS.read_text(encoding="utf-8"))
+
+
+def test_kept_results_give_reasons_only_for_failures():
+    for claim in kept_results()["claims"]:
+        assert set(claim["numbers"]) == {*claim["holds"], *claim["fails"]}
+        assert claim["fails"] or not claim["why"], claim["text"]
+
+
+def test_kept_reasons_are_those_of_the_kept_numbers():
+    from reproduction.evaluation import PAPERS
+    from reproduction.normals import why_not_below
+    from reproduction.segmentation import LABELED, listed, printed_best
+
+    kept = kept_results()
+    labeled = {}
+    for score in kept["scores"]:
+        labeled.setdefault(score["title"], {})[score["method"]] = score["fraction_labeled"]
+    labeled = {title: [by[method] for method in PAPERS] for title, by in labeled.items()}
+    seen = 0
+    for claim in kept["claims"]:
+        if "MSAE than" in claim["text"] or "mean angle than" in claim["text"]:
+            means = {
+                place: {name: float(mean) for name, mean in map(str.split, words.split(", "))}
+                for place, words in claim["numbers"].items()
+            }
+            assert claim["why"] == why_not_below(means, claim["fails"])
+            seen += 1
+        elif claim["why"].startswith("Fraction labeled: "):
+            assert claim["why"] == listed("Fraction labeled", labeled, LABELED.form, claim["fails"])
+            seen += 1
+        elif claim["where"] == "IV, Table 2":
+            assert claim == printed_best()
+            seen += 1
+    assert seen == 11
+
+
 def test_normals_hold_only_if_they_do_for_every_seed():
-    from reproduction.normal_tables import normal_claims
+    from reproduction.normals import normal_claims
 
     names = ("pca", "jet", "irls", "detmm", "libra", "paper")
 
@@ -223,13 +292,13 @@ def test_normals_hold_only_if_they_do_for_every_seed():
 
 
 def test_results_of_code_that_is_not_committed_are_refused(monkeypatch):
-    from reproduction import summary
+    from reproduction import report as module
 
-    monkeypatch.setattr(summary, "atomic_path", lambda path: pytest.fail("written"))
+    monkeypatch.setattr(module, "atomic_path", lambda path: pytest.fail("written"))
     for commit in ("2f26e94-dirty", "unknown", "2f26e94, ad1e777"):
         report = {"quick": False, "made_with": f"torchrg 0.1.0; commit {commit}; python 3"}
         with pytest.raises(ValueError, match=f"expected a report of one commit, got {commit}"):
-            summary.keep(report)
+            module.keep(report)
 
 
 def test_full_report_of_a_tree_with_changes_is_refused(tmp_path, monkeypatch):
@@ -242,7 +311,7 @@ def test_full_report_of_a_tree_with_changes_is_refused(tmp_path, monkeypatch):
 
 
 def test_only_reports_with_scores_are_kept():
-    from reproduction import summary
+    from reproduction.report import take_results
 
     with pytest.raises(ValueError, match="expected the part segmentation"):
-        summary.take_results({"parts": {"normals": {}}})
+        take_results({"parts": {"normals": {}}})

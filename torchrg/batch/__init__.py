@@ -28,3 +28,6 @@ Example:
     >>> sorted(path.name for path in (folder / "out" / "room").iterdir())
     ['coord.npy', 'curvature.npy', 'normal.npy', 'plane.npy', 'planes.json', 'provenance.json']
 """
+
+__all__ = ["local", "ray_tasks", "run", "scans", "sources", "stale"]
+__dir__ = __all__.copy

@@ -14,6 +14,9 @@ from torchrg._parallel import CHILD_ENVIRONMENT, in_root_directory
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
+__all__ = ["run_local"]
+__dir__ = __all__.copy
+
 POLL_SECONDS = 0.5
 """Interval at which an engine yields None, so that progress is shown and Ctrl-C is handled."""
 _STDERR = 2

@@ -11,6 +11,9 @@ from torchrg.batch.local import POLL_SECONDS
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
+__all__ = ["run_ray"]
+__dir__ = __all__.copy
+
 _RETRIES = 3
 """Maximum retries of a task whose process or node was lost."""
 _OBJECT_STORE_BYTES = 100_000_000

@@ -21,6 +21,19 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import check_space, marked_parts, normalize_file_name, run_mark
 
+__all__ = [
+    "BatchReport",
+    "Plan",
+    "check_free_space",
+    "list_jobs",
+    "lock_folder",
+    "make_plan",
+    "match_jobs",
+    "run_plan",
+    "write_report",
+]
+__dir__ = __all__.copy
+
 REPORT = "report.json"
 """Name of the report in the output directory."""
 LOCK = ".torchrg.lock"

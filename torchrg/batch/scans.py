@@ -30,6 +30,9 @@ from torchrg.errors import FormatError
 from torchrg.io.files import check_writable, marked_parts, remove_leftovers, run_mark, sync_folder
 from torchrg.result import PLANES_FILE, write_table
 
+__all__ = ["Job", "Source", "convert_scan"]
+__dir__ = __all__.copy
+
 
 class Source:
     """Convertible data set: lists its scans, and converts one of them.

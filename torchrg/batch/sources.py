@@ -30,6 +30,9 @@ from torchrg.errors import FormatError
 from torchrg.normals.orient import Orientation
 from torchrg.structures import Segmentation
 
+__all__ = ["CloudSource", "RGBDSource"]
+__dir__ = __all__.copy
+
 
 @dataclass(frozen=True)
 class CloudSource(Source):

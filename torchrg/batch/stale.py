@@ -33,6 +33,9 @@ from torchrg.io.files import (
 )
 from torchrg.result import PLANES_FILE
 
+__all__ = ["StaleResult", "check_stale", "find_stale", "remove_stale"]
+__dir__ = __all__.copy
+
 DataSet = dict[str, str]
 """First input file of each scan of a data set, by scan name."""
 _MAX_NAMED = 3

@@ -26,7 +26,7 @@ from torchrg.render import (
     write_page,
     write_png,
 )
-from torchrg.render.channels import MODES
+from torchrg.render.channels import COLOR_MODES
 from torchrg.render.page import MAX_POINTS
 from torchrg.result import Result, read_result
 from torchrg.structures import Cloud
@@ -160,18 +160,18 @@ def _colors(
     cloud: Cloud, color: PageColorBy | None, up: Direction, reference: Tensor | None
 ) -> Tensor:
     """Return the color of each point; raise ConfigError if the cloud lacks the quantity."""
-    present = [name for name in get_args(ColorBy) if MODES[name][1] in cloud.fields]
+    present = [name for name in get_args(ColorBy) if COLOR_MODES[name][1] in cloud.fields]
     if color is None:
         color = present[0] if present else None
     elif color not in present:
         raise ConfigError(
-            f"{cloud.source}: missing {MODES[color][1]}, required by --color {color}; has "
+            f"{cloud.source}: missing {COLOR_MODES[color][1]}, required by --color {color}; has "
             f"{', '.join(cloud.fields) or 'points alone'}."
             + (" Errors require a viewer and --ground-truth." if color.endswith("error") else "")
         )
     if color is None:
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)
-    values = torch.from_numpy(cloud.fields[MODES[color][1]])
+    values = torch.from_numpy(cloud.fields[COLOR_MODES[color][1]])
     if color in ("plane", "superpoint"):
         return color_planes(values, cloud.points, reference=reference if color == "plane" else None)
     if color == "normal":

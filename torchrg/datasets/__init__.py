@@ -40,3 +40,4 @@ __all__ = [
     "read_scannet_scan",
     "write_pointcept_scene",
 ]
+__dir__ = __all__.copy

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrg.datasets.folder import list_dir
 from torchrg.depth.camera import Pinhole, check_camera
 from torchrg.errors import DepthWarning, FormatError, TorchrgError
-from torchrg.io.files import PARSE_ERRORS, check_file, read_text, wrap_errors
+from torchrg.io.files import PARSE_ERRORS, check_file, decode_file, wrap_errors
 from torchrg.structures import FARTHEST
 
 Record = Mapping[str, Any]
@@ -118,7 +118,7 @@ def _read_any(path: Path) -> Record:
     """Return the names and values of a camera file in any format."""
     if path.suffix.lower() == ".npy":
         return _name_numbers(path, _read_array(path))
-    text = read_text(path)
+    text = decode_file(path)
     lines = (re.split(r"[\s,;\[\]()]+", line.partition("#")[0]) for line in text.splitlines())
     rows = [row for row in (" ".join(filter(None, line)) for line in lines) if row]
     numbers: list[float] = []
@@ -130,7 +130,7 @@ def _read_any(path: Path) -> Record:
         return read_info(path)
     if rows and all(_COLMAP.match(row) for row in rows):
         return _colmap_camera(path, rows)
-    record: Record = read_record(path)
+    record: Record = read_mapping(path)
     for section in _SECTIONS:
         record = {**record, **record[section]} if isinstance(record.get(section), dict) else record
     return record
@@ -173,11 +173,11 @@ def _colmap_camera(path: Path, rows: list[str]) -> Record:
     return {"camera_model": model, "w": width, "h": height, **named}
 
 
-def read_record(path: Path, *parts: str) -> dict[str, Any]:
+def read_mapping(path: Path, *parts: str) -> dict[str, Any]:
     """Read JSON or the first YAML document as a dict, or a section named in ``parts``."""
     import yaml
 
-    text = read_text(path)
+    text = decode_file(path)
     is_json = path.suffix.lower() == ".json" or text.lstrip()[:1] == "{"
     with wrap_errors(f"{path}: expected JSON or YAML, got: ", yaml.YAMLError, *PARSE_ERRORS):
         if is_json:
@@ -199,7 +199,7 @@ def read_record(path: Path, *parts: str) -> dict[str, Any]:
 def read_info(path: Path) -> dict[str, Any]:
     """Read lines of ``name = numbers``; single numbers are scalars, and text lines are skipped."""
     record: dict[str, Any] = {}
-    for name, _, words in (line.partition("=") for line in read_text(path).splitlines()):
+    for name, _, words in (line.partition("=") for line in decode_file(path).splitlines()):
         with suppress(ValueError):
             numbers = [float(word) for word in words.split()]
             record[name.strip()] = numbers[0] if len(numbers) == 1 else numbers

@@ -41,7 +41,7 @@ _NUM_STUFF = 2
 """Number of leading ScanNet classes (wall, floor) that have no instances."""
 _CENTERED = 127.5
 """Half the maximum color: SPFormer and ISBNet divide colors by it and subtract 1."""
-MODES = {"train": "train", "val": "validation", "test": "test"}
+SPLIT_NAMES = {"train": "train", "val": "validation", "test": "test"}
 """Mask3D's names of splits."""
 _MAX_OBJECTS = 999
 """Maximum number of objects per scan in Mask3D, whose ground truth is 1000 times the class plus the
@@ -125,7 +125,7 @@ def split_name(name: str) -> tuple[str, str]:
         (('val', 'scene0011_00'), ('', 'Area_1_office_1'))
     """
     head, _, tail = name.rpartition("/")
-    return (head, tail) if head in MODES else ("", name.replace("/", "_"))
+    return (head, tail) if head in SPLIT_NAMES else ("", name.replace("/", "_"))
 
 
 def layout_stem(layout: str, name: str, folder: str) -> str:
@@ -432,7 +432,10 @@ def _mask3d(scan: LayoutScan) -> Files:
     labels = None if scan.ground_truth is None else (scan.category, scan.ground_truth[1])
     # Mask3D identifies a scan by its mesh folder.
     entry = {"scene": scan.name, "raw_filepath": f"{scan.name}/{scan.name}_vh_clean_2.ply"}
-    paths = f"{MODES[scan.split]}/{_mask3d_name(scan.name)}", f"{MODES[scan.split]}/{scan.name}"
+    paths = (
+        f"{SPLIT_NAMES[scan.split]}/{_mask3d_name(scan.name)}",
+        f"{SPLIT_NAMES[scan.split]}/{scan.name}",
+    )
     return _mask3d_files(scan, *paths, labels, entry, first_class=0)
 
 

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from torchrg.datasets.folder import natural_key
-from torchrg.datasets.layouts import MODES
+from torchrg.datasets.layouts import SPLIT_NAMES
 from torchrg.datasets.s3dis import CLASS_ORDERS, ROOMS_PER_AREA
 from torchrg.datasets.scannet import CLASSES, NYU_IDS
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import create_folder, marked_parts, remove_leftovers, wrap_errors
 
-Entry = dict[str, Any]
+ListEntry = dict[str, Any]
 """List entry of a scan, by key."""
-Entries = Mapping[str, Sequence[Entry]]
+ListEntries = Mapping[str, Sequence[ListEntry]]
 """List entries by the folder that contains them."""
 
 
@@ -69,7 +69,7 @@ def write_lists(
 def _write_all(layout: str, dataset: str, out: Path, without: Collection[Path]) -> None:
     """Write all lists of a directory."""
     if (layout, dataset) == ("mmdet3d", "ScanNet"):
-        _write_names(out, [f"meta_data/scannetv2_{split}" for split in MODES], without)
+        _write_names(out, [f"meta_data/scannetv2_{split}" for split in SPLIT_NAMES], without)
     folders, contents = _DATABASES.get((layout, dataset), _NO_LISTS)
     entries = {folder: _read_entries(out, folder, without) for folder in folders}
     if any(entries.values()) or _entry_files(out, folders, without):
@@ -117,7 +117,7 @@ def _entry_files(out: Path, folders: Sequence[str], files: Collection[Path]) -> 
     return [path for path in files if path.parent in parents]
 
 
-def _read_entries(out: Path, folder: str, without: Collection[Path]) -> list[Entry]:
+def _read_entries(out: Path, folder: str, without: Collection[Path]) -> list[ListEntry]:
     """Return the entries of a list, with absolute file paths."""
     found = [path for path in (out / folder).glob("[!.]*.json") if path not in without]
     paths = sorted(found, key=lambda path: natural_key(path.stem))
@@ -135,9 +135,9 @@ _FILES = {"filepath", "instance_gt_filepath"}
 """Keys of an entry that are file paths."""
 
 
-def _mask3d(entries: Entries) -> dict[str, object]:
+def _mask3d(entries: ListEntries) -> dict[str, object]:
     """Return Mask3D's ScanNet databases, class table, and color statistics."""
-    train, validation, test = (entries[f"{mode}_database"] for mode in MODES.values())
+    train, validation, test = (entries[f"{mode}_database"] for mode in SPLIT_NAMES.values())
     labels = zip(NYU_IDS, CLASSES, strict=True)
     return {
         **{f"{folder}.yaml": [*scans] for folder, scans in entries.items()},
@@ -147,7 +147,7 @@ def _mask3d(entries: Entries) -> dict[str, object]:
     }
 
 
-def _mask3d_s3dis(entries: Entries) -> dict[str, object]:
+def _mask3d_s3dis(entries: ListEntries) -> dict[str, object]:
     """Return Mask3D's database of each S3DIS area, and of its training areas (all others)."""
     contents: dict[str, object] = {f"{folder}.yaml": [*scans] for folder, scans in entries.items()}
     for folder, test in entries.items():
@@ -160,7 +160,7 @@ def _mask3d_s3dis(entries: Entries) -> dict[str, object]:
     return contents
 
 
-def _color_mean_std(entries: Sequence[Entry]) -> dict[str, list[float]]:
+def _color_mean_std(entries: Sequence[ListEntry]) -> dict[str, list[float]]:
     """Return mean and deviation of colors from entries, which store the mean of squares."""
     if not entries:
         return {"mean": [0.0] * 3, "std": [1.0] * 3}
@@ -172,9 +172,12 @@ def _color_mean_std(entries: Sequence[Entry]) -> dict[str, list[float]]:
     return {"mean": mean.tolist(), "std": np.where(deviation > 0, deviation, 1.0).tolist()}
 
 
-_NO_LISTS: tuple[Sequence[str], Callable[[Entries], dict[str, object]]] = ((), lambda entries: {})
+_NO_LISTS: tuple[Sequence[str], Callable[[ListEntries], dict[str, object]]] = (
+    (),
+    lambda entries: {},
+)
 _DATABASES = {
-    ("mask3d", "ScanNet"): ([f"{mode}_database" for mode in MODES.values()], _mask3d),
+    ("mask3d", "ScanNet"): ([f"{mode}_database" for mode in SPLIT_NAMES.values()], _mask3d),
     ("mask3d", "S3DIS"): ([f"Area_{area}_database" for area in ROOMS_PER_AREA], _mask3d_s3dis),
 }
 """Entry folders and database writers, by layout and data set."""

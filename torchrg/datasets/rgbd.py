@@ -21,7 +21,7 @@ from torchrg.datasets.rgbd_files import (
     read_depth,
     refuse_recording,
 )
-from torchrg.datasets.rgbd_layouts import LAYOUTS, find_layout, find_recordings
+from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, find_layout, find_recordings
 from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.transforms.rows import SampleDict
@@ -141,10 +141,10 @@ class RGBDFrames(SceneDataset):
 
         Args:
             root: The folder of one recording, or of several.
-            layout: A key of :data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`: ``tum``, ``icl-nuim``,
-                ``scannet``, ``7-scenes``, ``nerfstudio``, ``arkitscenes``, ``replica``,
-                ``scannetpp``, ``3rscan``, or ``images`` for any folder of depth images. Default:
-                detected from the folder.
+            layout: A key of :data:`~torchrg.datasets.rgbd_layouts.FRAME_LAYOUTS`: ``tum``,
+                ``icl-nuim``, ``scannet``, ``7-scenes``, ``nerfstudio``, ``arkitscenes``,
+                ``replica``, ``scannetpp``, ``3rscan``, or ``images`` for any folder of depth
+                images. Default: detected from the folder.
             intrinsics: Camera matrix, shape ``(3, 3)``, or a camera of images of another size.
                 Default: from the frames or a camera file next to them, else the built-in camera of
                 ``tum``, ``icl-nuim`` and ``7-scenes``.
@@ -168,8 +168,8 @@ class RGBDFrames(SceneDataset):
         if folder.is_file():
             raise FormatError(f"{root}: expected a folder of frames, got a file; pass its folder.")
         name = find_layout(folder) if layout == "auto" else layout
-        if name not in LAYOUTS:
-            names = ", ".join(sorted(LAYOUTS))
+        if name not in FRAME_LAYOUTS:
+            names = ", ".join(sorted(FRAME_LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
         frames = [*_find_frames(folder, name, intrinsics, depth_scale)]
         if not frames:
@@ -205,7 +205,7 @@ def _find_frames(
     Warns:
         DepthWarning: If a camera is implausible for an image; once per recording.
     """
-    layout = LAYOUTS[name]
+    layout = FRAME_LAYOUTS[name]
     for prefix, folder in find_recordings(root, layout):
         shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}
         has_warned = False
@@ -259,7 +259,7 @@ def _shared_camera(
     """
     if found := find_camera(image_folder, root):
         return found[0], found[1:]
-    layout = LAYOUTS[name]
+    layout = FRAME_LAYOUTS[name]
     if layout.camera is None:
         return None, ()
     camera = layout.camera(folder)

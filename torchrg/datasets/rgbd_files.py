@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io.colors import narrow_colors
-from torchrg.io.files import PARSE_ERRORS, check_available, check_file, read_text, wrap_errors
+from torchrg.io.files import PARSE_ERRORS, check_available, check_file, decode_file, wrap_errors
 from torchrg.structures import FARTHEST, Array
 
 Value = TypeVar("Value")
@@ -322,7 +322,7 @@ def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
 
 def _words(path: Path) -> list[list[str]]:
     """Return the words of each non-empty row; ``#`` begins a comment."""
-    lines = read_text(path).splitlines()
+    lines = decode_file(path).splitlines()
     words = (line.split("#")[0].replace(",", " ").split() for line in lines)
     return [row for row in words if row]
 

@@ -1,7 +1,7 @@
 """Folder layouts of depth frames.
 
-A new layout needs a function that lists the frames of a recording, a row of :data:`LAYOUTS`, a
-choice of ``torchrg convert rgbd``, and a test.
+A new layout needs a function that lists the frames of a recording, a row of :data:`FRAME_LAYOUTS`,
+a choice of ``torchrg convert rgbd``, and a test.
 """
 
 import re
@@ -18,7 +18,7 @@ from torchrg.datasets.camera_files import (
     parse_matrix,
     parse_number,
     read_info,
-    read_record,
+    read_mapping,
 )
 from torchrg.datasets.folder import check_folder, find_files, list_dir, natural_key, warn_skipped
 from torchrg.datasets.rgbd_files import (
@@ -222,7 +222,7 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
     Its cameras have OpenGL's axes, and values of a frame override shared values.
     """
     path = folder / "transforms.json"
-    shared = read_record(path)
+    shared = read_mapping(path)
     frames = shared.get("frames", [])
     is_list = isinstance(frames, list) and all(isinstance(frame, dict) for frame in frames)
     if not is_list or not all(frame.get("depth_file_path") for frame in frames):
@@ -285,7 +285,7 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     """
     locations = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
     calibration = next((path for path in locations if path.is_file()), locations[0])
-    record = read_record(calibration, "camera")
+    record = read_mapping(calibration, "camera")
     camera = parse_camera(calibration, record)
     scale = parse_number(calibration, record, "scale")
     track = folder / "traj.txt"
@@ -309,7 +309,7 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
             f"{folder}: expected images in depth, got none; extract them from depth.bin with "
             "iphone/prepare_iphone_data.py of the data set's toolbox."
         )
-    records = read_record(path)
+    records = read_mapping(path)
     for name, image in _depth_images(folder, "depth/*"):
         record = records.get(name)
         if not isinstance(record, dict):
@@ -331,7 +331,7 @@ def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
         yield frame._replace(sources=(path, *frame.sources), camera=camera, depth_scale=scale)
 
 
-LAYOUTS = {
+FRAME_LAYOUTS = {
     "scannetpp": FrameLayout(
         _scannetpp_frames,
         "pose_intrinsic_imu.json",
@@ -382,7 +382,7 @@ def find_layout(root: Path) -> str:
 
     Default: ``images``.
     """
-    for name, layout in LAYOUTS.items():
+    for name, layout in FRAME_LAYOUTS.items():
         for folder in _marked_folders(root, layout) if layout.mark and layout.signs else ():
             if any(not sign or any(folder.glob(sign)) for sign in layout.signs):
                 return name

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import read_cloud
-from torchrg.io.files import PARSE_ERRORS, read_text, wrap_errors
+from torchrg.io.files import PARSE_ERRORS, decode_file, wrap_errors
 from torchrg.plane_table import Arrays
 from torchrg.structures import Cloud
 from torchrg.transforms.rows import SampleDict
@@ -260,7 +260,7 @@ def _read_lists(root: Path) -> dict[str, tuple[str, Path]]:
         name: (split, path)
         for split, path in paths
         if path is not None
-        for name in read_text(path).split()
+        for name in decode_file(path).split()
     }
 
 
@@ -428,7 +428,7 @@ def _read_list(path: Path, key: str) -> list[Any]:
     """Return the list at a key of a JSON file."""
     message = f"{path}: expected JSON with a list {key}, got: "
     with wrap_errors(message, *PARSE_ERRORS, repair="; the file may be corrupt"):
-        content = json.loads(read_text(path))
+        content = json.loads(decode_file(path))
         if not isinstance(content, dict) or not isinstance(content.get(key), list):
             raise TypeError(shortened(content))
         values: list[Any] = content[key]
@@ -449,7 +449,7 @@ def _read_rows(path: Path, columns: tuple[str, ...], delimiter: str) -> Iterator
     """Yield the rows of a table that has the given columns."""
     message = f"{path}: expected a table with columns {', '.join(columns)}, got: "
     with wrap_errors(message, csv.Error, *PARSE_ERRORS, repair="; the file may be corrupt"):
-        rows = csv.DictReader(StringIO(read_text(path), newline=None), delimiter=delimiter)
+        rows = csv.DictReader(StringIO(decode_file(path), newline=None), delimiter=delimiter)
         if missing := [name for name in columns if name not in (rows.fieldnames or ())]:
             raise LookupError(f"none called {missing[0]}")
         for row in rows:
@@ -508,7 +508,7 @@ def _read_mapping(root: Path) -> dict[str, str] | None:
 def _scannetpp_classes(root: Path) -> dict[str | None, int]:
     """Return the class indices of ScanNet++ by name; empty without a list."""
     path = _find_file(root, "top100.txt")
-    lines = [] if path is None else read_text(path).splitlines()
+    lines = [] if path is None else decode_file(path).splitlines()
     return {name.strip(): number for number, name in enumerate(filter(str.strip, lines))}
 
 

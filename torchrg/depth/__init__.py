@@ -16,3 +16,4 @@ __all__ = [
     "make_intrinsics",
     "segment_depth",
 ]
+__dir__ = __all__.copy

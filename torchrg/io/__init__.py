@@ -1,14 +1,13 @@
 """Point cloud files; the file suffix selects the format."""
 
-import os
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import FormatError
@@ -23,7 +22,7 @@ from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.text import count_text, read_text, write_text
 from torchrg.io.vg import write_vg
 from torchrg.plane_table import planes_to_arrays
-from torchrg.structures import Cloud, Segmentation, Superpoints
+from torchrg.structures import Cloud, FilePath, Points, Segmentation, Superpoints
 
 __all__ = [
     "FOLDER_SUFFIXES",
@@ -36,6 +35,7 @@ __all__ = [
     "takes_columns",
     "write_cloud",
 ]
+__dir__ = __all__.copy
 
 
 class Format(NamedTuple):
@@ -86,7 +86,7 @@ _PLANES_SUFFIX = ".vg"
 """Suffix of vertex groups, which are write-only and store coordinates, colors and planes."""
 
 
-def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = None) -> Cloud:
+def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud:
     r"""Read a point cloud; the file suffix selects the format.
 
     Convention:
@@ -141,7 +141,7 @@ def read_cloud(path: str | os.PathLike[str], *, columns: Sequence[str] | None = 
         ) from error
 
 
-def takes_columns(path: str | os.PathLike[str]) -> bool:
+def takes_columns(path: FilePath) -> bool:
     """Whether the format of a file allows column names to be passed.
 
     Example:
@@ -153,8 +153,8 @@ def takes_columns(path: str | os.PathLike[str]) -> bool:
 
 
 def write_cloud(
-    path: str | os.PathLike[str],
-    cloud: Cloud | Tensor | NDArray[np.floating],
+    path: FilePath,
+    cloud: Cloud | Points,
     segmentation: Segmentation | None = None,
     *,
     superpoints: Superpoints | None = None,
@@ -232,7 +232,7 @@ def write_cloud(
     _get_writer(target)(target, labeled)
 
 
-def check_output(path: str | os.PathLike[str], cloud: Cloud | None = None) -> None:
+def check_output(path: FilePath, cloud: Cloud | None = None) -> None:
     """Check an output path before long work: known suffix, existing writable folder.
 
     ``cloud`` is the cloud to write, if already known: LAS cannot store non-finite points.

@@ -228,7 +228,7 @@ def check_file(path: Path) -> int:
     return status.st_size
 
 
-def read_text(path: Path) -> str:
+def decode_file(path: Path) -> str:
     """Return the UTF-8 text of a file, without a byte order mark."""
     try:
         content = path.read_bytes()

@@ -47,7 +47,7 @@ INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
 }
 
 // Inserts two zero bits between the bits of a number below 2^21.
-INLINE int64_t spread(int64_t bits) {
+INLINE uint64_t spread(uint64_t bits) {
   bits = (bits | bits << 32) & 0x1F00000000FFFF;
   bits = (bits | bits << 16) & 0x1F0000FF0000FF;
   bits = (bits | bits << 8) & 0x100F00F00F00F00F;
@@ -59,10 +59,10 @@ template <class T>
 INLINE int64_t fill_codes(int64_t num_points, const T* points, const double (&low)[3],
                           double extent, int64_t* codes) {
   for (int64_t i = 0; i < num_points; i++) {
-    int64_t code = 0;
+    uint64_t code = 0;
     for (int axis = 0; axis < 3; axis++)
       code |= spread(int64_t((points[3 * i + axis] - low[axis]) / extent * 2097151)) << axis;
-    codes[i] = code;
+    codes[i] = int64_t(code);
   }
   return DONE;
 }

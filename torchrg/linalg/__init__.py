@@ -47,3 +47,4 @@ __all__ = [
     "unit_direction",
     "unsigned_angle_deg",
 ]
+__dir__ = __all__.copy

@@ -40,6 +40,7 @@ __all__ = [
     "score_partition",
     "segmentation_covering",
 ]
+__dir__ = __all__.copy
 
 
 class Index(NamedTuple):

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 else:
     Metric = require("torchmetrics", extra="metrics", purpose="use torchrg.metrics.modules").Metric
 
+__all__ = ["PlaneMetric"]
+__dir__ = __all__.copy
+
 _SCORES: dict[str, Callable[..., LabelScore | PartitionScore | ClusterScore | NormalScore]] = {
     "labels": score_labels,
     "superpoints": score_partition,

@@ -42,3 +42,4 @@ __all__ = [
     "search_knn",
     "search_nearest",
 ]
+__dir__ = __all__.copy

@@ -1,5 +1,7 @@
 """Exact nearest-neighbor search, by grid cells or a tree, and patches."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Callable
@@ -24,7 +26,7 @@ from torchrg._parallel import (
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.order import canonical_order, distinct_rows, mark_distinct
-from torchrg.structures import MAX_POINTS, Neighbors, Rows, bounding_box
+from torchrg.structures import MAX_POINTS, Neighbors, Points, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Number of sampled points that estimate the distance of the k-th neighbor."""
@@ -49,7 +51,7 @@ _MAX_CELLS_PER_POINT = 8
 @eager_only
 @sequential_operations()
 def search_knn(
-    points: Tensor | NDArray[np.floating],
+    points: Points,
     k: int,
     *,
     max_distance: float | None = None,

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
-from torchrg.structures import UNLABELED, bounding_box
+from torchrg.structures import UNLABELED, Points, bounding_box
 
 MORTON_BITS = 21
 """Bits per coordinate in a Morton code: three of them fit int64."""
@@ -26,7 +26,7 @@ _SPREADS = (
 """Shifts that halve the runs of adjacent bits, and the resulting bit masks."""
 
 
-def canonical_order(points: Tensor | NDArray[np.floating], ties: Sequence[Tensor] = ()) -> Tensor:
+def canonical_order(points: Points, ties: Sequence[Tensor] = ()) -> Tensor:
     """Return an order of finite points ``(N, 3)`` that depends on their coordinates alone.
 
     Points are sorted along a Morton curve through the bounding box, and lexicographically within

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrg.neighbors.knn import SomeNeighbors
 from torchrg.structures import Neighbors, Sampling
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 _NUM_SAMPLES = 600
 """Number of measured neighborhoods; their medians are accurate to a few hundredths."""
@@ -85,7 +85,7 @@ def _evenly(count: int, max_count: int) -> NDArray[np.int64]:
 
 def _nearest(
     points: Tensor, rows: NDArray[np.int64], lists: NDArray[np.integer], max_count: int
-) -> tuple[NDArray[np.int64], Array, Array]:
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
     """Return the nearest distinct positions in lists ``(n, L)``, starting with the point itself.
 
     Returns the rows with at least the median number of positions, up to ``max_count``, the
@@ -110,11 +110,11 @@ def _nearest(
     )
 
 
-def _deviations(patches: Array) -> Array:
+def _deviations(patches: FloatArray) -> FloatArray:
     """Return RMS distances of points ``(n, k, 3)`` to their plane, k - 3 degrees of freedom."""
     centered = patches - patches.mean(axis=1, keepdims=True)
     moments = np.linalg.eigvalsh(centered.swapaxes(1, 2) @ centered)
-    deviation: Array = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))
+    deviation: FloatArray = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))
     return deviation
 
 

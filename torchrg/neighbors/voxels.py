@@ -5,12 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.structures import UNLABELED
+from torchrg.structures import UNLABELED, Points
 
 _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
@@ -31,7 +30,7 @@ class Voxels(NamedTuple):
     inverse: Tensor
 
 
-def sample_voxels(points: Tensor | NDArray[np.floating], size: float) -> Voxels:
+def sample_voxels(points: Points, size: float) -> Voxels:
     """Select one point of each occupied cell of a cubic grid with cell width ``size``.
 
     The point nearest to the center of its cell is selected. The result consists of points of the

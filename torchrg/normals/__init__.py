@@ -19,13 +19,12 @@ Signs are arbitrary until :func:`orient_normals` chooses them. The ``fit_*`` fun
 of shape ``(*, K, 3)``; the estimators are built on them.
 """
 
+from __future__ import annotations
+
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from torchrg._checks import as_tensor, check_points, eager_only
 from torchrg._parallel import CHUNK_SIZE, sequential_operations
@@ -40,7 +39,7 @@ from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals
 from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
 from torchrg.precision import warn_about_steps
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
-from torchrg.structures import Neighbors, NormalFit
+from torchrg.structures import Neighbors, NormalFit, Points
 
 __all__ = [
     "ESTIMATORS",
@@ -55,6 +54,7 @@ __all__ = [
     "fit_normals_robust",
     "orient_normals",
 ]
+__dir__ = __all__.copy
 
 _MCD = {"support_fraction": "support_fraction", "quantile": "inlier_quantile"}
 _DETMCD = _MCD | {"scaling": "mcd_scaling", "inliers": "mcd_inliers"}
@@ -83,7 +83,7 @@ WITHOUT_GRADIENT = {"consensus"}
 @eager_only
 @sequential_operations()
 def estimate_normals(
-    points: Tensor | NDArray[np.floating],
+    points: Points,
     config: NormalsConfig | AnyConfig | None = None,
     *,
     neighbors: Neighbors | None = None,

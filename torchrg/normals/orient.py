@@ -1,11 +1,12 @@
 """Normal orientation: interior, mesh front, scanner position, axis, or consistent."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import (
@@ -21,15 +22,12 @@ from torchrg.errors import ConfigError
 from torchrg.neighbors import check_neighbors, distinct_points, distinct_rows, search_knn
 from torchrg.normals.faces import find_faces, find_surfaces
 from torchrg.normals.free_space import cell_width, vote_free_side
-from torchrg.structures import UNLABELED, Cloud, Neighbors
+from torchrg.structures import UNLABELED, Cloud, Neighbors, Points
 
 Orientation = Literal[
     "auto", "interior", "viewpoint", "consistent", "up", "+x", "-x", "+y", "-y", "+z", "-z", "none"
 ]
 """Modes of normal orientation; see :func:`orient_normals`."""
-
-Points = Tensor | NDArray[np.floating]
-"""Rows of three numbers, as a tensor or an array."""
 
 NUM_NEIGHBORS = 20
 """Neighborhood size for orientation, including the point itself."""

@@ -11,3 +11,4 @@ from torchrg.regions.superpoints import partition_points
 from torchrg.regions.table import summarize_planes
 
 __all__ = ["align_axes", "grow_regions", "partition_points", "select_planes", "summarize_planes"]
+__dir__ = __all__.copy

@@ -11,7 +11,14 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_IN_CACHE, Result, map_chunks, map_tasks, nonzero_rows, split_rows
+from torchrg._parallel import (
+    ROWS_IN_CACHE,
+    Returned,
+    map_chunks,
+    map_tasks,
+    nonzero_rows,
+    split_rows,
+)
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.structures import Neighbors, PlaneAdjacency, Rows
 
@@ -231,10 +238,10 @@ class _RegionEdges:
         lower, higher = torch.minimum(first, second), torch.maximum(first, second)
         return flat_index, near.indices, lower.long() * self._num_regions + higher
 
-    def map_contacts(self, work: Callable[[_Contacts], Result]) -> Iterator[Result]:
+    def map_contacts(self, work: Callable[[_Contacts], Returned]) -> Iterator[Returned]:
         """Yield the results of ``work`` for all edges in order, one chunk of points at a time."""
 
-        def find(rows: Tensor) -> Result:
+        def find(rows: Tensor) -> Returned:
             flat_index, targets, keys = self._boundary_edges(rows)
             source, column = flat_index // self._width, flat_index % self._width
             targets = targets.reshape(-1).index_select(0, flat_index)

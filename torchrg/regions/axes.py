@@ -1,5 +1,7 @@
 """Room alignment from planes: up from floors and ceilings, x and y along walls."""
 
+from __future__ import annotations
+
 import math
 import warnings
 from collections.abc import Sequence

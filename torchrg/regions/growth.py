@@ -1,5 +1,7 @@
 """Region growing from points, normals and neighbors."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -25,7 +27,7 @@ from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, 
 from torchrg.regions.fit import MIN_FITTED, RegionFits
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
-from torchrg.structures import UNLABELED, Neighbors
+from torchrg.structures import UNLABELED, Colors, Neighbors, Points, Values
 
 _ROOTS_AT_ONCE = 1024
 """Number of roots between two releases of memory-mapped arrays. Each root may map about 200 kB of
@@ -35,15 +37,15 @@ neighbor lists."""
 @eager_only
 @sequential_operations()
 def grow_regions(
-    points: Tensor | NDArray[np.floating],
-    normals: Tensor | NDArray[np.floating],
-    curvature: Tensor | NDArray[np.floating],
+    points: Points,
+    normals: Points,
+    curvature: Values,
     neighbors: Neighbors,
     config: GrowingConfig | AnyConfig | None = None,
     *,
     valid: Tensor | None = None,
-    residual_rms: Tensor | NDArray[np.floating] | None = None,
-    colors: Tensor | NDArray[np.generic] | None = None,
+    residual_rms: Values | None = None,
+    colors: Colors | None = None,
     max_color_distance: float = math.inf,
     signed_normals: bool = False,
     canonical: bool = False,
@@ -167,12 +169,12 @@ def label_regions(
 
 def checked_cloud(
     config: GrowingConfig,
-    points: Tensor | NDArray[np.floating],
-    normals: Tensor | NDArray[np.floating],
-    curvature: Tensor | NDArray[np.floating],
+    points: Points,
+    normals: Points,
+    curvature: Values,
     neighbors: Neighbors,
     valid: Tensor | None,
-    residual_rms: Tensor | NDArray[np.floating] | None,
+    residual_rms: Values | None,
 ) -> GrowingInput:
     """Validate the arguments of :func:`grow_regions`, keeping the point order."""
     caller = "grow_regions"
@@ -210,9 +212,7 @@ def checked_cloud(
     return GrowingInput(*columns, curvature, neighbors, valid, reach)
 
 
-def _add_colors(
-    cloud: GrowingInput, colors: Tensor | NDArray[np.generic] | None, max_distance: float
-) -> GrowingInput:
+def _add_colors(cloud: GrowingInput, colors: Colors | None, max_distance: float) -> GrowingInput:
     """Return the cloud with colors and the maximum color difference."""
     if colors is None or max_distance < 0:
         raise ConfigError(

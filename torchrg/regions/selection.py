@@ -1,5 +1,7 @@
 """Selection and ordering of planes by area and class."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal

@@ -1,11 +1,11 @@
 """Plane table: fits, measurements and adjacency of regions."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
@@ -20,15 +20,15 @@ from torchrg.regions.classes import classify_planes
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
 from torchrg.regions.polygons import trace_polygon
-from torchrg.structures import Neighbors, PlaneAdjacency, Planes, Rows
+from torchrg.structures import Labels, Neighbors, PlaneAdjacency, Planes, Points, Rows
 
 _Polygons = tuple[tuple[Tensor, ...], ...]
 
 
 def summarize_planes(
-    points: Tensor | NDArray[np.floating],
-    normals: Tensor | NDArray[np.floating],
-    labels: Tensor | NDArray[np.integer],
+    points: Points,
+    normals: Points,
+    labels: Labels,
     *,
     neighbors: Neighbors | None = None,
     up: Sequence[float] | str | None = None,

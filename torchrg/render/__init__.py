@@ -17,3 +17,4 @@ __all__ = [
     "write_page",
     "write_png",
 ]
+__dir__ = __all__.copy

@@ -20,7 +20,7 @@ from torchrg.render.colors import (
 )
 from torchrg.structures import UNLABELED
 
-MODES = {
+COLOR_MODES = {
     "plane": ("planes", "labels"),
     "superpoint": ("superpoints", "superpoint"),
     "color": ("point colors", "color"),
@@ -59,7 +59,7 @@ class Channel(NamedTuple):
     """Values of one color mode.
 
     Attributes:
-        mode: A key of :data:`MODES`.
+        mode: A key of :data:`COLOR_MODES`.
         values: Row of ``colors`` for each point, shape ``(n,)``, unsigned; if ``colors`` is None,
             color of each point, shape ``(n, 3)``, uint8.
         colors: Shape ``(C, 3)``, uint8.
@@ -77,7 +77,7 @@ def make_channels(
     ground_truth: Mapping[str, Tensor],
     palettes: Mapping[str, tuple[Tensor, Tensor]],
 ) -> Iterator[Channel]:
-    """Yield the available color channels, in the order of :data:`MODES`.
+    """Yield the available color channels, in the order of :data:`COLOR_MODES`.
 
     Args:
         fields: Fields of n points; see :class:`torchrg.structures.Cloud`. Labels and superpoints

@@ -16,9 +16,9 @@ from torchrg.neighbors import finite_rows
 from torchrg.plane_table import Json, describe_planes
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.table import summarize_planes
-from torchrg.render.channels import MODES
+from torchrg.render.channels import COLOR_MODES
 from torchrg.render.cutaway import Sides, find_sides
-from torchrg.render.surface import Surface, sample_surface
+from torchrg.render.surface import VisibleSurface, sample_surface
 from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
@@ -74,7 +74,7 @@ class PointSample(NamedTuple):
     levels: list[int]
     points: Tensor
     fields: dict[str, Tensor]
-    surface: Surface
+    surface: VisibleSurface
     sides: Sides
 
 
@@ -105,7 +105,7 @@ def choose_points(result: Result, frame: PageFrame, max_points: int) -> PointSam
     levels = torch.tensor([len(stratum) for stratum in strata]).cumsum(0).tolist()
     rows = finite[torch.cat(strata)]
     fields = {
-        name: result.fields[name][rows] for _, name in MODES.values() if name in result.fields
+        name: result.fields[name][rows] for _, name in COLOR_MODES.values() if name in result.fields
     }
     for name in ("normals", "curvature"):
         if name in fields:

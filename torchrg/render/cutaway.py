@@ -18,7 +18,7 @@ from torchrg.metrics.contingency import number_labels
 from torchrg.pipeline import segment_planes
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.table import summarize_planes
-from torchrg.render.surface import Surface
+from torchrg.render.surface import VisibleSurface
 from torchrg.structures import PLANE_KINDS, UNLABELED, Planes
 
 View = Literal["cutaway", "above", "outside", "sensor"]
@@ -74,7 +74,7 @@ class Sides(NamedTuple):
         return sum(1 << side for side, cut in enumerate(facing.tolist()) if cut)
 
 
-def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
+def find_sides(surface: VisibleSurface, labels: Tensor | None, up: Tensor) -> Sides:
     """Find the walls and ceilings that enclose a cloud.
 
     A wall is outer if almost nothing lies beyond its bounding rectangle. Points in the rectangle
@@ -119,7 +119,12 @@ def find_sides(surface: Surface, labels: Tensor | None, up: Tensor) -> Sides:
 
 
 def _find_outer_sides(
-    surface: Surface, planes: Planes, walls: Tensor, ceilings: Tensor, up: Tensor, height: float
+    surface: VisibleSurface,
+    planes: Planes,
+    walls: Tensor,
+    ceilings: Tensor,
+    up: Tensor,
+    height: float,
 ) -> tuple[Tensor, Tensor]:
     """Return the directions of outer sides, and the mask of voxels in each, ``(V, MAX_SIDES)``."""
     rows = (walls | ceilings).nonzero().squeeze(1)
@@ -178,7 +183,7 @@ class Viewpoint(NamedTuple):
 
 
 def choose_viewpoint(
-    surface: Surface,
+    surface: VisibleSurface,
     sides: Sides,
     view: View,
     up: Tensor,
@@ -226,7 +231,7 @@ def _turned(heading: Tensor, up: Tensor, azimuth_deg: float, elevation_deg: floa
     return turned
 
 
-def _count_visible(surface: Surface, sides: Sides, viewpoint: Viewpoint) -> int:
+def _count_visible(surface: VisibleSurface, sides: Sides, viewpoint: Viewpoint) -> int:
     """Return the number of visible voxels, in an orthographic view without the hidden sides."""
     centers = surface.centers[(sides.of_voxels & viewpoint.cut) == 0]
     if len(centers) == 0 or surface.size == 0:

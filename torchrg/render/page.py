@@ -32,7 +32,7 @@ from torchrg.io.files import atomic_path
 from torchrg.linalg import unit_direction
 from torchrg.neighbors.order import scatter_rows
 from torchrg.plane_table import encode_csv
-from torchrg.render.channels import MODES, encode_directions, make_channels
+from torchrg.render.channels import COLOR_MODES, encode_directions, make_channels
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
     PAGE_EXTENT,
@@ -105,8 +105,8 @@ def make_page(
             matching planes have the same color.
         ground_truth: Cloud of the same points with ``labels`` or ``normals``, to show errors.
         title: Title. Default: the names of the files.
-        color: Initial color mode, a key of :data:`torchrg.render.channels.MODES`. Default: the
-            first available one.
+        color: Initial color mode, a key of :data:`torchrg.render.channels.COLOR_MODES`.
+            Default: the first available one.
         view: Initial camera, see :func:`torchrg.render.render_cloud`.
         up: Up direction. Default: z; -y for the view ``"sensor"``.
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
@@ -137,9 +137,11 @@ def make_page(
             _describe_cloud(compare, others, true_fields if same else {}, reference, frame)
         ]
     scenes, blobs = [scene for scene, _ in described], [blob for _, blob in described]
-    modes = [mode for mode in MODES if any(mode in scene["channels"] for scene in scenes)]
+    modes = [mode for mode in COLOR_MODES if any(mode in scene["channels"] for scene in scenes)]
     if color is not None and color not in modes:
-        required = MODES[color][1] if color in MODES else f"one of {', '.join(MODES)}"
+        required = (
+            COLOR_MODES[color][1] if color in COLOR_MODES else f"one of {', '.join(COLOR_MODES)}"
+        )
         hint = " and ground truth" if color.endswith("error") else ""
         raise ConfigError(
             f"{cloud.source or 'make_page'}: expected {required}{hint} for color={color!r}, "
@@ -147,7 +149,7 @@ def make_page(
         )
     description = {
         "title": title or " and ".join(scene["name"] for scene in scenes),
-        "modes": [(mode, MODES[mode][0]) for mode in modes],
+        "modes": [(mode, COLOR_MODES[mode][0]) for mode in modes],
         "mode": color or (modes[0] if modes else None),
         "toward": rounded(_initial_direction(shown, view, frame, azimuth_deg)),
         "cut": view in MIN_FACING,

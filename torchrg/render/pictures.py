@@ -25,7 +25,7 @@ from torchrg.render.raster import (
     light_colors,
     shade_hollows,
 )
-from torchrg.render.surface import Surface, sample_surface
+from torchrg.render.surface import VisibleSurface, sample_surface
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -55,7 +55,7 @@ affect the image section."""
 
 def draw_picture(
     camera: "PinholeCamera",
-    surface: Surface,
+    surface: VisibleSurface,
     is_shown: Tensor,
     colors: Tensor,
     normals: Tensor | None,

@@ -21,7 +21,7 @@ _FLAT = 0.15
 """Maximum ratio of the two smallest eigenvalues of coplanar voxels."""
 
 
-class Surface(NamedTuple):
+class VisibleSurface(NamedTuple):
     """The n finite points of a cloud along a Morton curve, in V voxels.
 
     Attributes:
@@ -82,7 +82,7 @@ class Surface(NamedTuple):
         return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, cap, 1.0))
 
 
-def sample_surface(points: Tensor) -> Surface:
+def sample_surface(points: Tensor) -> VisibleSurface:
     """Sort the finite points of a cloud into voxels, and measure density and normals.
 
     The result does not depend on the order of the points: means are computed from integer steps,
@@ -112,7 +112,7 @@ def sample_surface(points: Tensor) -> Surface:
     sums = steps.new_zeros(len(held), 3).index_add_(0, voxel_of, steps[order])
     centers = ((sums / held.double()[:, None] + 0.5) * step).float()
     spacing, normals, near = _measure(centers, counts)
-    return Surface(
+    return VisibleSurface(
         rows[order],
         local[order],
         low.double(),

@@ -26,3 +26,4 @@ __all__ = [
     "qn_exceeds",
     "tau",
 ]
+__dir__ = __all__.copy

@@ -21,10 +21,11 @@ from torchrg.robust.lanes import (
 from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import sum_points
 from torchrg.robust.starts import (
-    Starts,
+    MCDStarts,
     draw_seed,
     elemental_sets,
     initial_sets,
+    random_subsets,
 )
 from torchrg.robust.weights import (
     Estimate,
@@ -44,6 +45,15 @@ _MAX_STEPS = 100
 
 _NUM_BEST = 10
 """Number of random starts that are concentrated to convergence, as published."""
+
+_NUM_MORE, _NUM_BEST_MORE = 24, 4
+"""The same for ``starts="more"``: random starts, and those concentrated to convergence."""
+
+_NUM_RESAMPLED, _NUM_SUBSETS = 2, 4
+"""Number of best sets from which ``starts="more"`` draws further starts, and of draws from each."""
+
+_LANES_IN_CACHE = 8192
+"""Number of random starts processed at a time, so that their data fits into the cache."""
 
 _MAX_COMPARED_STARTS = 16
 """Maximum number of starts per patch for which duplicate sets are detected; with more, comparing
@@ -81,7 +91,7 @@ def fit_detmcd(
     *,
     support_fraction: float = 0.5,
     quantile: float = 0.975,
-    starts: Starts = "paper",
+    starts: MCDStarts = "paper",
     small_sample: bool = False,
     scaling: Scaling = "consistency",
     inliers: Inliers = "raw",
@@ -106,9 +116,8 @@ def fit_detmcd(
 
         The published starts use the coordinate axes: rotating a patch changes the final set of
         every second one, and a compact minority can mislead all six. On synthetic patches near
-        edges of 90 degrees, the fraction of normals more than 10 degrees off is 21 % with them,
-        4.6 % with ``"planes"`` and 4.8 % with ``"more"``; with 30 % of outliers in one cluster
-        54 %, 0 and 0.
+        edges of 90 degrees, the fraction of normals more than 10 degrees off is 21 % with them
+        and 4.6 % with ``"planes"``; with 30 % of outliers in one cluster 54 % and 0.
 
     Args:
         patches: Points of each neighborhood, shape ``(*, K, P)``; see :class:`RobustFit`.
@@ -118,7 +127,9 @@ def fit_detmcd(
         starts: ``"paper"``: sets of ceil(K / 2) points, as published. ``"robustbase"``: of h
             points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes
             through P points; a third of the cost, rotation invariant, and robust against clusters.
-            ``"more"``: these, and the published six in the principal axes of the patch.
+            ``"more"``: these, 24 fixed random sets of P + 1 points, and subsets of the best sets
+            found so far. It reaches the best known minimum in 47 of 53 reference patches,
+            :func:`fit_fastmcd` in 51 and ``"paper"`` in 19, at three times the cost of ``"paper"``.
         small_sample: Apply the small-sample factors (P = 3 only).
         scaling: Factors of the scatters. ``"consistency"``: consistent for normal points.
             ``"quantile"``: ``d2_(h) / chi2inv(h/n)`` for the raw scatter, that is the h-th smallest
@@ -152,7 +163,7 @@ def fit_detmcd(
     """
     check_choices(
         "fit_detmcd",
-        starts=(starts, Starts),
+        starts=(starts, MCDStarts),
         scaling=(scaling, Scaling),
         inliers=(inliers, Inliers),
     )
@@ -163,12 +174,9 @@ def fit_detmcd(
         )
 
     def search(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrated:
-        parts = [
-            _concentrate(columns, initial, count, size, floor)
-            for initial, count in initial_sets(columns, size, starts)
-        ]
-        members, determinants = zip(*parts, strict=True)
-        return _Concentrated(torch.cat(members, dim=1), torch.cat(determinants))
+        if starts == "more":
+            return _search_more(columns, floor, size)
+        return _concentrate(columns, *initial_sets(columns, size, starts), size, floor)
 
     settings = _Settings(support_fraction, quantile, small_sample, scaling, inliers)
     return _fit_mcd("fit_detmcd", patches, mask, settings, min_dimension, chunk_size, search)
@@ -213,12 +221,7 @@ def fit_fastmcd(
     seed = draw_seed(generator)
 
     def search(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrated:
-        num_points, num_coordinates = len(columns[0]), len(columns)
-        sets = elemental_sets(num_points, num_coordinates + 1, num_starts, seed).to(floor.device)
-        marks = columns[0].new_zeros(len(sets), num_points).scatter_(1, sets, 1.0)
-        initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
-        quick = _concentrate(columns, initial, num_coordinates + 1, size, floor, max_steps=1)
-        return _concentrate(columns, _distinct_best(quick, _NUM_BEST), size, size, floor)
+        return _search_random(columns, floor, size, num_starts, _NUM_BEST, seed)
 
     settings = _Settings(support_fraction, quantile, small_sample)
     return _fit_mcd("fit_fastmcd", patches, mask, settings, min_dimension, chunk_size, search)
@@ -297,6 +300,39 @@ def _factors(ellipsoid: Ellipsoid, size: int, settings: _Settings) -> tuple[Tens
         raw *= small_sample_factor(*sizes, reweighted=False)
         final *= small_sample_factor(*sizes, reweighted=True)
     return torch.full_like(ellipsoid.squares[0], raw), final
+
+
+def _search_random(
+    columns: list[Tensor], floor: Tensor, size: int, num_starts: int, num_best: int, seed: int
+) -> _Concentrated:
+    """Concentrate random sets of P + 1 points twice, and the best of them to convergence."""
+    num_points, set_size = len(columns[0]), len(columns) + 1
+    sets = elemental_sets(num_points, set_size, num_starts, seed).to(floor.device)
+    marks = columns[0].new_zeros(len(sets), num_points).scatter_(1, sets, 1.0)
+    initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
+    quick = _join(
+        *(
+            _concentrate(columns, part, set_size, size, floor, max_steps=1)
+            for part in torch.split(initial, max(_LANES_IN_CACHE // len(floor), 1), dim=1)
+        )
+    )
+    return _concentrate(columns, _distinct_best(quick, num_best), size, size, floor)
+
+
+def _search_more(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrated:
+    """Search from planes, from random sets, and from subsets of the best sets of both."""
+    planes = _concentrate(columns, *initial_sets(columns, size, "planes"), size, floor)
+    random = _search_random(columns, floor, size, _NUM_MORE, _NUM_BEST_MORE, seed=0)
+    found = _join(planes, random)
+    best = _distinct_best(found, _NUM_RESAMPLED).repeat(1, _NUM_SUBSETS, 1)
+    subset_size = min(2 * len(columns), size)
+    subsets = random_subsets(best, subset_size, seed=0)
+    return _join(found, _concentrate(columns, subsets, subset_size, size, floor))
+
+
+def _join(*parts: _Concentrated) -> _Concentrated:
+    members, determinants = zip(*parts, strict=True)
+    return _Concentrated(torch.cat(members, dim=1), torch.cat(determinants))
 
 
 def _distinct_best(sets: _Concentrated, number: int) -> Tensor:

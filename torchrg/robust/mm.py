@@ -183,22 +183,20 @@ def _best_s_estimate(
     """Iterate every start of each lane to an S-estimate, and keep the one of smallest scale."""
     num_points, num_lanes = columns[0].shape
     cutoff = breakdown_constant(len(columns))
-    weights, scales = [], []
-    for initial, count in initial_sets(columns, size, starts):
-        num_starts = initial.shape[1]
-        points = [column.repeat(1, num_starts) for column in columns]
-        floors = floor.repeat(num_starts)
-        members = initial.reshape(num_points, -1)
-        ellipsoid = fit_ellipsoid(points, members, count, floors)
-        members = smallest_points(sq_distances(ellipsoid, count), size)
-        shape = _fit_shape(points, members, floors)
-        scale = _m_scale(shape.distances, cutoff)
-        converged, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
-        weights.append(converged.reshape(num_points, num_starts, num_lanes))
-        scales.append(scale.reshape(num_starts, num_lanes))
-    scale = torch.cat(scales)
+    initial, count = initial_sets(columns, size, starts)
+    num_starts = initial.shape[1]
+    points = [column.repeat(1, num_starts) for column in columns]
+    floors = floor.repeat(num_starts)
+    members = initial.reshape(num_points, -1)
+    ellipsoid = fit_ellipsoid(points, members, count, floors)
+    members = smallest_points(sq_distances(ellipsoid, count), size)
+    shape = _fit_shape(points, members, floors)
+    scale = _m_scale(shape.distances, cutoff)
+    weights, scale = _reweight(points, shape, scale, floors, cutoff, adapt_scale=True)
+    weights = weights.reshape(num_points, num_starts, num_lanes)
+    scale = scale.reshape(num_starts, num_lanes)
     best = scale.argmin(dim=0)
-    chosen = torch.cat(weights, dim=1).gather(1, best.expand(num_points, 1, -1)).squeeze(1)
+    chosen = weights.gather(1, best.expand(num_points, 1, -1)).squeeze(1)
     return _fit_shape(columns, chosen, floor), scale.gather(0, best[None]).squeeze(0)
 
 

@@ -29,7 +29,8 @@ from torchrg.robust.scale import (
     tau_of_sorted,
 )
 
-Starts = Literal["paper", "robustbase", "planes", "more"]
+Starts = Literal["paper", "robustbase", "planes"]
+MCDStarts = Literal[Starts, "more"]
 
 _MIN_TAU_VALUES = 1000
 """Number of values from which tau replaces Qn, as in robustbase, because Qn needs all pairs."""
@@ -47,17 +48,13 @@ _PLANES_PER_CHUNK = 8
 """Number of planes processed at a time, so that their data fits into the cache."""
 
 
-def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> list[tuple[Tensor, int]]:
-    """Return the initial sets of the chosen starts as 0/1 masks ``(K, S, M)``, with their sizes."""
-    half = -(-len(columns[0]) // 2)
-    if starts == "paper":
-        return [(_deterministic_starts(columns, half), half)]
-    if starts == "robustbase":
-        return [(_deterministic_starts(columns, size), size)]
-    planes = (_plane_starts(columns, size), size)
+def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> tuple[Tensor, int]:
+    """Return the initial sets of the chosen starts as 0/1 masks ``(K, S, M)``, and their size."""
     if starts == "planes":
-        return [planes]
-    return [planes, (_deterministic_starts(_rotate_to_axes(columns), half), half)]
+        return _plane_starts(columns, size), size
+    if starts == "paper":
+        size = -(-len(columns[0]) // 2)
+    return _deterministic_starts(columns, size), size
 
 
 def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
@@ -267,15 +264,6 @@ def _orthogonal_direction(edges: list[list[Tensor]], like: list[Tensor]) -> list
     return [component / length for component in normal]
 
 
-def _rotate_to_axes(columns: list[Tensor]) -> list[Tensor]:
-    """Transform the points of each lane to the eigenvectors of its covariance."""
-    ones = torch.ones_like(columns[0])
-    means = [sum_points(column) / len(column) for column in columns]
-    vectors = eigenvectors(covariance_entries(columns, means, ones, len(ones)))
-    centered = [column - mean for column, mean in zip(columns, means, strict=True)]
-    return [dot(centered, axis.unbind(dim=1)) for axis in vectors.unbind(dim=2)]
-
-
 @lru_cache(maxsize=64)
 def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tensor:
     """Choose random sets of ``size`` among ``num_points`` points, or all sets if there are few.
@@ -289,6 +277,13 @@ def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tens
     generator = torch.Generator().manual_seed(seed)
     draws = torch.rand(num_sets, num_points, generator=generator, device="cpu")
     return draws.argsort(dim=1, stable=True)[:, :size]
+
+
+def random_subsets(sets: Tensor, size: int, seed: int) -> Tensor:
+    """Choose ``size`` random points of each set ``(K, S, M)``; all lanes share the draws."""
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.rand(*sets.shape[:2], 1, generator=generator, device="cpu").to(sets)
+    return smallest_points(torch.where(sets > 0, draws, 2.0).flatten(1), size).view_as(sets)
 
 
 def draw_seed(generator: torch.Generator | None) -> int:

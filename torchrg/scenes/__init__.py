@@ -33,3 +33,4 @@ __all__ = [
     "scanner_positions",
     "unit",
 ]
+__dir__ = __all__.copy

@@ -18,7 +18,7 @@ from torchrg.scenes.scene import (
     Scene,
     SceneModel,
     is_occupied,
-    plane_table,
+    plane_equations,
     sample_scene,
     seeded_generator,
 )
@@ -322,8 +322,8 @@ def _has_coplanar_face(part: Part, others: Sequence[Part], min_gap: float) -> bo
     if not mine or not theirs:
         return False
     middles = np.stack([surface.bounds.mean(axis=0) for surface in mine])
-    normals, _ = plane_table(mine)
-    planes, offsets = plane_table(theirs)
+    normals, _ = plane_equations(mine)
+    planes, offsets = plane_equations(theirs)
     parallel = np.abs(np.vecdot(normals[:, None], planes)) > _PARALLEL
     near = np.abs(np.vecdot(middles[:, None], planes) - offsets) < min_gap
     return bool((parallel & near).any())

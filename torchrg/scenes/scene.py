@@ -196,7 +196,7 @@ def is_occupied(parts: Iterable[Part], points: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def plane_table(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
+def plane_equations(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
     """Return normals ``(M, 3)`` and offsets ``(M,)`` of surfaces; zero for curved ones."""
     curved = (np.zeros(3), 0.0)
     planes = [curved if surface.plane is None else surface.plane for surface in surfaces]
@@ -208,7 +208,7 @@ def label_points(
     model: SceneModel, points: Floats, labels: NDArray[np.int64], normals: Floats
 ) -> Scene:
     """Combine points ``(N, 3)`` of known faces ``(N,)`` with the tables of their scene."""
-    face_normals, face_offsets = plane_table(model.surfaces)
+    face_normals, face_offsets = plane_equations(model.surfaces)
     return Scene(
         points=torch.from_numpy(points),
         labels=torch.from_numpy(labels),

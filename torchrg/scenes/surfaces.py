@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchrg.scenes.geometry import Array, Frame, Triple, box_around
 
-Plane = tuple[Array, float]
+PlaneEquation = tuple[Array, float]
 Hole = tuple[float, float, float, float]
 """Rectangular hole in a surface: left, right, low and high end along its first two axes."""
 
@@ -29,7 +29,7 @@ class Surface(ABC):
     frame: Frame
 
     @property
-    def plane(self) -> Plane | None:
+    def plane(self) -> PlaneEquation | None:
         """Normal and offset of its plane, ``normal . x = offset``; None if curved."""
         return None
 
@@ -74,7 +74,7 @@ class Flat(Surface):
     cells: Array
 
     @property
-    def plane(self) -> Plane:
+    def plane(self) -> PlaneEquation:
         """Normal and offset of its plane."""
         normal = self.frame.axes[2]
         return normal, float(np.vecdot(normal, self.frame.origin))

@@ -41,3 +41,4 @@ __all__ = [
     "fuse_depth",
     "sample_voxels",
 ]
+__dir__ = __all__.copy

@@ -33,6 +33,9 @@ from torchrg.transforms.rows import (
 )
 from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
+__all__ = ["EstimateNormals", "SegmentPlanes", "index_operator", "point_collate_fn"]
+__dir__ = __all__.copy
+
 _FEATURES = ("curvature", "residual")
 """Scalar per-point entries that can be features."""
 _LABELS = ("plane", "superpoint")

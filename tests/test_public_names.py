@@ -1,0 +1,60 @@
+"""The public names are those of tests/public_names.txt, and ``dir`` shows no others."""
+
+import importlib
+import inspect
+import warnings
+from pathlib import Path
+
+import pytest
+
+import torchrg
+from torchrg._deprecated import warn_deprecated
+
+FILE = Path(__file__).with_name("public_names.txt")
+LISTED = {
+    module: names.split()
+    for module, _, names in (line.partition(":") for line in FILE.read_text().splitlines())
+}
+
+
+def test_every_public_module_is_listed():
+    found = [getattr(torchrg, name) for name in dir(torchrg)]
+    modules = {module.__name__ for module in found if inspect.ismodule(module)}
+    assert modules == {name for name in LISTED if name.count(".") == 1}
+
+
+@pytest.mark.parametrize("module", LISTED)
+def test_names_are_listed(module):
+    """A difference is a change of the API, which the changelog must name."""
+    if module == "torchrg.metrics.modules":
+        pytest.importorskip("torchmetrics")
+    loaded = importlib.import_module(module)
+    assert sorted(loaded.__all__) == LISTED[module]
+    assert set(dir(loaded)) >= {*LISTED[module]}
+    if module != "torchrg":
+        assert dir(loaded) == LISTED[module]
+    if module != "torchrg.batch":  # Its names are modules.
+        assert all(hasattr(loaded, name) for name in LISTED[module])
+
+
+def test_signatures_show_the_names_of_types():
+    for function in (torchrg.segment_planes, torchrg.estimate_normals, torchrg.grow_regions):
+        text = str(inspect.signature(function))
+        assert "Points" in text
+        assert "numpy" not in text
+        assert "typing" not in text
+
+
+def test_deprecation_names_the_replacement_the_removal_and_the_calling_line():
+    def old():
+        warn_deprecated("old()", "new()", removal="0.3.0")
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        old()
+    (warning,) = caught
+    assert warning.category is DeprecationWarning
+    assert str(warning.message) == (
+        "old() is deprecated and will be removed in torchrg 0.3.0; use new()."
+    )
+    assert (warning.filename, warning.lineno) == (__file__, inspect.currentframe().f_lineno - 6)
