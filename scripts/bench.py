@@ -1,8 +1,8 @@
-"""Measure torchrg, alone and beside other programs, by one of the benchmarks in ``benchmarks/``.
+"""Run one of the benchmarks in ``benchmarks/``.
 
-python scripts/bench.py                  # their names, and what each measures
-python scripts/bench.py peers --help     # the settings of one
-python scripts/bench.py steady --out steady.json --minutes 8    # again, until nothing is left
+python scripts/bench.py                  # list of benchmarks
+python scripts/bench.py peers --help     # options of a benchmark
+python scripts/bench.py steady --out steady.json --minutes 8    # repeat until complete
 """
 
 import ast
@@ -33,7 +33,7 @@ def title_of(name: str) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the benchmark that is named, or list all."""
+    """Run a benchmark, or list all."""
     if arguments[:1] == ["--serve"]:
         harness.serve(arguments[1], json.loads(arguments[2]))
         return 0

@@ -1,8 +1,7 @@
-"""Compiles torchrg/kernels/*.cpp while a wheel is built; without a compiler the wheel is pure.
+"""Build hook that compiles torchrg/kernels/*.cpp; without a compiler the wheel is pure Python.
 
-The variable TORCHRG_KERNELS asks for something else: 0 for a pure wheel, and a platform of WHEELS
-for the kernels of that one, compiled by ziglang, which the build then depends on. Where what it
-asks for cannot be had, the build fails.
+Set TORCHRG_KERNELS=0 for a pure wheel, or to a platform of WHEELS to cross-compile with ziglang,
+which then becomes a build dependency. The build fails if the requested kernels cannot be compiled.
 """
 
 import os
@@ -30,7 +29,7 @@ FLAGS = [
     "-fno-trapping-math",
     "-ffp-contract=off",
 ]
-"""The last keeps products and sums apart, so that the bits are the same on every processor."""
+"""The last flag forbids fused multiply-add, so results are bit-identical on all processors."""
 ZIG = "ziglang==0.17.1"
 WHEELS = {
     "x86_64-linux-gnu.2.17": "manylinux_2_17_x86_64",
@@ -39,34 +38,34 @@ WHEELS = {
     "aarch64-linux-musl": "musllinux_1_2_aarch64",
     "aarch64-macos.11.0": "macosx_11_0_arm64",
 }
-"""What wheels call the platforms that ziglang compiles for."""
-ASKED = os.environ.get("TORCHRG_KERNELS", "")
+"""Wheel platform tags of ziglang targets."""
+REQUESTED = os.environ.get("TORCHRG_KERNELS", "")
 
 
 def find_compiler() -> tuple[list[str], str]:
-    """Return the command that compiles, empty if there is none, and the platform of the wheel."""
-    if ASKED in WHEELS:
-        command = [sys.executable, "-m", "ziglang", "c++", "-nostdlib++", "-target", ASKED]
-        return command, WHEELS[ASKED]
+    """Return the compiler command, empty without a compiler, and the wheel platform."""
+    if REQUESTED in WHEELS:
+        command = [sys.executable, "-m", "ziglang", "c++", "-nostdlib++", "-target", REQUESTED]
+        return command, WHEELS[REQUESTED]
     system = {"Linux": "linux", "Darwin": "macosx_11_0"}.get(platform.system(), "")
     command = (os.environ.get("CXX") or "c++").split()
-    if ASKED or not system or not shutil.which(command[0]):
+    if REQUESTED or not system or not shutil.which(command[0]):
         return [], ""
     oldest = ["-mmacosx-version-min=11.0"] if system != "linux" else []
     return command + oldest, f"{system}_{platform.machine()}"
 
 
 class KernelsHook(BuildHookInterface[Any]):
-    """Puts a library for any processor, and on x86-64 one for those with AVX2, into the wheel."""
+    """Add a library for any processor and, on x86-64, one for AVX2 to the wheel."""
 
     def dependencies(self) -> list[str]:
-        """Return what the build needs beside hatchling."""
-        return [ZIG] if ASKED in WHEELS else []
+        """Return build dependencies in addition to hatchling."""
+        return [ZIG] if REQUESTED in WHEELS else []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile in place, where an editable install looks too.
+        """Compile in place, where editable installs also find the libraries.
 
-        With their usual names Python would take the libraries for modules.
+        The suffix ``.library`` prevents Python from importing them as modules.
         """
         folder = Path(self.root, "torchrg", "kernels")
         for old in folder.glob("libkernels-*"):
@@ -74,8 +73,8 @@ class KernelsHook(BuildHookInterface[Any]):
         command, wheel = find_compiler()
         kinds = {"base": []} | ({"avx2": ["-mavx2"]} if wheel.endswith("x86_64") else {})
         libraries = {kind: folder / f"libkernels-{kind}.library" for kind in kinds}
-        error = "" if command else "there is no C++ compiler"
-        if ASKED not in ("", "0", *WHEELS):
+        error = "" if command else "no C++ compiler found"
+        if REQUESTED not in ("", "0", *WHEELS):
             error = f"TORCHRG_KERNELS is none of 0, {', '.join(WHEELS)}"
         with tempfile.TemporaryDirectory() as cache:
             for kind, library in libraries.items() if command else ():
@@ -91,7 +90,7 @@ class KernelsHook(BuildHookInterface[Any]):
             return
         for library in libraries.values():
             library.unlink(missing_ok=True)
-        if ASKED not in ("", "0"):
-            self.app.abort(f"torchrg cannot be built with the kernels asked for: {error}")
-        if not ASKED:
+        if REQUESTED not in ("", "0"):
+            self.app.abort(f"torchrg cannot be built with the requested kernels: {error}")
+        if not REQUESTED:
             self.app.display_warning(f"torchrg is built without kernels and slower: {error}")

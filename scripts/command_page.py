@@ -1,4 +1,4 @@
-"""The page of the commands, made from their parser: see ``guides/commands.md``."""
+"""Reference page of the commands, generated from their parsers; see ``guides/commands.md``."""
 
 import dataclasses
 import importlib
@@ -14,24 +14,24 @@ PROGS: dict[str, type] = {
     for name in COMMANDS
     if name != "convert"
 } | {f"torchrg convert {name}": kind for name, kind in convert.KINDS.items()}
-"""What each command is parsed into, by how it is called."""
+"""Arguments class of each command."""
 
 
 def command_page() -> str:
-    """Return a section for each command: what it does, examples, and each argument."""
+    """Return a section for each command: description, examples, and arguments."""
     return "\n\n".join(line for prog, kind in PROGS.items() for line in _section(prog, kind))
 
 
 def flags_of(kind: type) -> list[Flag]:
-    """Return the arguments of a command; the defaults of settings are those of the preset."""
+    """Return the arguments of a command; defaults of settings come from the preset."""
     start = None
     if "settings" in {field.name for field in dataclasses.fields(kind)}:
-        start = {"settings": PlaneSettings.asked_for([])}
+        start = {"settings": PlaneSettings.from_arguments([])}
     return list(list_flags(kind, start))
 
 
 def _section(prog: str, kind: type) -> Iterator[str]:
-    """Yield the paragraphs on a command, whose arguments can be searched for and linked to."""
+    """Yield the paragraphs on a command; its arguments can be searched and linked."""
     groups = group_flags(flags_of(kind))
     needed = " ".join(flag.spelling for flag in groups.get(REQUIRED, ()))
     yield f"## {prog}"
@@ -46,5 +46,5 @@ def _section(prog: str, kind: type) -> Iterator[str]:
 
 
 def _escaped(text: str) -> str:
-    """Return plain text as Markdown."""
+    """Escape plain text for Markdown."""
     return re.sub(r"([\\*_`<>\[\]#])", r"\\\1", text)

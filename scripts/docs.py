@@ -1,7 +1,6 @@
-"""The documentation as a site: guides, whose examples run, and the reference; see ``docs.sh``.
+"""Documentation site: guides with tested examples, and the API reference; see ``docs.sh``.
 
-Ends with another exit code than 0 and a line for each name, link or picture that leads nowhere, or
-for the example that failed.
+Exits with a nonzero code and a line for each broken name, link or image, or the failed example.
 """
 
 import multiprocessing
@@ -12,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
 from pathlib import Path
 
-os.environ["SPHINX_APIDOC_OPTIONS"] = "members"  # Else it asks for what has no docstring, too.
+os.environ["SPHINX_APIDOC_OPTIONS"] = "members"  # The default includes members without docstrings.
 
 from guide_pages import GUIDES, guide_files, make_page
 from sphinx.cmd.build import build_main
@@ -26,7 +25,7 @@ PRIVATE = ("__main__.py", "cli", "kernels", "merge.py", "mesh.py", "precision.py
 
 
 def write_pages(folder: Path) -> None:
-    """Write all pages as Sphinx reads them; examples of several guides run at a time."""
+    """Write all pages for Sphinx; the examples of several guides run in parallel."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
         for page in pool.map(make_page, guide_files(), repeat(folder)):
@@ -42,14 +41,14 @@ def write_modules(folder: Path) -> None:
 
 
 def build_site(pages: Path, site: Path) -> int:
-    """Make the site of pages, and return the exit code: 0 if nothing leads nowhere."""
+    """Build the site from its pages and return the exit code, 0 without broken links."""
     trees = pages.with_name(f"{pages.name}.trees")
     where = ["-c", str(GUIDES), "-d", str(trees), "-b", "html", str(pages), str(site)]
     return build_main(["-q", "-W", "--keep-going", "-j", "auto", *where])
 
 
 def main() -> int:
-    """Make the site anew."""
+    """Rebuild the site."""
     pages, site = BUILD / "pages", BUILD / "docs"
     for folder in (pages, site):
         shutil.rmtree(folder, ignore_errors=True)
@@ -59,7 +58,7 @@ def main() -> int:
         sys.exit(f"docs.py: {error}")
     if code := build_site(pages, site):
         return code
-    print(f"{site / 'index.html'}: guides, commands, and the reference of the API")
+    print(f"{site / 'index.html'}: guides, commands, and API reference")
     return 0
 
 

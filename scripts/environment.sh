@@ -1,6 +1,5 @@
-# Sourced by the other scripts: makes an environment once, with the extras named in $1, and activates
-# it. It is .venv, or with $2 = lowest .venv-lowest, which has the oldest versions of everything that
-# pyproject.toml allows.
+# Sourced by other scripts: creates an environment once, with the extras in $1, and activates it.
+# It is .venv or, with $2 = lowest, .venv-lowest with the oldest versions that pyproject.toml allows.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -19,19 +18,19 @@ if [ ! -e "$stamp" ] || [ -n "$(find torchrg/kernels/*.{cpp,h} -newer "$stamp")"
   [ -z "$kind" ] || site=
   [ -x "$venv/bin/python" ] || "$python" -m venv $site "$venv"
   install=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check)
-  # Whoever has no compiler gets one for the build alone, a package of 100 MB, or no kernels.
+  # Without a compiler, download one for the build only (100 MB), or build no kernels.
   target=$("$python" -c 'import platform; print(platform.machine() + {"Linux": "-linux-gnu.2.17"}.get(platform.system(), "-macos.11.0"))')
   install_torchrg() {
     if [ -n "${TORCHRG_KERNELS+set}" ] || ${CXX:-c++} --version > /dev/null 2>&1; then
       "${install[@]}" "$@"
     elif TORCHRG_KERNELS=${target/arm64/aarch64} "${install[@]}" "$@" 2> /dev/null; then
-      echo "There is no C++ compiler: the kernels of torchrg were compiled by the package ziglang."
+      echo "No C++ compiler found: the package ziglang compiled the kernels of torchrg."
     else
       TORCHRG_KERNELS=0 "${install[@]}" "$@"
-      echo "There is no C++ compiler, and ziglang cannot be had: torchrg runs without its kernels, slower."
+      echo "No C++ compiler found, and ziglang is not available: torchrg runs slower without its kernels."
     fi
   }
-  echo "Installing torchrg into $venv (once; some minutes if PyTorch has to be downloaded) ..."
+  echo "Installing torchrg into $venv (once; some minutes if PyTorch must be downloaded) ..."
   if [ -n "$kind" ]; then
     # "laspy[lazrs]>=2.5" becomes laspy==2.5
     grep -oE '"[A-Za-z0-9_-]+(\[[a-z,]+\])?>=[0-9.]+"' pyproject.toml | tr -d '"' |

@@ -1,9 +1,9 @@
-"""Every message that the package raises or warns with, in one table: where, which, and its words.
+"""Table of all error and warning messages of the package.
 
     python scripts/messages.py > messages.md
 
-The table is made to be read from top to bottom: does each message say who is told, what was
-expected, what came, and what to do? What is in braces is put in when the message is made.
+Read the table from top to bottom: does each message name the caller, the expected value, the actual
+value, and the fix? Braces mark values inserted at run time.
 """
 
 import ast
@@ -15,15 +15,15 @@ PACKAGE = Path(__file__).resolve().parents[1] / "torchrg"
 
 
 class Message(NamedTuple):
-    """A message: the file and line that raise it, the class of the error, and its text."""
+    """Message with its file and line, error class, and text."""
 
-    place: str
+    line: str
     error: str
     text: str
 
 
 def messages_of(path: Path) -> Iterator[Message]:
-    """Yield the messages of a module in the order of its lines."""
+    """Yield the messages of a module in order of lines."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             error, arguments = ast.unparse(node.exc.func), node.exc.args
@@ -34,12 +34,12 @@ def messages_of(path: Path) -> Iterator[Message]:
             error, arguments = ast.unparse(node.func), node.args[:1]
         else:
             continue
-        place = f"{path.relative_to(PACKAGE.parent)}:{node.lineno}"
-        yield Message(place, error, " ".join(map(text_of, arguments)))
+        line = f"{path.relative_to(PACKAGE.parent)}:{node.lineno}"
+        yield Message(line, error, " ".join(map(text_of, arguments)))
 
 
 def text_of(node: ast.expr) -> str:
-    """Return the text that an expression makes, with its parts that vary in braces."""
+    """Return the text of an expression, with variable parts in braces."""
     if isinstance(node, ast.Constant):
         return str(node.value)
     if isinstance(node, ast.JoinedStr):
@@ -51,10 +51,10 @@ def text_of(node: ast.expr) -> str:
 
 
 def table() -> str:
-    """Return the messages of the package as a table of Markdown."""
+    """Return the messages of the package as a Markdown table."""
     found = [message for path in sorted(PACKAGE.rglob("*.py")) for message in messages_of(path)]
     rows = [" | ".join(cell.replace("|", "\\|") for cell in message) for message in found]
-    return "\n".join(["| place | error | message |", "|---|---|---|", *(f"| {r} |" for r in rows)])
+    return "\n".join(["| line | error | message |", "|---|---|---|", *(f"| {r} |" for r in rows)])
 
 
 if __name__ == "__main__":

@@ -1,12 +1,10 @@
-"""The pictures of the README: a scan, its planes and its superpoints, and the page.
+"""README images: a scan with its planes and superpoints, and the viewer.
 
     python scripts/pictures.py 1.png 1_depth.png
 
-``rooms.png`` and ``page.png`` beside this file are written again; the latter needs Chromium and
-playwright, and stays as it is where they are missing. The frame, of a desk at the Technical
-University of Munich, is in the folder ch7 of https://github.com/gaoxiang12/slambook2; where it is
-from dataclasses import replace
-from and its licence are in ``LICENSE.rooms`` beside this file.
+Writes ``rooms.png`` and ``page.png`` next to this file; the latter needs Chromium and playwright,
+and is unchanged without them. The frame shows a desk at the Technical University of Munich, from
+the folder ch7 of https://github.com/gaoxiang12/slambook2; see ``LICENSE.rooms`` for its license.
 """
 
 import argparse
@@ -28,24 +26,23 @@ from torchrg.result import Result
 
 FOLDER = Path(__file__).parent
 CAMERA, DEPTH_SCALE = (520.9, 521.0, 325.1, 249.7), 5000.0
-"""Focal lengths and principal point in pixels, and the stored value of a metre."""
+"""Focal lengths and principal point in pixels, and depth units per meter."""
 MAX_DEPTH = 2.6
-"""In metres. Farther away the steps of a Kinect's depth are wider than things on a desk."""
+"""Maximum depth, in meters. Beyond it, Kinect depth steps are larger than objects on a desk."""
 NUM_PARTS = 120
 WIDTH = 620
-"""Pixels of one of the three pictures."""
+"""Width of each of the three panels, in pixels."""
 CAPTION, LINE = 34, 56
-"""Pixels of the letters of a caption, and of its line, to be read at a fifth of the size as well.
-"""
+"""Font size and line height of captions in pixels, legible at a fifth of the size."""
 COLORS = 160
-"""Colours of the files, which keeps them small."""
+"""Number of palette colors, for small files."""
 NUM_POINTS, NOISE, SEED = 600_000, 0.003, 4
-"""The room of the page."""
+"""Synthetic room in the viewer."""
 PAGE = {"width": 1360, "height": 960}
 
 
 def draw_frame(path: Path, color: Path, depth: Path) -> None:
-    """Draw the points of a frame, its planes, and its superpoints, each above its caption."""
+    """Render the points, planes and superpoints of a frame with captions."""
     image = torch.from_numpy(np.array(Image.open(depth)).astype(np.float32)) / DEPTH_SCALE
     image[image > MAX_DEPTH] = 0
     intrinsics = make_intrinsics(*CAMERA)
@@ -58,11 +55,11 @@ def draw_frame(path: Path, color: Path, depth: Path) -> None:
             for name in ("labels", "normals", "curvature", "sharp", "valid")
         },
     )
-    own = torch.from_numpy(np.array(Image.open(color).convert("RGB"))).flatten(0, 1)
+    rgb = torch.from_numpy(np.array(Image.open(color).convert("RGB"))).flatten(0, 1)
     config = SuperpointsConfig(counts=(NUM_PARTS,))
-    parts = torchrg.make_superpoints(points, seg, config, colors=own).labels
+    parts = torchrg.make_superpoints(points, seg, config, colors=rgb).labels
     panels = {
-        "points": own,
+        "points": rgb,
         f"{len(seg.planes)} planes": color_planes(seg.labels, points),
         f"{int(parts.amax()) + 1} superpoints": color_planes(parts, points),
     }
@@ -74,22 +71,22 @@ def draw_frame(path: Path, color: Path, depth: Path) -> None:
     captioned = Image.new("RGB", (drawn.width, drawn.height + LINE), "white")
     captioned.paste(drawn)
     write, font = ImageDraw.Draw(captioned), ImageFont.load_default(CAPTION)
-    for place, caption in enumerate(panels):
-        middle = (place + 0.5) * WIDTH, drawn.height + LINE / 2
+    for index, caption in enumerate(panels):
+        middle = (index + 0.5) * WIDTH, drawn.height + LINE / 2
         write.text(middle, caption, fill="#1c2430", font=font, anchor="mm")
     _save(path, captioned)
 
 
 def segment_room() -> Result:
-    """Make a room, and find its planes."""
+    """Generate a room and segment it."""
     room = torchrg.scenes.make_room(NUM_POINTS, noise=NOISE, seed=SEED)
     upright = dataclasses.replace(torchrg.load_config(), planes=PlanesConfig(up="z"))
     seg = torchrg.segment_planes(room.points, upright)
-    return Result.of(torchrg.Cloud(room.points.numpy(), source="room.ply"), seg)
+    return Result.from_segmentation(torchrg.Cloud(room.points.numpy(), source="room.ply"), seg)
 
 
 def draw_page(path: Path, result: Result) -> bool:
-    """Take a picture of the page of a result; return whether a browser was there."""
+    """Take a screenshot of the viewer of a result; return False without a browser."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
     if chromium is None:
         return False
@@ -102,7 +99,7 @@ def draw_page(path: Path, result: Result) -> bool:
         browser = driver.chromium.launch(executable_path=chromium, args=flags)
         tab = browser.new_page(viewport=PAGE)
         tab.goto(page.as_uri())
-        ready = "globalThis.torchrg?.page?.ready && torchrg.state.share === 1"
+        ready = "globalThis.torchrg?.page?.ready && torchrg.state.fraction === 1"
         for _ in range(600):
             tab.wait_for_timeout(200)
             if tab.evaluate(ready):
@@ -120,14 +117,14 @@ def _save(path: Path, image: Image.Image) -> None:
 
 
 def main() -> None:
-    """Write both pictures."""
+    """Write both images."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("color", type=Path, help="color image of a frame of a depth camera")
-    parser.add_argument("depth", type=Path, help="its depth image, of 16 bits")
+    parser.add_argument("depth", type=Path, help="its 16-bit depth image")
     frame = parser.parse_args()
     draw_frame(FOLDER / "rooms.png", frame.color, frame.depth)
     if not draw_page(FOLDER / "page.png", segment_room()):
-        print("page.png stays as it is: no Chromium")
+        print("page.png unchanged: Chromium not found")
 
 
 if __name__ == "__main__":

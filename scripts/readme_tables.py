@@ -151,15 +151,15 @@ def to_section(figures: Figures) -> str:
 
 def insert(readme: str, figures: Figures) -> str:
     """Return a README with new figures; raise ValueError if it lacks their markers."""
-    before, _, rest = readme.partition(BEGIN)
-    _, _, after = rest.partition(END)
+    before, _, remaining = readme.partition(BEGIN)
+    _, _, after = remaining.partition(END)
     if not after:
         raise ValueError(f"insert: expected a README with {BEGIN!r} and {END!r}.")
     return f"{before}{BEGIN}\n{to_section(figures)}\n{END}{after}"
 
 
 def main() -> None:
-    """Update the README with the given and the stored figures."""
+    """Update the README with new and stored figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     tables = {"peers": times_of, "accuracy": quality_of, "superpoints": partitions_of}
     for name in tables:

@@ -6,8 +6,8 @@
 
 Open DIR/report.html. Results are stored under DIR and not computed again by the same commit, so an
 interrupted run resumes; delete DIR/cells to measure again. A full run needs a clean working tree,
-because a report describes one commit. Quick results are in DIR/quick. Synthetic clouds with ground
-truth replace the paper's clouds that are not passed.
+because a report describes one commit. Quick results are in DIR/quick. Synthetic clouds with
+ground truth replace the paper's clouds that are not passed.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""How far each constant of consensus normals may move before any score does.
+"""Sensitivity of scores to the constants of consensus normals.
 
-Halves and doubles every number of ``torchrg/normals/consensus/constants.py``, one at a time, on
-made rooms, shapes with sharp edges and smooth shapes, all with exact truth, and on scanned parts
-where their file is given (a cloud with ``labels``, 0 for points of no part). Where a score changes
-too much, less is tried. About half an hour on one core with ``--quick``. ``sensitivity.json``
-beside this file is what the last run with ``--quick`` and parts found:
+Halves and doubles every number of ``torchrg/normals/consensus/constants.py``, one at a time. Tests
+synthetic rooms and shapes with exact ground truth and, if given, a scan with labeled parts (a cloud
+with ``labels``, 0 for points without a part). If a score changes too much, smaller factors are
+tried. Takes about half an hour on one core with ``--quick``. ``sensitivity.json`` next to this file
+is the result of the last run with ``--quick`` and parts:
 
     python scripts/sensitivity.py --quick --parts office_parts.pcd --out scripts/sensitivity.json
     python scripts/sensitivity.py --only FLAT_LIMIT CURVED_LIMIT
@@ -40,50 +40,51 @@ from torchrg.scenes import RoomLayout, make_room
 from torchrg.structures import Neighbors
 
 TOLERANCES = {"ARI": 1.0, "mean": 0.05, "RMS": 0.25}
-"""Changes up to these count as none: percentage points of labels, degrees of normals. F1 and mean
-best IoU are means over faces; there one face won or lost counts as none, which chance decides."""
+"""Tolerated changes: percentage points for labels, degrees for normals. F1 and mean best IoU are
+means over surfaces; a change by one surface is tolerated as chance."""
 NOTE = (
-    "No change: F1 and mean best IoU by at most one face, ARI by 1 point, angles by 0.05 degrees "
-    "(mean) and 0.25 (RMS). The cloud with adaptive k is small: changes of 0.3 degrees are chance."
+    "No change: F1 and mean best IoU by at most one surface, ARI by 1 point, angles by 0.05 "
+    "degrees (mean) and 0.25 (RMS). The cloud with adaptive k is small: changes of 0.3 degrees "
+    "are chance."
 )
 FACTORS = (2.0, 1.5, 1.25, 1.1)
-"""Tried from the first, up and down, until nothing changes."""
+"""Factors, tried in this order upwards and downwards until no score changes."""
 MIN_SIZE = 50
-"""Points. Smaller regions are not scored, as in the paper."""
+"""Minimum region size for evaluation, in points, as in the paper."""
 _CONFIG = load_config("consensus")
 _CHUNK_SIZE = 16384
 
 
 class Case(NamedTuple):
-    """A cloud and what is scored on it."""
+    """Cloud with ground truth."""
 
-    name: str  # for the table
+    name: str  # title in the table
     points: Tensor  # shape ``(N, 3)``
     neighbors: Neighbors  # of all points
-    labels: Tensor | None  # true faces, ``(N,)``; labels are scored where there are any
-    normals: Tensor | None  # true normals, ``(N, 3)``, likewise
-    num_faces: int = 0  # number of true faces
-    ignore: int | None = None  # label of points that are not scored
+    labels: Tensor | None  # ground-truth surfaces, ``(N,)``; None: labels are not evaluated
+    normals: Tensor | None  # ground-truth normals, ``(N, 3)``; None: not evaluated
+    num_faces: int = 0  # number of ground-truth surfaces
+    ignore: int | None = None  # label of ignored points
     adaptive_k: int | None = None  # see :class:`torchrg.config.NormalsConfig`
 
 
 class Constant(NamedTuple):
-    """A number of the table: an attribute of ``constants``, or a place in one that is a tuple."""
+    """Number in ``constants``, or an element of a tuple there."""
 
     name: str
-    place: int | None
+    index: int | None
     value: float
     unit: str
 
     @property
     def title(self) -> str:
-        """The name in the table."""
-        return self.name if self.place is None else f"{self.name}[{self.place}]"
+        """Name in the table."""
+        return self.name if self.index is None else f"{self.name}[{self.index}]"
 
 
 @dataclass(frozen=True)
 class Change:
-    """The largest change of a score, by its tolerance, over all clouds."""
+    """Largest change of a score relative to its tolerance, over all clouds."""
 
     value: float
     score: str = ""
@@ -99,7 +100,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Finding:
-    """How a constant matters: half and double, and the factors between which no score changes."""
+    """Effect of a constant: half, double, and the factors between which no score changes."""
 
     constant: str
     value: float
@@ -111,7 +112,7 @@ class Finding:
 
 
 def read_table() -> list[Constant]:
-    """Return every constant, in the order of the file, with the unit its docstring begins with."""
+    """Return all constants in file order, with the unit from their docstrings."""
     found = []
     lines = ast.parse(inspect.getsource(constants)).body
     for line, text in pairwise(lines):
@@ -120,13 +121,13 @@ def read_table() -> list[Constant]:
             unit = ast.literal_eval(text.value).split(". ")[0]  # type: ignore[attr-defined]
             value = getattr(constants, name)
             several = enumerate(value) if isinstance(value, tuple) else [(None, value)]
-            found += [Constant(name, place, number, unit) for place, number in several]
+            found += [Constant(name, index, number, unit) for index, number in several]
     return found
 
 
 @contextmanager
 def moved(constant: Constant, factor: float) -> Iterator[float]:
-    """Multiply a constant for a while; counts stay whole and at least 1, fractions at most 1."""
+    """Multiply a constant temporarily; counts stay integers >= 1, fractions <= 1."""
     before = getattr(constants, constant.name)
     value = constant.value * factor
     if isinstance(constant.value, int):
@@ -134,8 +135,8 @@ def moved(constant: Constant, factor: float) -> Iterator[float]:
     if constant.unit.startswith("Fraction"):
         value = min(value, 1.0)
     after = value
-    if constant.place is not None:
-        after = (*before[: constant.place], value, *before[constant.place + 1 :])
+    if constant.index is not None:
+        after = (*before[: constant.index], value, *before[constant.index + 1 :])
     setattr(constants, constant.name, after)
     try:
         yield value
@@ -144,7 +145,7 @@ def moved(constant: Constant, factor: float) -> Iterator[float]:
 
 
 def score(case: Case) -> dict[str, float]:
-    """Return the scores of a cloud with the constants as they are."""
+    """Return the scores of a cloud with the current constants."""
     settings = replace(_CONFIG.normals, adaptive_k=case.adaptive_k)
     fit = estimate_consensus(case.points, case.neighbors, settings, _CHUNK_SIZE)
     scores = {}
@@ -167,18 +168,18 @@ def score(case: Case) -> dict[str, float]:
 
 
 def study(cases: Sequence[Case], table: Sequence[Constant]) -> Iterator[Finding]:
-    """Yield what becomes of the scores when constants move."""
+    """Yield the effect of each constant on the scores."""
     before = {case.name: score(case) for case in cases}
 
     def largest(
-        constant: Constant, factor: float, some: Sequence[Case]
+        constant: Constant, factor: float, subset: Sequence[Case]
     ) -> tuple[Change, list[Case]]:
-        """Return the largest change, by its tolerance, and the clouds where one is above it."""
+        """Return the largest relative change, and the clouds with changes above tolerance."""
         with moved(constant, factor) as value:
             if value == constant.value:
                 return Change(value), []
             worst, fraction, changed = Change(value), 0.0, []
-            for case in some:
+            for case in subset:
                 for name, after in score(case).items():
                     change = after - before[case.name][name]
                     relative = abs(change) / (TOLERANCES.get(name) or 100 / case.num_faces)
@@ -189,7 +190,7 @@ def study(cases: Sequence[Case], table: Sequence[Constant]) -> Iterator[Finding]
         return worst, changed
 
     def furthest(constant: Constant, factors: Sequence[float]) -> tuple[Change, float]:
-        """Return the change by the first factor, and the first that changes nothing."""
+        """Return the change by the first factor, and the first factor without a change."""
         first, changed = largest(constant, factors[0], cases)
         if not changed:
             return first, factors[0]
@@ -205,7 +206,7 @@ def study(cases: Sequence[Case], table: Sequence[Constant]) -> Iterator[Finding]
 
 
 def make_cases(parts: Path | None, *, quick: bool) -> list[Case]:
-    """Return the clouds: rooms (one in quick runs), parts if there are any, shapes."""
+    """Return the clouds: rooms (one in quick runs), optional parts, and shapes."""
     fraction = 0.6 if quick else 1.0
     cases = []
     for name, (layout, noise) in list(_ROOMS.items())[: 1 if quick else None]:
@@ -226,7 +227,7 @@ def make_cases(parts: Path | None, *, quick: bool) -> list[Case]:
 
 
 def _read_parts(path: Path, num_points: int) -> Case:
-    """Return the points of a file nearest to its middle, as dense as they are there."""
+    """Return the points of a file closest to its center, at full density."""
     cloud = read_cloud(path)
     distances = (cloud.points - cloud.points.median(dim=0).values).square().sum(dim=1)
     kept = distances.argsort(stable=True)[:num_points].sort().values
@@ -237,7 +238,7 @@ def _read_parts(path: Path, num_points: int) -> Case:
 
 
 def _small(layout: RoomLayout, **counts: int) -> RoomLayout:
-    """Return the layout in a small room with few things, where 50,000 points are dense."""
+    """Return the layout for a small room with few objects, dense at 50,000 points."""
     nothing = {field.name: 0 for field in fields(layout) if field.name.startswith("num_")}
     return replace(layout, size=(4.4, 3.4, 2.4), **{**nothing, "num_viewpoints": 1, **counts})
 
@@ -274,19 +275,19 @@ _SHAPES = {
     "cube, k = 16": ("cube", 0.001, 16, None),
     "torus, adaptive k": ("torus", 0.012, 50, 300),
 }
-"""Shape, noise by its diagonal, neighbours, most neighbours."""
+"""Shape, noise relative to its diagonal, k, and maximum k."""
 
 
 def main() -> None:
-    """Measure, print the table, and write it."""
+    """Measure, print and write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--parts", type=Path, help="cloud of scanned parts with labels")
-    parser.add_argument("--quick", action="store_true", help="one room, and fewer points")
+    parser.add_argument("--quick", action="store_true", help="one room and fewer points")
     parser.add_argument("--only", nargs="+", help="names of constants")
-    parser.add_argument("--out", type=Path, help="JSON file of what is found")
+    parser.add_argument("--out", type=Path, help="JSON file for the result")
     arguments = parser.parse_args()
     if arguments.parts is not None and not arguments.parts.is_file():
-        print(f"{arguments.parts}: not there; without scanned parts", file=sys.stderr)
+        print(f"{arguments.parts}: file not found; skipping scanned parts", file=sys.stderr)
         arguments.parts = None
     torch.set_num_threads(1)
     cases = make_cases(arguments.parts, quick=arguments.quick)

@@ -1,6 +1,6 @@
-"""What a time depends on: versions, commit, processor, cores and threads.
+"""Environment of a measurement: versions, commit, processor, cores and threads.
 
-Called as a script it prints a table: what torchrg needs at least, and what is here.
+As a script it prints the minimum and installed versions of the dependencies.
 """
 
 import os
@@ -14,7 +14,7 @@ PACKAGES = ("torchrg", "torch", "numpy", "scipy")
 
 
 def describe(threads: int) -> dict[str, str | int | None]:
-    """Return how what runs now is made, given its number of threads."""
+    """Return the environment of the current process and its number of threads."""
     git = subprocess.run(
         ["git", "describe", "--always", "--dirty"],
         cwd=Path(__file__).parent,
@@ -45,7 +45,7 @@ def _processor() -> str:
 
 
 def oldest_and_here() -> str:
-    """Return the oldest versions that are allowed and those that are installed, as Markdown."""
+    """Return the minimum and installed versions as a Markdown table."""
     needs = [f"python{metadata('torchrg')['Requires-Python']}", *sorted(requires("torchrg") or ())]
     found = (re.match(r"([\w-]+)(?:\[.*\])?>=([\d.]+)", need) for need in needs)
     rows = {f"| {row[1]} | {row[2]} | {_installed(row[1])} |": None for row in found if row}

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # Sets up .venv with the test extras, then runs the linters, the type checker and the whole suite.
 # Arguments go to pytest: bash scripts/test.sh --run-slow
-# With --lowest first: the suite alone, in .venv-lowest with the oldest versions that pyproject.toml
-# allows (several GB, Python 3.10 to 3.12). There warnings are no errors: old packages do what newer
-# ones of those they need have deprecated.
+# With --lowest first: only the suite, in .venv-lowest with the oldest versions that pyproject.toml
+# allows (several GB, Python 3.10 to 3.12). Warnings are not errors there, because old packages use
+# deprecated functions of newer dependencies.
 if [ "${1:-}" = --lowest ]; then
   shift
   source "$(dirname "${BASH_SOURCE[0]}")/environment.sh" dev,ray lowest

@@ -1,10 +1,10 @@
-"""The files that ``segment_planes`` runs through, in the order in which it first enters them.
+"""Files executed by ``segment_planes``, in order of their first call.
 
     python scripts/trace_path.py consensus
     python scripts/trace_path.py consensus --brief
 
-The map to read the code by: each file with the functions by which other files enter it. What runs
-only at import does not count, nor what a decorator wraps around a function.
+A map for reading the code: each file with the functions that other files call. Code that only runs
+at import and decorator wrappers are ignored.
 """
 
 import argparse
@@ -21,20 +21,20 @@ from torchrg.config import preset_names
 
 PACKAGE = Path(torchrg.__file__).parent
 NUM_POINTS = 8_000
-"""Enough for neighbours by cells, several chunks and every kind of surface."""
+"""Number of points; enough for the cell search, several chunks and all surface types."""
 
 WIDTH = 118
-"""Characters of a line of text."""
+"""Line width in characters."""
 
-LONGEST = {"classic": 23, "paper": 31, "consensus": 32}
-"""Most files on the path of a preset: a test keeps it."""
+MAX_FILES = {"classic": 23, "paper": 31, "consensus": 32}
+"""Maximum number of files per preset, enforced by a test."""
 
 
 def trace(preset: str) -> dict[str, list[str]]:
-    """Return the files on the path of a preset, and the functions by which they are entered."""
+    """Return the files executed by a preset, and the functions called from other files."""
     room = torchrg.scenes.make_room(num_points=NUM_POINTS, noise=0.003, seed=0)
     config = torchrg.load_config(preset)
-    torchrg.segment_planes(room.points[: NUM_POINTS // 8], config)  # Loads all the code.
+    torchrg.segment_planes(room.points[: NUM_POINTS // 8], config)  # Imports all modules.
     entered: dict[str, dict[str, None]] = {}
 
     def note(frame: FrameType, event: str, _: object) -> None:
@@ -43,11 +43,11 @@ def trace(preset: str) -> dict[str, list[str]]:
         is_wrapper = re.search(r"<locals>\.call", code.co_qualname)
         if event != "call" or PACKAGE not in path.parents or is_wrapper:
             return
-        doors = entered.setdefault(path.relative_to(PACKAGE).as_posix(), {})
+        entries = entered.setdefault(path.relative_to(PACKAGE).as_posix(), {})
         name, _, inner = code.co_qualname.partition(".")
-        is_door = not name.startswith(("_", "<")) and not inner.startswith("<locals>")
-        if is_door and caller and caller.f_code.co_filename != code.co_filename:
-            doors.setdefault(name)
+        is_entry = not name.startswith(("_", "<")) and not inner.startswith("<locals>")
+        if is_entry and caller and caller.f_code.co_filename != code.co_filename:
+            entries.setdefault(name)
 
     profile, num_threads = sys.getprofile(), torch.get_num_threads()
     torch.set_num_threads(1)
@@ -57,18 +57,18 @@ def trace(preset: str) -> dict[str, list[str]]:
     finally:
         sys.setprofile(profile)
         torch.set_num_threads(num_threads)
-    return {file: list(doors) for file, doors in entered.items()}
+    return {file: list(entries) for file, entries in entered.items()}
 
 
 def as_lines(path: dict[str, list[str]]) -> list[str]:
-    """Return a path as text: a line for each file, and their number."""
+    """Return a path as text, one line per file, and the number of files."""
     width = max(map(len, path))
-    lines = [f"{file:{width}}  {', '.join(doors)}".rstrip() for file, doors in path.items()]
+    lines = [f"{file:{width}}  {', '.join(entries)}".rstrip() for file, entries in path.items()]
     return [*lines, f"{len(path)} files"]
 
 
 def as_paragraph(path: dict[str, list[str]]) -> list[str]:
-    """Return the files of a path alone, in lines of text."""
+    """Return only the files of a path, as wrapped text."""
     return textwrap.wrap(" > ".join(path), WIDTH, break_on_hyphens=False)
 
 
@@ -76,7 +76,7 @@ def main() -> None:
     """Print the path of a preset."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("preset", nargs="?", default="consensus", choices=preset_names())
-    parser.add_argument("--brief", action="store_true", help="file names alone")
+    parser.add_argument("--brief", action="store_true", help="only file names")
     arguments = parser.parse_args()
     path = trace(arguments.preset)
     print(*(as_paragraph(path) if arguments.brief else as_lines(path)), sep="\n")

@@ -1,11 +1,11 @@
-"""What torchrg's normals, curvature and planes are worth to a small segmentation model.
+"""Effect of torchrg's normals, curvature and planes on a small segmentation model.
 
-Trains one point network (edge convolutions on 12 neighbours, four levels of voxels, plain torch) on
-made rooms with ten classes, and prints the mean IoU on rooms never seen, over all their points.
-Every variant has the same model with the same number of weights, the same steps, order of rooms and
-augmentation; inputs that a variant does not get are zero. All settings were chosen on the variant
-with coordinates alone. Walls, doors, windows, boards, cabinets and pillars share their normals, and
-the table's last line is what can be said from a point's height and true normal alone.
+Trains a point network (edge convolutions on 12 neighbors, four voxel levels, plain torch) on
+synthetic rooms with ten classes, and prints the mean IoU on unseen rooms over all points. All
+variants have the same model and number of weights, and the same steps, order of rooms and
+augmentation; inputs that a variant omits are zero. All settings were tuned on the variant with only
+coordinates. Walls, doors, windows, boards, cabinets and pillars have the same normals. The last
+line of the table is a lookup by height and ground-truth normal of a point.
 
     python scripts/train_example.py
     python scripts/train_example.py --train-rooms 2 --test-rooms 1 --num-points 3000 --steps 2
@@ -43,21 +43,21 @@ CLASSES = {
     "box": ["box"],
     "pillar": ["pillar", "column"],
 }
-"""Each class, and the kinds of faces that are part of it."""
+"""Classes and the kinds of surfaces in each."""
 VOXELS = (0.15, 0.35, 0.8, 1.9)
-"""Metres, from the points that the model sees to a few cells in a room."""
+"""Voxel sizes in meters, from the input of the model to a few cells per room."""
 WIDTHS = (32, 64, 96, 128)
-"""Features of a point on each level."""
+"""Features per point on each level."""
 NUM_NEIGHBORS = 12
 NOISE = 0.005
-"""Metres along the normal, of a good depth camera."""
+"""Standard deviation along the normal in meters, as of a good depth camera."""
 LEARNING_RATE = 3e-3
 TEST_SEED = 10_000
-"""Seeds from here on make the rooms of the test."""
+"""First seed of the test rooms."""
 
 
 class Variant(NamedTuple):
-    """What a model is given besides coordinates."""
+    """Inputs of a model in addition to coordinates."""
 
     normals: bool
     planes: bool
@@ -75,9 +75,9 @@ class Level(NamedTuple):
     """The points of one voxel size.
 
     Attributes:
-        coord: Shape ``(N, 3)``, metres.
-        near: Rows of each point's neighbours, shape ``(N, K)``.
-        coarser: Row of each point's voxel on the next level, shape ``(N,)``; none on the last.
+        coord: Shape ``(N, 3)``, meters.
+        near: Neighbors of each point, shape ``(N, K)``.
+        coarser: Voxel of each point on the next level, shape ``(N,)``; empty on the last.
     """
 
     coord: Tensor
@@ -92,10 +92,10 @@ class Sample(NamedTuple):
         levels: From the finest to the coarsest; the finest has ``N`` points.
         normal: Into the room, shape ``(N, 3)``.
         curvature: Shape ``(N,)``.
-        superpoint: A point without a plane is one of its own, shape ``(N,)``.
+        superpoint: Shape ``(N,)``; a point without a plane is a separate superpoint.
         target: Classes, shape ``(N,)``.
         inverse: Row in the finest level of each point of the scan, shape ``(P,)``.
-        truth: Classes of all points of the scan, shape ``(P,)``.
+        ground_truth: Classes of all points of the scan, shape ``(P,)``.
     """
 
     levels: list[Level]
@@ -104,7 +104,7 @@ class Sample(NamedTuple):
     superpoint: Tensor
     target: Tensor
     inverse: Tensor
-    truth: Tensor
+    ground_truth: Tensor
 
 
 def draw_room(seed: int, num_points: int) -> Scene:
@@ -135,24 +135,24 @@ def classes_of(room: Scene) -> Tensor:
 
 
 def prepare(room: Scene) -> Sample:
-    """Run torchrg on the scan, then reduce it to voxels."""
+    """Segment the scan, then downsample it to voxels."""
     seg = segment_planes(room.points)
     voxels = sample_voxels(room.points, VOXELS[0])
-    rows, truth = voxels.rows, classes_of(room)
-    plane, own = seg.labels[rows], len(seg.planes) + torch.arange(len(rows))
+    rows, ground_truth = voxels.rows, classes_of(room)
+    plane, singleton = seg.labels[rows], len(seg.planes) + torch.arange(len(rows))
     return Sample(
         make_levels(room.points[rows]),
         seg.normals[rows],
         seg.curvature[rows],
-        torch.where(plane >= 0, plane, own).unique(return_inverse=True)[1],
-        truth[rows],
+        torch.where(plane >= 0, plane, singleton).unique(return_inverse=True)[1],
+        ground_truth[rows],
         voxels.inverse,
-        truth,
+        ground_truth,
     )
 
 
 def make_levels(points: Tensor) -> list[Level]:
-    """Return points and their voxels, about the middle of the room and above its floor."""
+    """Return the voxel levels of points, relative to the center of the floor."""
     low, high = points.amin(dim=0), points.amax(dim=0)
     coord = points - torch.stack([*((low + high) / 2)[:2], low[2]])
     levels = []
@@ -167,26 +167,26 @@ def make_levels(points: Tensor) -> list[Level]:
 
 
 class EdgeConv(nn.Module):
-    """Adds to each point's features the largest of what its neighbours send, place included."""
+    """Residual edge convolution with relative positions and maximum pooling."""
 
     def __init__(self, width: int, size: float) -> None:
         super().__init__()
         self.size = size
         self.norm = nn.LayerNorm(width)
         self.send, self.receive = nn.Linear(width, width), nn.Linear(width, width, bias=False)
-        self.place, self.out = nn.Linear(3, width, bias=False), nn.Linear(width, width)
+        self.position, self.out = nn.Linear(3, width, bias=False), nn.Linear(width, width)
 
     def forward(self, features: Tensor, level: Level, coord: Tensor) -> Tensor:
-        """Return new features of the points of a level, which may have been turned to ``coord``."""
+        """Return new features of the points of a level at augmented positions ``coord``."""
         normed = self.norm(features)
-        sent = self.send(normed) + self.place(coord / self.size)
-        received = self.receive(normed) - self.place(coord / self.size)
+        sent = self.send(normed) + self.position(coord / self.size)
+        received = self.receive(normed) - self.position(coord / self.size)
         edges = gelu(sent[level.near] + received[:, None])
         return features + self.out(edges.amax(dim=1))
 
 
 class PointUNet(nn.Module):
-    """Edge convolutions from fine voxels to coarse ones and back."""
+    """U-Net of edge convolutions on voxel levels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -201,10 +201,10 @@ class PointUNet(nn.Module):
         self.classify = nn.Linear(WIDTHS[0], len(CLASSES))
 
     def forward(
-        self, levels: Sequence[Level], coords: Sequence[Tensor], given: Tensor, superpoint: Tensor
+        self, levels: Sequence[Level], coords: Sequence[Tensor], inputs: Tensor, superpoint: Tensor
     ) -> Tensor:
-        """Return a score for each point and class, shape ``(N, C)``."""
-        features = self.embed(torch.cat([coords[0] / VOXELS[-1], given], dim=1))
+        """Return the logits of each point and class, shape ``(N, C)``."""
+        features = self.embed(torch.cat([coords[0] / VOXELS[-1], inputs], dim=1))
         skipped = []
         for depth, (level, coord) in enumerate(zip(levels, coords, strict=True)):
             features = self.down[depth](features, level, coord)
@@ -228,21 +228,21 @@ def mean_of(values: Tensor, groups: Tensor) -> Tensor:
 
 
 def predict(model: PointUNet, sample: Sample, variant: Variant, turn: Tensor) -> Tensor:
-    """Return scores of a room that is turned, mirrored and scaled by a matrix ``(3, 3)``."""
+    """Return the logits of a room transformed by a matrix ``(3, 3)``."""
     coords = [level.coord @ turn.T for level in sample.levels]
     normal = sample.normal @ turn.T / turn[2, 2]
-    given = torch.cat([normal, 3 * sample.curvature[:, None]], dim=1)  # all within [-1, 1]
+    inputs = torch.cat([normal, 3 * sample.curvature[:, None]], dim=1)  # all within [-1, 1]
     alone = torch.arange(len(normal))
     return model(
         sample.levels,
         coords,
-        given * variant.normals,
+        inputs * variant.normals,
         sample.superpoint if variant.planes else alone,
     )
 
 
 def train(rooms: Sequence[Sample], variant: Variant, steps: int, seed: int) -> PointUNet:
-    """Return a model after a number of steps, each on one room turned about the upward axis."""
+    """Train a model; each step uses one room rotated about the vertical axis."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     model = PointUNet()
@@ -264,17 +264,17 @@ def train(rooms: Sequence[Sample], variant: Variant, steps: int, seed: int) -> P
 
 
 def draw_turn(rng: np.random.Generator) -> Tensor:
-    """Return a random turn about z, perhaps mirrored, with a scale of 0.9 to 1.1."""
+    """Return a random rotation about z with a scale of 0.9 to 1.1 and a random reflection."""
     angle, scale = rng.uniform(0, 2 * np.pi), rng.uniform(0.9, 1.1)
     cos, sin, flip = np.cos(angle), np.sin(angle), rng.choice([-1.0, 1.0])
     turn = np.array([[flip * cos, -sin, 0], [flip * sin, cos, 0], [0, 0, 1]])
     return torch.from_numpy(scale * turn).float()
 
 
-def class_ious(predicted: Sequence[Tensor], truth: Sequence[Tensor]) -> Tensor:
+def class_ious(predicted: Sequence[Tensor], ground_truth: Sequence[Tensor]) -> Tensor:
     """Return the intersection over union of each class over all rooms, in percent."""
     size = len(CLASSES)
-    pairs = torch.cat(list(truth)) * size + torch.cat(list(predicted))
+    pairs = torch.cat(list(ground_truth)) * size + torch.cat(list(predicted))
     counts = pairs.bincount(minlength=size * size).reshape(size, size).double()
     both = counts.diagonal()
     return 100 * both / (counts.sum(dim=0) + counts.sum(dim=1) - both).clamp(min=1)
@@ -285,24 +285,24 @@ def score(model: PointUNet, rooms: Sequence[Sample], variant: Variant) -> Tensor
     """Return the IoU of each class over all points of the rooms."""
     labels = [predict(model, room, variant, torch.eye(3)).argmax(dim=1) for room in rooms]
     restored = [expand_to_points(of, room.inverse) for of, room in zip(labels, rooms, strict=True)]
-    return class_ious(restored, [room.truth for room in rooms])
+    return class_ious(restored, [room.ground_truth for room in rooms])
 
 
 def score_lookup(train_rooms: Sequence[Scene], test_rooms: Sequence[Scene]) -> Tensor:
-    """Return the IoU of each class if height and slope of a face were all that is known."""
+    """Return the IoU of each class for a lookup by height and slope."""
 
     def cells(rooms: Sequence[Scene]) -> tuple[list[Tensor], list[Tensor]]:
         heights = [(room.points[:, 2] * 20).long().clamp(0, 79) for room in rooms]
         slopes = [((room.normals[:, 2] + 1) * 7.999).long() for room in rooms]
-        places = [height * 16 + slope for height, slope in zip(heights, slopes, strict=True)]
-        return places, [classes_of(room) for room in rooms]
+        indices = [height * 16 + slope for height, slope in zip(heights, slopes, strict=True)]
+        return indices, [classes_of(room) for room in rooms]
 
-    places, classes = cells(train_rooms)
+    indices, classes = cells(train_rooms)
     votes = torch.zeros(80 * 16, len(CLASSES))
-    votes.index_put_((torch.cat(places), torch.cat(classes)), torch.ones(()), accumulate=True)
+    votes.index_put_((torch.cat(indices), torch.cat(classes)), torch.ones(()), accumulate=True)
     votes *= votes.sum(dim=0).clamp(min=1) ** -0.5  # the weights of the loss
-    places, classes = cells(test_rooms)
-    return class_ious([votes.argmax(dim=1)[place] for place in places], classes)
+    indices, classes = cells(test_rooms)
+    return class_ious([votes.argmax(dim=1)[index] for index in indices], classes)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -314,29 +314,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS))
-    asked = parser.parse_args(arguments)
-    seeds = [*range(asked.train_rooms), *range(TEST_SEED, TEST_SEED + asked.test_rooms)]
-    scans = [draw_room(seed, asked.num_points) for seed in seeds]
+    options = parser.parse_args(arguments)
+    seeds = [*range(options.train_rooms), *range(TEST_SEED, TEST_SEED + options.test_rooms)]
+    scans = [draw_room(seed, options.num_points) for seed in seeds]
     rooms = [prepare(scan) for scan in tqdm(scans, desc="planes", leave=False, disable=None)]
-    training, unseen = rooms[: asked.train_rooms], rooms[asked.train_rooms :]
+    training, unseen = rooms[: options.train_rooms], rooms[options.train_rooms :]
     print(
-        f"{asked.train_rooms} rooms, {asked.steps} steps; mean IoU (%) on {asked.test_rooms} rooms "
-        f"never seen, mean and standard deviation of {len(asked.seeds)} seeds\n"
+        f"{options.train_rooms} rooms, {options.steps} steps; mean IoU (%) on {options.test_rooms} "
+        f"unseen rooms, mean and standard deviation of {len(options.seeds)} seeds\n"
     )
     print(f"| input | mean IoU | {' | '.join(CLASSES)} |")
     print(f"| --- |{' --: |' * (len(CLASSES) + 1)}", flush=True)
-    for name in asked.only:
+    for name in options.only:
         variant = VARIANTS[name]
-        models = [train(training, variant, asked.steps, seed) for seed in asked.seeds]
+        models = [train(training, variant, options.steps, seed) for seed in options.seeds]
         ious = torch.stack([score(model, unseen, variant) for model in models])
         means = ious.mean(dim=1)
         print_row(name, f"{means.mean():.1f} ± {means.std(correction=0):.1f}", ious.mean(dim=0))
-    known = score_lookup(scans[: asked.train_rooms], scans[asked.train_rooms :])
-    print_row("height and true normal of a point, no model", f"{known.mean():.1f}", known)
+    known = score_lookup(scans[: options.train_rooms], scans[options.train_rooms :])
+    print_row("height and ground-truth normal of a point, no model", f"{known.mean():.1f}", known)
 
 
 def print_row(name: str, mean: str, ious: Tensor) -> None:
-    """Print a row of the table at once."""
+    """Print a row of the table immediately."""
     print(f"| {name} | {mean} | {' | '.join(f'{iou:.0f}' for iou in ious)} |", flush=True)
 
 

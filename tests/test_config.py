@@ -102,7 +102,7 @@ def test_an_angle_beyond_a_right_one_is_refused():
         ("angle_deg: [5]", r"angle_deg: expected float, got \[5\]"),
         ("angle_deg: 91", r"expected angle_deg in \[0, 90\], got 91"),
         ("angles: 5", "unknown setting 'angles'; the nearest is planes"),
-        ("colour: 5", "unknown setting 'colour'; PipelineConfig has .*, angle_deg"),
+        ("shade: 5", "unknown setting 'shade'; PipelineConfig has .*, angle_deg"),
         ("growing: [", "expected YAML"),
         pytest.param("[" * 900, "expected YAML, got maximum recursion", id="brackets"),
         pytest.param("chunk_size: " + "9" * 5000, "expected YAML, got Exceeds", id="digits"),

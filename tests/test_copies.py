@@ -277,7 +277,7 @@ def test_commands_say_how_many_copies_there_are(points, tmp_path, run):
     (tmp_path / "in").mkdir()
     torchrg.write_cloud(tmp_path / "in" / "a.ply", Cloud(points.repeat(2, 1).numpy()))
     torchrg.write_cloud(tmp_path / "in" / "b.ply", Cloud(points.numpy()))
-    said = "1,500 of 3,000 points are copies of others"
+    said = "1,500 of 3,000 points are duplicates"
     for command in ("segment", "normals"):
         for name, count in (("a", 1), ("b", 0)):
             source, out = tmp_path / "in" / f"{name}.ply", tmp_path / f"{command}_{name}.npz"

@@ -96,7 +96,7 @@ EVERYTHING |= {
     "matching": lambda: metrics.match_points(
         Cloud(POINTS.numpy()), Cloud(POINTS[::2].numpy()), 0.1
     ),
-    "result": lambda: Result.of(Cloud(POINTS.numpy()), plain()[0]).fields,
+    "result": lambda: Result.from_segmentation(Cloud(POINTS.numpy()), plain()[0]).fields,
 }
 EVERYTHING |= {
     f"transforms.{make.__name__}": lambda make=make, values=values: make(**values)(

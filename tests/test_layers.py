@@ -113,7 +113,7 @@ def packages_of(module):
 def circles(imports):
     """Return the groups of modules that import each other, directly or around, in any order.
 
-    Whoever imports a module of another package loads that package first.
+    Importing a module of another package loads that package first.
     """
     loads = {
         module: targets.union(*map(packages_of, targets))

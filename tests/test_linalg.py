@@ -107,7 +107,7 @@ def test_normal_beside_a_near_double_root_is_right(rng, gap):
     values[::2, 2] *= 20
     found, vectors = smallest_eigenvector3((turn * values[:, None]) @ turn.mT)
     off = torch.linalg.cross(vectors, turn[..., 0]).norm(dim=1)
-    assert off.max() < 3e-14 / gap**2  # rounding, as of any root beside another
+    assert off.max() < 3e-14 / gap**2  # rounding, as of any root next to another
     assert (found[:, 1] / found[:, 0] - 1 - gap).abs().max() < 1e-6
 
 
@@ -238,7 +238,7 @@ def test_quantiles_of_small_and_large_regions_are_those_of_sorted_values(size: i
     values = torch.rand(len(labels), generator=generator)
     segments = Segments(labels)
     for fraction in (0.0, 0.33, 0.5, 1.0):
-        found = segments.quantile(segments.take(values), fraction)
+        found = segments.quantile(segments.gather(values), fraction)
         expected = []
         for label in range(40):
             ascending = values[labels == label].sort().values

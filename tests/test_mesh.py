@@ -211,8 +211,8 @@ def test_a_face_of_more_corners_than_its_mesh_can_have_is_damage(tmp_path, order
     faces = [*make_faces(6), [0, 1] * 31]
     cloud = read_cloud(write_mesh(tmp_path / "a.ply", make_points(), faces, order))
     assert cloud.front is None
-    told = "faces skipped: expected at most 60 corners a face, got 62"
-    assert cloud.notes == (told,)
+    message = "faces skipped: expected at most 60 corners a face, got 62"
+    assert cloud.notes == (message,)
 
 
 @pytest.mark.parametrize("place", ["first", "last"])

@@ -85,7 +85,7 @@ def test_the_outline_is_a_polygon_that_shapely_reads(square):
     expected = np.concatenate([[*ring, ring[0]] for ring in rings])
     np.testing.assert_array_equal(places, expected)
     normal, offset = [float(row[f"normal_{x}"]) for x in "xyz"], float(row["offset"])
-    # Doubles have steps of 1e-9 there; float32 would have some of half a metre.
+    # Doubles have steps of 1e-9 there; float32 would have some of half a meter.
     np.testing.assert_allclose(places @ normal, offset, atol=5e-9)
 
 

@@ -1,4 +1,4 @@
-"""What float32, or a coarse scale, has taken from coordinates is told once, where it is so."""
+"""What float32, or a coarse scale, has taken from coordinates is reported once, where it is so."""
 
 import warnings
 
@@ -39,8 +39,8 @@ def test_the_line_comes_where_steps_are_a_tenth_of_the_spacing(num_points, offse
         assert bool(found) == (step > 0.1 * spacing)
     if found:
         assert f"steps of {step:.2g} for" in found
-        told = float(found.split("about ")[1].split(";")[0])
-        assert spacing / 2 < told < 2 * spacing
+        message = float(found.split("about ")[1].split(";")[0])
+        assert spacing / 2 < message < 2 * spacing
 
 
 def test_the_line_does_not_depend_on_the_order_of_the_points(places):

@@ -193,7 +193,9 @@ def test_a_frame_of_convert_is_read_back_with_its_grid(tmp_path):
     torch.testing.assert_close(result.table.offset.double(), seg.planes.offset.double())
     assert result.table.adjacency is None
     assert result.planes.adjacency.pairs.tolist() == [[0, 1], [0, 2], [1, 2]]
-    in_memory = Result.of(Cloud(points.reshape(-1, 3).numpy(), grid_shape=(48, 64)), seg)
+    in_memory = Result.from_segmentation(
+        Cloud(points.reshape(-1, 3).numpy(), grid_shape=(48, 64)), seg
+    )
     assert torch.equal(in_memory.labels, result.labels)
 
 
@@ -215,7 +217,7 @@ def test_the_page_shows_the_table_of_the_result():
     pytest.importorskip("pydeck", reason="needs the extra view")
     points = make_room(num_points=20_000, noise=0.004, seed=3).points
     seg = torchrg.segment_planes(points, replace(CLASSIC, planes=PlanesConfig(up="z")))
-    result = Result.of(Cloud(points.numpy()), seg)
+    result = Result.from_segmentation(Cloud(points.numpy()), seg)
     shown = table_of_page(make_page(result))
     assert pairs_of_page(shown) == [tuple(p) for p in seg.planes.adjacency.pairs.tolist()]
     for name in ("count", "area", "rms", "extent", "normal", "offset", "kind", "curved"):
@@ -226,7 +228,7 @@ def test_the_page_shows_the_table_of_the_result():
 
 def test_a_page_draws_the_outlines_of_the_result(cloud, seg):
     pytest.importorskip("pydeck", reason="needs the extra view")
-    shown = table_of_page(make_page(Result.of(cloud, seg)))
+    shown = table_of_page(make_page(Result.from_segmentation(cloud, seg)))
     sizes = [[len(ring) for ring in rings] or [4] for rings in seg.planes.outline]
     assert [[len(ring) for ring in plane["rings"]] for plane in shown] == sizes
 
@@ -267,19 +269,19 @@ def test_labels_from_elsewhere_get_one_table(monkeypatch, cloud, seg):
 
 def test_neighbors_of_the_segmentation_are_not_searched_again(monkeypatch, cloud, seg):
     bare = replace(seg, planes=replace(seg.planes, adjacency=None))
-    searched = Result.of(cloud, bare).planes
+    searched = Result.from_segmentation(cloud, bare).planes
     rows = finite_rows(cloud.points)
     known = replace(bare, neighbors=torchrg.search_knn(cloud.points[rows], 50, canonical=True))
     monkeypatch.setattr("torchrg.result.search_knn", None)
-    result = Result.of(cloud, known)
+    result = Result.from_segmentation(cloud, known)
     assert_same_table(result.planes, searched)
     assert result.segmentation.neighbors is known.neighbors
     with pytest.raises(TypeError, match="not callable"):
-        _ = Result.of(cloud, bare).planes
+        _ = Result.from_segmentation(cloud, bare).planes
 
 
 def test_a_result_is_a_sample_of_transforms(cloud, seg, parts):
-    sample = Result.of(cloud, seg, parts).to_dict()
+    sample = Result.from_segmentation(cloud, seg, parts).to_dict()
     assert torch.equal(sample["coord"], cloud.points)
     assert torch.equal(sample["plane"], seg.labels)
     assert torch.equal(sample["superpoint"].long(), parts.labels)
@@ -374,7 +376,7 @@ def test_columns_of_files_are_those_of_the_table():
 
 def test_segmentations_of_other_points_and_other_files_are_refused(tmp_path, cloud, seg):
     with pytest.raises(ShapeError, match="expected a segmentation of 3 points, got 6,000"):
-        Result.of(Cloud(np.eye(3)), seg)
+        Result.from_segmentation(Cloud(np.eye(3)), seg)
     with pytest.raises(FormatError, match=r"file not found"):
         torchrg.read_result(tmp_path / "gone.npz")
     with pytest.raises(FormatError, match=r"expected coord\.npy in this folder, got none"):

@@ -32,7 +32,7 @@ def small(monkeypatch):
 
 
 def settings(preset, k=16):
-    """A preset with few neighbours, so that a block of a small cloud is not all of it."""
+    """A preset with few neighbors, so that a block of a small cloud is not all of it."""
     config = load_config(preset)
     return dataclasses.replace(
         config,

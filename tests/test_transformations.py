@@ -93,7 +93,7 @@ of_torch = pytest.mark.filterwarnings("ignore:.*should not be instantiated:Depre
 
 @pytest.fixture
 def patches():
-    """Return four noisy faces with some points beside them, no two eigenvalues alike."""
+    """Return four noisy faces with some points next to them, no two eigenvalues equal."""
     rng = torch.Generator().manual_seed(0)
     points = torch.randn(4, 15, 3, generator=rng, dtype=torch.float64)
     points = points * torch.tensor([1.0, 0.7, 0.05])

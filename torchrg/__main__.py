@@ -1,11 +1,11 @@
-"""Process of a command: ``torchrg`` and ``python -m torchrg``."""
+"""Entry point of ``torchrg`` and ``python -m torchrg``."""
 
 import gc
 import os
 import sys
 
-# The garbage collector would scan torch's objects several times during import, a fifth of the
-# startup time. Commands and workers enable it again.
+# Garbage collection during the import of torch takes a fifth of the startup time. Commands and
+# workers enable it again.
 gc.disable()
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):

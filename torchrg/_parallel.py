@@ -84,12 +84,12 @@ def map_chunks(
     chunk_size: int,
     device: torch.device,
     *,
-    least: int = _MIN_ROWS,
+    min_rows: int = _MIN_ROWS,
 ) -> list[Returned]:
     """Call ``work`` on slices that cover all rows, in order; see :func:`map_tasks`.
 
-    Without rows it is called once, on an empty slice. ``least`` is the minimum number of rows per
-    thread.
+    Without rows it is called once, on an empty slice. ``min_rows`` is the minimum number of rows
+    per thread.
 
     Example:
         >>> map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu"))
@@ -100,7 +100,7 @@ def map_chunks(
     num_threads = allowed_threads() if device.type == "cpu" else 1
     # Each thread gets the same number of slices.
     num_chunks = -(-num_rows // (chunk_size * num_threads)) * num_threads
-    size = max(-(-num_rows // max(num_chunks, 1)), min(least, chunk_size))
+    size = max(-(-num_rows // max(num_chunks, 1)), min(min_rows, chunk_size))
     return map_tasks(work, split_rows(num_rows, size) or [slice(0, 0)], device)
 
 

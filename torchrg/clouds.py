@@ -1,4 +1,4 @@
-"""The planes and superpoints of a cloud as it was read, with checks of its points.
+"""Segmentation of a cloud with checks of its points.
 
 ``torchrg segment`` and ``torchrg convert`` call :func:`segment_cloud` for each cloud.
 """
@@ -21,13 +21,13 @@ from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bound
 __all__ = ["check_finite", "find_objects", "note_on_copies", "segment_cloud"]
 __dir__ = __all__.copy
 
-_LOOKED_AT = 10_000
-"""Points, spread over a cloud, that tell where most of its points are."""
-_MIDDLE = (0.25, 0.75)
-"""Quantiles of each coordinate between which the middle half of a cloud lies."""
-_FAR_OFF = 1000
-"""Ratio of the extent of a cloud to that of its middle half from which on the user is warned. As
-float32 has seven digits, its steps are then a ten-thousandth of where most points are."""
+_SAMPLE_SIZE = 10_000
+"""Number of points from which the quantiles of coordinates are estimated."""
+_QUARTILES = (0.25, 0.75)
+"""Quantiles of each coordinate that bound the middle half of a cloud."""
+_MAX_EXTENT_RATIO = 1000
+"""Ratio of the extent of a cloud to that of its middle half above which a warning is issued. With
+the seven digits of float32, rounding steps are then 1e-4 of the extent of the middle half."""
 
 
 def segment_cloud(
@@ -42,22 +42,22 @@ def segment_cloud(
     begin: Callable[[str], None] = lambda stage: None,
     warn: Callable[[str], object] = lambda note: None,
 ) -> tuple[Segmentation, Superpoints | None]:
-    """Return the planes of a cloud, and with a ``partition`` its superpoints.
+    """Segment a cloud into planes, and with ``partition`` into superpoints.
 
     Args:
-        cloud: The cloud, its labels among its fields.
-        settings: How planes are found.
-        orient: Side to which normals point; see :func:`torchrg.segment_planes`.
-        viewpoint: Where the sensor stood; see there.
-        partition: How superpoints are made. Default: none are.
-        voxel: Side of voxels, of which one point each is segmented.
-        within: Name of the field of objects that contain planes; see :func:`find_objects`.
-        begin: Called with the name of each stage when it starts.
-        warn: Called with each warning of :func:`check_finite`, before the work.
+        cloud: Point cloud with its fields.
+        settings: Plane configuration.
+        orient: Normal orientation, as in :func:`torchrg.segment_planes`.
+        viewpoint: Scanner position, as in :func:`torchrg.segment_planes`.
+        partition: Superpoint configuration. Default: no superpoints.
+        voxel: Voxel size; one point per voxel is segmented. Default: segment all points.
+        within: Name of the field with the object of each point; see :func:`find_objects`.
+        begin: Callback that receives the name of each stage at its start.
+        warn: Callback that receives each warning of :func:`check_finite`, before segmentation.
 
     Raises:
-        FormatError: If no point is finite, or ``within`` is not a field of whole numbers.
-        ConfigError: If normals shall point to scanners, and the cloud does not name any.
+        FormatError: If no point is finite, or ``within`` is not a field of integers.
+        ConfigError: If normals are oriented by viewpoint and the cloud has no scanner positions.
 
     Example:
         >>> from torchrg.config import load_config
@@ -73,7 +73,7 @@ def segment_cloud(
     is_kept = partition is not None
     seg = segment_planes(
         cloud,
-        # Superpoints keep to the borders of all planes.
+        # Superpoints respect the boundaries of all planes.
         settings.without_selection() if is_kept else settings,
         orient=orient,
         viewpoint=viewpoint,
@@ -93,33 +93,36 @@ def segment_cloud(
 
 
 def check_finite(cloud: Cloud) -> tuple[str, ...]:
-    """Return warnings if points are missing, far off, or have lost digits; one has to be finite.
+    """Return warnings about missing points, outliers and lost precision.
+
+    Raises:
+        FormatError: If no point is finite.
 
     Example:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
-        ('2 of 3 points are not finite or beyond 1e+12; they stay in place, unlabelled',)
+        ('2 of 3 points are not finite or beyond 1e+12; they stay unlabeled',)
     """
     num_bad = len(cloud) - int(np.count_nonzero(cloud.finite))
     if num_bad == len(cloud):
         raise FormatError(
-            f"{cloud.source}: expected finite points, got none in {num_bad:,} points; those beyond "
-            f"{FARTHEST:g} count as missing: use another unit, or look where they come from."
+            f"{cloud.source}: expected finite points, got none in {num_bad:,} points; coordinates "
+            f"beyond {FARTHEST:g} count as missing: use another unit, or check the file."
         )
     notes = []
     if num_bad:
         notes.append(
             f"{num_bad:,} of {len(cloud):,} points are not finite or beyond {FARTHEST:g}; they "
-            "stay in place, unlabelled"
+            "stay unlabeled"
         )
     finite = cloud.coordinates[cloud.finite] if num_bad else cloud.coordinates
     low, high = bounding_box(finite)
     size = float((high - low).max())
-    low, high = np.quantile(finite[:: max(len(cloud) // _LOOKED_AT, 1)], _MIDDLE, axis=0)
+    low, high = np.quantile(finite[:: max(len(cloud) // _SAMPLE_SIZE, 1)], _QUARTILES, axis=0)
     width = float((high - low).max())
-    if width > 0 and size > _FAR_OFF * width:
+    if width > 0 and size > _MAX_EXTENT_RATIO * width:
         notes.append(
-            f"half of its points lie within {width:.3g}, single ones {size:.3g} apart, which costs "
-            "the others their precision; remove those that are none"
+            f"half of the points lie within {width:.3g}, but the extent is {size:.3g}, which costs "
+            "precision; remove outliers"
         )
     elif cloud.precision_note:
         notes.append(cloud.precision_note)
@@ -127,28 +130,28 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
 
 
 def note_on_copies(num_copies: int, num_points: int) -> tuple[str, ...]:
-    """Return a line for people if points of a cloud repeat the coordinates of others.
+    """Return a note if a cloud has points with equal coordinates.
 
     Example:
         >>> note_on_copies(2, 3)
-        ('2 of 3 points are copies of others; copies count once and get one result',)
+        ('2 of 3 points are duplicates; duplicates count once and share one result',)
     """
     if not num_copies:
         return ()
     return (
-        f"{num_copies:,} of {num_points:,} points are copies of others; copies count once and get "
+        f"{num_copies:,} of {num_points:,} points are duplicates; duplicates count once and share "
         "one result",
     )
 
 
 def find_objects(cloud: Cloud, name: str | None) -> NDArray[np.int64] | None:
-    """Return the object of each point of a cloud, the field of a name; None without a name.
+    """Return the object of each point from a field of the cloud; None without a name.
 
-    ``segment`` is ``segment20`` where there is only that. Of several labels of a point the first
-    is taken; text and scalar fields of PLY have whole numbers as floats.
+    ``segment`` falls back to ``segment20``. If a point has several labels, the first one is used.
+    Integers stored as floats, as in text and scalar fields of PLY, are accepted.
 
     Raises:
-        FormatError: If there is no such field, or it does not hold a whole number for each point.
+        FormatError: If the field is missing or does not have one integer per point.
 
     Example:
         >>> cloud = Cloud(np.zeros((2, 3)), {"instance": np.array([[3, 5], [4, -1]])})
@@ -158,14 +161,14 @@ def find_objects(cloud: Cloud, name: str | None) -> NDArray[np.int64] | None:
     if name is None:
         return None
     fields: Mapping[str, NDArray[Any]] = cloud.fields
-    values, wanted = fields.get(name, fields.get(f"{name}20")), f"the field {name} of --within"
+    values, field = fields.get(name, fields.get(f"{name}20")), f"the field {name} of --within"
     if values is None:
         names = ", ".join(sorted(fields)) or "none"
         names += "".join(f" ({note})" for note in cloud.notes if name in note)
-        raise FormatError(f"{cloud.source}: expected {wanted}, got {names}; name one of these.")
+        raise FormatError(f"{cloud.source}: expected {field}, got {names}; choose one of these.")
     if values.dtype.kind not in "iubf" or len(values) != len(cloud) or not are_integers(values):
         raise FormatError(
-            f"{cloud.source}: expected {wanted} to be a whole number for each of {len(cloud):,} "
+            f"{cloud.source}: expected {field} to have one integer for each of {len(cloud):,} "
             f"points, got {values.dtype} of shape {values.shape}; number the objects."
         )
     return values.reshape(len(values), -1)[:, 0].astype(np.int64)

@@ -407,8 +407,8 @@ class SuperpointsConfig:
 
     strengths: tuple[float, ...] = (0.5, 1.5, 4.0, 12.0)
     """Regularization strength per level, ascending. Two adjacent regions merge if the cost is at
-    most this, measured in points on opposite sides of a right angle. Doubling it leaves about 0.6
-    times as many superpoints."""
+    most this, measured in points on opposite sides of a right angle. Doubling it leaves about 60 %
+    of the superpoints."""
     counts: tuple[int, ...] | None = None
     """Number of superpoints per level, descending; overrides strengths. Actual counts can be lower
     or higher, depending on connectivity and the minimum size. None: set by strengths."""
@@ -651,7 +651,7 @@ _FIXES = {
 
 def _fix_for(key: str, value: object, kind: type) -> str:
     """Return the fix for an unknown key."""
-    names = own_names = [*typing.get_type_hints(kind), *["angle_deg"] * (kind is PipelineConfig)]
+    names = valid_names = [*typing.get_type_hints(kind), *["angle_deg"] * (kind is PipelineConfig)]
     for section, section_kind in _SECTIONS.items() if kind is PipelineConfig else ():
         names = [*names, *(f"{section}.{name}" for name in typing.get_type_hints(section_kind))]
     tails = {name.rpartition(".")[2]: name for name in reversed(names)}
@@ -661,7 +661,7 @@ def _fix_for(key: str, value: object, kind: type) -> str:
         return _FIXES[key]
     if near := difflib.get_close_matches(key, [*tails, *names], 1):
         return f"the nearest is {tails.get(near[0], near[0])}"
-    return f"{kind.__name__} has {', '.join(own_names)}"
+    return f"{kind.__name__} has {', '.join(valid_names)}"
 
 
 def _convert(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
@@ -757,7 +757,7 @@ def _flat_values(config: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401
     """Yield the settings by their dotted names."""
     for name, value in vars(config).items():
         if dataclasses.is_dataclass(value):
-            yield from ((f"{name}.{inner}", own) for inner, own in _flat_values(value))
+            yield from ((f"{name}.{inner}", item) for inner, item in _flat_values(value))
         else:
             yield name, value
 

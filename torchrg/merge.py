@@ -86,7 +86,7 @@ def _kind(name: str, cloud: Cloud) -> object:
 
 
 def _note_sizes(clouds: Sequence[Cloud]) -> list[str]:
-    """Return a note if the extents of clouds differ so much that their units may differ."""
+    """Return a note if the extents of clouds suggest different units."""
     finite = [(cloud.source, cloud.coordinates[cloud.finite]) for cloud in clouds]
     sizes = [(float(np.ptp(values, axis=0).max()), name) for name, values in finite if len(values)]
     positive = [size for size in sizes if size[0] > 0]

@@ -1,4 +1,4 @@
-"""From points to planes, and to superpoints: each in one function."""
+"""Plane segmentation and superpoint partition of a point cloud."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ __all__ = [
 __dir__ = __all__.copy
 
 _STRENGTH_OF_K = 100.0
-"""Strength of superpoints for a threshold of 1 of ScanNet's Segmentator. At its usual 0.01 there
-shall be about as many superpoints as it makes segments of meshed depth frames."""
+"""Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
+meshed depth frames get about the same number of superpoints as Segmentator's segments."""
 
 
 @eager_only
@@ -77,62 +77,60 @@ def segment_planes(
     on_stage: Callable[[str], None] | None = None,
     **changes: Any,  # noqa: ANN401
 ) -> Segmentation:
-    """Segment a cloud into planes: neighbours, normals, regions, plane table.
+    """Segment a point cloud into planes.
 
-    Of the memory that this takes most is in the lists of neighbours and edges. For a cloud that is
-    too large for it, :func:`torchrg.scratch.on_disk` keeps these in files without a name.
+    Most of the memory goes to the neighbor and edge lists. If a cloud does not fit in memory,
+    :func:`torchrg.scratch.on_disk` spills these lists to unnamed temporary files.
 
     Convention:
-        The result does not depend on the order of the points, on chunk size, on the number of
-        threads or on where arrays are. Lengths are in the unit of the cloud. Another unit, another
-        origin, and float64 in place of float32 change results where rounding decides, as between
-        equal distances. A unit that is a power of two times another changes nothing, but for
-        settings that are measured, in three digits.
+        The result does not depend on the order of the points, the chunk size, the number of
+        threads, or spilling to disk. Lengths are in the unit of the cloud. Another unit, another
+        origin, or float64 instead of float32 changes results only where rounding decides, such as
+        between equal distances. Scaling by a power of two changes nothing, except settings that are
+        measured from the cloud, which have three digits.
 
-        Points with equal coordinates are copies. Neighbors are searched among distinct points, and
-        copies of a point have its result, so the normals and planes are those of the distinct
-        points. ``min_size`` and the table count copies once, except the table's ``count``. Labels
-        are numbered by ``count``.
+        Points with equal coordinates are duplicates. Neighbors are searched among distinct points,
+        and duplicates share one result. ``min_size`` and the table count duplicates once, except
+        the table's ``count``. Labels are sorted by ``count``.
 
-        Normals point to one side, and every command and transform chooses the same one. This takes
-        a tenth of the time; ``orient="none"`` saves it.
+        Normals are oriented in the same way by every command and transform. Orientation takes a
+        tenth of the time; ``orient="none"`` skips it.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64, a cloud, or the path of a file.
-            Planes of a cloud or a file are about :attr:`torchrg.Cloud.origin`, as its points are.
-            Tensors far from the origin should be float64, or moved to it first.
-        config: Settings, a dictionary of them, or the name of a preset or a file. Default: that of
+            Planes of a cloud or a file are relative to :attr:`torchrg.Cloud.origin`, like its
+            points. Use float64 for tensors far from the origin, or shift them first.
+        config: Configuration, dictionary, preset name, or file. Default: see
             :func:`torchrg.load_config`.
-        orient: Side to which normals point, as in :func:`torchrg.normals.orient_normals`. Default:
-            to the front of the surface where the cloud knows it, else into the free space of rooms.
-        viewpoint: Where the scanner stood, for ``orient="viewpoint"``; see there.
-        front: Direction from each point to where its surface was seen from, shape ``(N, 3)``; see
-            there. Default: that of the cloud.
-        voxel: Side of voxels, in the unit of the cloud: one point of each is segmented, and every
-            point has the result of its voxel. Sizes of regions are counted in voxels then; planes
-            are described from all points and numbered by their number, and which of them meet is
-            found on the voxels. Default: all points are segmented.
-        within: Object of each point, shape ``(N,)``, integers, to keep planes within objects: no
-            plane has points of two of them, and the table names that of each. Where objects share
-            a position or a voxel, it counts once for each of them. Default: planes go across.
-        keep_neighbors: Whether the result carries the neighbours, 4 bytes for each of a point, so
-            that :func:`make_superpoints` need not search them again.
-        on_stage: Called with the name of each stage when it starts, and with ``"done"``.
-        **changes: Single settings, as in ``**{"normals.k": 30}``.
+        orient: Normal orientation, as in :func:`torchrg.normals.orient_normals`. Default: the front
+            of the surface if the cloud has it, else the interior of rooms.
+        viewpoint: Scanner position for ``orient="viewpoint"``, as in ``orient_normals``.
+        front: Direction from each point to the side from which its surface was seen, shape
+            ``(N, 3)``, as in ``orient_normals``. Default: that of the cloud.
+        voxel: Voxel size, in the unit of the cloud. One point per voxel is segmented, and every
+            point gets the result of its voxel. Region sizes are then in voxels and the adjacency is
+            that of the voxels; the table describes all points. Default: segment all points.
+        within: Object ID of each point, shape ``(N,)``, integers. No plane crosses objects, and the
+            table has the object of each plane. A position or voxel shared by several objects counts
+            once per object. Default: no restriction.
+        keep_neighbors: Whether to return the neighbors, at 4 bytes per neighbor, so
+            :func:`make_superpoints` need not search them again. Default: False.
+        on_stage: Callback that receives the name of each stage at its start, and ``"done"``.
+        **changes: Individual settings, as in ``**{"normals.k": 30}``.
 
     Returns:
-        Labels, normals, curvature and masks in the order of the points, and the table of planes. A
-        point with NaN or Inf is not ``valid``: label :data:`torchrg.UNLABELED`, normal zero. A
-        cloud with fewer points than ``k`` uses those it has; fewer than three points give no plane.
+        Labels, normals, curvature and masks in the order of the points, and the plane table. Points
+        with NaN or Inf are not ``valid``: label :data:`torchrg.UNLABELED`, zero normal. A cloud of
+        fewer than ``k`` points uses all of them; fewer than three points give no plane.
 
     Raises:
-        ShapeError: If ``points`` or ``within`` has another shape or dtype.
-        ConfigError: If ``voxel`` is not positive, or a setting is wrong.
-        FormatError: If arrays are kept on a disk, and it is full.
+        ShapeError: If ``points`` or ``within`` has the wrong shape or dtype.
+        ConfigError: If ``voxel`` is not positive, or a setting is invalid.
+        FormatError: If arrays spill to disk and the disk is full.
 
     Warns:
-        PrecisionWarning: If the steps of float32 are more than a tenth of the spacing of the
-            points, as they are far from the origin.
+        PrecisionWarning: If the rounding step of float32 exceeds a tenth of the point spacing, as
+            it does far from the origin.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
@@ -155,7 +153,7 @@ def segment_planes(
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
     if objects is not None and (objects.is_floating_point() or objects.is_complex()):
         raise ShapeError(
-            f"segment_planes: expected within of integers, got {objects.dtype}; number the objects."
+            f"segment_planes: expected integer within, got {objects.dtype}; number the objects."
         )
     settings = config
     if not isinstance(settings, PipelineConfig) or changes:
@@ -178,7 +176,7 @@ def segment_planes(
 
 
 class _Side(NamedTuple):
-    """The side that normals point to, and the directions to it ``(N, 3)``, if there are any."""
+    """Normal orientation, and the front directions ``(N, 3)`` if known."""
 
     orient: Orientation
     front: Tensor | None
@@ -192,44 +190,44 @@ def _segment(
     objects: Tensor | None,
     begin: Callable[[str], None],
 ) -> Segmentation:
-    """Do what :func:`segment_planes` says: the steps, in their order.
+    """Run the stages of :func:`segment_planes`.
 
-    Places are distinct points, or one point of each voxel, and ``inverse`` is the place of each
-    point. Regions grow on parts: the points of one object at a place are one part.
+    Sites are distinct points, or one point per voxel, and ``inverse`` is the site of each point.
+    Regions grow on parts: the points of one object at a site form one part.
     """
     begin("neighbors")
     distinct = distinct_points(points)
-    places, inverse = distinct.points, distinct.inverse
+    sites, inverse = distinct.points, distinct.inverse
     if voxel is not None:
-        places, inverse = _sample_places(distinct, voxel)
+        sites, inverse = _sample_sites(distinct, voxel)
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
-    if len(places):
-        k = min(config.normals.k, len(places))
-        neighbors = search_knn(places, k, canonical=True)
+    if len(sites):
+        k = min(config.normals.k, len(sites))
+        neighbors = search_knn(sites, k, canonical=True)
     sampling = None
     if _has_auto(config):
-        sampling = measure_sampling(places, neighbors)
+        sampling = measure_sampling(sites, neighbors)
         config = config.with_sampling(sampling)
 
     begin("normals")
     estimate = ESTIMATORS[config.normals.method]
-    fit = estimate(places, neighbors, config.normals, config.chunk_size)
+    fit = estimate(sites, neighbors, config.normals, config.chunk_size)
 
     begin("regions")
     parts: Rows = slice(None)
-    beside, around, part_of = neighbors, neighbors, inverse
+    restricted, full, part_of = neighbors, neighbors, inverse
     if objects is not None:
-        parts, groups, part_of = _split_places(inverse, objects, len(places))
-        # Growth, and all steps after it, join neighbours alone.
-        beside = restrict_to_groups(neighbors, groups, config.chunk_size, parts)
-        if len(groups) > len(places):
-            around = search_knn(places[parts], neighbors.indices.shape[1], canonical=True)
+        parts, groups, part_of = _split_sites(inverse, objects, len(sites))
+        # Growth and all later stages only join neighbors.
+        restricted = restrict_to_groups(neighbors, groups, config.chunk_size, parts)
+        if len(groups) > len(sites):
+            full = search_knn(sites[parts], neighbors.indices.shape[1], canonical=True)
     normals, curvature, valid, residual_rms = (values[parts] for values in fit[:4])
     labels = grow_regions(
-        places[parts],
+        sites[parts],
         normals,
         curvature,
-        beside,
+        restricted,
         config.growing,
         valid=valid,
         residual_rms=residual_rms,
@@ -238,9 +236,9 @@ def _segment(
     )
 
     begin("planes")
-    of_points = expand_to_points(labels, part_of, fill=UNLABELED)
-    numbers = rank_by_count(of_points)
-    labels, of_points = numbers[labels], numbers[of_points]
+    point_labels = expand_to_points(labels, part_of, fill=UNLABELED)
+    numbers = rank_by_count(point_labels)
+    labels, point_labels = numbers[labels], numbers[point_labels]
     growing = config.growing
     describe = partial(
         summarize_planes,
@@ -248,7 +246,7 @@ def _segment(
         outline=config.planes.outline,
         facet_tolerance=growing.facet_tolerance if growing.faceted is True else None,
     )
-    planes = describe(places[parts], normals, labels, neighbors=around, canonical=True)
+    planes = describe(sites[parts], normals, labels, neighbors=full, canonical=True)
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     normals, curvature, sharp, valid = (
         expand_to_points(values, inverse)
@@ -257,29 +255,29 @@ def _segment(
     axes = planes.normal
     if voxel is not None:
         rows: Rows = distinct.rows if objects is None else slice(None)
-        cloud = points[rows], normals[rows], of_points[rows]
-        whole = describe(*cloud, canonical=objects is None)
-        planes = replace(whole, adjacency=planes.adjacency)
-    planes = replace(planes, count=torch.bincount(of_points + 1, minlength=1)[1:])
+        cloud = points[rows], normals[rows], point_labels[rows]
+        table = describe(*cloud, canonical=objects is None)
+        planes = replace(table, adjacency=planes.adjacency)
+    planes = replace(planes, count=torch.bincount(point_labels + 1, minlength=1)[1:])
     if objects is not None:
         of_plane = objects.new_zeros(len(planes))
-        of_plane[of_points[of_points >= 0]] = objects[of_points >= 0]
+        of_plane[point_labels[point_labels >= 0]] = objects[point_labels >= 0]
         planes = replace(planes, object=of_plane)
 
     begin("orientation")
     if isinstance(parts, Tensor):
-        none = torch.full((len(places),), UNLABELED, device=labels.device)
+        none = torch.full((len(sites),), UNLABELED, device=labels.device)
         labels = none.scatter_reduce(0, parts, labels, "amax")
 
     def turn(side: Orientation) -> Tensor:
-        turned = turn_faces(places, fit.normals, side, neighbors, labels, axes)
+        turned = turn_faces(sites, fit.normals, side, neighbors, labels, axes)
         return expand_to_points(turned, inverse)
 
     normals = choose_side(points, normals, side.orient, side.front, turn)
     begin("done")
     searched = neighbors if voxel is None else None
     return Segmentation(
-        of_points,
+        point_labels,
         normals,
         curvature,
         sharp,
@@ -292,24 +290,24 @@ def _segment(
     )
 
 
-def _sample_places(distinct: DistinctPoints, voxel: float) -> tuple[Tensor, Tensor]:
-    """Return one point of each voxel, in canonical order, and the place of each point there."""
+def _sample_sites(distinct: DistinctPoints, voxel: float) -> tuple[Tensor, Tensor]:
+    """Return one point per voxel in canonical order, and the site of each point."""
     voxels = sample_voxels(distinct.points, voxel)
     order = canonical_order(distinct.points[voxels.rows])
-    place = order.argsort()[voxels.inverse]
-    return distinct.points[voxels.rows[order]], distinct.restore(place, fill=UNLABELED)
+    site = order.argsort()[voxels.inverse]
+    return distinct.points[voxels.rows[order]], distinct.restore(site, fill=UNLABELED)
 
 
-def _split_places(inverse: Tensor, objects: Tensor, num_places: int) -> tuple[Rows, Tensor, Tensor]:
-    """Return the places and the objects of parts, ascending, and the part of each point.
+def _split_sites(inverse: Tensor, objects: Tensor, num_sites: int) -> tuple[Rows, Tensor, Tensor]:
+    """Return the sites and objects of parts in ascending order, and the part of each point.
 
-    Objects are numbered from 0 unless each place has one point.
+    Objects are numbered from 0 unless each site has one point.
     """
-    has_place = inverse >= 0
-    if num_places == int(torch.count_nonzero(has_place)):
-        of_place = objects.new_empty(num_places)
-        of_place[inverse[has_place]] = objects[has_place]
-        return slice(None), of_place, inverse
+    has_site = inverse >= 0
+    if num_sites == int(torch.count_nonzero(has_site)):
+        object_of_site = objects.new_empty(num_sites)
+        object_of_site[inverse[has_site]] = objects[has_site]
+        return slice(None), object_of_site, inverse
     values, groups = torch.unique(objects, return_inverse=True)
     keys, part = torch.unique(inverse * len(values) + groups, return_inverse=True)
     num_bad = int(torch.count_nonzero(keys < 0))
@@ -318,7 +316,7 @@ def _split_places(inverse: Tensor, objects: Tensor, num_places: int) -> tuple[Ro
 
 
 def _has_auto(config: PipelineConfig) -> bool:
-    """Return whether a setting that counts is measured."""
+    """Return whether a setting in use is measured from the cloud (``auto``)."""
     scope = config.normals.method == "consensus" and config.normals.noise_scope
     return scope == "auto" or needs_sampling(config.growing)
 
@@ -334,43 +332,43 @@ def make_superpoints(
     voxel: float | None = None,
     **changes: Any,  # noqa: ANN401
 ) -> Superpoints:
-    """Partition a cloud into superpoints: every finite point in exactly one, in nested levels.
+    """Partition a point cloud into nested superpoints.
 
-    Superpoints are connected (of a chain of points between any two, each is one of the 8 nearest
-    neighbours of the one before or after it), of one orientation, and keep to the borders of
-    objects and of planes. Each point is a region at first, or each plane. Regions merge while that
-    costs an energy like that of cut pursuit at most the strength of the level; see
-    :func:`torchrg.regions.superpoints.partition_points` for it and its sources.
+    Every finite point belongs to exactly one superpoint per level. Superpoints are connected in the
+    graph of the 8 nearest neighbors, have one orientation, and respect the boundaries of objects
+    and planes. Initially each point, or each plane, is a region. Regions merge while the merging
+    cost, an energy like that of cut pursuit, is at most the strength of the level; see
+    :func:`torchrg.regions.superpoints.partition_points` for details and sources.
 
     Convention:
-        The result does not depend on the order of the points or on the number of threads. Copies of
-        a point are in one superpoint. Sizes are counted in distinct points, of any density, and
-        superpoints are numbered by all their points. A few points may lie on another plane than
-        the rest of their superpoint.
+        The result does not depend on the order of the points or the number of threads. Duplicates
+        are in one superpoint. Sizes count distinct points regardless of density; superpoints are
+        sorted by the number of all their points. A few points may lie on another plane than most of
+        their superpoint.
 
     Args:
         points: Points, shape ``(N, 3)``, float32 or float64.
-        seg: What :func:`segment_planes` said about them. Default: it is asked, with the preset
+        seg: Segmentation of the same points. Default: :func:`segment_planes` with the preset
             ``consensus``.
-        config: Settings, or a dictionary of them.
-        colors: Colors, shape ``(N, 3)``, in 0..1, 0..255 or 0..65535, as
-            :func:`torchrg.io.colors.find_white` tells. Copies of a point have one color, halfway
-            between the least and the largest of each channel. Default: colors play no part.
-        voxel: Side of voxels, in the unit of the cloud: the points that stand for voxels are
-            partitioned, and every point is in the superpoint of its voxel. Sizes are counted in
-            voxels then, and superpoints numbered by their number. Default: all points are.
-        **changes: Single settings, as in ``counts=100``.
+        config: Configuration or dictionary.
+        colors: Colors, shape ``(N, 3)``, in 0..1, 0..255 or 0..65535, as determined by
+            :func:`torchrg.io.colors.find_white`. Duplicates share the midrange of each channel.
+            Default: colors are ignored.
+        voxel: Voxel size, in the unit of the cloud. One point per voxel is partitioned, and every
+            point gets the superpoint of its voxel. Sizes and the numbering then count voxels.
+            Default: partition all points.
+        **changes: Individual settings, as in ``counts=100``.
 
     Returns:
-        The partition of the first strength, and those of the others. A superpoint smaller than
-        ``min_size`` has no neighbour to join, or only beyond ``max_extent``.
+        The partition of the first strength, and those of the remaining strengths. A superpoint
+        smaller than ``min_size`` has no neighbor that it could join within ``max_extent``.
 
     Raises:
-        ShapeError: If a shape or dtype is wrong, or ``seg`` is of another number of points.
-        ConfigError: If a setting is wrong, or if colors are in none of these ranges.
+        ShapeError: If a shape or dtype is wrong, or ``seg`` has another number of points.
+        ConfigError: If a setting is invalid, or the colors fit none of these ranges.
 
     Warns:
-        UserWarning: If a range of colors is not the usual one of their type, or some are clipped.
+        UserWarning: If the colors do not have the default range of their dtype, or are clipped.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -416,11 +414,11 @@ def _unit_colors(
     *,
     num_decorators: int,
 ) -> Tensor | None:
-    """Return the colors of points in [0, 1], float64, for a function with so many decorators.
+    """Return the colors of points in [0, 1], float64.
 
     Warns:
-        UserWarning: The caller of that function, if the values decided their range, or some are
-            clipped.
+        UserWarning: If the range was judged from the values, or some are clipped. The warning is
+            issued to the caller of a function with ``num_decorators`` decorators.
     """
     if colors is None:
         return None
@@ -444,27 +442,27 @@ def segment_mesh(
     colors: Colors | None = None,
     config: AnyConfig | None = None,
 ) -> Tensor:
-    """Return superpoints of the vertices of a mesh, in the shape of ScanNet's Segmentator.
+    """Return superpoints of mesh vertices, a drop-in replacement for ScanNet's Segmentator.
 
     Programs that call ``segmentator.segment_mesh(vertices, faces)`` change their import to ``import
-    torchrg as segmentator``, and have those of :func:`make_superpoints` then.
+    torchrg as segmentator`` to use the superpoints of :func:`make_superpoints`.
 
     Args:
         vertices: Shape ``(V, 3)``, floating.
-        faces: Rows of the corners of triangles, shape ``(F, 3)``. Superpoints are connected along
-            their edges. Default: along neighbours, for points without a mesh.
-        k_thresh: As of Segmentator, in proportion: 0.01 is a strength of 1 in
+        faces: Vertex indices of triangles, shape ``(F, 3)``. Superpoints are connected along mesh
+            edges. Default: connect nearest neighbors, for points without a mesh.
+        k_thresh: Segmentator's threshold; 0.01 corresponds to a strength of 1 in
             :class:`torchrg.config.SuperpointsConfig`.
-        seg_min_verts: Smaller superpoints join a neighbour, in vertices.
-        colors: As of :func:`make_superpoints`; Segmentator knows none.
-        config: How planes are found, as of :func:`segment_planes`.
+        seg_min_verts: Minimum superpoint size, in vertices; smaller ones join a neighbor.
+        colors: Colors as in :func:`make_superpoints`; Segmentator has none.
+        config: Plane configuration, as in :func:`segment_planes`.
 
     Returns:
-        Superpoint of each vertex, shape ``(V,)``, int64, consecutive from 0 on by descending size;
-        -1 for vertices that are not finite.
+        Superpoint of each vertex, shape ``(V,)``, int64, numbered from 0 by descending size; -1 for
+        vertices that are not finite.
 
     Raises:
-        ShapeError: If a shape or dtype is wrong, or a face has a corner that is no vertex.
+        ShapeError: If a shape or dtype is wrong, or a vertex index is out of range.
 
     Example:
         >>> x, y = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).unbind(1)
@@ -483,8 +481,8 @@ def segment_mesh(
         low, high = int(corners.min()), int(corners.max())
         if not 0 <= low <= high < len(tensor):
             raise ShapeError(
-                f"segment_mesh: expected faces of rows of {len(tensor):,} vertices, got {low:,} to "
-                f"{high:,}; number them from 0."
+                f"segment_mesh: expected vertex indices in [0, {len(tensor):,}), got {low:,} to "
+                f"{high:,}; number the vertices from 0."
             )
     shades = _unit_colors("segment_mesh", tensor, colors, num_decorators=1)
     seg = segment_planes(tensor, config)

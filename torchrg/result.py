@@ -107,7 +107,7 @@ class Result:
     neighbors: Neighbors | None = None
 
     @classmethod
-    def of(
+    def from_segmentation(
         cls, cloud: Cloud, segmentation: Segmentation, superpoints: Superpoints | None = None
     ) -> Result:
         """Create the result of segmenting a cloud, or a depth image with its pixels as points.
@@ -216,9 +216,9 @@ class Result:
         points, (present, labels) = self.cloud.points[sampled], number_labels(self.labels[sampled])
         if table is None:
             has_normals = "normals" in self.fields
-            beside = neighbors if has_normals and len(sampled) == len(rows) else None
+            knn = neighbors if has_normals and len(sampled) == len(rows) else None
             table = summarize_planes(
-                *(values[rows] for values in whole), neighbors=beside, canonical=True
+                *(values[rows] for values in whole), neighbors=knn, canonical=True
             )
             count = torch.bincount(self.labels + 1, minlength=1)[1:]
             table = replace(table, count=count, curved=table.curved & has_normals)

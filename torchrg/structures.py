@@ -176,7 +176,7 @@ class Cloud:
     @cached_property
     def _local(self) -> Tensor:
         """:attr:`points`, without the precision warning."""
-        return self.about(self.origin)
+        return self.relative_to(self.origin)
 
     @cached_property
     def precision_note(self) -> str:
@@ -194,7 +194,7 @@ class Cloud:
         fix = "leave out points that are far off, or cut the cloud into parts"
         return describe_steps(self._local.numpy(), fix=fix)
 
-    def about(self, origin: NDArray[np.float64]) -> Tensor:
+    def relative_to(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates relative to ``origin`` ``(3,)``, float32, shape ``(N, 3)``."""
         coordinates = self.coordinates
         if not self.finite.all() and (is_code := np.abs(coordinates) > FARTHEST).any():
@@ -253,21 +253,21 @@ class Neighbors(NamedTuple):
     indices: Tensor
     valid: Tensor | None = None
 
-    def at(self, rows: Rows) -> "Neighbors":
+    def select(self, rows: Rows) -> "Neighbors":
         """Return the neighbors of the selected points."""
         return Neighbors(self.indices[rows], None if self.valid is None else self.valid[rows])
 
-    def of(self, values: Tensor, rows: Rows = slice(None)) -> Tensor:
+    def gather(self, values: Tensor, rows: Rows = slice(None)) -> Tensor:
         """Gather the values ``(N,)`` of the neighbors of the selected points, shape ``(n, K)``.
 
         Example:
-            >>> Neighbors(torch.tensor([[0, 1], [1, 0]])).of(torch.tensor([0.5, 2.5])).tolist()
+            >>> Neighbors(torch.tensor([[0, 1], [1, 0]])).gather(torch.tensor([0.5, 2.5])).tolist()
             [[0.5, 2.5], [2.5, 0.5]]
         """
         indices = self.indices[rows]
         return values.index_select(0, indices.reshape(-1)).view(indices.shape)
 
-    def counted(self, rows: Rows = slice(None)) -> Tensor:
+    def mask(self, rows: Rows = slice(None)) -> Tensor:
         """Return the mask of valid entries of the selected points, shape ``(n, K)``, bool."""
         if self.valid is not None:
             return self.valid[rows]
@@ -317,7 +317,7 @@ class NormalFit(NamedTuple):
     residual_rms: Tensor
     sharp: Tensor | None = None
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
+    def map(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
         """Apply a function to all tensors; None stays None."""
         sharp = None if self.sharp is None else change(self.sharp)
         normals, curvature, valid, residual_rms = (change(values) for values in self[:4])

@@ -1,5 +1,5 @@
-"""Benchmarks, a file each, that ``scripts/bench.py NAME`` runs.
+"""Benchmarks for ``scripts/bench.py NAME``, one file each.
 
-To add one, write a file with a :class:`benchmarks.harness.Benchmark` of the name ``Case``: clouds,
-contenders that run on each, and columns of the table if the usual one will not do.
+To add a benchmark, write a file with a subclass of :class:`benchmarks.harness.Benchmark` named
+``Case``: its clouds, its contenders, and a report if the default table does not fit.
 """

@@ -1,15 +1,16 @@
-"""torchrg, PCL, Open3D, CGAL and GoCoPP: planes by three known protocols.
+"""Plane accuracy of torchrg, PCL, Open3D, CGAL and GoCoPP by three published protocols.
 
-Clouds with exact truth: made rooms at four levels of noise and at three densities, rendered depth
-frames without noise and with a Kinect's, a scan of SynPEB's test set, scans with labelled parts (0
-is none), and folders of rooms as scanners and reconstructions give them, ``NAME_SEED.npz`` with
-``points`` and ``labels`` (-1 is no plane). FOLDER holds the programs ``pclrg`` (PCL's normals and
-region growing), ``cgalrg`` (CGAL's region growing and Efficient RANSAC) and ``gocopp``; PYTHON has
-Open3D. A program that is missing is left out. CGAL runs with PCA normals and with those of
-``consensus``. Open3D finds boxes: a point goes to the nearest within 5 cm. ``depth`` sees a frame
-as an image, all others as a cloud. Settings of a folder's rooms are chosen on one folder, and
-another is held out. The first table has means over the clouds of a kind. Published figures stand
-below the tables, and are of other data.
+Clouds with exact ground truth: synthetic rooms at four noise levels and three densities, rendered
+depth frames without noise and with Kinect noise, a scan of SynPEB's test set, and scans with
+labeled parts (0 is none). Also folders of simulated scans and reconstructions of rooms,
+``NAME_SEED.npz`` with ``points`` and ``labels`` (-1 is no plane).
+
+FOLDER contains the programs ``pclrg`` (PCL's normals and region growing), ``cgalrg`` (CGAL's region
+growing and Efficient RANSAC) and ``gocopp``; PYTHON has Open3D. Missing programs are skipped. CGAL
+runs with PCA and ``consensus`` normals. Open3D returns boxes; a point belongs to the nearest box
+within 5 cm. ``depth`` segments a frame as an image, all other contenders as a cloud. Settings for
+room folders were chosen on one folder; another is held out. The first table has means over the
+clouds of a kind. Published figures below the tables are for other data.
 
     python scripts/bench.py accuracy --programs FOLDER --open3d-python PYTHON --synpeb FILE.pcd
         --parts office_parts.pcd --rooms CHOSEN HELD_OUT --out accuracy.json
@@ -42,38 +43,38 @@ from torchrg.scenes import build_room, make_room
 
 PRESETS = ("classic", "paper", "consensus")
 NOISES = (0.0005, 0.001, 0.003, 0.006)
-"""Standard deviations of the points of made rooms, in metres."""
+"""Noise levels of synthetic rooms, standard deviation in meters."""
 POINTS = 300_000
-"""Points of each of the rooms with these."""
+"""Number of points per noise level."""
 DENSITIES = (100_000, 200_000, 1_000_000)
-"""Points of the same room at 3 mm."""
+"""Numbers of points of the same room with 3 mm noise."""
 NUM_FRAMES = 4
 FRAME_SEED = 21
 SYNPEB_MIN_SIZE = 10
-"""Points of the smallest region, and of the smallest face, as smaller ones are void there."""
+"""Minimum number of points of regions and surfaces; SynPEB ignores smaller ones."""
 SYNPEB_VOID = 3
-"""Label of SynPEB's points of no plane."""
+"""SynPEB's label of points without a plane."""
 PARTS_MIN_SIZE = 500
-"""Points of the smallest part of a scan that is a face."""
+"""Minimum number of points for a part of a scan to count as a surface."""
 ROOMS_MIN_SIZES = {"s3dis": 300, "laser": 300, "rgbd": 200, "scannet": 60}
-"""Points of the smallest face of a room, by what its name has in it."""
+"""Minimum number of points of a surface, by a substring of the room name."""
 VOID = -2
-"""Truth of points that do not count."""
+"""Ground-truth label of ignored points."""
 EVOPS = ("precision", "recall", "mean_iou")
-"""Indices of its protocol."""
+"""Metrics of the EVOPS protocol."""
 VOXEL_SIZE = 0.05
-"""Side of the voxels, in metres."""
+"""Voxel size, in meters."""
 
 CGAL_K, CGAL_ANGLE_DEG = 20, 25
-"""Neighbors and largest angle of CGAL's region growing."""
+"""Neighbors and maximum angle of CGAL's region growing."""
 CGAL = {
     "growing": ("rg", 0.02, ()),
     "RANSAC": ("ransac", 0.01, (0.05, 0.01)),
 }
-"""Mode, distance to a plane in meters, and for RANSAC the gap within a plane and its probability to
-miss the largest one. Distances of 10 and 20 mm were tried; these serve most clouds best."""
+"""Mode, distance to a plane in meters, and for RANSAC the gap within a plane and the probability of
+missing the largest plane. Distances of 10 and 20 mm were tried; these fit most clouds best."""
 
-PUBLISHED = """Correct to noise: SynPEB's at 80 %, of the true faces. Published, of other data:
+PUBLISHED = """Correct to noise: fractions of surfaces, SegComp at 80 %. Published for other data:
 
 | by | data | measure |
 |---|---|---|
@@ -86,41 +87,41 @@ PUBLISHED = """Correct to noise: SynPEB's at 80 %, of the true faces. Published,
 | CAPE | EVOPS | precision about .5, recall about .2, mean IoU .67 |"""
 
 
-class Labelled(NamedTuple):
-    """A cloud with its truth."""
+class LabeledCloud(NamedTuple):
+    """Point cloud with ground truth."""
 
     points: Tensor  # shape ``(N, 3)``
-    truth: Tensor  # shape ``(N,)``, -1 for points of no plane, VOID for those that do not count
-    # Points of the smallest region, but where the method measures it.
+    ground_truth: Tensor  # shape ``(N,)``, -1 for no plane, VOID for ignored points
+    # Minimum region size, unless the preset measures it.
     min_size: int = MIN_SIZE
-    # The depth image that the points are of, in the order of its pixels with depth.
+    # Source depth image; points are in the order of its pixels with depth.
     frame: DepthFrame | None = None
 
 
-Clouds = Sequence[Labelled]
-"""What a row of the table is of: indices are means."""
+Clouds = Sequence[LabeledCloud]
+"""Clouds of one table row; metrics are averaged over them."""
 
 
 @dataclass(frozen=True)
 class Case(Benchmark):
     programs: Path | None = None
-    """Folder of the program pclrg."""
+    """Folder of the peer programs."""
     open3d_python: str | None = None
-    """A Python that has Open3D."""
+    """Python executable with Open3D."""
     synpeb: Path | None = None
-    """A scan with labels in the field intensity."""
+    """Scan with labels in the field intensity."""
     parts: tuple[Path, ...] = ()
-    """Scans with labelled parts."""
+    """Scans with labeled parts."""
     rooms: tuple[Path, ...] = ()
-    """Folders of rooms with truth."""
+    """Folders of rooms with ground truth."""
     scale: float = 1.0
-    """Share of the points of what is made."""
+    """Fraction of the default number of points of synthetic data."""
 
     def clouds(self) -> Mapping[str, Callable[[], Clouds]]:
         rooms = {f"room, {1000 * noise:g} mm": (POINTS, noise) for noise in NOISES}
         rooms |= {f"room, {number:,} points": (number, 0.003) for number in DENSITIES}
         makers: dict[str, Callable[[], Clouds]] = {
-            name: partial(_made_room, round(self.scale * number), noise)
+            name: partial(_synthetic_room, round(self.scale * number), noise)
             for name, (number, noise) in rooms.items()
         }
         for sensor in ("exact", "kinect"):
@@ -134,7 +135,7 @@ class Case(Benchmark):
         return makers
 
     def contenders(self) -> Mapping[str, Callable[[Clouds], Figures | None]]:
-        runs: dict[str, Callable[[Labelled], Tensor]] = {
+        runs: dict[str, Callable[[LabeledCloud], Tensor]] = {
             name: partial(_run_preset, name) for name in PRESETS
         }
         runs["depth"] = _run_depth
@@ -152,7 +153,7 @@ class Case(Benchmark):
         return {name: partial(_mean_scores, run) for name, run in runs.items()}
 
     def report(self, results: Results) -> str:
-        """Return means and worst of each kind, all rows, and published figures."""
+        """Return the mean and worst scores of each kind, all rows, and published figures."""
         kinds: dict[str, list[str]] = {}
         for cloud in results:
             kinds.setdefault(re.split(r", |_[^_]*$", cloud)[0], []).append(cloud)
@@ -161,18 +162,18 @@ class Case(Benchmark):
             [kind, *(_summary([results[cloud].get(name) for cloud in clouds]) for name in names)]
             for kind, clouds in kinds.items()
         ]
-        head = ["found / mean best IoU (worst) / regions", *names]
+        head = ["detected / mean best IoU (worst) / regions", *names]
         return f"{markdown(head, rows)}\n\n{table(results)}\n\n{PUBLISHED}"
 
 
-def _made_room(num_points: int, noise: float) -> Clouds:
-    """Return a room with all its faces."""
+def _synthetic_room(num_points: int, noise: float) -> Clouds:
+    """Return a synthetic room with its surfaces."""
     room = make_room(num_points, noise=noise, seed=0)
-    return [Labelled(room.points, room.labels)]
+    return [LabeledCloud(room.points, room.labels)]
 
 
 def _frames(sensor: str, scale: float) -> Clouds:
-    """Return what a depth camera sees of a made room."""
+    """Return depth frames of a synthetic room as clouds."""
     model = build_room(FRAME_SEED)
     height = max(round(480 * scale**0.5), 60)
     size = {"width": height * 4 // 3, "height": height}
@@ -181,45 +182,45 @@ def _frames(sensor: str, scale: float) -> Clouds:
         frame = render_depth(model, camera, sensor=sensor, seed=number)
         seen = frame.depth.flatten() > 0
         points = depth_to_points(frame.depth[None], camera.intrinsics[None])[0].view(-1, 3)
-        # Columns and balls are no planes.
+        # Columns and balls are not planar.
         planar = torch.cat([frame.planar, torch.tensor([False])])
-        truth = torch.where(planar[frame.labels], frame.labels, -1).flatten()
-        clouds.append(Labelled(points[seen].float(), truth[seen], frame=frame))
+        ground_truth = torch.where(planar[frame.labels], frame.labels, -1).flatten()
+        clouds.append(LabeledCloud(points[seen].float(), ground_truth[seen], frame=frame))
     return clouds
 
 
 def _read_synpeb(path: Path) -> Clouds:
-    """Return a scan of SynPEB: its labels are in the field ``intensity``."""
+    """Read a SynPEB scan, whose labels are in the field ``intensity``."""
     cloud = torchrg.read_cloud(path)
     labels = torch.as_tensor(cloud.fields["intensity"]).long()
     known = (labels != SYNPEB_VOID) & (torch.bincount(labels)[labels] >= SYNPEB_MIN_SIZE)
-    return [Labelled(torch.as_tensor(cloud.points)[known], labels[known], SYNPEB_MIN_SIZE)]
+    return [LabeledCloud(torch.as_tensor(cloud.points)[known], labels[known], SYNPEB_MIN_SIZE)]
 
 
 def _read_parts(path: Path) -> Clouds:
-    """Return a scan whose field ``labels`` tells its parts, 0 for none."""
+    """Read a scan whose field ``labels`` has the part of each point, 0 for none."""
     cloud = torchrg.read_cloud(path)
     parts = torch.as_tensor(cloud.fields["labels"]).long() - 1
-    return [Labelled(torch.as_tensor(cloud.points), _large_faces(parts, PARTS_MIN_SIZE))]
+    return [LabeledCloud(torch.as_tensor(cloud.points), _large_faces(parts, PARTS_MIN_SIZE))]
 
 
 def _read_room(path: Path) -> Clouds:
-    """Return a room; points of faces that are too small to be seen do not count."""
-    least = next((least for kind, least in ROOMS_MIN_SIZES.items() if kind in path.stem), MIN_SIZE)
+    """Read a room; points of surfaces too small to be detected are ignored."""
+    sizes = (size for kind, size in ROOMS_MIN_SIZES.items() if kind in path.stem)
     with np.load(path) as room:
-        truth = _large_faces(torch.as_tensor(room["labels"]).long(), least)
-        return [Labelled(torch.as_tensor(room["points"]).float(), truth)]
+        ground_truth = _large_faces(torch.as_tensor(room["labels"]).long(), next(sizes, MIN_SIZE))
+        return [LabeledCloud(torch.as_tensor(room["points"]).float(), ground_truth)]
 
 
-def _large_faces(truth: Tensor, least: int) -> Tensor:
-    """Return a truth in which points of smaller faces are void."""
-    is_face = truth >= 0
-    sizes = torch.bincount(truth[is_face])
-    return truth.where(~is_face | (sizes[truth.clamp(min=0)] >= least), VOID)
+def _large_faces(ground_truth: Tensor, min_size: int) -> Tensor:
+    """Return ground truth in which points of smaller surfaces are ignored."""
+    is_face = ground_truth >= 0
+    sizes = torch.bincount(ground_truth[is_face])
+    return ground_truth.where(~is_face | (sizes[ground_truth.clamp(min=0)] >= min_size), VOID)
 
 
 def _summary(runs: Sequence[Sequence[Figures] | None]) -> str:
-    """Return the mean share of the faces, the mean and the worst of the best IoU, and regions."""
+    """Return the means of detected fraction, best IoU (and its minimum), and regions."""
     figures = [medians(rows) for rows in runs if rows]
     if not figures:
         return ""
@@ -229,8 +230,8 @@ def _summary(runs: Sequence[Sequence[Figures] | None]) -> str:
     return f"{fmean(found):.3f} / {fmean(iou):.3f} ({min(iou):.3f}) / {fmean(regions):.0f}"
 
 
-def _run_preset(name: str, cloud: Labelled) -> Tensor:
-    """Return the labels of a preset."""
+def _run_preset(name: str, cloud: LabeledCloud) -> Tensor:
+    """Segment with a preset."""
     config = torchrg.load_config(name)
     growing = config.growing
     if growing.min_size != "auto":
@@ -238,14 +239,14 @@ def _run_preset(name: str, cloud: Labelled) -> Tensor:
     return torchrg.segment_planes(cloud.points, dataclasses.replace(config, growing=growing)).labels
 
 
-def _run_depth(cloud: Labelled) -> Tensor:
-    """Return the labels of the image's pixels with depth."""
+def _run_depth(cloud: LabeledCloud) -> Tensor:
+    """Segment the depth image; return labels of pixels with depth."""
     depth = cloud.frame.depth
     return segment_depth(depth, cloud.frame.camera.intrinsics).labels.flatten()[depth.flatten() > 0]
 
 
-def _run_pcl(program: Path, cloud: Labelled) -> Tensor:
-    """Return the labels of PCL's region growing."""
+def _run_pcl(program: Path, cloud: LabeledCloud) -> Tensor:
+    """Segment with PCL's region growing."""
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder) / "cloud.f32", Path(folder) / "labels.i32"
         cloud.points.float().numpy().tofile(source)
@@ -254,9 +255,9 @@ def _run_pcl(program: Path, cloud: Labelled) -> Tensor:
 
 
 def _run_cgal(
-    program: Path, settings: tuple[str, float, tuple[float, ...]], normals: str, cloud: Labelled
+    program: Path, settings: tuple[str, float, tuple[float, ...]], normals: str, cloud: LabeledCloud
 ) -> Tensor:
-    """Return the labels of CGAL's region growing or RANSAC with normals of a method of torchrg."""
+    """Segment with CGAL's region growing or RANSAC, given normals from torchrg."""
     mode, distance, more = settings
     with tempfile.TemporaryDirectory() as folder:
         source, result, turned = (Path(folder) / name for name in ("p.f32", "l.i32", "n.f32"))
@@ -268,8 +269,8 @@ def _run_cgal(
         return torch.from_numpy(np.fromfile(result, dtype=np.int32)).long()
 
 
-def _run_gocopp(program: Path, cloud: Labelled) -> Tensor:
-    """Return the labels of GoCoPP with its own settings."""
+def _run_gocopp(program: Path, cloud: LabeledCloud) -> Tensor:
+    """Segment with GoCoPP and its default settings."""
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder) / "cloud.f32", Path(folder) / "labels.i32"
         cloud.points.float().numpy().tofile(source)
@@ -277,8 +278,8 @@ def _run_gocopp(program: Path, cloud: Labelled) -> Tensor:
         return torch.from_numpy(np.fromfile(result, dtype=np.int32)).long()
 
 
-def _run_open3d(python: str, cloud: Labelled) -> Tensor:
-    """Return the box of Open3D's planar patches that is nearest to each point."""
+def _run_open3d(python: str, cloud: LabeledCloud) -> Tensor:
+    """Return the nearest box of Open3D's planar patches for each point."""
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder) / "cloud.npy", Path(folder) / "labels.npy"
         np.save(source, cloud.points.numpy())
@@ -286,21 +287,21 @@ def _run_open3d(python: str, cloud: Labelled) -> Tensor:
         return torch.from_numpy(np.load(result)).long()
 
 
-def _mean_scores(run: Callable[[Labelled], Tensor], clouds: Clouds) -> Figures | None:
-    """Return the means of all indices over clouds, None for images where there are none."""
+def _mean_scores(run: Callable[[LabeledCloud], Tensor], clouds: Clouds) -> Figures | None:
+    """Return the means of all metrics over clouds; None for ``depth`` without images."""
     if run is _run_depth and clouds[0].frame is None:
         return None
     rows = [_score(cloud, run(cloud)) for cloud in clouds]
     return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 
-def _score(cloud: Labelled, labels: Tensor) -> Figures:
-    """Return the indices of all protocols."""
-    counts = cloud.truth != VOID
-    cloud, labels = Labelled(cloud.points[counts], cloud.truth[counts]), labels[counts]
-    found = score_labels(labels, cloud.truth)
-    voxels = score_voxels(cloud.points, labels, cloud.truth, voxel_size=VOXEL_SIZE)
-    table = contingency_table(labels, cloud.truth)
+def _score(cloud: LabeledCloud, labels: Tensor) -> Figures:
+    """Return the metrics of all protocols."""
+    counts = cloud.ground_truth != VOID
+    cloud, labels = LabeledCloud(cloud.points[counts], cloud.ground_truth[counts]), labels[counts]
+    found = score_labels(labels, cloud.ground_truth)
+    voxels = score_voxels(cloud.points, labels, cloud.ground_truth, voxel_size=VOXEL_SIZE)
+    table = contingency_table(labels, cloud.ground_truth)
     evops = score_evops(table)
     return {
         **{name: getattr(found, name) for name in ("regions", "faces", "mean_best_iou")},

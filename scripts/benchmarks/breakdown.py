@@ -1,4 +1,4 @@
-"""What outliers do to robust fits: the angle of the fitted plane's normal under contamination.
+"""Breakdown of robust fits: angle of the fitted normal under contamination.
 
 python scripts/bench.py breakdown
 """
@@ -16,7 +16,7 @@ from torchrg.linalg import covariance, eigh3, unsigned_angle_deg
 from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve
 
 SEED = 0
-SHARES = (0.0, 0.1, 0.3, 0.45)
+FRACTIONS = (0.0, 0.1, 0.3, 0.45)
 FITS: dict[str, Callable[[Tensor], Tensor]] = {
     "PCA": lambda patches: covariance(patches)[1],
     "DetMCD": lambda patches: fit_detmcd(patches).covariance,
@@ -27,13 +27,13 @@ FITS: dict[str, Callable[[Tensor], Tensor]] = {
     "DetS": lambda patches: fit_dets(patches).covariance,
     "DetMM": lambda patches: fit_detmm(patches).covariance,
 }
-"""Covariances; "planes" and "more" are starts of DetMCD."""
+"""Covariance estimators; "planes" and "more" are starts of DetMCD."""
 
 
 @dataclass(frozen=True)
 class Case(Benchmark):
     patches: int = 200
-    """Of each kind and share of outliers."""
+    """Number of patches per kind and fraction of outliers."""
 
     def clouds(self) -> Mapping[str, Callable[[], tuple[Tensor, Tensor]]]:
         return {
@@ -41,14 +41,14 @@ class Case(Benchmark):
                 kind, fraction, torch.Generator().manual_seed(SEED), self.patches
             )
             for kind in OUTLIERS
-            for fraction in SHARES
+            for fraction in FRACTIONS
         }
 
     def contenders(self) -> Mapping[str, Callable[[tuple[Tensor, Tensor]], Figures]]:
         return {name: partial(_angles, fit) for name, fit in FITS.items()}
 
     def report(self, results: Results) -> str:
-        """Return medians and 90th percentiles, a column for each fit."""
+        """Return medians and 90th percentiles, one column per fit."""
         rows = [
             [cloud, *("{median:.1f} / {p90:.1f}".format(**medians(runs)) for runs in by.values())]
             for cloud, by in results.items()
@@ -59,7 +59,7 @@ class Case(Benchmark):
 
 
 def _angles(fit: Callable[[Tensor], Tensor], cloud: tuple[Tensor, Tensor]) -> Figures:
-    patches, truth = cloud
+    patches, ground_truth = cloud
     normals = eigh3(fit(patches).double())[1][..., 0]
-    angles = unsigned_angle_deg(normals, truth.double())
+    angles = unsigned_angle_deg(normals, ground_truth.double())
     return {"median": float(angles.median()), "p90": float(angles.quantile(0.9))}

@@ -1,9 +1,9 @@
-"""``torchrg convert s3dis`` on a made S3DIS: workers, stages, memory, and equal bytes.
+"""``torchrg convert s3dis`` on synthetic rooms: speed, memory, and byte-identical results.
 
-Makes a tree of rooms in the raw layout of S3DIS (100,000 to 1,000,000 points, geometrically), and
-converts it with one worker, with two, and on Ray. Shows points a second, of the whole and of each
-stage, what S3DIS with its 273 million points would take, the peak memory of a worker against 2 GB +
-1.2 GB per million points, and whether all runs wrote the same bytes.
+Writes rooms in the raw layout of S3DIS (100,000 to 1,000,000 points in a geometric sequence), and
+converts them with one worker, two workers, and Ray. Reports points per second, in total and per
+worker, the time extrapolated to the 273 million points of S3DIS, the peak memory of a worker
+relative to 2 GB + 1.2 GB per million points, and whether all runs are byte-identical.
 
     python scripts/bench.py convert
     python scripts/bench.py convert --rooms 6 --smallest 20000 --largest 50000 --only 1 2
@@ -31,23 +31,23 @@ from torchrg.scenes import make_room
 S3DIS_POINTS = 273_000_000
 CLASSES = ("wall", "table", "chair", "bookcase", "board", "door", "window", "clutter")
 REPORTED = ("points", "seconds", "points_per_second", "points_per_second_of_a_worker")
-"""Fields of the command's own report."""
-PROMISED_BYTES, PROMISED_BYTES_A_POINT = 2e9, 1200.0
-"""What a worker may take at most."""
+"""Fields of ``report.json``."""
+MAX_BYTES, MAX_BYTES_PER_POINT = 2e9, 1200.0
+"""Maximum memory of a worker: constant and per point, in bytes."""
 
 
 @dataclass(frozen=True)
 class Case(Benchmark):
     rooms: int = 24
     smallest: int = 100_000
-    """Points of the first room."""
+    """Number of points of the first room."""
     largest: int = 1_000_000
-    """Points of the last room."""
+    """Number of points of the last room."""
     noise: float = 0.003
-    """Metres."""
+    """Standard deviation in meters."""
     preset: str = "consensus"
     folder: Path | None = None
-    """Keeps the tree and the results."""
+    """Folder that keeps the rooms and the results. Default: a temporary folder."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
         return {f"{self.rooms} rooms, {self.preset}": self._make_tree}
@@ -60,19 +60,19 @@ class Case(Benchmark):
         }
 
     def report(self, results: Results) -> str:
-        """Return a table, and whether the bytes are equal.
+        """Return a table.
 
         Raises:
-            SystemExit: If they are not.
+            SystemExit: If the runs are not byte-identical.
         """
         runs = [figures for by in results.values() for rows in by.values() for figures in rows]
         if len({figures["sha256"] for figures in runs}) > 1:
             raise SystemExit(f"{table(results)}\nRUNS WROTE DIFFERENT BYTES")
-        return f"{table(results)}\n\nall runs wrote the same bytes"
+        return f"{table(results)}\n\nall runs are byte-identical"
 
     @contextlib.contextmanager
     def _make_tree(self) -> Iterator[Path]:
-        """Write rooms as ``Area_i/room_j/Annotations/*.txt``; what is there already is kept."""
+        """Write rooms as ``Area_i/room_j/Annotations/*.txt``; complete rooms are reused."""
         sizes = np.geomspace(self.smallest, self.largest, self.rooms).astype(int)
         with tempfile.TemporaryDirectory() as temporary:
             folder = self.folder or Path(temporary)
@@ -84,7 +84,7 @@ class Case(Benchmark):
             yield folder
 
     def _convert(self, options: list[str], folder: Path) -> Figures:
-        """Convert the tree, and return what the report says."""
+        """Convert the rooms and return figures of the report."""
         out = folder / options[-1] if "ray" not in options else folder / "ray"
         command = [sys.executable, "-m", "torchrg", "convert", "s3dis", folder / "raw", out]
         begin = time.perf_counter()
@@ -96,22 +96,20 @@ class Case(Benchmark):
         )
         seconds = time.perf_counter() - begin
         report = json.loads((out / "report.json").read_text())
-        promised = [
-            PROMISED_BYTES + PROMISED_BYTES_A_POINT * scan["num_points"] for scan in report["scans"]
-        ]
-        fractions = [s["peak_memory"] / p for s, p in zip(report["scans"], promised, strict=True)]
+        limits = [MAX_BYTES + MAX_BYTES_PER_POINT * scan["num_points"] for scan in report["scans"]]
+        fractions = [s["peak_memory"] / p for s, p in zip(report["scans"], limits, strict=True)]
         return {
             **{name: report[name] for name in REPORTED},
-            "with start and checks": seconds,
+            "with start-up and checks": seconds,
             "minutes for S3DIS": S3DIS_POINTS / report["points_per_second"] / 60,
             "GB": report["peak_memory"] / 1e9,
-            "of what is promised": max(fractions),
+            "fraction of maximum": max(fractions),
             "sha256": _digest(out),
         }
 
 
 def _write_room(folder: Path, seed: int, num_points: int, noise: float) -> None:
-    """Write the faces of a room, each as an object."""
+    """Write each surface of a room as an object."""
     folder.mkdir(parents=True, exist_ok=True)
     made = make_room(num_points=num_points, noise=noise, seed=seed)
     points, labels = np.asarray(made.points), np.asarray(made.labels)
@@ -125,7 +123,7 @@ def _write_room(folder: Path, seed: int, num_points: int, noise: float) -> None:
 
 
 def _digest(out: Path) -> str:
-    """Return a hash over all results, the records among them."""
+    """Return a hash of all results, including records."""
     total = hashlib.sha256()
     for path in sorted(out.rglob("*.*")):
         if path.name not in ("report.json", ".torchrg.lock"):

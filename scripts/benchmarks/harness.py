@@ -1,4 +1,4 @@
-"""What all benchmarks share: clouds, contenders that run on each, rounds, a file and a table."""
+"""Benchmark harness: clouds, contenders, rounds, result file and table."""
 
 import contextlib
 import importlib
@@ -20,43 +20,43 @@ from tqdm import tqdm
 BENCH = Path(__file__).parents[1] / "bench.py"
 
 Figures = dict[str, Any]
-"""What one run of a contender on a cloud gives."""
+"""Figures of one run of a contender on a cloud."""
 Results = dict[str, dict[str, list[Figures]]]
-"""The figures of each round, by cloud and contender."""
+"""Figures of each round, by cloud and contender."""
 Column = Callable[[Figures], object]
-"""What a column of a table shows of figures; None leaves a cell empty."""
+"""Function from figures to a table cell; None leaves the cell empty."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """The settings that all benchmarks have; each adds its own."""
+    """Base class with the settings common to all benchmarks."""
 
     only: tuple[str, ...] = ()
-    """Contenders that run. Default: all there are."""
+    """Contenders to run. Default: all."""
     rounds: int = 1
-    """Times that each contender runs on each cloud, in turn with all others; medians are shown."""
+    """Number of runs of each contender on each cloud, in turn; tables show medians."""
     threads: int = os.cpu_count() or 1
-    """Threads of torch."""
+    """Number of torch threads."""
     minutes: float = math.inf
-    """Begin nothing after so many."""
+    """Time after which no run starts, in minutes."""
     out: Path | None = None
-    """JSON file of all figures. What it has is not measured again."""
+    """JSON file of all figures. Existing figures are not measured again."""
 
     def clouds(self) -> Mapping[str, Callable[[], Any]]:
-        """Return what makes each cloud, perhaps a context that removes it again."""
+        """Return a function for each cloud that returns it, or a context manager for it."""
         raise NotImplementedError
 
     def contenders(self) -> Mapping[str, Callable[[Any], Figures | None]]:
-        """Return what runs on a cloud, and returns None where it is not meant for it."""
+        """Return the contenders, functions of a cloud; None if a contender does not apply."""
         raise NotImplementedError
 
     def report(self, results: Results) -> str:
-        """Return tables of all figures."""
+        """Return the tables of all figures."""
         return table(results)
 
 
 def run(benchmark: Benchmark) -> None:
-    """Measure what is asked for and not known yet, and print the tables."""
+    """Measure the missing figures and print the tables."""
     os.environ["OMP_NUM_THREADS"] = str(benchmark.threads)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(benchmark.threads)
@@ -64,11 +64,11 @@ def run(benchmark: Benchmark) -> None:
     print(", ".join(f"{k} {v}" for k, v in surroundings.describe(benchmark.threads).items()), "\n")
     print(benchmark.report(results))
     if not is_complete:
-        print("\nNot all is measured: run it again.")
+        print("\nIncomplete: run the same command again.")
 
 
 def measure(benchmark: Benchmark) -> tuple[Results, bool]:
-    """Return all figures, those of the file included, and whether none is left to measure."""
+    """Return all figures, including those of the file, and whether they are complete."""
     contenders = benchmark.contenders()
     unknown = set(benchmark.only) - set(contenders)
     if unknown:
@@ -112,7 +112,7 @@ def _save(benchmark: Benchmark, results: Results) -> None:
 
 
 def medians(rows: Sequence[Figures]) -> Figures:
-    """Return the medians of figures over rounds; what is no number is that of the first round."""
+    """Return the medians of figures over rounds; other values are those of the first round."""
     found = {}
     for name, value in rows[0].items():
         if isinstance(value, dict):
@@ -125,13 +125,13 @@ def medians(rows: Sequence[Figures]) -> Figures:
 
 
 def ratio(rows: Iterable[Figures], others: Iterable[Figures], name: str) -> float | None:
-    """Return the median of the ratios of one figure within each round, None without any."""
+    """Return the median over rounds of the ratio of a figure; None without rounds."""
     ratios = [mine[name] / other[name] for mine, other in zip(rows, others, strict=False)]
     return median(ratios) if ratios else None
 
 
 def table(results: Results, columns: Mapping[str, Column] | None = None) -> str:
-    """Return a row of medians for each cloud and contender, by default of all that are numbers."""
+    """Return a table with a row of medians per cloud and contender; default: all figures."""
     rows = [
         (cloud, name, medians(runs)) for cloud, by in results.items() for name, runs in by.items()
     ]
@@ -148,7 +148,7 @@ def table(results: Results, columns: Mapping[str, Column] | None = None) -> str:
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table in Markdown."""
+    """Return a Markdown table."""
     lines = [" | ".join(["", *map(_shown, cells), ""]).strip() for cells in (head, *rows)]
     return "\n".join([lines[0], "|" + " --- |" * len(head), *lines[1:]])
 
@@ -162,7 +162,7 @@ def _shown(value: object) -> str:
 
 
 class Finished(NamedTuple):
-    """A program that has ended: what it printed, its time, and its largest resident memory."""
+    """Output, run time and peak resident memory of a finished program."""
 
     text: str
     seconds: float
@@ -171,13 +171,13 @@ class Finished(NamedTuple):
 
 
 def run_program(command: Sequence[object], stdin: str = "") -> Finished:
-    """Run a program to its end.
+    """Run a program and wait for it.
 
-    What the system says that it needed at most includes what its parent had when it started it: a
-    benchmark that measures memory so must not load torch itself.
+    The peak memory reported by the system includes the memory of the parent at the start.
+    Benchmarks that measure memory therefore must not load torch.
 
     Raises:
-        RuntimeError: If it fails.
+        RuntimeError: If the program fails.
     """
     begin = time.perf_counter()
     process = subprocess.Popen(
@@ -204,10 +204,10 @@ def serve_command(target: str, *arguments: object, python: str = sys.executable)
 
 
 def serve(target: str, arguments: Sequence[Any]) -> None:
-    """Call ``module:function``, then for each line of input what it returned, and print figures."""
+    """Call ``module:function``; run the returned function per input line and print figures."""
     module, _, name = target.partition(":")
     work = getattr(importlib.import_module(module), name)(*arguments)
-    # The memory of a process of another library must not have torch in it.
+    # torch must not add to the memory of another library.
     memory = importlib.import_module("torchrg.batch.memory") if "torchrg" in sys.modules else None
     print("{}", flush=True)
     for _ in sys.stdin:
@@ -222,12 +222,12 @@ def serve(target: str, arguments: Sequence[Any]) -> None:
 
 
 def _cpu_seconds() -> float:
-    """Return the CPU time of this process and of those it has waited for."""
+    """Return the CPU time of this process and its finished children."""
     return sum(os.times()[:4])
 
 
 class Worker:
-    """A process that does one kind of work whenever it is told to; see :func:`serve`."""
+    """Process that repeats one task on request; see :func:`serve`."""
 
     def __init__(self, target: str, *arguments: object, threads: int | None = None) -> None:
         environment = {} if threads is None else {"OMP_NUM_THREADS": str(threads)}
@@ -241,19 +241,19 @@ class Worker:
         self.wait()
 
     def begin(self) -> None:
-        """Let it work once."""
+        """Start the task once."""
         print(file=self._process.stdin, flush=True)
 
     def wait(self) -> Figures:
-        """Return the figures of what it did last."""
+        """Wait for the task and return its figures."""
         line = self._process.stdout.readline() if self._process.stdout else ""
         if not line:
-            raise SystemExit("bench: a contender died; its error is above.")
+            raise SystemExit("bench: a contender failed; see its error above.")
         result: Figures = json.loads(line)
         return result
 
     def run(self) -> Figures:
-        """Work once, and return what :meth:`wait` does."""
+        """Run the task once and return its figures."""
         self.begin()
         return self.wait()
 

@@ -1,10 +1,9 @@
-"""torchrg beside PCL, CGAL and Open3D on the same clouds: seconds of stages, memory, ratios.
+"""Speed and memory of torchrg, PCL, CGAL and Open3D on the same clouds.
 
-FOLDER of ``--programs`` holds ``pclrg`` (PCL's normals and region growing) and ``cgaln`` (CGAL's
-PCA and jet normals); what is missing there, or not installed, is left out. ``torchrg-*`` and
-``open3d-*`` are warm calls in one process, ``*-command`` the whole command, which is compared with
-PCL's whole process. Contenders run one after the other, round by round; ratios are those within a
-round.
+FOLDER of ``--programs`` contains ``pclrg`` (PCL's normals and region growing) and ``cgaln`` (CGAL's
+PCA and jet normals); missing programs are skipped. ``torchrg-*`` and ``open3d-*`` are warm calls in
+one process; ``*-command`` is the complete command, compared with PCL's complete process. Contenders
+run in turn, round by round; ratios are medians of the ratios within a round.
 
     python scripts/bench.py peers --programs FOLDER --out peers.json
     python scripts/bench.py peers --programs FOLDER --sizes 100000 --only pclrg torchrg-classic
@@ -36,26 +35,26 @@ from benchmarks.harness import (
 )
 
 K, MAX_ANGLE_DEG, CURVATURE_PERCENTILE, MIN_SIZE = 50, 5, 95, 50
-"""Settings of PCL's region growing: those of ``classic``."""
+"""Settings of PCL's region growing, as in ``classic``."""
 OPEN3D = """
 import sys, numpy as np, open3d
 points = np.load(sys.argv[1]).astype(np.float64)
 cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
 cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
 boxes = cloud.detect_planar_patches(search_param=open3d.geometry.KDTreeSearchParamKNN(30))
-labels, least = np.full(len(points), -1), np.full(len(points), 0.05)
+labels, closest = np.full(len(points), -1), np.full(len(points), 0.05)
 for number, box in enumerate(boxes):
     away = np.abs((points - box.center) @ box.R) - np.asarray(box.extent) / 2
     distance = np.linalg.norm(np.maximum(away, 0), axis=1)
-    nearer = distance < least
-    labels[nearer], least[nearer] = number, distance[nearer]
+    nearer = distance < closest
+    labels[nearer], closest[nearer] = number, distance[nearer]
 np.save(sys.argv[2], labels)
 """
-"""Open3D's planar patches, from a file of points to a file of labels."""
+"""Open3D's planar patches: script from a point file to a label file."""
 PRESETS = ("classic", "paper", "consensus")
 SEED, NOISE = 7, 0.003
 WARM_UP = 5000
-"""Points, about, on which a contender runs once before it is timed."""
+"""Approximate number of points for the warm-up run."""
 
 
 def pcl_command(program: Path, cloud: Path, labels: Path, min_size: int = MIN_SIZE) -> list[object]:
@@ -69,11 +68,11 @@ class Case(Benchmark):
     programs: Path | None = None
     """Folder of the programs pclrg and cgaln."""
     open3d_python: str | None = None
-    """Python that has Open3D. Default: this one, if it has."""
+    """Python executable with Open3D. Default: this one, if it has Open3D."""
     scans: tuple[Path, ...] = ()
-    """Scans to run on too."""
+    """Additional scans."""
     sizes: tuple[int, ...] = (100_000, 1_000_000, 4_000_000)
-    """Points of made rooms, in random order and in that of a space-filling curve."""
+    """Numbers of points of synthetic rooms, in random order and along a space-filling curve."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
         rooms = [f"room {size} {order}" for size in self.sizes for order in ("random", "sorted")]
@@ -97,7 +96,7 @@ class Case(Benchmark):
         return runs
 
     def report(self, results: Results) -> str:
-        """Return seconds, memory, and ratios of like to like; above 1 torchrg is slower."""
+        """Return seconds, memory, and ratios of comparable runs; above 1 torchrg is slower."""
         rows = []
         for cloud, by_name in results.items():
             for name, runs in by_name.items():
@@ -110,7 +109,7 @@ class Case(Benchmark):
                     for other in ("pclrg", "open3d-pca")
                 ]
                 rows.append([cloud, name, *(found[key] for key in FIELDS), *ratios])
-        return markdown(["cloud", "what", *FIELDS.values(), "to PCL", "to Open3D"], rows)
+        return markdown(["cloud", "contender", *FIELDS.values(), "to PCL", "to Open3D"], rows)
 
 
 FIELDS = {
@@ -120,19 +119,19 @@ FIELDS = {
     "cpu": "CPU of the process, s",
     "peak_mib": "peak MiB",
 }
-"""Figures of a run, and their columns."""
+"""Figures of a run and their column titles."""
 
 
 @contextlib.contextmanager
 def cloud_files(cloud: str) -> Iterator[Path]:
-    """Write a cloud as ``cloud.npy`` and ``cloud.f32``, in a process of its own."""
+    """Write a cloud as ``cloud.npy`` and ``cloud.f32`` in a separate process."""
     with tempfile.TemporaryDirectory() as folder:
         run_program(serve_command("benchmarks.peers:write_cloud", cloud, folder))
         yield Path(folder)
 
 
 def write_cloud(cloud: str, folder: str) -> None:
-    """Read a scan or make a room, and write its points for all contenders."""
+    """Read a scan or generate a room, and write its points for all contenders."""
     import numpy as np
     import torch
 
@@ -162,7 +161,7 @@ def _figures(seconds: dict[str, float], done: Finished) -> Figures:
 
 
 def _run_warm(work: str, folder: Path, *, python: str = sys.executable) -> Figures:
-    """Run a call of a Python library, warm, in a process of its own."""
+    """Run a warm call of a Python library in a separate process."""
     arguments = work, str(folder / "cloud.npy")
     command = serve_command("benchmarks.peers:prepare", *arguments, python=python)
     done = run_program(command, stdin="\n")
@@ -183,9 +182,9 @@ def _run_open3d(python: str, folder: Path) -> Figures:
 
 
 def _run_peer(program: Path, folder: Path) -> Figures:
-    """Run a program, which prints the seconds of its stages."""
+    """Run a program that prints the seconds of its stages."""
     cloud = folder / "cloud.f32"
-    # CGAL adds the point itself.
+    # CGAL adds the point itself to its neighbors.
     command = [program, cloud, K - 1]
     if program.name == "pclrg":
         command = pcl_command(program, cloud, folder / "labels.i32")
@@ -196,7 +195,7 @@ def _run_peer(program: Path, folder: Path) -> Figures:
 
 
 def prepare(work: str, file: str) -> Callable[[], Figures]:
-    """Return what times a library on a file of points, run once already on few of them."""
+    """Return a timed call of a library on a file of points, after a warm-up run."""
     import numpy as np
 
     points = np.load(file)

@@ -1,4 +1,4 @@
-"""Indices of plane labels as three published comparisons take them."""
+"""Plane metrics of three published comparisons."""
 
 from typing import Any, NamedTuple
 
@@ -14,18 +14,18 @@ from torchrg.neighbors import sample_voxels
 from torchrg.structures import UNLABELED
 
 _MATCH_IOU = 0.75
-"""Least IoU of a match in the EVOPS benchmark. Above 0.5 a match is one to one."""
+"""Minimum IoU of a match in the EVOPS benchmark. Above 0.5, matches are one to one."""
 
 
 class SegCompCounts(NamedTuple):
-    """How the regions and faces are classified by the SegComp protocol.
+    """Counts of regions and faces (ground-truth planes) by the SegComp protocol.
 
     Attributes:
-        correct: Pairs of a region and a face that are each other.
-        over_segmented: Faces that two or more regions make up together.
-        under_segmented: Regions that two or more faces make up together.
-        missed: Faces in none of these.
-        noise: Regions in none of these.
+        correct: Matching pairs of a region and a face.
+        over_segmented: Faces split into two or more regions.
+        under_segmented: Regions that cover two or more faces.
+        missed: Remaining faces.
+        noise: Remaining regions.
     """
 
     correct: int
@@ -36,11 +36,11 @@ class SegCompCounts(NamedTuple):
 
 
 class EvopsScore(NamedTuple):
-    """Indices of the EVOPS benchmark, shares in [0, 1].
+    """Metrics of the EVOPS benchmark, in [0, 1].
 
     Attributes:
-        precision: Regions that match a face, of all regions.
-        recall: Faces that match a region, of all faces.
+        precision: Fraction of regions that match a face.
+        recall: Fraction of faces that match a region.
         mean_iou: Mean IoU of the matches.
     """
 
@@ -50,11 +50,11 @@ class EvopsScore(NamedTuple):
 
 
 class VoxelScore(NamedTuple):
-    """Voxels of planes that are found, shares in [0, 1].
+    """Voxel metrics of planes, in [0, 1].
 
     Attributes:
-        precision: Voxels of regions in which a region meets its face, of all voxels of regions.
-        recall: The same of all voxels of faces.
+        precision: Fraction of region voxels that contain points of a region and of its face.
+        recall: The same number as a fraction of all face voxels.
         f1: Harmonic mean of precision and recall.
     """
 
@@ -66,34 +66,34 @@ class VoxelScore(NamedTuple):
 def score_voxels(
     points: Tensor | NDArray[np.floating],
     labels: Tensor | NDArray[Any],
-    truth: Tensor | NDArray[Any],
+    ground_truth: Tensor | NDArray[Any],
     *,
     voxel_size: float,
     threshold: float = 0.5,
 ) -> VoxelScore:
-    """Score regions by the voxels that they share with their faces [1], as compared in [2].
+    """Evaluate regions by the voxels that they share with their faces [1], as in [2].
 
-    The face of a region is the one that holds most of its points, if these are at least
-    ``threshold`` of them; several regions may have one face, so split faces cost nothing. A voxel
-    is right where a region and its face both have points in it.
+    The face of a region is the face with most of its points, if it has at least the fraction
+    ``threshold``. Several regions may have the same face, so split faces are not penalized. A voxel
+    is correct if it contains points of a region and of its face.
 
     Convention:
-        The grid begins at the least coordinates. Points of no face count in their region's size,
-        and their voxels as voxels of the region. Of two faces that hold as many points the one of
-        the lower label is taken. Points that are not finite are left out.
+        The grid starts at the minimum coordinates. Points without a face count for the size and the
+        voxels of their region. Ties between faces go to the lower label. Points that are not finite
+        are ignored.
 
     Args:
         points: Points, shape ``(N, 3)``.
         labels: Predicted label of each point, shape ``(N,)``, integers, -1 for none.
-        truth: True label of each point, shape ``(N,)``, integers, -1 for none.
-        voxel_size: Side of a voxel, in the unit of the points; [2] has 5 cm to 13 cm.
-        threshold: Least share of a region that its face holds.
+        ground_truth: Ground-truth label of each point, shape ``(N,)``, integers, -1 for none.
+        voxel_size: Voxel size, in the unit of the points; [2] uses 5 to 13 cm.
+        threshold: Minimum fraction of a region in its face. Default: 0.5.
 
     Returns:
-        Shares; 0 where there is nothing to take a share of.
+        The metrics; 0 if a denominator is 0.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is wrong.
         ConfigError: If ``voxel_size`` is not positive.
 
     References:
@@ -104,24 +104,30 @@ def score_voxels(
 
     Example:
         >>> line = torch.arange(6.0)[:, None] * torch.tensor([1.0, 0, 0])
-        >>> labels, truth = torch.tensor([0, 0, 0, 0, 1, -1]), torch.tensor([0, 0, 0, 1, 1, 1])
-        >>> score_voxels(line, labels, truth, voxel_size=1.0)
+        >>> labels = torch.tensor([0, 0, 0, 0, 1, -1])
+        >>> ground_truth = torch.tensor([0, 0, 0, 1, 1, 1])
+        >>> score_voxels(line, labels, ground_truth, voxel_size=1.0)
         VoxelScore(precision=0.8, recall=0.6666666666666666, f1=0.7272727272727273)
     """
-    places = as_tensor("score_voxels", "points", points)
-    labels, truth = check_labels("score_voxels", labels=labels, truth=truth)
-    check_shapes("score_voxels", points=(places, "N 3"), labels=(labels, "N"), truth=(truth, "N"))
-    voxels = sample_voxels(places, voxel_size).inverse
+    positions = as_tensor("score_voxels", "points", points)
+    labels, ground_truth = check_labels("score_voxels", labels=labels, ground_truth=ground_truth)
+    check_shapes(
+        "score_voxels",
+        points=(positions, "N 3"),
+        labels=(labels, "N"),
+        ground_truth=(ground_truth, "N"),
+    )
+    voxels = sample_voxels(positions, voxel_size).inverse
     seen = voxels >= 0
-    voxels, labels, truth = voxels[seen], labels[seen], truth[seen]
-    table = count_overlaps("score_voxels", labels, truth, 1, None)
+    voxels, labels, ground_truth = voxels[seen], labels[seen], ground_truth[seen]
+    table = count_overlaps("score_voxels", labels, ground_truth, 1, None)
     face_of = _face_of_region(table, threshold)
-    # Points of no region find the entry behind the last.
+    # Points without a region use the last entry.
     row = torch.searchsorted(table.region_labels, labels)
     row[labels == UNLABELED] = len(face_of) - 1
-    face = torch.searchsorted(table.face_labels, truth)
+    face = torch.searchsorted(table.face_labels, ground_truth)
     width = len(table.face_labels) + 1
-    found, true = face_of[row] >= 0, truth != UNLABELED
+    found, true = face_of[row] >= 0, ground_truth != UNLABELED
     keys = voxels[found] * width + face_of[row][found]
     right = keys[torch.isin(keys, voxels[true] * width + face[true])] // width
     num_right = len(torch.unique(right))
@@ -136,38 +142,37 @@ def score_voxels(
 
 
 def _face_of_region(table: ContingencyTable, threshold: float) -> Tensor:
-    """Return the face that holds most of each region, -1 for less than a share; a last -1."""
+    """Return the face with most points of each region, -1 below the threshold; append -1."""
     num_regions = len(table.region_sizes)
-    most = table.overlaps.new_zeros(num_regions)
-    most = most.scatter_reduce(0, table.regions, table.overlaps, "amax")
-    first = most.new_full((num_regions,), len(table.face_sizes))
-    is_most = table.overlaps == most[table.regions]
-    first = first.scatter_reduce(0, table.regions[is_most], table.faces[is_most], "amin")
-    chosen = torch.where(most >= threshold * table.region_sizes, first, UNLABELED)
+    largest = table.overlaps.new_zeros(num_regions)
+    largest = largest.scatter_reduce(0, table.regions, table.overlaps, "amax")
+    first = largest.new_full((num_regions,), len(table.face_sizes))
+    is_largest = table.overlaps == largest[table.regions]
+    first = first.scatter_reduce(0, table.regions[is_largest], table.faces[is_largest], "amin")
+    chosen = torch.where(largest >= threshold * table.region_sizes, first, UNLABELED)
     return torch.cat([chosen, chosen.new_tensor([UNLABELED])])
 
 
 def count_segcomp(table: ContingencyTable, *, threshold: float = 0.8) -> SegCompCounts:
     """Classify regions and faces by the SegComp protocol [1], as SynPEB applies it [2].
 
-    A region and a face are a *correct* pair if they share more than ``threshold`` of the points of
-    each. A face is *over-segmented* if two or more regions lie in it, each with more than that
-    share of its own points, and together hold more than that share of the face. A region is
-    *under-segmented* by the mirrored rule. What takes part in several of these goes to the one
-    with the highest mean of its two measures (correct: both shares; otherwise the mean share of
-    the parts, and the share of the whole that they hold); at equal means correct goes first, then
-    over-segmented.
+    A region and a face form a *correct* pair if their overlap exceeds the fraction ``threshold`` of
+    both. A face is *over-segmented* if two or more regions each have more than that fraction of
+    their points in it, and together cover more than that fraction of the face. A region is
+    *under-segmented* by the symmetric rule. Conflicts are resolved by the highest mean of two
+    measures: both fractions of a correct pair, else the mean fraction of the parts and the covered
+    fraction of the whole. Ties prefer correct, then over-segmented.
 
     Convention:
-        Shares must exceed the threshold, as in [2]; [1] writes "at least". A point of no face
-        counts in its region's size, a point of no region in its face's.
+        Fractions must exceed the threshold, as in [2]; [1] states "at least". Points without a face
+        count for the size of their region, and points without a region for that of their face.
 
     Args:
         table: Overlaps of regions and faces.
-        threshold: The share, in [0.5, 1); SynPEB's results are for 0.8.
+        threshold: Minimum fraction, in [0.5, 1). Default: 0.8, as in SynPEB's results.
 
     Returns:
-        The counts; all 0 where there is neither region nor face.
+        The counts; all 0 without regions and faces.
 
     Raises:
         ConfigError: If the threshold is outside [0.5, 1): below, the classes are not unique.
@@ -180,8 +185,9 @@ def count_segcomp(table: ContingencyTable, *, threshold: float = 0.8) -> SegComp
 
     Example:
         >>> from torchrg.metrics.contingency import contingency_table
-        >>> labels, truth = torch.tensor([0, 0, 1, 1, 2, 2]), torch.tensor([5, 5, 5, 5, 6, 6])
-        >>> table = contingency_table(labels, truth)
+        >>> labels = torch.tensor([0, 0, 1, 1, 2, 2])
+        >>> ground_truth = torch.tensor([5, 5, 5, 5, 6, 6])
+        >>> table = contingency_table(labels, ground_truth)
         >>> count_segcomp(table)
         SegCompCounts(correct=1, over_segmented=1, under_segmented=0, missed=0, noise=0)
     """
@@ -220,7 +226,7 @@ def count_segcomp(table: ContingencyTable, *, threshold: float = 0.8) -> SegComp
 def _wholes(
     wholes: Tensor, inside: Tensor, fractions: Tensor, overlaps: Tensor, sizes: Tensor, limit: float
 ) -> Tensor:
-    """Return the mean of the two measures of each whole made of several parts, 0 for others."""
+    """Return the mean of both measures for each whole with several parts, else 0."""
     count = torch.bincount(wholes[inside], minlength=len(sizes))
     points = sizes.new_zeros(len(sizes)).index_add_(0, wholes[inside], overlaps[inside])
     held = points.double() / sizes
@@ -230,15 +236,16 @@ def _wholes(
 
 
 def score_evops(table: ContingencyTable) -> EvopsScore:
-    """Score regions against faces that they match, at an IoU of at least 0.75, as EVOPS does [1].
+    """Match regions to faces at an IoU of at least 0.75, as in EVOPS [1].
 
-    A point of no face counts in its region's size, a point of no region in its face's.
+    Points without a face count for the size of their region, and points without a region for that
+    of their face.
 
     Args:
         table: Overlaps of regions and faces.
 
     Returns:
-        Shares; 0 where there is nothing to take a share of.
+        The metrics; 0 if a denominator is 0.
 
     References:
         [1] A. Kornilova et al. EVOPS benchmark: evaluation of plane segmentation from RGBD and

@@ -1,4 +1,4 @@
-"""Microseconds of the robust estimators for a neighbourhood, beside other implementations.
+"""Time of robust estimators per neighborhood, compared with other implementations.
 
 python scripts/bench.py robust --scan scan.pcd
 python scripts/bench.py robust --patches 10000
@@ -26,9 +26,9 @@ from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve
 
 K = 50
 CHUNK = 65_536
-"""Neighbourhoods whose eigenvalues are taken at once."""
+"""Number of neighborhoods per eigenvalue computation."""
 QN_LIMIT = 0.01
-"""Threshold of the test of Qn, metres."""
+"""Threshold of the Qn test, in meters."""
 R_SCRIPT = """
 library(robustbase)
 points <- as.matrix(read.csv("{file}", header = FALSE))
@@ -43,15 +43,15 @@ cat(seconds / length(starts) * 1e6)
 class Case(Benchmark):
     rounds: int = 3
     scan: Path | None = None
-    """A scan to take neighbourhoods from."""
+    """Additional scan with neighborhoods."""
     patches: int = 100_000
     sample: int = 200
-    """Neighbourhoods that other implementations get."""
+    """Number of neighborhoods for other implementations."""
 
     def clouds(self) -> Mapping[str, Callable[[], Tensor]]:
         few = max(self.patches // 4, 1)
         sets = {
-            "edges of a made room": lambda: edge_rich_patches(self._room(0.003), self.patches),
+            "edges of a synthetic room": lambda: edge_rich_patches(self._room(0.003), self.patches),
             "the same on a grid (ties)": lambda: _on_grid(
                 edge_rich_patches(self._room(0.003), self.patches)[:few]
             ),
@@ -87,20 +87,20 @@ class Case(Benchmark):
             runs[name] = lambda patches, fit=fit, part=part: _time(
                 fit, patches[: max(len(patches) // part, 1)]
             )
-        for name, fit_one in _others().items():
+        for name, fit_one in _other_implementations().items():
             runs[name] = lambda patches, fit=fit_one: _time(
-                partial(_try_each, fit), self._some(patches)
+                partial(_try_each, fit), self._subset(patches)
             )
         if shutil.which("Rscript"):
-            runs["R robustbase covMcd"] = lambda patches: _time_r(self._some(patches))
+            runs["R robustbase covMcd"] = lambda patches: _time_r(self._subset(patches))
         return runs
 
-    def _some(self, patches: Tensor) -> Tensor:
+    def _subset(self, patches: Tensor) -> Tensor:
         return patches[:: max(len(patches) // self.sample, 1)][: self.sample]
 
 
 def edge_rich_patches(points: Tensor, count: int) -> Tensor:
-    """Return neighbourhoods with the largest surface variation, shape ``(count, 50, 3)``."""
+    """Return the neighborhoods with the largest surface variation, shape ``(count, 50, 3)``."""
     neighbors = torchrg.search_knn(points, k=K).indices.long()
     variation = empty(len(points))
     for start in range(0, len(points), CHUNK):
@@ -118,7 +118,7 @@ def _rows(patches: Tensor) -> Tensor:
 
 
 def _on_grid(patches: Tensor) -> Tensor:
-    """Return neighbourhoods rounded to 64 steps of their largest coordinate."""
+    """Round neighborhoods to a 64th of their largest coordinate."""
     step = patches.abs().amax() / 64
     return (patches / step).round() * step
 
@@ -129,8 +129,8 @@ def _time(fit: Callable[[Tensor], object], batch: Tensor) -> Figures:
     return {"us": 1e6 * (time.perf_counter() - begin) / len(batch), "of": len(batch)}
 
 
-def _others() -> dict[str, Callable[[np.ndarray], object]]:
-    """Return the Python implementations that are installed."""
+def _other_implementations() -> dict[str, Callable[[np.ndarray], object]]:
+    """Return the installed Python implementations."""
     found: dict[str, Callable[[np.ndarray], object]] = {}
     if find_spec("sklearn"):
         from sklearn.covariance import MinCovDet
@@ -144,7 +144,7 @@ def _others() -> dict[str, Callable[[np.ndarray], object]]:
 
 
 def _try_each(fit: Callable[[np.ndarray], object], patches: Tensor) -> None:
-    """Fit each neighbourhood; those that the implementation refuses count as tried."""
+    """Fit each neighborhood; failures are ignored, but their time counts."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for patch in patches.double().numpy():

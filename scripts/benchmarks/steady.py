@@ -1,11 +1,11 @@
-"""Times on a machine that is not idle, on one thread and on larger clouds, as ratios in one run.
+"""Relative times on a busy machine, on one thread, and on larger clouds.
 
-Each contender is a process of its own that is warm, and takes turns with all others: alone, twice
-at once, beside one and two processes that only count, and on one thread. ``depth`` is a noise-free
-rendered frame of 640 x 480 pixels, ``depth-kinect`` one with a Kinect's noise, ``depth-large`` one
-of 1280 x 960; the others are presets, on a made room.
+Each contender is a separate warm process. They run in turn under several conditions: alone, two at
+once, next to one or two busy processes, and on one thread. ``depth`` is a noise-free rendered frame
+of 640 x 480 pixels, ``depth-kinect`` has Kinect noise, and ``depth-large`` has 1280 x 960 pixels.
+The remaining contenders are presets on a synthetic room.
 
-    python scripts/bench.py steady --out steady.json --minutes 8     # again, until nothing is left
+    python scripts/bench.py steady --out steady.json --minutes 8     # repeat until complete
     python scripts/bench.py steady --work consensus --sizes 100000 1000000 --only alone
 """
 
@@ -24,20 +24,20 @@ from tests.made import cameras_around, render_depth
 
 PRESETS = ("classic", "paper", "consensus")
 FRAMES = {"depth": (480, "exact"), "depth-kinect": (480, "kinect"), "depth-large": (960, "exact")}
-"""Rows of a frame, and the sensor that sees it."""
+"""Height of a frame in pixels, and its sensor."""
 BUSY = [sys.executable, "-c", "while True: pass"]
 NOISE, SEED = 0.003, 7
 WARM_UP = 5000
-"""Points, about, that a preset segments before it is timed."""
+"""Approximate number of points for the warm-up run of a preset."""
 
 
 @dataclass(frozen=True)
 class Case(Benchmark):
     rounds: int = 5
     work: tuple[str, ...] = (*FRAMES, *PRESETS)
-    """Presets, and kinds of depth frames."""
+    """Presets and depth frames."""
     sizes: tuple[int, ...] = (200_000,)
-    """Points of the room."""
+    """Numbers of points of the room."""
 
     def clouds(self) -> Mapping[str, Callable[[], object]]:
         keys = [(name, size) for name in self.work for size in (self.sizes, (0,))[name in FRAMES]]
@@ -50,13 +50,13 @@ class Case(Benchmark):
         return {
             "alone": lambda workers: workers.get().run() | {"points": workers.size},
             "twice": _run_both,
-            "beside one": lambda workers: _run_beside(workers, 1),
-            "beside two": lambda workers: _run_beside(workers, 2),
+            "one busy process": lambda workers: _run_under_load(workers, 1),
+            "two busy processes": lambda workers: _run_under_load(workers, 2),
             "one thread": lambda workers: workers.get(threads=1).run(),
         }
 
     def report(self, results: Results) -> str:
-        """Return times as ratios to those alone, and the cost of a point."""
+        """Return times relative to the time alone, and the cost per point."""
         rows = []
         for cloud, by in results.items():
             if "alone" in by:
@@ -65,15 +65,15 @@ class Case(Benchmark):
                 cost = [alone["seconds"] / million, alone["peak_gb"] / million] if million else []
                 ratios = [ratio(by.get(name, []), by["alone"], "seconds") for name in CONDITIONS]
                 rows.append([cloud, alone["seconds"], *ratios, *(cost or [None, None])])
-        head = ["times the time alone", "alone, s", *CONDITIONS]
-        return markdown([*head, "us a point", "GB a million points"], rows)
+        head = ["time relative to alone", "alone, s", *CONDITIONS]
+        return markdown([*head, "us per point", "GB per million points"], rows)
 
 
-CONDITIONS = ("twice", "beside one", "beside two", "one thread")
+CONDITIONS = ("twice", "one busy process", "two busy processes", "one thread")
 
 
 class Workers(contextlib.ExitStack):
-    """Processes that do the same work, each started when it is first asked for."""
+    """Processes with the same task, each started on first use."""
 
     def __init__(self, name: str, size: int, threads: int) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class Workers(contextlib.ExitStack):
         self._found: dict[tuple[int, int], Worker] = {}
 
     def get(self, number: int = 0, threads: int | None = None) -> Worker:
-        """Return one of several with so many threads."""
+        """Return the worker with an index and a number of threads."""
         key = (number, threads or self.threads)
         if key not in self._found:
             work = "benchmarks.steady:prepare", self.name, self.size
@@ -97,7 +97,7 @@ def _run_both(workers: Workers) -> Figures:
     return max((worker.wait() for worker in pair), key=lambda figures: figures["seconds"])
 
 
-def _run_beside(workers: Workers, number: int) -> Figures:
+def _run_under_load(workers: Workers, number: int) -> Figures:
     first = workers.get()
     with _busy(number):
         return first.run()
@@ -105,7 +105,7 @@ def _run_beside(workers: Workers, number: int) -> Figures:
 
 @contextlib.contextmanager
 def _busy(number: int) -> Iterator[None]:
-    """Keep processes busy that only count."""
+    """Run busy processes in the background."""
     others = [subprocess.Popen(BUSY) for _ in range(number)]
     try:
         yield
@@ -116,7 +116,7 @@ def _busy(number: int) -> Iterator[None]:
 
 
 def prepare(name: str, size: int) -> Callable[[], None]:
-    """Return the work of a process, done once already on little."""
+    """Return the task of a process, after a warm-up run."""
     if name in FRAMES:
         height, sensor = FRAMES[name]
         model = torchrg.scenes.build_room(SEED)

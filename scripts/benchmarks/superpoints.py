@@ -1,11 +1,11 @@
-"""Superpoints beside those of cut pursuit: accuracy over their number, and seconds.
+"""Superpoints of torchrg and cut pursuit: accuracy by number, and run time.
 
-Clouds: real rooms with labelled parts (``--parts``, label 0 is none), and made ones with objects: a
-room on voxels of 3 cm, one put together from pieces of equally many points, so that its density
-jumps, one scanned from few places, near and far, and depth frames fused. The cloud of pieces is
-also voxelled first. The peer's file has ``partition(points, strength)``, which returns labels and
-seconds, and runs in a Python of its own (numpy below 2, pgeof, pycut-pursuit); without it only
-torchrg is measured. Seconds are from points to superpoints, planes included, for all levels.
+Clouds: real rooms with labeled parts (``--parts``, label 0 is none), and synthetic ones with
+objects. The latter are a room on 3 cm voxels, a room of pieces with equal numbers of points (the
+density jumps), a room scanned from few positions, and fused depth frames. The cloud of pieces is
+also tested with voxels. The peer's file defines ``partition(points, strength)``, which returns
+labels and seconds. It runs in a separate Python (numpy below 2, pgeof, pycut-pursuit); without it
+only torchrg is measured. Seconds are for all levels, from points to superpoints, including planes.
 
     python scripts/bench.py superpoints --parts office_parts.pcd --peer cutpursuit.py
         --peer-python VENV/bin/python --out superpoints.json
@@ -40,19 +40,19 @@ from torchrg.scenes import Scene, build_room, make_room
 from torchrg.structures import UNLABELED
 
 VOXEL = 0.03
-"""Side of voxels, metres."""
+"""Voxel size, in meters."""
 STRENGTHS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.5, 4.0, 7.0, 12.0, 20.0, 35.0)
 PEER_STRENGTHS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 LAYOUT = CurvedLayout(
     size=(9.0, 7.0, 2.8), num_tables=5, num_columns=1, num_round_tables=1, num_balls=1, num_lamps=1
 )
 NOISE = 0.003
-"""Metres."""
+"""Standard deviation in meters."""
 SPARE = 8
-"""Points that a room has before pieces are thinned, for one that is left."""
+"""Ratio of the numbers of points of a room before and after thinning its pieces."""
 SHOWN = ("asa", "oracle_miou", "boundary_recall")
-"""Scores in the table."""
-OURS, VOXELLED, PEER = "torchrg", "torchrg, voxels first", "cut pursuit"
+"""Metrics in the table."""
+OURS, VOXELS_FIRST, PEER = "torchrg", "torchrg, voxels first", "cut pursuit"
 PIECES = "pieces of equally many points"
 
 PEER_SCRIPT = """
@@ -67,33 +67,33 @@ for strength in json.loads(sys.argv[3]):
 print(json.dumps(list(seconds.values())))
 """
 
-Labelled = tuple[Tensor, Tensor, str]
-"""Points ``(N, 3)``, the object of each, ``(N,)``, -1 for none, and the name of the cloud."""
+LabeledCloud = tuple[Tensor, Tensor, str]
+"""Points ``(N, 3)``, their objects ``(N,)`` (-1 for none), and the name of the cloud."""
 
 
 @dataclass(frozen=True)
 class Case(Benchmark):
     parts: tuple[Path, ...] = ()
-    """Rooms with parts."""
+    """Rooms with labeled parts."""
     points: int = 300_000
-    """Points of each made cloud."""
+    """Number of points of each synthetic cloud."""
     made: tuple[str, ...] = ("voxels", "pieces", "scan", "frames")
-    """Made clouds."""
+    """Synthetic clouds."""
     peer: Path | None = None
-    """File of the peer."""
+    """Python file of the peer."""
     peer_python: str = "python"
-    """Python that the peer runs in."""
+    """Python executable of the peer."""
 
-    def clouds(self) -> Mapping[str, Callable[[], Labelled]]:
-        makers: dict[str, Callable[[], Labelled]] = {
+    def clouds(self) -> Mapping[str, Callable[[], LabeledCloud]]:
+        makers: dict[str, Callable[[], LabeledCloud]] = {
             path.stem: partial(_read_parts, path) for path in self.parts
         }
         return makers | {CLOUDS[key][0]: partial(_make, key, self.points) for key in self.made}
 
-    def contenders(self) -> Mapping[str, Callable[[Labelled], Figures | None]]:
-        runs: dict[str, Callable[[Labelled], Figures | None]] = {
+    def contenders(self) -> Mapping[str, Callable[[LabeledCloud], Figures | None]]:
+        runs: dict[str, Callable[[LabeledCloud], Figures | None]] = {
             OURS: lambda cloud: _score(cloud, *_run_ours(cloud[0], None)),
-            VOXELLED: lambda cloud: (
+            VOXELS_FIRST: lambda cloud: (
                 _score(cloud, *_run_ours(cloud[0], VOXEL)) if cloud[2] == PIECES else None
             ),
         }
@@ -102,7 +102,7 @@ class Case(Benchmark):
         return runs
 
     def _run_peer(self, points: Tensor) -> tuple[list[Tensor], list[float]]:
-        """Return the peer's partitions for its strengths, and the seconds of each."""
+        """Return the peer's partition and seconds for each of its strengths."""
         with tempfile.TemporaryDirectory() as folder:
             np.save(Path(folder) / "points.npy", points.numpy())
             file = (self.peer or Path()).resolve()
@@ -116,7 +116,7 @@ class Case(Benchmark):
         return labels, json.loads(done.stdout.splitlines()[-1])
 
     def report(self, results: Results) -> str:
-        """Return ours at the numbers of superpoints of others, or at our own without any."""
+        """Compare torchrg at the numbers of superpoints of its peers, or at its own numbers."""
         rows, taken = [], []
         for cloud, by in results.items():
             levels = {name: runs[0]["levels"] for name, runs in by.items()}
@@ -129,7 +129,7 @@ class Case(Benchmark):
             for name, runs in by.items():
                 seconds = ", ".join(f"{value:.1f}" for value in dict.fromkeys(runs[0]["seconds"]))
                 taken.append([cloud, runs[0]["points"], name, seconds])
-        head = ["cloud", "points", "by", "seconds for all levels, or of each strength"]
+        head = ["cloud", "points", "by", "seconds for all levels, or per strength"]
         return f"{markdown(['cloud', 'superpoints', *SHOWN], rows)}\n\n{markdown(head, taken)}"
 
 
@@ -148,25 +148,25 @@ CLOUDS: dict[str, tuple[str, Callable[[int], Scene]]] = {
     ),
     "frames": ("depth frames fused", lambda size: make_kinect_room(size, num_frames=8, seed=14)),
 }
-"""What the made clouds are, and what makes them."""
+"""Titles of the synthetic clouds and functions that generate them."""
 
 
-def _make(key: str, num_points: int) -> Labelled:
-    """Return a made cloud with its objects."""
+def _make(key: str, num_points: int) -> LabeledCloud:
+    """Return a synthetic cloud with its objects."""
     name, make = CLOUDS[key]
     scene = make(num_points)
     return scene.points, objects_of(scene), name
 
 
-def _read_parts(path: Path) -> Labelled:
-    """Return a scanned room with its parts."""
+def _read_parts(path: Path) -> LabeledCloud:
+    """Read a scanned room with its parts."""
     cloud = read_cloud(path)
     labels = torch.from_numpy(cloud.fields["labels"])
     return cloud.points, torch.where(labels == 0, UNLABELED, labels), path.stem
 
 
 def _run_ours(points: Tensor, voxel: float | None) -> tuple[list[Tensor], list[float]]:
-    """Return partitions for all strengths, and the seconds that they took together."""
+    """Return the partitions for all strengths, and their total seconds."""
     config = SuperpointsConfig(strengths=STRENGTHS)
     begin = time.perf_counter()
     seg = segment_planes(points, voxel=voxel)
@@ -174,15 +174,17 @@ def _run_ours(points: Tensor, voxel: float | None) -> tuple[list[Tensor], list[f
     return [found.labels, *found.levels], [time.perf_counter() - begin]
 
 
-def _score(cloud: Labelled, partitions: Sequence[Tensor], seconds: list[float]) -> Figures:
-    """Return the scores of each partition."""
-    points, truth, _ = cloud
-    levels = [score_partition(partition, truth, points)._asdict() for partition in partitions]
+def _score(cloud: LabeledCloud, partitions: Sequence[Tensor], seconds: list[float]) -> Figures:
+    """Return the metrics of each partition."""
+    points, ground_truth, _ = cloud
+    levels = [
+        score_partition(partition, ground_truth, points)._asdict() for partition in partitions
+    ]
     return {"points": len(points), "seconds": seconds, "levels": levels}
 
 
 def at_count(rows: Sequence[Figures], count: float, name: str) -> float:
-    """Return a score at so many superpoints, between those measured by their logarithms."""
+    """Interpolate a metric at a number of superpoints, linearly in its logarithm."""
     ordered = sorted(rows, key=lambda row: row["count"])
     counts = np.log([row["count"] for row in ordered])
     return float(np.interp(np.log(count), counts, [row[name] for row in ordered]))

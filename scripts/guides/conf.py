@@ -1,4 +1,4 @@
-"""What Sphinx is told about the pages that ``scripts/docs.py`` lays before it."""
+"""Sphinx configuration for the pages written by ``scripts/docs.py``."""
 
 import pkgutil
 from pathlib import Path
@@ -13,15 +13,15 @@ project_copyright = "the torchrg authors"
 release = torchrg.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
 exclude_patterns = ["made"]
-"""Where the examples of guides run: pages are not looked for there, pictures are."""
+"""Folder where the examples of guides run; it contains images, but no pages."""
 
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", "PinholeCamera|Template|Arguments")]
-"""Types that are only there for type checkers."""
+"""Types that exist only for type checkers."""
 suppress_warnings = ["ref.python"]
-"""A type that is called as attributes of several classes are, as ``object`` is."""
+"""A type with the name of attributes of several classes, such as ``object``."""
 smartquotes = False
-"""Else flags lose a dash."""
+"""Smart quotes would turn the two dashes of flags into one."""
 myst_heading_anchors = 3
 napoleon_custom_sections = ["Convention"]
 autodoc_default_options = {"members": True, "show-inheritance": True}
@@ -39,48 +39,48 @@ html_search_scorer = str(Path(__file__).with_name("search.js"))
 
 
 def show_public_bases(_app: Sphinx, _name: str, _of: type, _options: object, bases: Any) -> None:  # noqa: ANN401
-    """Put the bases of private bases in their place."""
+    """Replace private bases by their bases."""
     shown = [*bases]
     while private := [base for base in shown if getattr(base, "__name__", "").startswith("_")]:
-        place = shown.index(private[0])
-        shown[place : place + 1] = private[0].__bases__
+        index = shown.index(private[0])
+        shown[index : index + 1] = private[0].__bases__
     bases[:] = shown
 
 
 def leave_out_aliases(*event: Any) -> bool | None:  # noqa: ANN401
-    """Skip fields of named tuples, which the docstrings of these describe."""
+    """Skip fields of named tuples, which their class docstrings describe."""
     return True if str(event[3].__doc__).startswith("Alias for field number") else None
 
 
 def keep_colons(*event: Any) -> None:  # noqa: ANN401
-    """Begin the text of a constant with an empty comment: its first colon is not after a type."""
+    """Start docstrings of constants with a comment, so a first colon does not mark a type."""
     if event[1] in ("attribute", "data", "property"):
         event[-1][:0] = ["..", ""]
 
 
 def leave_out_factories(*event: Any) -> tuple[str, str] | None:  # noqa: ANN401
-    """Write defaults that are made anew as dots: as Python writes them they are no expression."""
+    """Replace default factories by dots, because their repr is not an expression."""
     *_, signature, returned = event
     return (signature.replace("<factory>", "..."), returned) if signature else None
 
 
-def find_elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:  # noqa: ANN401
-    """Lead a name to where it is described, though a package shows it, or another module has it.
+def resolve_reference(app: Sphinx, env: Any, node: Any, text: Any) -> Any:  # noqa: ANN401
+    """Resolve a name to its documentation, even if it is re-exported or in another module.
 
-    Names of other packages, and those of ours that have no docstring, need only be there.
+    Names of other packages, and names without a docstring, only need to exist.
     """
     target, domain = node.get("reftarget", ""), env.get_domain("py")
-    is_ours, is_there = target.startswith("torchrg."), True
+    is_ours, exists = target.startswith("torchrg."), True
     try:
         pkgutil.resolve_name(target)
     except (AttributeError, ImportError, ValueError):
-        is_there = False
+        exists = False
     ending = f".{target.rpartition('.')[2] if is_ours else target}"
-    places = [name for name in domain.objects if name.endswith(ending)]
-    if places and (is_there or not is_ours):
-        place = min(places, key=len)
-        return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", place, node, text)
-    return text if is_there else None
+    matches = [name for name in domain.objects if name.endswith(ending)]
+    if matches and (exists or not is_ours):
+        match = min(matches, key=len)
+        return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", match, node, text)
+    return text if exists else None
 
 
 def setup(app: Sphinx) -> None:
@@ -89,4 +89,4 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-skip-member", leave_out_aliases)
     app.connect("autodoc-process-docstring", keep_colons, priority=400)  # Before napoleon.
     app.connect("autodoc-process-signature", leave_out_factories)
-    app.connect("missing-reference", find_elsewhere)
+    app.connect("missing-reference", resolve_reference)

@@ -58,7 +58,7 @@ class Surfaces(NamedTuple):
         sizes: Number of points of each, shape ``(F,)``.
         best_iou: Maximum intersection over union with a region, shape ``(F,)``.
         precision: Precision of the matched region, in percent, shape ``(F,)``; NaN if unmatched.
-        recall: Recall of the matched region, likewise.
+        recall: Recall of the matched region, in the same form.
     """
 
     labels: Tensor

@@ -1,4 +1,4 @@
-"""A source whose input files say what shall go wrong, importable by worker processes."""
+"""A source whose input files say what goes wrong, importable by worker processes."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ from torchrg.io import atomic_path
 
 @dataclass(frozen=True)
 class FaultySource(Source):
-    """Text files, named ``<points>_<anything>``; the text is a behaviour and becomes the result."""
+    """Text files, named ``<points>_<anything>``; the text is a behavior and becomes the result."""
 
     root: Path
     settings: PipelineConfig = field(default_factory=PipelineConfig)
@@ -41,8 +41,8 @@ class FaultySource(Source):
             log.write(f"{scan.name} {os.getpid()}\n")
         act(behavior, self.root.parent / f"{scan.name}.once")
         begin("write")
-        with atomic_path(folder / "result.txt") as beside:
-            beside.write_text(behavior)
+        with atomic_path(folder / "result.txt") as temporary:
+            temporary.write_text(behavior)
             if behavior == "kill while writing":
                 os.kill(os.getpid(), signal.SIGKILL)
             if behavior == "full":
@@ -80,7 +80,7 @@ def act(behavior, once):
 
 
 def make_jobs(folder, behaviors):
-    """Return jobs for scans by name, with the behaviour of each."""
+    """Return jobs for scans by name, with the behavior of each."""
     (folder / "in").mkdir(parents=True, exist_ok=True)
     for name, behavior in behaviors.items():
         (folder / "in" / f"{name}.txt").write_text(behavior)

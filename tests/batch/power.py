@@ -57,9 +57,9 @@ class Disk:
         return self.kept / "names" / "|".join(["root", *parts])
 
     def _put(self, path, content):
-        beside = path.with_name(f"{path.name}.{os.getpid()}")
-        beside.write_bytes(content)
-        _replace(beside, path)
+        temporary = path.with_name(f"{path.name}.{os.getpid()}")
+        temporary.write_bytes(content)
+        _replace(temporary, path)
 
     def _names(self, folder):
         try:

@@ -100,8 +100,8 @@ def check_whole(out, undisturbed):
 
 def finish(process):
     """Let a command end, which it does well."""
-    shown, told = process.communicate()
-    assert process.returncode == 0, told
+    shown, message = process.communicate()
+    assert process.returncode == 0, message
     assert "4 of 4 scans are complete" in shown
 
 
@@ -180,10 +180,10 @@ def test_an_interrupt_says_how_to_go_on(larger_rooms, tmp_path, number):
             os.killpg(process.pid, number)  # A terminal sends it to the whole group.
         else:
             process.send_signal(number)
-        _, told = process.communicate()
+        _, message = process.communicate()
         if process.returncode:
             break  # Else all rooms were done before the signal came.
-    assert process.returncode == 130, told
-    assert told.count("\n") == 1
-    assert "of 4 scans are complete. Rerun the same command to resume." in told
+    assert process.returncode == 130, message
+    assert message.count("\n") == 1
+    assert "of 4 scans are complete. Rerun the same command to resume." in message
     assert not list(out.rglob(".*.np?"))

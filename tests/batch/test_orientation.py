@@ -210,7 +210,7 @@ def test_normals_by_viewpoint_look_to_the_scanners_of_the_file(mesh, tmp_path, r
 
 
 def corner(path):
-    """A depth image of a floor and a wall behind it, in millimetres."""
+    """A depth image of a floor and a wall behind it, in millimeters."""
     v = np.arange(30.0)[:, None] - 14.5
     depth = np.minimum(np.where(v > 0, 0.5 / np.maximum(v / 50, 1e-6), 9), 3.0)
     stored = (1000 * np.broadcast_to(depth, (30, 40))).astype(np.uint16)

@@ -70,7 +70,7 @@ def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
     convert_scan(job)
     record = json.loads((job.folder / RECORD).read_text())
     nothing = {"bytes": 0, "sha256": hashlib.sha256().hexdigest()}
-    earlier = ("superpoint.npy", "edited.npy", "../../elsewhere.npy")
+    earlier = ("superpoint.npy", "edited.npy", "../../other.npy")
     record["outputs"] |= dict.fromkeys(earlier, nothing)
     (job.folder / RECORD).write_text(json.dumps(record))
     unfinished = f".result.{job.mark}01234567.txt"
@@ -80,7 +80,7 @@ def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
     convert_scan(job)
     names = {path.name for path in job.folder.iterdir()}
     assert names == {"result.txt", RECORD, "theirs.npy", "edited.npy", ".result.0123abcd.txt"}
-    assert (tmp_path / "elsewhere.npy").exists()
+    assert (tmp_path / "other.npy").exists()
 
 
 @pytest.fixture

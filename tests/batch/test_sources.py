@@ -75,7 +75,7 @@ def load(folder, *names):
 
 
 def write_room(room, objects, *, prefix=""):
-    """Write a room of S3DIS: points by object, with colours 1, 2, 3."""
+    """Write a room of S3DIS: points by object, with colors 1, 2, 3."""
     (room / "Annotations").mkdir(parents=True)
     for name, points in objects.items():
         lines = [f"{prefix}{x:.3f} {y:.3f} {z:.3f} 1 2 3\n" for x, y, z in points]

@@ -90,8 +90,8 @@ def test_a_scan_that_changes_its_split_leaves_the_old_one(root, out, tmp_path, c
     assert convert(*command).code == 0
     before = files_of(out)
     move(root)
-    told = f"remove train/{MOVED}: its scan is val/{MOVED} now\n"
-    assert told in convert(*command, "--dry-run").out
+    message = f"remove train/{MOVED}: its scan is val/{MOVED} now\n"
+    assert message in convert(*command, "--dry-run").out
     assert files_of(out) == before
     done = convert(*command)
     assert (done.code, done.err) == (0, "")
@@ -163,8 +163,8 @@ def test_what_a_user_changed_or_added_is_never_removed(root, out, convert, layou
             assert files_of(out) == held
         path.unlink() if before is None else path.write_bytes(before)
     changed.unlink()
-    changed.symlink_to(out.parent / "elsewhere")
-    (out.parent / "elsewhere").write_bytes(whole)
+    changed.symlink_to(out.parent / "other")
+    (out.parent / "other").write_bytes(whole)
     assert f"{changed}: was changed or not" in convert(*command).error
     changed.unlink()
     assert convert(*command).code == 0
@@ -334,7 +334,7 @@ def test_files_of_other_layouts_go_with_their_scan(root, out, convert):
     assert MOVED.encode() not in found["train_database.yaml"]
     assert "superpoints/scene0002_00.npy" in found
     assert "train/scene0001_00.h5" in found
-    # Without its fingerprint nobody knows whether a file was changed.
+    # Without its fingerprint no one knows whether a file was changed.
     path = out / "val" / MOVED / RECORD
     path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
     assert convert("scannet", root, out, "--layout", "nag").code == 0

@@ -243,7 +243,7 @@ def test_info_says_what_a_file_holds_and_where_it_is(room_file, tmp_path, run):
 
 @pytest.fixture
 def leica(room_file, tmp_path):
-    """Points, intensity, colour and no names, and what the colours are."""
+    """Points, intensity, color and no names, and what the colors are."""
     cloud = read_cloud(room_file)
     values = np.random.default_rng(0).integers(0, 256, (len(cloud), 4))
     (tmp_path / "in").mkdir()
@@ -266,7 +266,7 @@ def test_a_run_without_kernels_says_once_and_in_one_line_how_to_get_them(
         code, _, err = run(command[0], room_file, *command[1:])
         (line,) = (line for line in err.splitlines() if "kernels" in line)
         assert line.startswith("torchrg: warning: torchrg runs without its kernels")
-        assert line.endswith("with TORCHRG_KERNELS set as the guide says.")
+        assert line.endswith("or set TORCHRG_KERNELS (see the guide Install).")
         assert (code, "_library()" in err) == (0, False)
 
 
@@ -354,14 +354,17 @@ def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
         with np.load(out) as result:
             labels.append(result["labels"])
     assert np.array_equal(np.load(out)["points"], far, equal_nan=True)
-    told = "4 of 6,000 points are not finite or beyond 1e+12; they stay in place, unlabelled"
-    assert told in done.err
+    reported = "4 of 6,000 points are not finite or beyond 1e+12; they stay unlabeled"
+    assert reported in done.err
     assert (labels[1][[3, 5, 9, 11]] == -1).all()
     assert (labels[1] != labels[0]).sum() < 60
     assert labels[1].max() == labels[0].max() >= 3
     np.save(tmp_path / "huge.npy", far * 1e20)
     line = run("segment", tmp_path / "huge.npy", "--out", tmp_path / "a.npz").error
-    assert "huge.npy: expected finite points, got none in 6,000 points; those beyond 1e+12" in line
+    assert (
+        "huge.npy: expected finite points, got none in 6,000 points; coordinates beyond 1e+12"
+        in line
+    )
 
 
 def test_single_points_far_off_that_cost_precision_are_told(room_file, tmp_path, run):
@@ -370,5 +373,5 @@ def test_single_points_far_off_that_cost_precision_are_told(room_file, tmp_path,
     np.save(tmp_path / "zero.npy", far)
     done = run("segment", tmp_path / "zero.npy", "--out", tmp_path / "a.npz", *CLASSIC)
     first, second = done.err.splitlines()
-    assert "zero.npy: half of its points lie within " in first
+    assert "zero.npy: half of the points lie within " in first
     assert "no plane found" in second

@@ -172,8 +172,8 @@ def test_progress_is_scans_points_a_second_and_time_left(unit, bar_unit, sizes, 
 def test_depth_frames_are_counted_by_the_second():
     scans = (TaskReport("a", "converted", num_points=640), TaskReport("b", "failed"))
     report = BatchReport(scans, started=0.0, seconds=4.0, engine="local", workers=1)
-    told = "640 points in 4.0 s: 160 points, 0.25 frames a second"
-    assert told in format_report(report, unit="frame")
+    reported = "640 points in 4.0 s: 160 points, 0.25 frames a second"
+    assert reported in format_report(report, unit="frame")
 
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")

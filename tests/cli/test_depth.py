@@ -1,4 +1,4 @@
-"""``torchrg depth``: planes of depth images and of organised clouds."""
+"""``torchrg depth``: planes of depth images and of organized clouds."""
 
 import json
 import struct
@@ -33,7 +33,7 @@ def points_of(depth, camera=INTRINSICS):
 
 @pytest.fixture
 def depth():
-    """A wall with a step and a hole, in metres."""
+    """A wall with a step and a hole, in meters."""
     depth = torch.full((60, 80), 2.0)
     depth[:, 50:] = 2.5
     depth[:4, :5] = 0
@@ -121,13 +121,13 @@ def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_pa
         (folder / name).write_bytes(frame.read_bytes())
     (folder / "2.png").write_bytes(frame.read_bytes()[:90])
     inputs = [folder / f"{number}.png" for number in (1, 2, 3)]
-    told = run("depth", *inputs, *CAMERA, "--out", out)
-    assert told.code == 3
-    damaged, sums = told.err.splitlines()
+    reported = run("depth", *inputs, *CAMERA, "--out", out)
+    assert reported.code == 3
+    damaged, sums = reported.err.splitlines()
     assert damaged.startswith(f"torchrg: {inputs[1]}: ")
     assert damaged.count("2.png") == 1
     assert sums == "torchrg: 1 of 3 inputs failed, the remaining ones are written."
-    assert told.out.count(" 2 planes, ") == 2
+    assert reported.out.count(" 2 planes, ") == 2
     assert sorted(path.name for path in out.iterdir()) == ["1", "3"]
     assert contents(out / "1") == contents(out / "3")
     assert len(contents(out / "1")) == 5
@@ -291,21 +291,23 @@ def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, 
     root.mkdir()
     frame.rename(root / frame.name)
     flags = [*CAMERA[:3], scale]
-    told = f"frame.png: expected a median depth of 0.05 to 100 m, got {median} with --depth-scale "
+    reported = (
+        f"frame.png: expected a median depth of 0.05 to 100 m, got {median} with --depth-scale "
+    )
     for command in (
         ("depth", root / frame.name, "--out", tmp_path / "labels.png"),
         ("depth", root, "--out", tmp_path / "labels.npz"),
         ("convert", "rgbd", root, tmp_path / "out", "--dry-run"),
     ):
         (line,) = run(*command, *flags).err.splitlines()
-        assert told in line
+        assert reported in line
         assert "pass 1000 for millimeters" in line
     camera = parse_intrinsics(CAMERA[1])
     source = RGBDSource(root, DepthConfig(), "images", camera, float(scale))
     with pytest.warns(DepthWarning, match="expected a median depth"):
         jobs = list_jobs(source, tmp_path / "out")
     (note,) = convert_scan(jobs[0]).warnings
-    assert told in note
+    assert reported in note
     data = RGBDFrames.from_folder(root, intrinsics=camera, depth_scale=float(scale))
     with pytest.warns(DepthWarning, match="expected a median depth"):
         _ = data[0]

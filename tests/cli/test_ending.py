@@ -45,8 +45,8 @@ def start(*command):
     )
 
 
-def check_interrupted(process, told):
-    assert (process.returncode, told) == (130, LINE)
+def check_interrupted(process, message):
+    assert (process.returncode, message) == (130, LINE)
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +68,8 @@ def room(folder_of_clouds):
 )
 def test_a_signal_while_modules_load_is_one_line(tmp_path, room, module, number):
     process = start("-c", RUN, module, int(number), "segment", room, "--out", tmp_path / "x.npz")
-    shown, told = process.communicate()
-    check_interrupted(process, told)
+    shown, message = process.communicate()
+    check_interrupted(process, message)
     assert shown in ("", "1 loaded\n", "2 loaded\n", "3 loaded\n")
     assert not list(tmp_path.iterdir())
 
@@ -89,16 +89,16 @@ sys.exit(process.main())
 
 def test_a_second_signal_while_the_first_is_told_adds_no_stack():
     process = start("-c", TWICE)
-    _, told = process.communicate()
-    check_interrupted(process, told)
+    _, message = process.communicate()
+    check_interrupted(process, message)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_when_all_is_done_comes_too_late(number):
     ending = f"import atexit, os\natexit.register(lambda: os.kill(os.getpid(), {int(number)}))\n"
     process = start("-c", ending + RUN, "never", 0, "--version")
-    shown, told = process.communicate()
-    assert (process.returncode, told) == (0, "")
+    shown, message = process.communicate()
+    assert (process.returncode, message) == (0, "")
     assert shown.startswith("torchrg ")
 
 
@@ -136,8 +136,8 @@ def undisturbed(room, tmp_path, request):
     out, begin = tmp_path / "undisturbed", time.monotonic()
     out.mkdir()
     process = start("-c", RUN, "never", 0, *words_of(request.param, room, out))
-    _, told = process.communicate()
-    assert (process.returncode, told) == (0, "")
+    _, message = process.communicate()
+    assert (process.returncode, message) == (0, "")
     files = {path.name: path.read_bytes() for path in out.iterdir()}
     return request.param, files, time.monotonic() - begin
 
@@ -156,12 +156,12 @@ def test_a_signal_at_any_time_is_one_line_or_comes_too_late(room, tmp_path, undi
         process.stdout.readline()
         time.sleep(0.05 + times.uniform(0, seconds))
         process.send_signal(signal.SIGTERM if number % 2 else signal.SIGINT)
-        _, told = process.communicate()
+        _, message = process.communicate()
         codes.append(process.returncode)
         if process.returncode:
-            check_interrupted(process, told)
+            check_interrupted(process, message)
         else:
-            assert told == ""
+            assert message == ""
             assert len(list(out.iterdir())) == len(files)
         check_whole(out, files)
     assert 130 in codes

@@ -1,4 +1,4 @@
-"""Files of Python beside the scans are data: no command runs them, nor a process that it starts."""
+"""Files of Python next to the scans are data: no command or its processes run them."""
 
 import subprocess
 import sys

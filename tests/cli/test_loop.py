@@ -11,7 +11,7 @@ import pytest
 
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000"]
 # prctl(PR_CAPBSET_DROP, ...) of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, by which the superuser
-# writes where nobody may.
+# writes where no one may.
 _PR_CAPBSET_DROP, _CAPABILITIES = 24, (1, 2)
 
 
@@ -37,7 +37,7 @@ for line in sys.stdin:
 
 @pytest.fixture(scope="module")
 def server():
-    """A process whom permissions hold, and that runs one command after another."""
+    """A process that is subject to permissions and runs commands in sequence."""
     with subprocess.Popen(
         [sys.executable, "-c", SERVER],
         stdin=subprocess.PIPE,
@@ -62,7 +62,7 @@ def there(server, place):
 
 @pytest.fixture
 def place(tmp_path):
-    """Two rooms, a depth image, a folder that nobody may write into, and files nobody may change.
+    """Two rooms, a depth image, a folder that no one may write into, and files no one may change.
 
     A command that begins its work would fail with another message: all inputs are damaged.
     """

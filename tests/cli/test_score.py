@@ -101,8 +101,8 @@ def test_points_without_a_match_are_told_and_count_as_unlabelled(folder, run, re
     done = run("score", part, folder / "truth.npz", *flags)
     lost = np.ones(SIZE, dtype=bool)
     lost[kept] = False
-    told = f"{folder / 'truth.npz'}: 1,500 of 3,000 points have no match in {part} and count as"
-    assert done.err == f"torchrg: warning: {told} unlabeled.\n"
+    message = f"{folder / 'truth.npz'}: 1,500 of 3,000 points have no match in {part} and count as"
+    assert done.err == f"torchrg: warning: {message} unlabeled.\n"
     scores, truth = json.loads(done.out), read_cloud(folder / "truth.npz")
     assert scores["match"] == {"points": SIZE, "unmatched": SIZE // 2, "unused": 0}
     ours = {name: v.copy() for name, v in read_cloud(folder / "ours.npz").fields.items()}

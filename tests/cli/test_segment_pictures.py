@@ -1,4 +1,4 @@
-"""``torchrg segment --picture``: a picture of the planes beside the result."""
+"""``torchrg segment --picture``: a picture of the planes next to the result."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""``--table``: the planes for other programs beside any result; ``--within``: planes of objects."""
+"""``--table``: the plane table next to any result; ``--within``: planes of objects."""
 
 import csv
 import json
@@ -119,8 +119,8 @@ def test_convert_keeps_its_tables_and_never_replaces_those_of_others(scans, tmp_
     assert run(*command).code == 0
     assert files(out) == [name for name in before if name != "planes.csv"]
     (out / "room" / "planes.csv").write_text("mine")
-    told = run(*command, "--table", "planes.csv")
-    assert (told.code, "was not written by torchrg" in told.err) == (3, True)
+    reported = run(*command, "--table", "planes.csv")
+    assert (reported.code, "was not written by torchrg" in reported.err) == (3, True)
     assert (out / "room" / "planes.csv").read_text() == "mine"
 
 
@@ -147,8 +147,8 @@ def test_a_table_without_a_place_is_refused_before_the_work(scans, tmp_path, run
     "table", ["../planes.csv", "planes.txt", "provenance.json", ".csv", "a/b.csv"]
 )
 def test_convert_refuses_a_table_outside_the_folder_of_a_scan(scans, tmp_path, run, table):
-    told = run("convert", "folder", scans[0], tmp_path / "out", "--table", table)
-    assert "expected --table to be a file name ending in .csv or .json" in told.error
+    reported = run("convert", "folder", scans[0], tmp_path / "out", "--table", table)
+    assert "expected --table to be a file name ending in .csv or .json" in reported.error
     assert not (tmp_path / "out").exists()
 
 
@@ -173,8 +173,8 @@ def test_objects_of_other_files_are_found(scans, tmp_path, run):
         out = tmp_path / f"{name}.npz"
         columns = ("--columns", "x,y,z,instance") if name.endswith("txt") else ()
         command = ("segment", tmp_path / name, *CLASSIC, "--out", out, *columns)
-        told = run(*command, "--within", "instance")
-        assert told.code == 0, told.err
+        reported = run(*command, "--within", "instance")
+        assert reported.code == 0, reported.err
         assert set(read_result(out).planes.object.tolist()) <= set(scans[1].tolist())
 
 
@@ -188,8 +188,8 @@ def test_convert_keeps_planes_within_objects_in_every_kind_of_folder(scans, tmp_
     np.save(scene / "instance.npy", np.stack([scans[1], scans[1] * 0 - 1], axis=1).astype(np.int16))
     np.save(scene / "segment20.npy", scans[1] % 2)
     for name, place in (("instance", out), ("segment", tmp_path / "out2"), ("instance", root)):
-        told = run("convert", "folder", root, place, *CLASSIC, "--within", name)
-        assert told.code == 0, told.err
+        reported = run("convert", "folder", root, place, *CLASSIC, "--within", name)
+        assert reported.code == 0, reported.err
         planes = json.loads((place / "scene" / "planes.json").read_text())["planes"]
         labels = np.load(place / "scene" / "plane.npy")
         objects = scans[1] if name == "instance" else scans[1] % 2
@@ -198,28 +198,30 @@ def test_convert_keeps_planes_within_objects_in_every_kind_of_folder(scans, tmp_
             assert np.unique(objects[labels == row["id"]]).tolist() == [row["object"]]
     # Other objects give other planes, also in place.
     np.save(scene / "instance.npy", scans[1][:, None].astype(np.int16) // 2)
-    told = run("convert", "folder", root, root, *CLASSIC, "--within", "instance")
-    assert "nothing to do" not in told.out
+    reported = run("convert", "folder", root, root, *CLASSIC, "--within", "instance")
+    assert "nothing to do" not in reported.out
 
 
 @pytest.mark.parametrize(
     ("field", "message"),
     [
-        ("object", "room.npz: expected the field object of --within, got height, instance; name"),
+        ("object", "room.npz: expected the field object of --within, got height, instance; choose"),
         ("height", "each of 5,000 points, got float32 of shape (5000,); number the objects."),
-        ("few", "got height, instance (few skipped: not 5,000 rows); name one of these"),
+        ("few", "got height, instance (few skipped: not 5,000 rows); choose one of these"),
     ],
 )
 @pytest.mark.parametrize("command", ["segment", "convert"])
 def test_what_are_no_objects_is_refused_in_one_line(scans, tmp_path, run, command, field, message):
     if command == "segment":
-        told = run("segment", scans[0] / "room.npz", "--out", tmp_path / "o.npz", "--within", field)
-        assert message in told.error
+        reported = run(
+            "segment", scans[0] / "room.npz", "--out", tmp_path / "o.npz", "--within", field
+        )
+        assert message in reported.error
         assert files(tmp_path) == []
         return
-    told = run("convert", "folder", scans[0], tmp_path / "out", "--within", field)
-    assert told.code == 3
-    assert message in told.err
+    reported = run("convert", "folder", scans[0], tmp_path / "out", "--within", field)
+    assert reported.code == 3
+    assert message in reported.err
     assert set(files(tmp_path)) == {".torchrg.lock", ".torchrg.scans.json", "report.json"}
 
 
@@ -228,9 +230,9 @@ def test_lengths_that_differ_in_a_folder_are_refused(scans, tmp_path, run):
     scene.mkdir(parents=True)
     np.save(scene / "coord.npy", np.random.default_rng(0).random((500, 3), np.float32))
     np.save(scene / "instance.npy", np.zeros(499, np.int32))
-    told = run("convert", "folder", tmp_path / "root", tmp_path / "out", "--within", "instance")
-    assert told.code == 3
-    assert "instance.npy: expected 500 rows" in told.err or "499" in told.err
+    reported = run("convert", "folder", tmp_path / "root", tmp_path / "out", "--within", "instance")
+    assert reported.code == 3
+    assert "instance.npy: expected 500 rows" in reported.err or "499" in reported.err
     assert set(files(tmp_path / "out")) == {".torchrg.lock", ".torchrg.scans.json", "report.json"}
 
 

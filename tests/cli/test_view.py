@@ -47,7 +47,7 @@ def test_view_draws_the_same_planes_beside_each_other_from_one_place_in_one_colo
     labels = cloud.fields["labels"]
     np.savez(tmp_path / "renumbered.npz", points=cloud.coordinates, labels=labels.max() - labels)
     np.savez(tmp_path / "room.npz", points=cloud.coordinates, labels=labels)
-    pair = (tmp_path / "room.npz", "--beside", tmp_path / "renumbered.npz")
+    pair = (tmp_path / "room.npz", "--compare", tmp_path / "renumbered.npz")
     assert "(240 x " in run("view", *pair, "--out", out, "--width", "240").out
     both = image_file.open(out)
     left, right = (both.crop((x, 0, x + 120, both.height)).tobytes() for x in (0, 120))
@@ -61,7 +61,7 @@ def test_view_puts_clouds_of_two_heights_beside_each_other(tmp_path, run):
     np.save(tmp_path / "wide.npy", flat)
     np.save(tmp_path / "square.npy", flat * [1.0, 4.0, 1.0])
     out, flags = tmp_path / "both.png", ("--view", "above", "--width", "160")
-    files = (tmp_path / "wide.npy", "--beside", tmp_path / "square.npy")
+    files = (tmp_path / "wide.npy", "--compare", tmp_path / "square.npy")
     assert run("view", *files, "--out", out, *flags).code == 0
     both = np.asarray(image_file.open(out))
     assert both.shape[1] == 160

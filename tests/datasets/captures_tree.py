@@ -8,17 +8,17 @@ import numpy as np
 from torchrg.render import write_png
 
 SIZE = np.array([4.0, 3.0, 2.5])
-"""Sides of the room in metres; a corner is the origin, z points up."""
+"""Sides of the room in meters; a corner is the origin, z points up."""
 WIDTH, HEIGHT = 128, 96
 FX, FY, CX, CY = 832.0, 840.0, 505.0, 390.0
-"""Camera of the colour images, in pixels from their corner, where the first middle is 0.5."""
+"""Camera of the color images, in pixels from their corner, where the first middle is 0.5."""
 ENLARGED = 8
-"""Pixels of a colour image along one of a depth image."""
+"""Pixels of a color image along one of a depth image."""
 COLOR = (ENLARGED * WIDTH, ENLARGED * HEIGHT)
 
 
 class MadeFrame(NamedTuple):
-    """A depth image in metres ``(H, W)``, its points ``(H, W, 3)``, and the turn and place."""
+    """A depth image in meters ``(H, W)``, its points ``(H, W, 3)``, and the turn and place."""
 
     depth: np.ndarray
     points: np.ndarray
@@ -56,7 +56,7 @@ GL, CV = (1, 1, 1), (1, -1, -1)
 
 
 def write_depth(path, depth, scale=1000.0):
-    """Write depth in metres as its suffix says: whole numbers as PNG or PGM, or floating point."""
+    """Write depth in meters as its suffix says: whole numbers as PNG or PGM, or floating point."""
     path.parent.mkdir(parents=True, exist_ok=True)
     values = (depth * scale).round().astype(np.int32)
     if path.suffix == ".png":
@@ -81,7 +81,7 @@ def camera_of_depth(first_middle):
 
 
 def write_nerfstudio(root, suffix=".png", scale=1000.0, **more):
-    """Write ``transforms.json``, whose intrinsics are of colour images, and its depth images."""
+    """Write ``transforms.json``, whose intrinsics are of color images, and its depth images."""
     names = {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": COLOR[0], "h": COLOR[1]}
     frames = []
     for number, frame in enumerate(FRAMES):
@@ -144,7 +144,7 @@ def write_scannetpp(root):
 
 
 def write_3rscan(root):
-    """Write a sequence of 3RScan, with a rendered image beside one."""
+    """Write a sequence of 3RScan, with one rendered image."""
     folder = root / "0988ea72" / "sequence"
     fx, fy, cx, cy = camera_of_depth(0)
     info = f"""m_sensorName = Tango

@@ -1,6 +1,6 @@
 """A small tree laid out like the raw release of S3DIS, with every defect that is known of it.
 
-What each room must read as is written down beside it, not derived by the code under test.
+What each room must read as is written down next to it, not derived by the code under test.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ BROKEN = {
 
 
 def rows_of(seed, count):
-    """Return rows of an object: coordinates in millimetres, whole colours."""
+    """Return rows of an object: coordinates in millimeters, whole colors."""
     random = np.random.default_rng(seed)
     coordinates = random.integers(-20_000, 20_000, (count, 3)) / 1000
     return np.hstack([coordinates, random.integers(0, 256, (count, 3))])

@@ -1,6 +1,6 @@
 """Small trees laid out like the releases of ScanNet and ScanNet++, written by means of their own.
 
-What each scan must read as is written down beside it, not derived by the code under test.
+What each scan must read as is written down next to it, not derived by the code under test.
 """
 
 import json

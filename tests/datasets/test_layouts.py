@@ -115,7 +115,7 @@ def test_pointcept(converted, room):
 
 
 def test_scannet(converted, room):
-    """``segIndices`` of the file that ``*[0-9].segs.json`` finds beside the mesh, by vertex."""
+    """``segIndices`` of the file that ``*[0-9].segs.json`` finds next to the mesh, by vertex."""
     folder = converted["scannet"] / "scans" / SCAN
     (path,) = folder.glob("*[0-9].segs.json")
     assert path.name == f"{SCAN}_vh_clean_2.0.010000.segs.json"
@@ -202,7 +202,7 @@ def check_labels(room, segment, objects):
 
 
 def test_spformer(converted, room):
-    """Five arrays, the superpoints third; three of a test, whose superpoints are numbered anew."""
+    """Five arrays, the superpoints third; three of a test, whose superpoints are numbered again."""
     folder = converted["spformer"]
     (path,) = (folder / "train").glob("*_inst_nostuff.pth")
     assert path.name == f"{SCAN}_inst_nostuff.pth"
@@ -280,7 +280,7 @@ def test_what_is_done_is_kept_and_layouts_share_a_directory(root, room, tmp_path
     path.write_bytes(b"")
     assert len(convert(root, tmp_path, "npy", only=f"*{SCAN}")) == 1
     assert path.read_bytes() == before
-    # A file of somebody else is never replaced.
+    # A file of another user is never replaced.
     path = tmp_path / "other" / "superpoints" / f"{SCAN}.npy"
     path.parent.mkdir(parents=True)
     path.write_bytes(b"theirs")

@@ -79,7 +79,7 @@ def write(folder, files):
 
 
 def given_of(mesh, root):
-    """What is known of a scan beside its points."""
+    """Properties of a scan other than its points."""
     cloud = read_scannet_scan(mesh, root)
     return {**cloud.fields, **cloud.header}
 

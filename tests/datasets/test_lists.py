@@ -35,7 +35,7 @@ MODES = {"train": "train", "validation": "val", "test": "test"}
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """Scans of 600 points, each of its own colour, the faces of a room as objects."""
+    """Scans of 600 points, each of its own color, the faces of a room as objects."""
     root = tmp_path_factory.mktemp("scannet")
     made = make_room(num_points=600, seed=1)
     coord, faces = made.points.float().numpy(), made.labels.numpy()

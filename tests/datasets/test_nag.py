@@ -170,10 +170,10 @@ def test_a_command_without_h5py_or_place_is_one_line(tmp_path, run, folder_of_cl
     command = ("convert", "folder", source, out, "--layout", "nag", "--preset", "classic")
     out.mkdir()
     (out / "nag").write_text("a file where the folder would be")
-    told = run(*command)
-    assert told.code == 3
-    assert "a: " in told.err
-    assert "nag: cannot be created: File exists." in told.err
+    reported = run(*command)
+    assert reported.code == 3
+    assert "a: " in reported.err
+    assert "nag: cannot be created: File exists." in reported.err
     own = {".torchrg.lock", ".torchrg.scans.json", "report.json"}
     assert {path.name for path in out.rglob("*")} == {"nag", *own}
     (out / "nag").unlink()

@@ -89,7 +89,7 @@ def test_labels_keep_their_values_in_the_least_type_that_holds_them(sample, seg,
         write_pointcept_scene(tmp_path, {**sample, "instance": instance}, seg)
         assert np.load(tmp_path / "instance.npy").dtype.str == dtype
         assert torch.equal(read_pointcept_scene(tmp_path)["instance"], instance)
-    # Beside the labels of ScanNet objects have its type.
+    # With labels of ScanNet, objects have its type.
     scannet = {**sample, "segment20": sample["segment"], "instance": instance}
     write_pointcept_scene(tmp_path, scannet, seg)
     assert np.load(tmp_path / "instance.npy").dtype.str == "<i8"

@@ -50,7 +50,7 @@ def test_frames_lie_on_the_walls_that_they_were_taken_of(tmp_path, layout):
     data = RGBDFrames.from_folder(root)
     assert [scene.name for scene in data.scenes] == NAMES[layout]
     for sample, frame in zip(data, FRAMES, strict=True):
-        # Half a millimetre of rounding, and what a ray of it moves sideways.
+        # Half a millimeter of rounding, and what a ray of it moves sideways.
         np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)
     assert all(root in path.parents for path in data.scenes[0].files)
 
@@ -161,8 +161,8 @@ def test_depth_that_is_missing_fails_its_frame_and_leaves_nothing(tmp_path, run)
     (root / "depth" / "frame_00001.png").unlink()
     done = run("convert", "rgbd", root, out, "--workers", "1")
     assert done.code == 3
-    (told,) = [line for line in done.err.splitlines() if "frame_00001" in line]
-    assert told.endswith(f"{root / 'depth' / 'frame_00001.png'}: No such file or directory.")
+    (reported,) = [line for line in done.err.splitlines() if "frame_00001" in line]
+    assert reported.endswith(f"{root / 'depth' / 'frame_00001.png'}: No such file or directory.")
     assert [path.name for path in (out / "capture" / "depth").iterdir()] == ["frame_00000"]
     alone = tmp_path / "alone"
     shared = json.loads((root / "transforms.json").read_text())

@@ -158,7 +158,7 @@ def test_mask3d(converted, rooms):
         assert np.array_equal(points[:, 11], room.objects)
         assert np.array_equal(np.array(names)[truth // 1000 - 1], room.names)
         assert np.array_equal(truth % 1000 - 1, room.objects)
-        # What is trained on the other areas is normalised by them.
+        # What is trained on the other areas is normalized by them.
         other = rooms[name if mode == "train" else next(n for n in rooms if n != name)]
         assert np.allclose(colors["mean"], (other.color / 255).mean(axis=0))
         assert np.allclose(colors["std"], (other.color / 255).std(axis=0))

@@ -1,4 +1,4 @@
-"""A room reads as its objects in natural order, whatever lies beside them."""
+"""A room reads as its objects in natural order, whatever lies next to them."""
 
 import numpy as np
 import pytest

@@ -78,7 +78,7 @@ def test_improbable_cameras_are_doubted_at_every_door(name, tmp_path, run):
     root.mkdir()
     write_png(root / "0.png", torch.full(SIZE[::-1], 2000))
     flags = ["--intrinsics", ",".join(map(str, numbers)), "--depth-scale", "1000"]
-    told = "0.png: expected --intrinsics fx,fy,cx,cy of images of 320 x 240 pixels, got "
+    reported = "0.png: expected --intrinsics fx,fy,cx,cy of images of 320 x 240 pixels, got "
     for command in (
         ("depth", root / "0.png", "--out", labels),
         ("convert", "rgbd", root, tmp_path / "out", "--dry-run"),
@@ -86,7 +86,7 @@ def test_improbable_cameras_are_doubted_at_every_door(name, tmp_path, run):
         done = run(*command, *flags)
         assert done.code == 0
         (line,) = done.err.splitlines()
-        assert told in line
+        assert reported in line
         assert message in line
     camera = make_intrinsics(*numbers)
     with pytest.warns(DepthWarning, match=message):

@@ -129,7 +129,7 @@ def test_planes_that_end_stay_apart():
 
 
 def roof(turn_deg, step=0.0):
-    """Return labels and planes for ``join_strips``: a face, and 6 columns beside it."""
+    """Return labels and planes for ``join_strips``: a face, and 6 columns next to it."""
     x = rays()[0, :, 0]
     slope = math.tan(math.radians(turn_deg))
     crease = float(x[200])

@@ -58,7 +58,7 @@ def test_pixels_off_the_other_plane_stay():
 
 
 def test_borders_do_not_run_along_the_crease():
-    # A leg stands on a floor: beside the leg, the floor goes on behind the line where they meet.
+    # A leg stands on a floor: next to the leg, the floor goes on behind the line where they meet.
     x = torch.arange(60).double() / 100
     y = torch.arange(60).double()[:, None] / 100
     floor = 1 + 2 * (y - 0.2) + 0 * x

@@ -82,7 +82,7 @@ def test_faces_of_a_real_frame_are_regions(scan):
     assert float((seg.labels[depth > 0] >= 0).double().mean()) > 0.9
     wall, floor = seg.planes.normal[first[0]], seg.planes.normal[first[1]]
     assert float(unsigned_angle_deg(wall, floor)) > 80
-    # The sensor bends the wall, and its depth has steps, of 2.85 mm times the square of metres.
+    # The sensor bends the wall, and its depth has steps, of 2.85 mm times the square of meters.
     farthest = torch.stack([depth[seg.labels == label].max() for label in first])
     assert bool((seg.planes.rms[first] < 0.00285 * farthest**2).all())
 

@@ -55,7 +55,7 @@ def assert_same_fixture():
 
 @pytest.fixture
 def write_scan():
-    """Write coordinates and colours of a cloud as an E57 file, which torchrg only reads."""
+    """Write coordinates and colors of a cloud as an E57 file, which torchrg only reads."""
     pye57 = pytest.importorskip("pye57")
 
     def write(path, cloud, **about):

@@ -16,7 +16,7 @@ QUARTER = np.array([0.5**0.5, 0.0, 0.0, 0.5**0.5])
 
 @pytest.fixture
 def scans(tmp_path):
-    """A file that pye57 itself wrote: two scans with poses, the first with colour."""
+    """A file that pye57 itself wrote: two scans with poses, the first with color."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(2, 20, 3)).astype(np.float32).astype(np.float64)
     path = tmp_path / "scans.e57"
@@ -327,8 +327,10 @@ def test_rotations_of_another_length_are_told(tmp_path, length, is_told):
     cloud = read_cloud(write_columns(tmp_path / "a.e57", columns, pose=length * QUARTER))
     expected = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] if length else np.eye(3)
     np.testing.assert_allclose(cloud.coordinates, expected, atol=1e-15)
-    told = [note for note in cloud.notes if note.startswith("the rotations of 1 of 1 scans are")]
-    assert len(told) == is_told
+    reported = [
+        note for note in cloud.notes if note.startswith("the rotations of 1 of 1 scans are")
+    ]
+    assert len(reported) == is_told
 
 
 @pytest.mark.parametrize("grid", [(1e300, 0.0), (1e-310, 0.0), (1e-30, 1e6)])
@@ -347,5 +349,5 @@ def test_bounds_that_contradict_the_points_are_told(tmp_path):
     for name, bounds in {"right": [[0] * 3, [1] * 3], "wrong": [[0] * 3, [1, 1e-3, 1]]}.items():
         path = write_columns(tmp_path / f"{name}.e57", columns, bounds=bounds)
         notes[name] = read_cloud(path).notes
-    told = "the points of 1 of 1 scans lie outside the bounds in the header; check the scales"
-    assert notes == {"right": (), "wrong": (told,)}
+    reported = "the points of 1 of 1 scans lie outside the bounds in the header; check the scales"
+    assert notes == {"right": (), "wrong": (reported,)}

@@ -22,8 +22,8 @@ def test_interrupted_writing_leaves_the_older_file(tmp_path):
     path.write_text("old")
 
     def write_half():
-        with atomic_path(path) as beside:
-            beside.write_text("half")
+        with atomic_path(path) as temporary:
+            temporary.write_text("half")
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -34,10 +34,10 @@ def test_interrupted_writing_leaves_the_older_file(tmp_path):
 
 def test_file_is_moved_into_place_at_the_end(tmp_path):
     path = tmp_path / "a.txt"
-    with atomic_path(path) as beside:
-        beside.write_text("new")
-        assert beside.parent == tmp_path
-        assert beside.suffix == ".txt"
+    with atomic_path(path) as temporary:
+        temporary.write_text("new")
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".txt"
         assert not path.exists()
     assert path.read_text() == "new"
     assert list(tmp_path.iterdir()) == [path]

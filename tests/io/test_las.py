@@ -22,7 +22,7 @@ WKT = 'LOCAL_CS["hand made"]'
 
 @pytest.fixture
 def scanned(tmp_path):
-    """A file as a scanner writes it: own scale, reference system, dimensions, wide colours."""
+    """A file as a scanner writes it: own scale, reference system, dimensions, wide colors."""
 
     def write(point_format=3, version="1.2", suffix=".las"):
         header = laspy.LasHeader(point_format=point_format, version=version)
@@ -119,7 +119,7 @@ def described(tmp_path):
     header.scales = [0.001] * 3
     params = [
         ("Pulse width", "f4", "of the echo", {}),
-        ("Range", "u2", "in metres", {"offsets": [5.0], "scales": [0.01]}),
+        ("Range", "u2", "in meters", {"offsets": [5.0], "scales": [0.01]}),
         ("vector", "3i2", "", {}),
         ("Beam", "2i4", "angles", {"offsets": [0.0, 1.0], "scales": [0.5, 0.25]}),
         ("label", "u1", "ground truth", {}),
@@ -295,7 +295,7 @@ def put_in_record(path, place, layout, value):
 
 @pytest.mark.parametrize("chunk_size", [50_000, 0, 2**32 - 1])
 def test_points_compressed_without_chunks_are_read(scanned, chunk_size):
-    # LASzip's first compressor has no table of chunks, and nobody asks for their size.
+    # LASzip's first compressor has no table of chunks, and no one asks for their size.
     path = scanned(3, "1.2", ".laz")
     expected = read_cloud(path)
     data = path.read_bytes()

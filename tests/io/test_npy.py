@@ -59,7 +59,7 @@ def test_fortran_order_and_foreign_bytes_are_read(tmp_path):
         (np.tile([-1640.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
         (np.tile([0.5, 0.6, 0, -0.8], (4, 1)), {"column_4", "normals"}),
         (np.tile([0.6, 0, -0.8, 3], (4, 1)), {"normals", "column_7"}),
-        # Intensity and colour, or colour and label: values do not tell.
+        # Intensity and color, or color and label: values do not tell.
         (np.tile([255.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
         (np.tile([0.5, 0, 7, 0.5], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
     ],
@@ -125,7 +125,7 @@ def test_structured_arrays_are_read_by_name(tmp_path):
 
 
 class Bomb:
-    """Says so if anybody unpickles it."""
+    """Fails if it is unpickled."""
 
     def __reduce__(self):
         return (pytest.fail, ("a pickle was loaded",))

@@ -101,8 +101,8 @@ def test_other_elements_before_and_after_are_passed_over(tmp_path, order):
     cloud = read_cloud(save(tmp_path / "a.ply", header, body))
     np.testing.assert_array_equal(cloud.coordinates, np.array(POINTS, np.float32))
     assert set(cloud.fields) == {"color", "labels"}
-    told = "1 of camera, 2 of strip"
-    assert cloud.notes == (f"elements skipped (only vertices and faces are read): {told}",)
+    reported = "1 of camera, 2 of strip"
+    assert cloud.notes == (f"elements skipped (only vertices and faces are read): {reported}",)
 
 
 @pytest.mark.parametrize("kind", ["ply", "pcd"])

@@ -63,7 +63,7 @@ def test_las_keeps_coordinates_to_its_grid_and_fields_exactly(tmp_path, make_clo
     cloud = make_cloud(dtype="f8", origin=UTM)
     write_cloud(tmp_path / f"a{kind}", cloud)
     found = read_cloud(tmp_path / f"a{kind}")
-    # Half a step of the grid (32 bits over a few metres, in powers of ten) and half a float64.
+    # Half a step of the grid (32 bits over a few meters, in powers of ten) and half a float64.
     np.testing.assert_allclose(found.coordinates, cloud.coordinates, rtol=0, atol=0.5e-8 + 1e-9)
     for name, values in cloud.fields.items():
         np.testing.assert_array_equal(found.fields[name], values, err_msg=name)
@@ -128,16 +128,16 @@ def test_own_fields_that_a_result_has_too_are_kept_aside(
     write_cloud(tmp_path / f"c{kind}", read_cloud(tmp_path / f"b{kind}"), seg)
     for name in ("a", "b", "c"):
         fields = read_cloud(tmp_path / f"{name}{kind}").fields
-        aside = {"label_input", "normals_input", "curvature_input"}
-        assert fields.keys() == cloud.fields.keys() | aside
+        renamed = {"label_input", "normals_input", "curvature_input"}
+        assert fields.keys() == cloud.fields.keys() | renamed
         for field, values in results.items():
             np.testing.assert_array_equal(fields[field].astype("f4"), values)
             own = "label_input" if field == "labels" else f"{field}_input"
             np.testing.assert_array_equal(fields[own].astype("f4"), cloud.fields[field])
     assert (tmp_path / f"b{kind}").read_bytes() == (tmp_path / f"c{kind}").read_bytes()
-    told = describe_renamed_fields(cloud.fields, RESULT_FIELDS)
+    reported = describe_renamed_fields(cloud.fields, RESULT_FIELDS)
     names = "label as label_input, normals as normals_input, curvature as curvature_input"
-    assert told == [f"input fields are kept next to the result: {names}"]
+    assert reported == [f"input fields are kept next to the result: {names}"]
     assert describe_renamed_fields(again.fields, RESULT_FIELDS) == [
         "its own label, normals, curvature left out for the result's; label_input, normals_input, "
         "curvature_input stay"
@@ -193,7 +193,7 @@ def test_planes_are_written_in_the_coordinates_of_the_input(
     assert offset.dtype == centroid.dtype == center.dtype == np.float64
     np.testing.assert_allclose(centroid - cloud.origin, seg.planes.centroid, atol=1e-8)
     np.testing.assert_allclose(center - cloud.origin, seg.planes.center, atol=1e-8)
-    # The centroids lie in their planes, there and here; float32 at a few metres is good for 1e-6.
+    # The centroids lie in their planes, there and here; float32 at a few meters is good for 1e-6.
     distance = (normal.astype(np.float64) * centroid).sum(axis=1) - offset
     np.testing.assert_allclose(distance, 0, atol=2e-6)
 

@@ -94,8 +94,10 @@ LEICA = "0 1.5 -2 {} 255 128 7\n3 4 1e3 {} 0 1 2\n"
 )
 def test_names_that_are_taken_for_granted_are_told(tmp_path, text, taken):
     cloud = read_cloud(save(tmp_path / "a.txt", text))
-    told = f"its columns have no names and are taken as {taken}; if they are others, name them"
-    assert [note.removesuffix(" with --columns") for note in cloud.notes] == [told] * bool(taken)
+    reported = f"its columns have no names and are taken as {taken}; if they are others, name them"
+    assert [note.removesuffix(" with --columns") for note in cloud.notes] == [reported] * bool(
+        taken
+    )
 
 
 def test_colours_come_last_in_files_of_leica(tmp_path):
@@ -121,7 +123,7 @@ def test_colours_come_last_in_files_of_leica(tmp_path):
     ],
 )
 def test_one_row_decides_the_names_of_all(tmp_path, kind, at, row, fields):
-    # Unit vectors that are whole numbers, too: normals or colours, as the other row says.
+    # Unit vectors that are whole numbers, too: normals or colors, as the other row says.
     table = np.zeros((60, 7))
     table[:, :3] = np.random.default_rng(0).random((60, 3))
     table[np.arange(60), 3 + np.arange(60) % 3] = 1.0

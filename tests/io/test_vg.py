@@ -9,7 +9,7 @@ from torchrg.structures import Cloud
 
 
 def literal_groups(lines):
-    """What abspy reads: points up to the colours, and the line after each number of points."""
+    """What abspy reads: points up to the colors, and the line after each number of points."""
     end = next(i for i, line in enumerate(lines) if "num_colors" in line)
     points = np.array(" ".join(lines[1:end]).split(), float).reshape(-1, 3)
     rows = [lines[i + 1] for i, line in enumerate(lines) if line.startswith("group_num_point")]

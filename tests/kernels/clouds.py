@@ -1,4 +1,4 @@
-"""Clouds, and lists of neighbours, on which kernels are compared with their definitions."""
+"""Clouds, and lists of neighbors, on which kernels are compared with their definitions."""
 
 import contextlib
 from unittest import mock
@@ -41,7 +41,7 @@ def clouds():
 
 
 def lists(points, k, masked):
-    """Neighbours of points, some of them masked out if asked for."""
+    """Neighbors of points, some of them masked out if asked for."""
     indices = search_knn(points, min(k, len(points))).indices
     if not masked:
         return Neighbors(indices)

@@ -1,4 +1,4 @@
-"""The kernels of consensus normals do what the functions of torch beside them do."""
+"""The kernels of consensus normals do what the functions of torch next to them do."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from torchrg.normals.pca import fit_points_pca
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 
 CLOUDS = {name: points for name, points in clouds().items() if name != "line"}
-ALIKE = 0.98
+MIN_EQUAL = 0.98
 """Share of the points at which a choice, as that of a best plane, is the same: rounding may decide
 between two that are as good."""
 
@@ -54,13 +54,15 @@ def assert_same_planes(found, expected, unit, fraction=1.0, rows=slice(None)):
 
 def test_broken_planes(points, near, survey):
     fit, (_, _, noise, _) = survey
-    # The kernel is for points of equally many neighbours.
-    count = near.counted().sum(dim=1)
+    # The kernel is for points of equally many neighbors.
+    count = near.mask().sum(dim=1)
     rows = (fit.valid & noise.isfinite() & (count == count.mode().values)).nonzero().squeeze(1)
     (voted, meeting), (voted_too, meeting_too) = (
-        both(broken_planes, points, near.at(rows), noise[rows], fit.normals[rows])
+        both(broken_planes, points, near.select(rows), noise[rows], fit.normals[rows])
         if near.valid is None
-        else both(broken_planes, points, type(near)(*near.at(rows)), noise[rows], fit.normals[rows])
+        else both(
+            broken_planes, points, type(near)(*near.select(rows)), noise[rows], fit.normals[rows]
+        )
     )
     # To the bit: rounding would decide between planes that are as good.
     for found, expected in zip((*voted, *meeting), (*voted_too, *meeting_too), strict=True):
@@ -71,10 +73,10 @@ def test_paraboloids(points, near, survey):
     fit, (_, _, _, radius) = survey
     rows = fit.valid.nonzero().squeeze(1)
     found, expected = both(_paraboloids, points, *near, fit.normals, rows)
-    enough = near.counted()[rows].sum(dim=1) > 6
-    assert_same_planes(found[:2], expected[:2], radius[rows], ALIKE, enough)
+    enough = near.mask()[rows].sum(dim=1) > 6
+    assert_same_planes(found[:2], expected[:2], radius[rows], MIN_EQUAL, enough)
     error = ((found[2] - expected[2]).abs() / radius[rows])[enough]
-    assert (error < 1e-3).float().mean() >= ALIKE
+    assert (error < 1e-3).float().mean() >= MIN_EQUAL
 
 
 def test_smoothing(points, near, survey):
@@ -93,7 +95,7 @@ def test_choice_among_planes(points, near, survey):
     planes = TangentPlanes(fit.normals, offsets)
     rows = (fit.valid & noise.isfinite()).nonzero().squeeze(1)[::3]
     found, expected = both(choose_planes, points, near, planes, noise, rows, chunk_size=700)
-    assert_same_planes(found, expected, radius, ALIKE, radius > 0)
+    assert_same_planes(found, expected, radius, MIN_EQUAL, radius > 0)
 
 
 def test_inliers(points, near, survey):
@@ -101,7 +103,7 @@ def test_inliers(points, near, survey):
     rows = (fit.valid & noise.isfinite()).nonzero().squeeze(1)
     found, expected = both(_inliers, points, *near, fit.normals, offsets, noise, rows)
     same = found[0] == expected[0]
-    assert same.float().mean() > ALIKE
+    assert same.float().mean() > MIN_EQUAL
     error = (found[1] - expected[1]).abs() / radius[rows, None] ** 2
     assert error[same].max() < 1e-5
 

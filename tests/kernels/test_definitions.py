@@ -1,4 +1,4 @@
-"""Every kernel does what the function of torch does that stands beside it."""
+"""Every kernel does what the function of torch does that stands next to it."""
 
 import pytest
 import torch
@@ -90,10 +90,10 @@ def test_survey_is_that_of_the_definition(points, masked):
     for place in (0, 1, 2):
         assert_close(found[place], expected[place], radius)
     for place in (5, 6):
-        # Of neighbours spread alike along two directions any plane across them is the thinnest.
-        alike = (found[place] - expected[place]).abs() <= 1e-5 * radius
-        alike |= found[place].isinf() & expected[place].isinf()
-        assert alike.float().mean() > 0.95
+        # Of neighbors spread equally along two directions any plane across them is the thinnest.
+        equal = (found[place] - expected[place]).abs() <= 1e-5 * radius
+        equal |= found[place].isinf() & expected[place].isinf()
+        assert equal.float().mean() > 0.95
     # The deviations from two layers, and where places repeat.
     assert torch.equal(found[3], expected[3])
     assert torch.equal(found[4], expected[4])

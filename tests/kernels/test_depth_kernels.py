@@ -82,7 +82,7 @@ def stages_of(depth):
     found = [*planes.squares.values(), planes.narrow, planes.pixels, *planes.choice, *pixels]
     found += [labels]
     if bool((labels >= 0).any()):
-        fit = fit_inverse_planes(cloud, labels, most=500)
+        fit = fit_inverse_planes(cloud, labels, max_pixels=500)
         reach = fit.scale_thickness(3.0)
         absorbed = assign_unlabeled_pixels(cloud, labels, fit, reach)
         found += [*fit, absorbed, *hidden_contacts(cloud.points, cloud.seen, labels, fit, reach)]
@@ -158,8 +158,8 @@ def test_rows_and_outer_points_of_regions_are_those_of_the_definition(most, rng)
     labels = labels[torch.randperm(900, generator=rng)]
 
     def stages():
-        segments = Segments(labels, most=most)
-        columns = [segments.take(column) for column in places.T]
+        segments = Segments(labels, max_points=most)
+        columns = [segments.gather(column) for column in places.T]
         return [
             segments.rows,
             segments.counts,

@@ -92,7 +92,7 @@ def test_no_arguments_crash_a_kernel():
 
 def test_a_row_that_is_not_there_is_an_error():
     points, lists = torch.rand(5, 3), torch.tensor([[0, 5, 1]], dtype=torch.int32)
-    with pytest.raises(IndexError, match="names a row that is not there"):
+    with pytest.raises(IndexError, match="expected neighbor indices of existing rows"):
         kernels.call("fit_normals_pca", points, lists, None, torch.zeros(1), 0.0, 0.0)
 
 

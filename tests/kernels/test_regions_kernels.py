@@ -1,4 +1,4 @@
-"""Neighbours, edges and growth by kernels are those of the definitions to the bit."""
+"""Neighbors, edges and growth by kernels are those of the definitions to the bit."""
 
 import dataclasses
 
@@ -87,7 +87,7 @@ def test_shared_neighbors_are_those_of_the_definition(name, k, masked):
     near = lists(CLOUDS[name], k, masked)
     num_points, width = near.indices.shape
     draws = torch.rand(num_points, width, generator=torch.Generator().manual_seed(2))
-    asked = near.counted() & (draws < 0.8)
+    asked = near.mask() & (draws < 0.8)
     for least in (1, width // 3, width):
         shared = SharedNeighbors(near, least)
         for rows in (slice(0, num_points), slice(100, 250)):

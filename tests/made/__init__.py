@@ -1,4 +1,4 @@
-"""Scenes beside furnished rooms: curved rooms, storeys, scans, depth frames, shapes.
+"""Scenes in addition to furnished rooms: curved rooms, storeys, scans, depth frames, shapes.
 
 To add a scene, return a :class:`torchrg.scenes.SceneModel` from a function here: parts (surfaces,
 each a face, and solids that hide what is inside them) and places where a scanner may stand.

@@ -32,18 +32,18 @@ _STEEPEST = 0.5
 """Tangent of the steepest look downwards."""
 
 _KINECT_BASELINE = 0.075
-"""Metres."""
+"""Meters."""
 _KINECT_RANGE = (0.4, 8.0)
-"""Metres."""
+"""Meters."""
 _DISPARITY_STEP = 1 / 8
 """Pixels."""
 _NOISE_FLOOR, _NOISE_GROWTH = 0.0012, 0.0019
-"""Standard deviation at the nearest depth, metres, and its growth with the square beyond it."""
+"""Standard deviation at the nearest depth, meters, and its growth with the square beyond it."""
 
 _KINECT2_RANGE = (0.5, 4.5)
-"""Metres, of a Kinect v2."""
+"""Meters, of a Kinect v2."""
 _KINECT2_NOISE = (0.0015, -0.0005, 0.0003)
-"""Standard deviation of its depth in metres: a polynomial of the depth in metres."""
+"""Standard deviation of its depth in meters: a polynomial of the depth in meters."""
 _KINECT2_SIZE, _KINECT2_FOCAL = (512, 424), 365.0
 """Pixels."""
 
@@ -141,7 +141,7 @@ class DepthFrame(NamedTuple):
     """A depth image with its exact truth.
 
     Attributes:
-        depth: Distance along the optical axis in metres, shape ``(H, W)``, float32; 0 where there
+        depth: Distance along the optical axis in meters, shape ``(H, W)``, float32; 0 where there
             is none.
         labels: Faces of the scene, shape ``(H, W)``, int64; ``torchrg.UNLABELED`` where there is no
             depth. Not every face is seen.
@@ -164,7 +164,7 @@ def render_depth(
     """Render what a depth camera sees, by exact ray casting.
 
     The Kinect's noise is the axial one of [1]: a standard deviation of
-    ``0.0012 + 0.0019 (z - 0.4)^2`` metres along the optical axis; then the disparity, for a
+    ``0.0012 + 0.0019 (z - 0.4)^2`` meters along the optical axis; then the disparity, for a
     baseline of 7.5 cm, is rounded to an eighth of a pixel, and depth outside of 0.4 to 8 m is
     dropped. A Kinect v2 measures the time of flight, without such steps: its noise is the axial one
     of [2] for surfaces that face it, ``0.0015 - 0.0005 z + 0.0003 z^2``, from 0.5 to 4.5 m.
@@ -247,7 +247,7 @@ def make_mapped_room(
 ) -> Scene:
     """Make the map of an office that a Kinect v2 was carried through: the mean of each voxel.
 
-    A voxel, of a side in metres, has the mean of the points of all frames in it, as RTAB-Map
+    A voxel, of a side in meters, has the mean of the points of all frames in it, as RTAB-Map
     exports its maps. The points are a random subset of these, in random order; face and normal are
     of one point in each.
     """

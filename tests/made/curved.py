@@ -233,7 +233,7 @@ class CurvedLayout(RoomLayout):
     num_bent_walls: int = 0
     """Up to 4."""
     wall_bend: float = 0.04
-    """How far the middle of a bent wall bulges into the room, metres."""
+    """How far the middle of a bent wall bulges into the room, meters."""
 
     def draw_wall(self, number: int, wall: Frame, length: float, holes: Sequence[Hole]) -> Part:
         """Return an arc of a large cylinder through both ends of a bent wall, or a flat one."""

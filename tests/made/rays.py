@@ -14,7 +14,7 @@ _PLACES, _NOISE = range(2)
 """What random numbers are drawn for: the same places whatever the noise."""
 
 _FLAT_SLACK = 1e-9
-"""Rays through the seam of two faces must not slip between them; metres."""
+"""Rays through the seam of two faces must not slip between them; meters."""
 _SLACK = 1e-9
 """The same for curved faces, relative."""
 
@@ -47,7 +47,7 @@ def cast_rays(model: SceneModel, origin: Array, directions: Array) -> Hits:
     Args:
         model: The scene.
         origin: Where the rays start, shape ``(3,)``.
-        directions: A grid of rays, of any length, shape ``(H, W, 3)``. Neighbours should be
+        directions: A grid of rays, of any length, shape ``(H, W, 3)``. Neighbors should be
             similar: whole blocks of rays skip the faces they cannot meet.
 
     Example:

@@ -12,7 +12,7 @@ from torchrg.scenes import Scene, SceneModel
 from torchrg.structures import UNLABELED
 
 OUTLIERS = ("cluster", "shell", "far")
-"""Kinds: a compact cluster beside the plane, a shell around the point, and a cluster far away."""
+"""Kinds: a compact cluster next to the plane, a shell around the point, and a cluster far away."""
 _PATCH_SIZE = 50
 """Points of a neighbourhood."""
 
@@ -24,7 +24,7 @@ def take_rows(scene: Scene, rows: Tensor) -> Scene:
 
 
 def on_voxels(scene: Scene, size: float) -> Scene:
-    """Return one point of each voxel of a side, in metres."""
+    """Return one point of each voxel of a side, in meters."""
     return take_rows(scene, sample_voxels(scene.points, size).rows)
 
 
@@ -52,7 +52,7 @@ def in_pieces(scene: Scene, num_points: int, *, num_pieces: int = 40, seed: int 
 def drawn_from_triangles(scene: Scene, num_points: int, *, seed: int = 0) -> Scene:
     """Return points drawn from triangles between near points, as S3DIS is drawn from meshes.
 
-    A triangle is a point and two of its six neighbours; a point of it belongs to the face of the
+    A triangle is a point and two of its six neighbors; a point of it belongs to the face of the
     nearest corner.
     """
     rng, num_neighbors = np.random.default_rng(seed), 6

@@ -50,13 +50,13 @@ _ROOM = RoomLayout(
 )
 """What is in each room of a storey; its size is drawn."""
 _WIDTHS, _DEPTHS, _HEIGHTS = (4.6, 6.2), (4.3, 5.1), (2.6, 2.9)
-"""Least and greatest extents of rooms, metres; the width is along the hallway."""
+"""Least and greatest extents of rooms, meters; the width is along the hallway."""
 _WALLS = (0.33, 0.42)
-"""Least and greatest thickness of walls, metres."""
+"""Least and greatest thickness of walls, meters."""
 _DOOR_HEIGHTS = (1.98, 2.15)
-"""Metres."""
+"""Meters."""
 _DOOR_LEAF = 0.04
-"""Thickness, metres."""
+"""Thickness, meters."""
 
 _HALL_WALLS = (0, 2)
 """The long walls of the hallway."""
@@ -182,7 +182,7 @@ def _floor(rooms: list[_Room], length: float, width: float) -> Flat:
 
 
 def _open_door(room: _Room, rng: np.random.Generator) -> Part:
-    """Return the leaf of an open door, inside the room beside the doorway."""
+    """Return the leaf of an open door, inside the room next to the doorway."""
     left, right, top = room.door
     hinge = left - 0.1 if left < room.size[0] / 2 else right + 0.1
     frame = room.frame.moved(hinge, 0.05 + (right - left) / 2, rng.uniform(0.01, 0.03))

@@ -219,7 +219,7 @@ def test_a_cluster_of_one_point_has_no_spread():
     [
         (torch.zeros(4, 2), torch.zeros(4).long(), r"normals of shape \(N, 3\), got \(4, 2\)"),
         (torch.zeros(4, 3), torch.zeros(3).long(), r"labels of shape \(N\) with N=4, got \(3,\)"),
-        (torch.zeros(4, 3), torch.zeros(4), "labels of integers, got float32"),
+        (torch.zeros(4, 3), torch.zeros(4), "integer labels, got float32"),
         (torch.zeros(4, 3).long(), torch.zeros(4).long(), "normals of float32 or float64"),
         (np.zeros((4, 3), dtype="U1"), torch.zeros(4).long(), "normals to be a tensor or a NumPy"),
         (torch.zeros(4, 3, device="meta"), torch.zeros(4).long(), "on one device, got meta and"),

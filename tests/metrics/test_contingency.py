@@ -12,10 +12,10 @@ def random_labels(rng, count, num_labels):
     return torch.randint(-1, num_labels, (count,), generator=rng)
 
 
-def counted(labels, truth):
+def counted(labels, ground_truth):
     """Overlaps, region sizes and face sizes, by loops over the points."""
     overlaps, regions, faces = {}, {}, {}
-    for label, true in zip(labels, truth, strict=True):
+    for label, true in zip(labels, ground_truth, strict=True):
         if label != -1:
             regions[label] = regions.get(label, 0) + 1
         if true != -1:
@@ -37,25 +37,27 @@ def as_dicts(table):
 
 @pytest.mark.parametrize("num_labels", [1, 3, 40])
 def test_table_counts_what_loops_count(rng, num_labels):
-    labels, truth = random_labels(rng, 300, num_labels), random_labels(rng, 300, 5)
-    table = contingency_table(labels, truth)
-    assert as_dicts(table) == counted(labels.tolist(), truth.tolist())
+    labels, ground_truth = random_labels(rng, 300, num_labels), random_labels(rng, 300, 5)
+    table = contingency_table(labels, ground_truth)
+    assert as_dicts(table) == counted(labels.tolist(), ground_truth.tolist())
     assert table.num_points == 300
 
 
 def test_labels_may_be_any_integers(rng):
     names = torch.tensor([-(2**40), -7, 0, 5, 2**40, -1])
-    labels, truth = names[torch.randint(6, (2, 200), generator=rng)]
-    assert as_dicts(contingency_table(labels, truth)) == counted(labels.tolist(), truth.tolist())
+    labels, ground_truth = names[torch.randint(6, (2, 200), generator=rng)]
+    assert as_dicts(contingency_table(labels, ground_truth)) == counted(
+        labels.tolist(), ground_truth.tolist()
+    )
 
 
 @pytest.mark.parametrize(
     "kind", [np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, ">i4"]
 )
 def test_numpy_integers_of_any_kind_are_accepted(kind):
-    labels, truth = np.array([0, 0, 1, 2]).astype(kind), np.array([3, 4, 4, 4]).astype(kind)
-    expected = counted(labels.tolist(), truth.tolist())
-    assert as_dicts(contingency_table(labels, truth)) == expected
+    labels, ground_truth = np.array([0, 0, 1, 2]).astype(kind), np.array([3, 4, 4, 4]).astype(kind)
+    expected = counted(labels.tolist(), ground_truth.tolist())
+    assert as_dicts(contingency_table(labels, ground_truth)) == expected
 
 
 def test_unlabelled_points_make_their_partner_larger_and_nothing_else():
@@ -65,10 +67,10 @@ def test_unlabelled_points_make_their_partner_larger_and_nothing_else():
 
 
 def test_ignored_points_count_nowhere(rng):
-    labels, truth = random_labels(rng, 300, 6), random_labels(rng, 300, 6)
-    kept = truth != 2
-    table = contingency_table(labels, truth, ignore=2)
-    assert as_dicts(table) == counted(labels[kept].tolist(), truth[kept].tolist())
+    labels, ground_truth = random_labels(rng, 300, 6), random_labels(rng, 300, 6)
+    kept = ground_truth != 2
+    table = contingency_table(labels, ground_truth, ignore=2)
+    assert as_dicts(table) == counted(labels[kept].tolist(), ground_truth[kept].tolist())
     assert table.num_points == int(kept.sum())
 
 
@@ -79,19 +81,19 @@ def test_points_of_no_face_can_be_ignored():
 
 def test_small_regions_count_as_unlabelled():
     labels = torch.tensor([4, 4, 4, 6, 6, 9])
-    truth = torch.tensor([0, 0, 1, 1, 1, 1])
-    table = contingency_table(labels, truth, min_size=3)
+    ground_truth = torch.tensor([0, 0, 1, 1, 1, 1])
+    table = contingency_table(labels, ground_truth, min_size=3)
     assert as_dicts(table) == ({(4, 0): 2, (4, 1): 1}, {4: 3}, {0: 2, 1: 4})
 
 
 def test_size_of_a_region_is_taken_before_points_are_ignored():
-    labels, truth = torch.tensor([4, 4, 4]), torch.tensor([0, 8, 8])
-    table = contingency_table(labels, truth, min_size=3, ignore=8)
+    labels, ground_truth = torch.tensor([4, 4, 4]), torch.tensor([0, 8, 8])
+    table = contingency_table(labels, ground_truth, min_size=3, ignore=8)
     assert as_dicts(table) == ({(4, 0): 1}, {4: 1}, {0: 1})
 
 
 @pytest.mark.parametrize(
-    ("labels", "truth", "expected"),
+    ("labels", "ground_truth", "expected"),
     [
         ([], [], ({}, {}, {})),
         ([-1, -1], [-1, -1], ({}, {}, {})),
@@ -100,34 +102,37 @@ def test_size_of_a_region_is_taken_before_points_are_ignored():
         ([3], [8], ({(3, 8): 1}, {3: 1}, {8: 1})),
     ],
 )
-def test_nothing_on_a_side_gives_an_empty_side(labels, truth, expected):
+def test_nothing_on_a_side_gives_an_empty_side(labels, ground_truth, expected):
     table = contingency_table(
-        torch.tensor(labels, dtype=torch.int64), torch.tensor(truth, dtype=torch.int64)
+        torch.tensor(labels, dtype=torch.int64), torch.tensor(ground_truth, dtype=torch.int64)
     )
     assert as_dicts(table) == expected
 
 
 def test_table_does_not_depend_on_the_order_of_the_points(rng):
-    labels, truth = random_labels(rng, 500, 9), random_labels(rng, 500, 9)
+    labels, ground_truth = random_labels(rng, 500, 9), random_labels(rng, 500, 9)
     order = torch.randperm(500, generator=rng)
-    first, second = contingency_table(labels, truth), contingency_table(labels[order], truth[order])
+    first, second = (
+        contingency_table(labels, ground_truth),
+        contingency_table(labels[order], ground_truth[order]),
+    )
     for one, other in zip(first, second, strict=True):
         assert torch.equal(torch.as_tensor(one), torch.as_tensor(other))
 
 
 def test_arguments_are_left_alone():
-    labels, truth = torch.tensor([0, 1, 1]), torch.tensor([2, 2, 3])
-    contingency_table(labels, truth, min_size=2, ignore=3)
+    labels, ground_truth = torch.tensor([0, 1, 1]), torch.tensor([2, 2, 3])
+    contingency_table(labels, ground_truth, min_size=2, ignore=3)
     assert labels.tolist() == [0, 1, 1]
-    assert truth.tolist() == [2, 2, 3]
+    assert ground_truth.tolist() == [2, 2, 3]
 
 
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        (torch.zeros(4), "labels of integers, got float32; convert with .long"),
-        (torch.zeros(4, dtype=torch.bool), "labels of integers, got bool"),
-        (np.zeros(4), "labels of integers, got float64"),
+        (torch.zeros(4), "integer labels, got float32; convert with .long"),
+        (torch.zeros(4, dtype=torch.bool), "integer labels, got bool"),
+        (np.zeros(4), "integer labels, got float64"),
         (torch.zeros(3, dtype=torch.int64), r"truth of shape \(N\) with N=3, got \(4,\)"),
         (torch.zeros(2, 2, dtype=torch.int64), r"labels of shape \(N\), got \(2, 2\)"),
         ([0, 0, 0, 0], "labels to be a tensor or a NumPy array, got list"),

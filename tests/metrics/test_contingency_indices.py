@@ -12,22 +12,24 @@ def pairs_of_labels():
     rng = torch.Generator().manual_seed(3)
     for count, ours, true in ((2, 2, 2), (10, 3, 4), (200, 1, 6), (200, 30, 4), (5000, 60, 60)):
         yield torch.randint(-1, ours, (2, count), generator=rng) % (true + 1) - 1
-    truth = torch.randint(-1, 20, (3000,), generator=rng)
-    yield torch.stack([torch.where(torch.rand(3000, generator=rng) < 0.2, -1, truth), truth])
-    yield torch.stack([truth, truth])
-    yield torch.stack([truth // 2, truth])
+    ground_truth = torch.randint(-1, 20, (3000,), generator=rng)
+    yield torch.stack(
+        [torch.where(torch.rand(3000, generator=rng) < 0.2, -1, ground_truth), ground_truth]
+    )
+    yield torch.stack([ground_truth, ground_truth])
+    yield torch.stack([ground_truth // 2, ground_truth])
 
 
-@pytest.mark.parametrize(("labels", "truth"), list(pairs_of_labels()))
-def test_adjusted_rand_index_is_that_of_scikit_learn(labels, truth):
-    table = contingency_table(labels, truth)
-    expected = adjusted_rand_score(truth.numpy(), labels.numpy())
+@pytest.mark.parametrize(("labels", "ground_truth"), list(pairs_of_labels()))
+def test_adjusted_rand_index_is_that_of_scikit_learn(labels, ground_truth):
+    table = contingency_table(labels, ground_truth)
+    expected = adjusted_rand_score(ground_truth.numpy(), labels.numpy())
     assert adjusted_rand_index(table) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.filterwarnings("ignore:The number of unique classes:UserWarning")
 @pytest.mark.parametrize(
-    ("labels", "truth"),
+    ("labels", "ground_truth"),
     [
         ([], []),
         ([0], [5]),
@@ -40,11 +42,11 @@ def test_adjusted_rand_index_is_that_of_scikit_learn(labels, truth):
         ([0, 1, 0, 1], [0, 0, 1, 1]),
     ],
 )
-def test_degenerate_labellings_have_the_values_of_scikit_learn(labels, truth):
+def test_degenerate_labellings_have_the_values_of_scikit_learn(labels, ground_truth):
     table = contingency_table(
-        torch.tensor(labels, dtype=torch.int64), torch.tensor(truth, dtype=torch.int64)
+        torch.tensor(labels, dtype=torch.int64), torch.tensor(ground_truth, dtype=torch.int64)
     )
-    expected = adjusted_rand_score(truth, labels)
+    expected = adjusted_rand_score(ground_truth, labels)
     assert adjusted_rand_index(table) == pytest.approx(expected, abs=1e-12)
 
 
@@ -74,16 +76,16 @@ def test_rand_index_of_a_split_region_is_the_textbook_value():
 @pytest.mark.parametrize("seed", range(10))
 def test_covering_is_the_sum_over_faces_by_loops(seed):
     rng = torch.Generator().manual_seed(seed)
-    labels, truth = torch.randint(-1, 6, (2, 80), generator=rng)
+    labels, ground_truth = torch.randint(-1, 6, (2, 80), generator=rng)
     total, weight = 0.0, 0
-    for face in set(truth.tolist()) - {-1}:
-        own = truth == face
+    for face in set(ground_truth.tolist()) - {-1}:
+        own = ground_truth == face
         best = max(
             float(((labels == region) & own).sum() / ((labels == region) | own).sum().double())
             for region in set(labels.tolist()) - {-1}
         )
         total, weight = total + best * int(own.sum()), weight + int(own.sum())
-    table = contingency_table(labels, truth)
+    table = contingency_table(labels, ground_truth)
     assert segmentation_covering(table) == pytest.approx(total / weight, abs=1e-14)
 
 

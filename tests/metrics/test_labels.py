@@ -20,10 +20,10 @@ from torchrg.metrics import (
 SHARES = [name for name, index in METRICS["labels"].items() if index.unit != "count"]
 
 
-def scored_by_loops(labels, truth):
+def scored_by_loops(labels, ground_truth):
     """Precision, recall, F1 and the IoU indices, from sets of points."""
     regions = {a: {i for i, x in enumerate(labels) if x == a} for a in set(labels) - {-1}}
-    faces = {b: {i for i, x in enumerate(truth) if x == b} for b in set(truth) - {-1}}
+    faces = {b: {i for i, x in enumerate(ground_truth) if x == b} for b in set(ground_truth) - {-1}}
     iou = {
         (a, b): len(region & face) / len(region | face)
         for a, region in regions.items()
@@ -64,19 +64,19 @@ def scored_by_loops(labels, truth):
 @pytest.mark.parametrize("seed", range(20))
 def test_indices_are_those_of_loops_over_sets(seed):
     rng = torch.Generator().manual_seed(seed)
-    truth = torch.randint(-1, 8, (200,), generator=rng)
+    ground_truth = torch.randint(-1, 8, (200,), generator=rng)
     noise = torch.rand(200, generator=rng) < 0.02 * seed
-    labels = torch.where(noise, torch.randint(-1, 9, (200,), generator=rng), truth + 30)
-    labels[truth == -1] = 7
-    score = score_labels(labels, truth)._asdict()
-    expected = scored_by_loops(labels.tolist(), truth.tolist())
+    labels = torch.where(noise, torch.randint(-1, 9, (200,), generator=rng), ground_truth + 30)
+    labels[ground_truth == -1] = 7
+    score = score_labels(labels, ground_truth)._asdict()
+    expected = scored_by_loops(labels.tolist(), ground_truth.tolist())
     assert {name: score[name] for name in expected} == pytest.approx(expected, abs=1e-12)
 
 
 def test_indices_by_hand():
     labels = torch.tensor([1, 1, 1, 1, 2, 2, -1, -1])
-    truth = torch.tensor([5, 5, 5, 6, 6, 6, 6, -1])
-    score = score_labels(labels, truth)
+    ground_truth = torch.tensor([5, 5, 5, 6, 6, 6, 6, -1])
+    score = score_labels(labels, ground_truth)
     assert score.pairs == 2
     assert score.precision == pytest.approx(100 * (3 / 4 + 1) / 2)
     assert score.recall == pytest.approx(100 * (1 + 2 / 4) / 2)
@@ -87,8 +87,8 @@ def test_indices_by_hand():
 
 
 def test_the_truth_itself_scores_full_marks(rng):
-    truth = torch.randint(0, 12, (400,), generator=rng)
-    score = score_labels(100 - truth, truth)._asdict()
+    ground_truth = torch.randint(0, 12, (400,), generator=rng)
+    score = score_labels(100 - ground_truth, ground_truth)._asdict()
     full = {name: 100.0 if METRICS["labels"][name].unit == "%" else 1.0 for name in SHARES}
     full |= {name: 0.0 for name in SHARES if METRICS["labels"][name].higher_is_better is False}
     assert {name: score[name] for name in SHARES} == pytest.approx(full, abs=1e-12)
@@ -96,7 +96,7 @@ def test_the_truth_itself_scores_full_marks(rng):
 
 
 @pytest.mark.parametrize(
-    ("labels", "truth", "counts", "agreement"),
+    ("labels", "ground_truth", "counts", "agreement"),
     [
         pytest.param([], [], (0, 0, 0, 0), 1, id="no point"),
         pytest.param([-1, -1], [-1, -1], (0, 0, 0, 2), 1, id="all unlabelled"),
@@ -105,9 +105,9 @@ def test_the_truth_itself_scores_full_marks(rng):
         pytest.param([0, -1], [-1, 0], (0, 1, 1, 2), 1, id="nothing in common"),
     ],
 )
-def test_means_over_nothing_are_zero_and_the_counts_tell(labels, truth, counts, agreement):
+def test_means_over_nothing_are_zero_and_the_counts_tell(labels, ground_truth, counts, agreement):
     score = score_labels(
-        torch.tensor(labels, dtype=torch.int64), torch.tensor(truth, dtype=torch.int64)
+        torch.tensor(labels, dtype=torch.int64), torch.tensor(ground_truth, dtype=torch.int64)
     )
     assert (score.pairs, score.regions, score.faces, score.points) == counts
     assert score.ari == agreement
@@ -116,12 +116,12 @@ def test_means_over_nothing_are_zero_and_the_counts_tell(labels, truth, counts, 
 
 
 def test_ignored_points_and_small_regions_score_as_if_they_were_not_there(rng):
-    truth = torch.randint(0, 6, (300,), generator=rng)
-    labels = truth.clone()
+    ground_truth = torch.randint(0, 6, (300,), generator=rng)
+    labels = ground_truth.clone()
     labels[:9] = torch.tensor([20, 20, 20, 20, 21, 21, 21, 22, 23])
-    cleaned, kept = torch.where(labels > 20, -1, labels), truth != 3
-    expected = score_labels(cleaned[kept], truth[kept])
-    assert score_labels(labels, truth, min_size=4, ignore=3) == expected
+    cleaned, kept = torch.where(labels > 20, -1, labels), ground_truth != 3
+    expected = score_labels(cleaned[kept], ground_truth[kept])
+    assert score_labels(labels, ground_truth, min_size=4, ignore=3) == expected
 
 
 @pytest.mark.parametrize(
@@ -138,8 +138,8 @@ def test_fields_of_scores_are_those_of_the_catalog(part, score):
 
 
 def test_scores_are_plain_numbers_for_json(rng):
-    labels, truth = torch.randint(-1, 6, (2, 300), generator=rng)
-    score = score_labels(labels, truth)
+    labels, ground_truth = torch.randint(-1, 6, (2, 300), generator=rng)
+    score = score_labels(labels, ground_truth)
     assert json.loads(json.dumps(score._asdict(), allow_nan=False)) == score._asdict()
     assert all(type(value) in (int, float) for value in score)
     assert all(math.isfinite(value) for value in score)
@@ -147,9 +147,11 @@ def test_scores_are_plain_numbers_for_json(rng):
 
 def test_labels_that_do_not_fit_are_refused():
     whole = torch.zeros(4, dtype=torch.int64)
-    with pytest.raises(ShapeError, match=r"score_labels: expected truth of shape \(N\) with N=4"):
+    with pytest.raises(
+        ShapeError, match=r"score_labels: expected ground_truth of shape \(N\) with N=4"
+    ):
         score_labels(whole, whole[:3])
-    with pytest.raises(ShapeError, match="score_labels: expected labels of integers, got float32"):
+    with pytest.raises(ShapeError, match="score_labels: expected integer labels, got float32"):
         score_labels(whole.float(), whole)
     with pytest.raises(ConfigError, match="score_labels: expected min_size >= 1, got 0"):
         score_labels(whole, whole, min_size=0)

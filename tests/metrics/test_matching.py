@@ -47,12 +47,12 @@ def test_what_a_format_without_rounding_holds_is_the_same_cloud(tmp_path, points
 
 
 def test_rounded_files_match_within_the_rounding_in_any_order(points):
-    millimetres = (points + CORNER).round(3)
-    assert len(differing_rows(Cloud(millimetres), Cloud(points + CORNER))) > 0.99 * len(points)
+    millimeters = (points + CORNER).round(3)
+    assert len(differing_rows(Cloud(millimeters), Cloud(points + CORNER))) > 0.99 * len(points)
     rows = np.random.default_rng(0).permutation(len(points))
-    found = match_points(Cloud(millimetres[rows]), Cloud(points + CORNER), 0.001)
+    found = match_points(Cloud(millimeters[rows]), Cloud(points + CORNER), 0.001)
     assert np.flatnonzero(found < 0).tolist() == [7, 50]
-    apart = np.abs(millimetres[rows][found] - points - CORNER)
+    apart = np.abs(millimeters[rows][found] - points - CORNER)
     assert apart[found >= 0].max() < 0.00051
 
 

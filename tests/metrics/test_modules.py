@@ -29,13 +29,16 @@ def scans(part):
     """Four scans of different size as (arguments, their score as a dict)."""
     rng = torch.Generator().manual_seed(7)
     for count in (60, 90, 20, 200):
-        labels, truth = torch.randint(-1, 5, (2, count), generator=rng)
-        truth = torch.where(torch.rand(count, generator=rng) < 0.8, labels, truth)
+        labels, ground_truth = torch.randint(-1, 5, (2, count), generator=rng)
+        ground_truth = torch.where(torch.rand(count, generator=rng) < 0.8, labels, ground_truth)
         normals, clusters = scattered(rng, [count, 7, 9], 0.1)
         other = normals + 0.1 * torch.randn(normals.shape, generator=rng, dtype=torch.float64)
         arguments, score = {
-            "labels": ((labels, truth), score_labels),
-            "superpoints": ((labels, truth, torch.rand(count, 3, generator=rng)), score_partition),
+            "labels": ((labels, ground_truth), score_labels),
+            "superpoints": (
+                (labels, ground_truth, torch.rand(count, 3, generator=rng)),
+                score_partition,
+            ),
             "clusters": ((normals, clusters), score_clusters),
             "normals": ((normals, other), score_errors),
         }[part]
@@ -83,21 +86,23 @@ def test_unknown_indices_and_those_of_several_parts_are_refused():
 
 
 def test_directions_say_which_of_two_results_is_better():
-    truth = torch.repeat_interleave(torch.arange(4), 25)
-    merged = torch.where(truth == 1, 0, truth)
+    ground_truth = torch.repeat_interleave(torch.arange(4), 25)
+    merged = torch.where(ground_truth == 1, 0, ground_truth)
     assert PlaneMetric("f1").higher_is_better
     for name in ("f1", "ari", "covering"):
         right, wrong = PlaneMetric(name), PlaneMetric(name)
-        right.update(truth, truth)
-        wrong.update(merged, truth)
+        right.update(ground_truth, ground_truth)
+        wrong.update(merged, ground_truth)
         assert (right.compute() > wrong.compute()) == right.higher_is_better
 
 
 @pytest.mark.filterwarnings("ignore:Sparse invariant checks:UserWarning")
 def test_agreement_with_torchmetrics_on_one_scan():
-    for (labels, truth), _ in scans("labels"):
+    for (labels, ground_truth), _ in scans("labels"):
         ours, theirs = PlaneMetric("ari"), AdjustedRandScore()
-        assert float(ours(labels, truth)) == pytest.approx(float(theirs(labels, truth)), abs=1e-6)
+        assert float(ours(labels, ground_truth)) == pytest.approx(
+            float(theirs(labels, ground_truth)), abs=1e-6
+        )
 
 
 @pytest.mark.parametrize("part", METRICS)
@@ -141,10 +146,10 @@ def test_no_scan_gives_nan():
 
 
 def test_settings_reach_the_function():
-    labels, truth = torch.tensor([0, 0, 0, 1, 2, 2]), torch.tensor([5, 5, 5, 5, 7, 7])
+    labels, ground_truth = torch.tensor([0, 0, 0, 1, 2, 2]), torch.tensor([5, 5, 5, 5, 7, 7])
     metric = PlaneMetric("labels", min_size=2, ignore=7)
-    metric.update(labels, truth)
-    expected = score_labels(labels, truth, min_size=2, ignore=7)
+    metric.update(labels, ground_truth)
+    expected = score_labels(labels, ground_truth, min_size=2, ignore=7)
     assert values_of(metric) == expected._asdict()
     normals, clusters = scattered(
         torch.Generator().manual_seed(0), [90, 90, 5], 0.1, axes=torch.eye(3)[[0, 0, 1]]

@@ -10,31 +10,31 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import PartitionScore, score_partition
 
 
-def counted_oracle(superpoints, truth, ignored):
+def counted_oracle(superpoints, ground_truth, ignored):
     """ASA and mean IoU point by point."""
-    scored = [i for i in range(len(truth)) if truth[i] not in ignored]
-    parts = sorted({truth[i] for i in scored})
+    scored = [i for i in range(len(ground_truth)) if ground_truth[i] not in ignored]
+    parts = sorted({ground_truth[i] for i in scored})
     given = {}
     for superpoint in {superpoints[i] for i in scored} - {-1}:
-        votes = Counter(truth[i] for i in scored if superpoints[i] == superpoint)
+        votes = Counter(ground_truth[i] for i in scored if superpoints[i] == superpoint)
         given[superpoint] = min(votes, key=lambda part: (-votes[part], part))
     found = {i: given.get(superpoints[i]) for i in scored}
-    right = sum(found[i] == truth[i] for i in scored)
+    right = sum(found[i] == ground_truth[i] for i in scored)
     ious = []
     for part in parts:
-        both = sum(found[i] == part and truth[i] == part for i in scored)
-        either = sum(found[i] == part or truth[i] == part for i in scored)
+        both = sum(found[i] == part and ground_truth[i] == part for i in scored)
+        either = sum(found[i] == part or ground_truth[i] == part for i in scored)
         ious.append(both / either)
     return right / len(scored), sum(ious) / len(parts)
 
 
-def counted_borders(superpoints, truth, points, distance):
+def counted_borders(superpoints, ground_truth, points, distance):
     """Recall and precision of borders from all distances."""
     away = np.linalg.norm(points[:, None] - points[None], axis=2)
     nearest = np.argsort(away, axis=1, kind="stable")[:, 1:9]
     ours, theirs = (
         [i for i in range(len(points)) if any(labels[j] != labels[i] for j in nearest[i])]
-        for labels in (superpoints, truth)
+        for labels in (superpoints, ground_truth)
     )
     recall = np.mean([min(away[i, j] for j in ours) <= distance for i in theirs])
     precision = np.mean([min(away[i, j] for j in theirs) <= distance for i in ours])
@@ -45,31 +45,31 @@ def counted_borders(superpoints, truth, points, distance):
 def test_scores_are_those_of_an_independent_count(seed):
     rng = np.random.default_rng(seed)
     points = rng.random((300, 3)) * [1, 1, 0.01]
-    truth = (points[:, 0] * 4).astype(int) + (rng.random(300) < 0.02)
+    ground_truth = (points[:, 0] * 4).astype(int) + (rng.random(300) < 0.02)
     superpoints = (points[:, 0] * 5).astype(int) * 3 + (points[:, 1] * 3).astype(int) - 1
-    score = score_partition(superpoints, truth, points, boundary_distance=0.03)
-    asa, miou = counted_oracle(superpoints.tolist(), truth.tolist(), ())
-    recall, precision = counted_borders(superpoints, truth, points, 0.03)
+    score = score_partition(superpoints, ground_truth, points, boundary_distance=0.03)
+    asa, miou = counted_oracle(superpoints.tolist(), ground_truth.tolist(), ())
+    recall, precision = counted_borders(superpoints, ground_truth, points, 0.03)
     assert (score.asa, score.oracle_miou) == pytest.approx((asa, miou), rel=1e-12)
     assert score.boundary_recall == pytest.approx(recall, rel=1e-12)
     assert score.boundary_precision == pytest.approx(precision, rel=1e-12)
     assert 0 < precision < 1
     assert 0 < recall < 1
     assert score.count == len(set(superpoints.tolist()) - {-1})
-    hidden = score_partition(superpoints, np.where(truth == 2, -1, truth), ignore=1)
-    asa, miou = counted_oracle(superpoints.tolist(), truth.tolist(), (1, 2))
+    hidden = score_partition(superpoints, np.where(ground_truth == 2, -1, ground_truth), ignore=1)
+    asa, miou = counted_oracle(superpoints.tolist(), ground_truth.tolist(), (1, 2))
     assert (hidden.asa, hidden.oracle_miou) == pytest.approx((asa, miou), rel=1e-12)
     assert hidden.boundary_recall is hidden.boundary_distance is None
-    assert hidden.points == (~np.isin(truth, (1, 2))).sum()
+    assert hidden.points == (~np.isin(ground_truth, (1, 2))).sum()
 
 
 def test_the_truth_itself_and_single_points_are_perfect(rng):
     points = torch.rand(200, 3, generator=rng)
-    truth = (points[:, 0] > 0.5).long()
-    score = score_partition(truth, truth, points)
+    ground_truth = (points[:, 0] > 0.5).long()
+    score = score_partition(ground_truth, ground_truth, points)
     assert score[:4] == (1.0, 1.0, 1.0, 1.0)
     assert (score.count, score.points_per_superpoint) == (2, 100.0)
-    assert score_partition(torch.arange(200), truth, points)[:3] == (1.0, 1.0, 1.0)
+    assert score_partition(torch.arange(200), ground_truth, points)[:3] == (1.0, 1.0, 1.0)
 
 
 def test_a_point_of_no_superpoint_is_wrong():
@@ -97,12 +97,12 @@ def test_arguments_are_checked():
         score_partition(labels, labels, boundary_distance=0)
     with pytest.raises(ShapeError, match="score_partition: expected points of shape"):
         score_partition(labels, labels, torch.zeros(2, 2))
-    with pytest.raises(ShapeError, match="score_partition: expected truth"):
+    with pytest.raises(ShapeError, match="score_partition: expected ground_truth"):
         score_partition(labels, torch.zeros(3, dtype=torch.int64))
 
 
 def row_of_points(count):
-    """Points a metre apart: those that have a border within four places are at it."""
+    """Points a meter apart: those that have a border within four places are at it."""
     return torch.arange(float(count))[:, None] * torch.tensor([1.0, 0, 0])
 
 
@@ -116,7 +116,7 @@ def test_borders_agree_up_to_the_distance_and_at_it(distance, fraction):
 
 
 def test_borders_among_points_that_are_not_scored_do_not_count():
-    truth = torch.tensor([0] * 10 + [1] * 10 + [-1] * 20)
+    ground_truth = torch.tensor([0] * 10 + [1] * 10 + [-1] * 20)
     superpoints = torch.tensor([0] * 10 + [1] * 20 + [2] * 10)
-    score = score_partition(superpoints, truth, row_of_points(40), boundary_distance=0.5)
+    score = score_partition(superpoints, ground_truth, row_of_points(40), boundary_distance=0.5)
     assert (score.boundary_recall, score.boundary_precision) == (1, 1)

@@ -1,4 +1,4 @@
-"""Neighbours of blocks and the boxes they are found by, against all distances."""
+"""Neighbors of blocks and the boxes they are found by, against all distances."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Neighbours are exact, ties and duplicates included, whatever the order of the points."""
+"""Neighbors are exact, ties and duplicates included, whatever the order of the points."""
 
 import numpy as np
 import pytest

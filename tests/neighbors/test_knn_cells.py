@@ -1,4 +1,4 @@
-"""Neighbours by cells against all distances, on clouds that are easy and hard for cells."""
+"""Neighbors by cells against all distances, on clouds that are easy and hard for cells."""
 
 from functools import lru_cache
 

@@ -19,11 +19,11 @@ from torchrg.structures import Sampling
 
 K = 50
 COUNT = 40_000
-"""Points of the made rooms: 50 neighbours are within 15 cm, as in real ones."""
+"""Points of the made rooms: 50 neighbors are within 15 cm, as in real ones."""
 HEIGHT = 2.7
-"""Height of the made rooms in metres."""
+"""Height of the made rooms in meters."""
 NOISE = 0.002
-"""Noise of the made laser scan in metres."""
+"""Noise of the made laser scan in meters."""
 
 
 def measure(points: np.ndarray, k: int = K) -> Sampling:
@@ -54,7 +54,7 @@ def scan(seed: int) -> np.ndarray:
 
 
 def reconstruction(seed: int) -> np.ndarray:
-    """Walls that are bent by waves of a metre, each centimetres high, as reconstructions are."""
+    """Walls that are bent by waves of a meter, each centimeters high, as reconstructions are."""
     points = walls(seed)
     waves = 0.03 * np.sin(2 * math.pi * (points[:, [1, 2, 0]] + points[:, [2, 0, 1]]))
     return points + waves
@@ -77,7 +77,7 @@ def cloud(request):
 
 
 def literal_measures(points: np.ndarray, k: int) -> tuple[float, float, float, float]:
-    """Whiteness, variation, exactness and density, point by point, of all neighbours there are."""
+    """Whiteness, variation, exactness and density, point by point, of all neighbors there are."""
     small, large, exact, radius, first, flatness = [], [], [], [], [], []
     order = np.linspace(0, len(points) - 1, min(600, len(points))).astype(int)
     cloud = torch.as_tensor(points, dtype=torch.float32)

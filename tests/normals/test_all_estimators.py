@@ -91,7 +91,7 @@ def test_far_origin_changes_nothing_in_float64(corner, fits, method):
 def test_order_changes_nothing(corner, fits, method):
     order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
     fit = estimate_normals(corner[0][order], method=method, k=K)
-    assert_equal(fit, fits[method].each(lambda part: part[order]))
+    assert_equal(fit, fits[method].map(lambda part: part[order]))
 
 
 @methods_but_irls
@@ -124,7 +124,7 @@ def test_points_that_are_not_finite_take_no_part(corner, fits, method):
     bad = torch.tensor([[torch.nan, 0, 0], [0, torch.inf, 0]])
     points = torch.cat([bad[:1], corner[0], bad[1:]])
     fit = estimate_normals(points, method=method, k=K)
-    assert_equal(fit.each(lambda part: part[1:-1]), fits[method])
+    assert_equal(fit.map(lambda part: part[1:-1]), fits[method])
     for row in (0, -1):
         assert not fit.valid[row]
         assert not fit.normals[row].any()
@@ -132,7 +132,7 @@ def test_points_that_are_not_finite_take_no_part(corner, fits, method):
 
 @pytest.mark.parametrize("method", sorted(ESTIMATORS.keys() - {"irls", "detmm"}))
 def test_neighbors_outside_the_radius_do_not_count(corner, method):
-    # The columns beyond the most neighbours of any point hold nothing that counts.
+    # The columns beyond the most neighbors of any point hold nothing that counts.
     points = corner[0][:70]
     wide = search_knn(points, 40, max_distance=0.45)
     most = int(wide.valid.sum(dim=1).max())
@@ -193,7 +193,7 @@ def test_duplicates_are_no_trouble(corner, method):
     assert fit.curvature.isfinite().all()
     lengths = fit.normals.norm(dim=1)
     assert torch.allclose(lengths, fit.valid.float(), atol=1e-5)
-    # The three of each place see the same neighbours.
+    # The three of each place see the same neighbors.
     turned = unsigned_angle_deg(fit.normals[:50], fit.normals[50:100])
     assert (turned > SAME_DEG).sum() <= SWAPPED
 

@@ -98,7 +98,7 @@ def test_kernel_of_links_equals_the_definition(rng):
 
 @pytest.mark.parametrize("labeled", [True, False])
 def test_both_sides_of_a_plate_are_faces(rng, labeled):
-    # Farther apart than a neighbor is high: sides are told apart by heights alone.
+    # Farther apart than a neighbor is high: sides are reported apart by heights alone.
     top = draw(rng, 300, (0.0, 0, 0.04), (1.5, 1, 0.04))
     bottom = draw(rng, 260, (0.0, 0, 0), (1.5, 1, 0), side=1.0)
     stray = draw(rng, 20, (0.0, 0, -0.2), (1.5, 1, -0.1))

@@ -13,7 +13,7 @@ from torchrg.structures import Neighbors
 
 @pytest.fixture(scope="module")
 def cube():
-    """Points of a cube, their neighbours, and normals that PCA bends at the edges."""
+    """Points of a cube, their neighbors, and normals that PCA bends at the edges."""
     points = make_shape("cube", 1500, 0.004).points
     neighbors = search_knn(points, 24)
     return points, neighbors, estimate_normals(points, method="pca", neighbors=neighbors).normals

@@ -33,7 +33,7 @@ def segment(
 ):
     """Return a label for each point; all arguments are lists, points in order of preference.
 
-    ``k`` is the number of neighbours asked for where some lists are shorter.
+    ``k`` is the number of neighbors asked for where some lists are shorter.
     """
     num_points, k = len(points), k or len(knn[0])
     valid = [True] * num_points if valid is None else valid

@@ -60,7 +60,7 @@ def plates(rng, n):
 
 
 def graded(rng, n):
-    """A plane whose density falls off sharply: neighbours are far from mutual."""
+    """A plane whose density falls off sharply: neighbors are far from mutual."""
     points = rng.uniform(0, 1, (n, 3)) ** 4
     points[:, 2] = 0.01 * rng.normal(size=n) * points[:, 0]
     return points
@@ -90,7 +90,7 @@ KINDS = {
 
 
 def prepare(coordinates, k, *, dtype=torch.float64, ties=0):
-    """Return points in canonical order with PCA normals, curvature and neighbours.
+    """Return points in canonical order with PCA normals, curvature and neighbors.
 
     With ``ties``, curvatures are rounded up to as many different values.
     """

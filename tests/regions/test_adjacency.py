@@ -34,7 +34,7 @@ def touching_regions(k, masked):
 
 
 def contacts_by_loops(labels, neighbors):
-    """Return rows, neighbours and columns of the edges of each pair of regions."""
+    """Return rows, neighbors and columns of the edges of each pair of regions."""
     found = defaultdict(list)
     for row, near in enumerate(neighbors.indices.tolist()):
         for column, other in enumerate(near):

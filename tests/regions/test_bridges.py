@@ -1,4 +1,4 @@
-"""Faces joined by a few doubtful points are told apart; smooth surfaces stay whole."""
+"""Faces joined by a few doubtful points are reported apart; smooth surfaces stay whole."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ WHOLE = dataclasses.replace(CUT, growing=dataclasses.replace(CUT.growing, cut_br
 
 
 def crease(angle_deg, noise, joint, width=0.5, num_points=4000):
-    """Faces 0.5 and ``width`` wide, 1 metre long, that meet in an arc; 1 on the second."""
+    """Faces 0.5 and ``width`` wide, 1 meter long, that meet in an arc; 1 on the second."""
     rng = np.random.default_rng(0)
     along, across = rng.uniform(-0.5, width, num_points), rng.uniform(0, 1, num_points)
     angle = np.radians(angle_deg)

@@ -99,7 +99,7 @@ def shell(names):
 
 
 def in_room(part):
-    """A room of 5 by 4 by 3 metres, without two of its walls, and a part."""
+    """A room of 5 by 4 by 3 meters, without two of its walls, and a part."""
     return assemble(
         [
             surface("floor", (0, 0, 0), (5, 0, 0), (0, 4, 0)),

@@ -61,7 +61,7 @@ def test_the_increment_rule_compares_with_the_point_that_was_joined():
 
 
 def test_a_point_that_joined_unconnected_is_a_seed_once_a_connected_seed_reaches_it():
-    # 0 claims 2, but only 1 shares three neighbours with it; 3 hangs on 2 alone.
+    # 0 claims 2, but only 1 shares three neighbors with it; 3 hangs on 2 alone.
     rows = [[0, 2, 1, 5], [1, 0, 2, 4], [2, 1, 4, 3], [3, 5, 4, 0], [4, 5, 3, 0], [5, 0, 3, 4]]
     points, normals, _, _ = strip(6, 0.0)
     cloud = (points, normals, torch.arange(6).double(), Neighbors(torch.tensor(rows)))
@@ -98,7 +98,7 @@ def test_points_without_finite_normal_or_curvature_do_not_join():
     curvature[7] = torch.nan
     labels = grow_regions(points, normals, curvature, neighbors, CLASSIC)
     assert labels[3] == labels[7] == -1
-    # With two neighbours on a line nobody reaches across.
+    # With two neighbors on a line no one reaches across.
     assert len(labels.unique()) == 4
 
 
@@ -118,8 +118,8 @@ def test_tiny_clouds_work(config, num_points):
 @pytest.mark.parametrize("config", [CLASSIC, papers_growing(min_size=1)])
 def test_a_cloud_without_a_valid_point_has_no_region(config):
     cloud = strip(6, 0.0)
-    nobody = torch.zeros(6, dtype=torch.bool)
-    assert grow_regions(*cloud, config, valid=nobody).tolist() == [-1] * 6
+    none = torch.zeros(6, dtype=torch.bool)
+    assert grow_regions(*cloud, config, valid=none).tolist() == [-1] * 6
 
 
 @pytest.mark.parametrize("config", [CLASSIC, papers_growing(min_size=1)])
@@ -159,7 +159,7 @@ def test_no_python_number_is_kept_for_every_point():
 
 
 def grow_chain(num_points, joins):
-    """Grow from each point in turn, whose only neighbour is the next one, joined or not."""
+    """Grow from each point in turn, whose only neighbor is the next one, joined or not."""
     following = (torch.arange(num_points, dtype=torch.int32) + 1).clamp(max=num_points - 1)
     bits = torch.full((num_points, 1), joins)
     every, order = torch.ones(num_points, dtype=torch.bool), torch.arange(num_points)

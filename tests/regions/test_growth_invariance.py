@@ -30,7 +30,7 @@ def clouds(kind, seed=0, k=10, **options):
 
 
 def permuted(points, normals, curvature, neighbors, order):
-    """The same cloud with its rows, and the rows its neighbours name, in another order."""
+    """The same cloud with its rows, and the rows its neighbors name, in another order."""
     row_of = torch.empty_like(order)
     row_of[order] = torch.arange(len(order))
     indices = row_of[neighbors.indices[order].long()].to(torch.int32)
@@ -94,7 +94,7 @@ def test_the_sign_of_normals_does_not_matter(config, rng):
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_float32_and_float64_agree(config):
     *values, neighbors = clouds("room")
-    # Points with the same neighbours have the same curvature up to the rounding of float64, which
+    # Points with the same neighbors have the same curvature up to the rounding of float64, which
     # differs from processor to processor: both runs get numbers that float32 can hold.
     singles = [value.float() for value in values]
     doubles = [value.double() for value in singles]

@@ -131,7 +131,7 @@ def test_points_that_are_not_finite_are_of_no_plane(room):
 @pytest.mark.parametrize(
     ("objects", "message"),
     [
-        (torch.zeros(50), "segment_planes: expected within of integers, got torch.float32"),
+        (torch.zeros(50), "segment_planes: expected integer within, got torch.float32"),
         (torch.zeros(49, dtype=torch.int64), "segment_planes: expected within of shape"),
         (torch.zeros(50, 1, dtype=torch.int64), "segment_planes: expected within of shape"),
     ],

@@ -151,7 +151,7 @@ def test_conversions_select_alike(points, chosen, tmp_path):
     (tmp_path / "in").mkdir()
     write_cloud(tmp_path / "in" / "room.npz", Cloud(points.numpy()))
     flags = (str(tmp_path / "in"), str(tmp_path / "out"), *FLAGS)
-    start = {"settings": PlaneSettings.asked_for(["--preset", "classic"])}
+    start = {"settings": PlaneSettings.from_arguments(["--preset", "classic"])}
     arguments = parse(FolderArguments, flags, prog="torchrg convert folder", default=start)
     source = arguments.source(tmp_path / "in")
     job = Job(source, source.list_scans(tmp_path / "out")[0], tmp_path / "out")

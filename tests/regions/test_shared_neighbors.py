@@ -1,4 +1,4 @@
-"""Shared neighbours against sets."""
+"""Shared neighbors against sets."""
 
 import numpy as np
 import pytest

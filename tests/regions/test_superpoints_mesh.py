@@ -159,7 +159,7 @@ def test_vertices_with_many_edges_and_without_any():
 def test_mistakes_are_told(mesh):
     vertices, faces, _ = mesh
     for wrong in (faces + len(vertices), faces - 1):
-        with pytest.raises(ShapeError, match=r"segment_mesh: expected faces of rows of"):
+        with pytest.raises(ShapeError, match=r"segment_mesh: expected vertex indices in"):
             segmentator.segment_mesh(vertices, wrong)
     with pytest.raises(ShapeError, match="expected faces"):
         segmentator.segment_mesh(vertices, faces[:, :2])

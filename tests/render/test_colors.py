@@ -1,4 +1,4 @@
-"""Colours: planes that touch against brute force, and to eyes that lack a cone."""
+"""Colors: planes that touch against brute force, and to eyes that lack a cone."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ A physiologically-based model for simulation of color vision deficiency, 2009, s
 
 
 def without_cone(colors, matrix):
-    """Return sRGB colours ``(C, 3)`` as eyes of a dichromacy see them."""
+    """Return sRGB colors ``(C, 3)`` as eyes of a dichromacy see them."""
     linear = rgb_to_linear_rgb(colors.T[None, :, :, None])[0, :, :, 0].T
     seen = (linear @ linear.new_tensor(matrix).T).clamp(0, 1)
     return linear_rgb_to_rgb(seen.T[None, :, :, None])[0, :, :, 0].T
@@ -153,7 +153,7 @@ def test_curvature_scale_ends_where_it_is_told():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: color_planes(torch.zeros(3)), ShapeError, "labels of integers"),
+        (lambda: color_planes(torch.zeros(3)), ShapeError, "integer labels"),
         (lambda: color_planes(torch.zeros(3).long(), torch.rand(4, 3)), ShapeError, "points of"),
         (
             lambda: color_planes(torch.zeros(3).long(), reference=torch.zeros(2).long()),

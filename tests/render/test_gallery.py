@@ -1,4 +1,4 @@
-"""Pages beside pictures: of segment, of convert, and the index that leads from one to the other."""
+"""Viewers next to images: segment, convert, and the index of all viewers."""
 
 import re
 

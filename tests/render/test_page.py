@@ -141,7 +141,7 @@ def test_a_sample_is_stated_and_strata_are_spread_evenly():
 def test_what_the_same_planes_have_beside_each_other_is_one_colour():
     cloud = room()
     other = room(labels=cloud.fields["labels"].max() - cloud.fields["labels"])
-    page = make_page(Result(cloud), beside=Result(other))
+    page = make_page(Result(cloud), compare=Result(other))
     first, second = (unpacked(page, place)["plane colors"] for place in (0, 1))
     assert (first[:-1] == second[:-1][::-1]).all()
 
@@ -170,7 +170,7 @@ def test_errors_are_shown_against_a_truth():
     cloud = room()
     wrong = cloud.fields["labels"].copy()
     wrong[:100] = -1
-    page = make_page(Result(room(labels=wrong)), truth=cloud, color="error")
+    page = make_page(Result(room(labels=wrong)), ground_truth=cloud, color="error")
     assert described(page)["mode"] == "error"
     assert (unpacked(page)["error"] == 3).sum() == 100
     assert (unpacked(page)["normal-error"] == 0).all()
@@ -240,7 +240,7 @@ def test_directions_survive_two_bytes():
         ({"view": "inside"}, "expected view to be one of"),
         ({"color": "height"}, "expected one of plane"),
         ({"color": "error"}, "expected labels and ground truth for color='error'"),
-        ({"truth": Cloud(np.eye(3))}, "expected ground truth for 1,600 points, got 3"),
+        ({"ground_truth": Cloud(np.eye(3))}, "expected ground truth for 1,600 points, got 3"),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(settings, message):
@@ -257,7 +257,7 @@ def test_missing_package_is_told_with_its_repair(monkeypatch):
 def test_view_writes_a_page(tmp_path, run):
     path, out = tmp_path / "room.npz", tmp_path / "room.html"
     np.savez(path, points=room().coordinates, **room().fields)
-    flags = ("--out", out, "--beside", path, "--unit", "m")
+    flags = ("--out", out, "--compare", path, "--unit", "m")
     assert "1,600 and 1,600 points" in run("view", path, *flags).out
     what = described(Page(out.read_text(), ()))
     assert len(what["clouds"]) == 2
@@ -270,13 +270,13 @@ def test_view_writes_a_page(tmp_path, run):
     [
         (["--out", "no/page.html"], "not found; create it first"),
         (["--out", "page.pdf"], "expected a file ending in .png or .html"),
-        (["--out", "page.png", "--truth", "room.npz"], "with a viewer"),
+        (["--out", "page.png", "--ground-truth", "room.npz"], "with a viewer"),
         (
-            ["--out", "page.html", "--truth", "few.npz"],
+            ["--out", "page.html", "--ground-truth", "few.npz"],
             "expected ground truth for 300 points, got 3",
         ),
         (["--out", "page.html", "--color", "sharp"], "expected sharp for color="),
-        (["--out", "page.html", "--beside", "gone.npz"], "file not found"),
+        (["--out", "page.html", "--compare", "gone.npz"], "file not found"),
         (["--out", "page.html", "--max-points", "0"], "expected max_points >= 1"),
     ],
 )

@@ -58,7 +58,7 @@ class Tab:
 
     def settle(self):
         self.wait_for(
-            "!torchrg.state.moving && torchrg.state.share === 1 && !torchrg.deck().needsRedraw()"
+            "!torchrg.state.moving && torchrg.state.fraction === 1 && !torchrg.deck().needsRedraw()"
         )
         self.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
@@ -97,7 +97,7 @@ def tab(browser, room, tmp_path_factory):
         room.fields, labels=np.where(room.fields["labels"] == 0, -1, room.fields["labels"])
     )
     other = Cloud(room.coordinates, fields, source="other.npz")
-    write_page(path, make_page(Result(room), beside=Result(other), title=EVIL))
+    write_page(path, make_page(Result(room), compare=Result(other), title=EVIL))
     return Tab(browser, path)
 
 
@@ -311,7 +311,7 @@ def test_the_outline_of_a_hidden_plane_hides_with_it(tab):
 
 
 def test_discs_do_not_hide_the_face_beyond_an_edge(browser, tmp_path):
-    """Of a cube, pixels with the colour of a face that is not theirs, by rays. Flat discs: 7 %."""
+    """Of a cube, pixels with the color of a face that is not theirs, by rays. Flat discs: 7 %."""
     rng = np.random.default_rng(0)
     faces = np.arange(3000) % 6
     points = rng.random((3000, 3))
@@ -423,7 +423,7 @@ def test_targets_are_large_and_nothing_overflows(tab, width):
     tab.page.set_viewport_size({"width": width, "height": 900})
     tab.run("cloud.value = 0; cloud.onchange()")
     small = tab.run(
-        "[...document.querySelectorAll('aside button, aside input, aside select')]"
+        "[...document.querySelectorAll('aside :is(button, input, select)')]"  # codespell:ignore
         ".filter((e) => e.offsetParent && Math.min(e.offsetHeight, e.offsetWidth) < 24"
         " && e.type !== 'range').map((e) => e.outerHTML.slice(0, 60))"
     )

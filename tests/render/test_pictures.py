@@ -24,7 +24,7 @@ def square(depth, color, half=1.0, count=60):
 
 
 def hue_share(picture, color):
-    """Share of pixels whose largest channel is that of a colour."""
+    """Share of pixels whose largest channel is that of a color."""
     chosen = picture.float()
     drawn = chosen.amin(dim=-1) < 200
     channel = torch.tensor(color).argmax()
@@ -60,7 +60,7 @@ def test_surfaces_are_closed_at_every_distance(rng):
 
 
 def face_of_box(eye, pose, size, focal):
-    """The face of the unit cube that each pixel sees, by rays; -1 beside it."""
+    """The face of the unit cube that each pixel sees, by rays; -1 next to it."""
     places = torch.arange(size) - (size - 1) / 2
     rows, columns = torch.meshgrid(places, places, indexing="ij")
     rays = torch.stack([columns / focal, rows / focal, torch.ones(size, size)], dim=-1)
@@ -72,7 +72,7 @@ def face_of_box(eye, pose, size, focal):
 
 @pytest.mark.parametrize("eye", [(2.5, 2.0, 1.8), (2.5, 0.9, 1.5)])
 def test_discs_do_not_color_the_face_beyond_an_edge(rng, eye):
-    """Colours of the nearest discs, which reach past edges, are wrong in three times as many."""
+    """Colors of the nearest discs, which reach past edges, are wrong in three times as many."""
     count, most = 600, 0.03
     points = torch.rand(6 * count, 3, generator=rng)
     faces = torch.arange(6 * count) % 6
@@ -92,8 +92,8 @@ def test_discs_do_not_color_the_face_beyond_an_edge(rng, eye):
     picture = render_points(points, colors[faces].byte(), camera, normals=normals, supersampling=1)
     hue = picture.float() / picture.amax(dim=-1, keepdim=True).clamp(min=1)
     seen = (hue[:, :, None] - colors.float() / 250).square().sum(dim=-1).argmin(dim=-1)
-    truth = face_of_box(eye, pose, size, focal)
-    assert float((seen != truth)[truth >= 0].float().mean()) < most
+    ground_truth = face_of_box(eye, pose, size, focal)
+    assert float((seen != ground_truth)[ground_truth >= 0].float().mean()) < most
 
 
 @pytest.mark.parametrize("view", ["cutaway", "sensor"])
@@ -228,7 +228,7 @@ def test_input_that_needs_gradients_is_drawn(room):
         ({"colors": torch.zeros(4, 3, dtype=torch.uint8)}, ShapeError, "expected colors of shape"),
         ({"normals": torch.zeros(4, 3)}, ShapeError, "expected normals of shape"),
         ({"labels": torch.zeros(4).long()}, ShapeError, "expected labels of shape"),
-        ({"labels": torch.zeros(5)}, ShapeError, "expected labels of integers, got float32"),
+        ({"labels": torch.zeros(5)}, ShapeError, "expected integer labels, got float32"),
         ({"points": torch.zeros(5, 3).long()}, ShapeError, "points of float32 or float64"),
         ({"view": "inside"}, ConfigError, "view to be one of cutaway, above, outside, sensor"),
         ({"up": (0.0, 0.0, 0.0)}, ConfigError, "up to be a direction"),

@@ -40,7 +40,7 @@ def drawn(discs, parts=(slice(None),), width=WIDTH, height=HEIGHT, max_radius=5)
 
 
 def draw_by_loops(discs):
-    """The depth and colour of each pixel, from all discs that cover it."""
+    """The depth and color of each pixel, from all discs that cover it."""
     depth = torch.zeros(HEIGHT, WIDTH)
     paint = torch.full((HEIGHT, WIDTH, 3), 255, dtype=torch.uint8)
     for row in range(HEIGHT):

@@ -23,7 +23,7 @@ ESTIMATORS = {
     "detmm": fit_detmm,
 }
 
-# Listed in the notes beside the reference values: QR tolerance, false exact fits, cut iterations.
+# Listed in the notes next to the reference values: QR tolerance, false exact fits, cut iterations.
 WRONG_RRCOV = {"planar_very_fine", "planar_tilt__aniso_units"}
 
 # Columns of extent 1e3, 1 and 1e-3: flat to the rounding of float32.

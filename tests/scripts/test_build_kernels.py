@@ -17,7 +17,7 @@ def build(tmp_path, monkeypatch):
 
     def run(asked, compiler):
         (folder / "libkernels-base.library").touch()
-        monkeypatch.setattr(build_kernels, "ASKED", asked)
+        monkeypatch.setattr(build_kernels, "REQUESTED", asked)
         monkeypatch.setattr(build_kernels.sys, "executable", compiler)
         monkeypatch.setenv("CXX", compiler)
         app = Application().get_safe_application()

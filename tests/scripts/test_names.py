@@ -1,4 +1,4 @@
-"""Scripts are found by who reads README and guides, and use public names alone."""
+"""README and guides name all scripts, and scripts use only public names."""
 
 import ast
 import re
@@ -7,11 +7,11 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
 BEHIND = {"environment.sh": "test.sh", "docs.py": "docs.sh"}
-"""Scripts that others start, and these."""
+"""Scripts started by other scripts, and the latter."""
 
 
 def commands():
-    """Return the scripts that somebody starts."""
+    """Return the scripts for users."""
     found = [*SCRIPTS.glob("*.sh"), *SCRIPTS.glob("*.py")]
     return sorted(
         path.name for path in found if path.suffix == ".sh" or "__main__" in path.read_text()

@@ -1,20 +1,18 @@
-"""README and guides can be read aloud: short sentences, words of a dictionary, known commands."""
+"""README, guides and names: short sentences, US spelling, and the words of the field."""
 
-import ast
-import itertools
 import re
 import subprocess
 import sys
 
 import guide_pages
 import pytest
+import words
 
 README = guide_pages.GUIDES.parents[1] / "README.md"
 PAGES = [README, *guide_pages.guide_files()]
 MAX_WORDS = 35
-MODULES = sorted((guide_pages.GUIDES.parents[1] / "torchrg").rglob("*.py"))
-VAGUE = re.compile(r"\b(?:found|given|some|own|part|rest|kept|known)\b")
-MAX_VAGUE = 1000
+MAX_KEPT = 150
+"""Words of the list in the package that stay for a reason."""
 
 
 def sentences_of(markdown):
@@ -29,7 +27,7 @@ def sentences_of(markdown):
     ]
 
 
-def test_sentences_are_told_apart():
+def test_sentences_are_separated():
     text = "# One\n\nTwo, e.g. 2.\nThree?\n\n```text\nx. Y.\n```\n* Four. Five\n| a | b. C |\n"
     found = ["# One", "Two, e.g. 2.", "Three?", "* Four.", "Five", "a", "b.", "C"]
     assert sentences_of(text) == found
@@ -43,41 +41,33 @@ def test_sentences_are_short(page):
 
 
 def test_words_are_spelled_right():
-    places = ["README.md", ".github", "scripts", "torchrg", "tests"]
-    command = [sys.executable, "-m", "codespell_lib", *places]
+    paths = ["README.md", ".github", "scripts", "torchrg", "tests"]
+    command = [sys.executable, "-m", "codespell_lib", *paths]
     done = subprocess.run(command, cwd=README.parent, capture_output=True, text=True)
     assert (done.stdout, done.returncode) == ("", 0)
 
 
-def docstrings_of_constants(code):
-    """Return the texts right after assignments of a module and of its classes."""
-    bodies = [
-        node.body
-        for node in ast.walk(ast.parse(code))
-        if isinstance(node, (ast.Module, ast.ClassDef))
-    ]
-    pairs = [pair for body in bodies for pair in itertools.pairwise(body)]
-    return [
-        text.value.value
-        for constant, text in pairs
-        if isinstance(constant, (ast.Assign, ast.AnnAssign))
-        and isinstance(text, ast.Expr)
-        and isinstance(text.value, ast.Constant)
-    ]
+def test_names_and_phrases_have_no_better_word(capsys):
+    assert words.main() == 0, capsys.readouterr().out
+    package, texts = capsys.readouterr().out.splitlines()
+    assert int(package.split()[1]) <= MAX_KEPT
+    assert texts == "texts: 0 words, 0 with a reason"
 
 
-def test_docstrings_of_constants_are_read():
-    code = 'A = 1\n"""One."""\nB = 2\n\nclass C:\n    """C."""\n    d: int\n    """Two."""\n'
-    assert docstrings_of_constants(code) == ["One.", "Two."]
-
-
-def test_docstrings_of_constants_begin_with_what_they_are():
-    texts = [text for path in MODULES for text in docstrings_of_constants(path.read_text("utf-8"))]
-    assert len(texts) > 500
-    others = [text for text in texts if text.split()[0] in {"And", "Of", "What"}]
-    assert not others
-
-
-def test_vague_words_are_rare():
-    counts = {path: len(VAGUE.findall(path.read_text(encoding="utf-8"))) for path in MODULES}
-    assert sum(counts.values()) <= MAX_VAGUE, sorted(counts.items(), key=lambda item: -item[1])[:5]
+@pytest.mark.parametrize(
+    ("name", "text", "found"),
+    [
+        ("a.py", "most_fitted = 3\n", (1, "most_fitted", "max", False)),
+        (
+            "a.py",
+            "x = 1  # the rows, as many as there are\n",
+            (1, "as many", "the number or amount", False),
+        ),
+        ("a.cpp", "float share = 1;  // a fraction\n", (1, "share", "fraction", False)),
+        ("a.md", "The truth is\n", (1, "truth", "ground truth", False)),
+        ("a.py", "at_most = absorb\n", (1, "absorb", "assign", True)),
+    ],
+)
+def test_words_are_found_with_their_replacement(tmp_path, name, text, found):
+    (tmp_path / name).write_text(text)
+    assert found in words.words_of(tmp_path / name)

@@ -36,7 +36,7 @@ def test_every_room_has_every_class():
 
 
 def test_the_points_of_the_model_are_those_of_the_scan(room, sample):
-    assert sample.truth.tolist() == train_example.classes_of(room).tolist()
+    assert sample.ground_truth.tolist() == train_example.classes_of(room).tolist()
     finest = sample.levels[0]
     assert len(sample.inverse) == len(room.points)
     assert len(sample.target) == len(sample.normal) == len(finest.coord) < len(room.points)

@@ -112,7 +112,7 @@ def test_a_flip_and_a_crop_keep_normals_planes_and_intrinsics_right(mirrored):
         assert (heights - offset).abs().max() < 1e-3
         assert ((normal[0][on_plane] @ table[number]).abs() > 0.99).float().mean() > 0.95
 
-    # And the frame is segmented alike from the start: as many planes, of the same normals.
+    # And the frame is segmented the same way from the start: as many planes, of the same normals.
     again = SegmentDepth()({"depth": depth, "intrinsics": intrinsics})
     same = (again["plane"] == plane).float().mean()
     assert same > 0.97

@@ -94,7 +94,7 @@ def test_entries_left_off_a_list_that_somebody_made_are_in_doubt():
     sample = sample_of(
         mine=np.arange(NUM_POINTS), other=np.zeros(NUM_POINTS), index_valid_keys=names
     )
-    with pytest.raises(ConfigError, match="KeepFinite: cannot tell whether other of the sample"):
+    with pytest.raises(ConfigError, match="KeepFinite: cannot decide whether other of the sample"):
         KeepFinite()(sample)
     names.append("other")
     assert len(KeepFinite()(sample)["other"]) == len(KEPT)
@@ -106,16 +106,16 @@ def test_entries_left_off_a_list_that_somebody_made_are_in_doubt():
     ids=["numbers", "nested", "words"],
 )
 def test_rows_that_are_not_in_an_array_are_in_doubt(value):
-    with pytest.raises(ConfigError, match="cannot tell whether mine of the sample"):
+    with pytest.raises(ConfigError, match="cannot decide whether mine of the sample"):
         SampleVoxels(0.1)(sample_of(mine=value))
 
 
 def test_in_a_tiny_cloud_only_names_tell():
     sample = {"coord": torch.rand(4, 3), "segment": torch.arange(4), "pose": torch.eye(4)}
     assert KeepFinite()(sample)["pose"].shape == (4, 4)
-    with pytest.raises(ConfigError, match="cannot tell whether camera of the sample"):
+    with pytest.raises(ConfigError, match="cannot decide whether camera of the sample"):
         KeepFinite()({**sample, "camera": torch.eye(4)})
-    with pytest.raises(ConfigError, match="cannot tell whether camera of the sample"):
+    with pytest.raises(ConfigError, match="cannot decide whether camera of the sample"):
         KeepFinite()({"coord": torch.rand(16, 3), "camera": torch.eye(4).flatten()})
 
 

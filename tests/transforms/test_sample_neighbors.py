@@ -1,4 +1,4 @@
-"""A sample may carry its neighbours, so that they are searched once, with the same results."""
+"""A sample may carry its neighbors, so that they are searched once, with the same results."""
 
 import pickle
 
@@ -22,7 +22,7 @@ from torchrg.transforms import (
 
 @pytest.fixture
 def searches(monkeypatch):
-    """Numbers of neighbours that are searched, one for each search of a cloud."""
+    """Numbers of neighbors that are searched, one for each search of a cloud."""
     asked = []
     search = knn._search_cloud
 

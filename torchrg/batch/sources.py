@@ -153,7 +153,7 @@ class CloudSource(Source):
 
     def check_results(self, scans: Sequence[SceneFiles], out: Path) -> None:
         """Raise FormatError if two scans, or lists of other origin, would be overwritten."""
-        check_stems(self.layout, {scan.name: scan.place or scan.name for scan in scans})
+        check_stems(self.layout, {scan.name: scan.release_path or scan.name for scan in scans})
         check_lists(self.layout, self._list_dataset, out)
 
     def write_lists(self, out: Path, mark: str, *, without: Collection[Path] = ()) -> None:

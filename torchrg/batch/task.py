@@ -32,7 +32,7 @@ class TaskReport:
     """Result of a task.
 
     Attributes:
-        name: Its name.
+        name: Name of the task.
         status: ``converted`` now, ``kept`` from an earlier run, ``failed``, or ``not started``.
         num_points: Number of points, including non-finite ones.
         num_regions: Number of planes.
@@ -44,9 +44,9 @@ class TaskReport:
         peak_memory: Largest resident memory of the process, in bytes.
         reason: One-line reason of a failure.
         details: Traceback of an unexpected failure.
-        disk_full: Whether it failed because the disk is full.
-        host: Machine and process that ran it.
-        attempts: Number of attempts, if the engine reports it: Ray does not.
+        disk_full: Whether the task failed because the disk is full.
+        host: Machine and process that ran the task.
+        attempts: Number of attempts; Ray does not report it.
     """
 
     name: str
@@ -67,11 +67,11 @@ class TaskReport:
 
 
 Reports = Generator[TaskReport | None, None, None]
-"""Reports yielded by an engine: one per finished task, None while there is none."""
+"""Reports yielded by an engine: one per finished task, or None while waiting."""
 
 
 def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
-    """Run a task; errors are put into the report and never raised."""
+    """Run a task; errors are reported, never raised."""
     clock = _StageClock()
     reset_peak_memory()
     try:
@@ -80,7 +80,7 @@ def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
             warnings.simplefilter("ignore", PrecisionWarning)
             warnings.simplefilter("ignore", DepthWarning)
             report = work(clock.begin)
-    except Exception as error:  # noqa: BLE001 A failing task must not end the others.
+    except Exception as error:  # noqa: BLE001 A failing task must not stop other tasks.
         is_expected = isinstance(error, TorchrgError | OSError) or is_out_of_memory(error)
         report = TaskReport(
             name,

@@ -51,7 +51,7 @@ class Arguments:
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, align each input and write it."""
-    start = {"settings": flags.PlaneSettings.asked_for(argv)}
+    start = {"settings": flags.PlaneSettings.from_arguments(argv)}
     arguments = parse(Arguments, argv, prog="torchrg align", default=start)
     flags.limit_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)

@@ -182,8 +182,8 @@ def _read(
     if missing:
         inputs = [values[flag.path] for flag in flags if flag.is_positional and flag.path in values]
         words = " ".join(" ".join(words) if isinstance(words, list) else words for words in inputs)
-        given = f" for {words}" if words else ""
-        raise ConfigError(f"missing required {' and '.join(missing)}{given}.{example}")
+        purpose = f" for {words}" if words else ""
+        raise ConfigError(f"missing required {' and '.join(missing)}{purpose}.{example}")
     return {flag.path: _to_value(flag, values[flag.path]) for flag in flags if flag.path in values}
 
 
@@ -193,27 +193,27 @@ def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]
         return f"unrecognized option {word}. Did you mean ./{word}?"
     if not word.startswith("-"):
         start = list(arguments).index(word)
-        before = [place for place in range(start) if arguments[place].startswith("-")]
+        before = [index for index in range(start) if arguments[index].startswith("-")]
         if not before:
             return f"unrecognized argument {word}."
         words = [*itertools.takewhile(lambda x: x[:1] != "-", arguments[before[-1] + 1 :])]
-        given = arguments[before[-1]]
-        takes_one = any(flag.name == given and flag.hint is not bool for flag in flags)
+        flag_name = arguments[before[-1]]
+        takes_one = any(flag.name == flag_name and flag.hint is not bool for flag in flags)
         if len(words) == 1 or not takes_one:
             return f"unrecognized argument {word}."
         return (
-            f"expected one value for {given}, got {' '.join(words)}; separate values with commas: "
-            f"{given} {','.join(words)}."
+            f"expected one value for {flag_name}, got {' '.join(words)}; separate values with "
+            f"commas: {flag_name} {','.join(words)}."
         )
-    asked = word.partition("=")[0].replace("_", "-")
+    unknown = word.partition("=")[0].replace("_", "-")
     names = {flag.name: flag.name for flag in flags if not flag.is_positional}
     # The first flag of a tail wins; settings of superpoints, which are rarely changed, come last.
     ordered = sorted(names, key=lambda name: name.startswith("--partition."))
     tails = {f"--{name.lstrip('-').rpartition('.')[2]}": name for name in reversed(ordered)}
-    near = difflib.get_close_matches(asked, [*tails, *names], n=1)
-    tail = f"--{asked.lstrip('-').rpartition('.')[2]}"
+    near = difflib.get_close_matches(unknown, [*tails, *names], n=1)
+    tail = f"--{unknown.lstrip('-').rpartition('.')[2]}"
     name = tails.get(tail) or next((names.get(word) or tails[word] for word in near), "")
-    return f"unrecognized option {asked}.{f' Did you mean {name}?' if name else ''}"
+    return f"unrecognized option {unknown}.{f' Did you mean {name}?' if name else ''}"
 
 
 def _join_dashed_values(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:

@@ -269,13 +269,13 @@ def run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
         raise SystemExit(0 if argv else USAGE_ERROR)
-    kind, *rest = flags.expand_counts(argv)
+    kind, *remaining = flags.expand_counts(argv)
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     chosen, start = KINDS[kind], {}
     if issubclass(chosen, CloudArguments):
-        start["settings"] = flags.PlaneSettings.asked_for(rest)
-    arguments = parse(chosen, rest, prog=f"torchrg convert {kind}", default=start)
+        start["settings"] = flags.PlaneSettings.from_arguments(remaining)
+    arguments = parse(chosen, remaining, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with print_warnings():

@@ -157,7 +157,7 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
 def _label(
     arguments: Arguments,
     source: Path,
-    given: RGBDFrame | Pinhole | None,
+    known: RGBDFrame | Pinhole | None,
     target: Path,
     is_folder: bool,
     picture: Path | None,
@@ -167,12 +167,12 @@ def _label(
     begin = time.perf_counter()
     _check_memory(source)
     scale = arguments.depth_scale
-    if isinstance(given, RGBDFrame):
-        scale = given.depth_scale
+    if isinstance(known, RGBDFrame):
+        scale = known.depth_scale
         with print_warnings():
-            cloud, depth, camera = _read_image(given)
+            cloud, depth, camera = _read_image(known)
     else:
-        cloud, depth, camera = _read_cloud(source, given)
+        cloud, depth, camera = _read_cloud(source, known)
     is_image = _is_png(target)
     if not is_folder and not is_image:
         check_output(target, cloud)
@@ -201,7 +201,7 @@ def _label(
     else:
         provenance = describe_run(source, arguments.depth) | {
             "config": {"depth": asdict(arguments.depth)},
-            "intrinsics": given and format_intrinsics(camera),
+            "intrinsics": known and format_intrinsics(camera),
             "depth_scale": scale,
             "orient": arguments.orient,
         }
@@ -243,10 +243,10 @@ def _read_image(frame: RGBDFrame) -> tuple[Cloud, Tensor, Tensor]:
     return cloud, depth, frame.intrinsics
 
 
-def _read_cloud(path: Path, given: Pinhole | None) -> tuple[Cloud, Tensor, Tensor]:
+def _read_cloud(path: Path, known: Pinhole | None) -> tuple[Cloud, Tensor, Tensor]:
     """Return an organized cloud, its depth ``(H, W)``, and its camera matrix.
 
-    The camera is estimated from the points if ``given`` is None.
+    The camera is estimated from the points if ``known`` is None.
     """
     cloud = read_cloud(path)
     if cloud.grid_shape is None:
@@ -255,12 +255,12 @@ def _read_cloud(path: Path, given: Pinhole | None) -> tuple[Cloud, Tensor, Tenso
         )
     height, width = cloud.grid_shape
     points = torch.from_numpy(cloud.coordinates).view(height, width, 3)
-    camera = find_intrinsics(points) if given is None else given.matrix((width, height), f"{path}")
+    camera = find_intrinsics(points) if known is None else known.matrix((width, height), f"{path}")
     if camera is None:
         raise FormatError(
             f"{path}: expected points in the coordinates of a pinhole camera; use torchrg segment."
         )
-    off = 0.0 if given is None else reprojection_error(points, camera)
+    off = 0.0 if known is None else reprojection_error(points, camera)
     if off > _MAX_MISFIT * max(height, width):
         raise FormatError(
             f"{path}: --intrinsics do not match the points: half of them are {off:.3g} pixels or "

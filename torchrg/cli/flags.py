@@ -142,14 +142,15 @@ class PlaneSettings:
     )
 
     @classmethod
-    def asked_for(cls, argv: list[str]) -> "PlaneSettings":
+    def from_arguments(cls, argv: list[str]) -> "PlaneSettings":
         """Return the settings of the preset or file in the arguments, as defaults of the flags.
 
         The up axis is z unless the file sets another. With --table, polygons are traced if shapely
         is installed.
 
         Example:
-            >>> PlaneSettings.asked_for(["scan.pcd", "--preset=classic"]).resolved.normals.method
+            >>> settings = PlaneSettings.from_arguments(["scan.pcd", "--preset=classic"])
+            >>> settings.resolved.normals.method
             'pca'
         """
         values = {"--preset": "", "--config": "", "--angle-deg": ""}

@@ -92,7 +92,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         near = search_knn(distinct.points, min(settings.k, len(distinct.points)), canonical=True)
         fit = estimate_normals(
             distinct.points, settings, neighbors=near, chunk_size=arguments.chunk_size
-        ).each(distinct.restore)
+        ).map(distinct.restore)
         advance("orientation")
         turned = orient_normals(
             cloud, fit.normals, orient=arguments.orient, viewpoint=arguments.viewpoint

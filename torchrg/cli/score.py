@@ -50,7 +50,7 @@ class Arguments:
     predicted: Annotated[Path, Argument("PREDICTED", is_positional=True)]
     """Scan with labels or normals, as written by torchrg segment or convert, or a folder of
     scans."""
-    truth: Annotated[Path, Argument("TRUTH", is_positional=True)]
+    ground_truth: Annotated[Path, Argument("TRUTH", is_positional=True)]
     """File with ground-truth labels or normals, or a folder with one such file per result."""
     match_distance: float | None = None
     """Match each ground-truth point to the nearest predicted point within this distance, in units
@@ -76,22 +76,22 @@ def run(argv: list[str]) -> int:
     arguments = parse(Arguments, argv, prog="torchrg score")
     if arguments.match_distance is not None and not arguments.match_distance > 0:
         raise ConfigError(f"expected --match-distance > 0, got {arguments.match_distance}.")
-    predicted, truth = arguments.predicted, arguments.truth
-    for path in (predicted, truth):
+    predicted, ground_truth = arguments.predicted, arguments.ground_truth
+    for path in (predicted, ground_truth):
         if not path.exists():
             raise FormatError(f"{path}: file not found.")
     are_folders = _is_data_set(predicted)
-    if are_folders != _is_data_set(truth):
-        file, folder = (truth, predicted) if are_folders else (predicted, truth)
+    if are_folders != _is_data_set(ground_truth):
+        file, folder = (ground_truth, predicted) if are_folders else (predicted, ground_truth)
         raise FormatError(f"{file}: expected a folder like {folder}; or pass two files.")
     if are_folders:
         with print_warnings():
-            pairs = _pair_scans(predicted, truth).items()
+            pairs = _pair_scans(predicted, ground_truth).items()
         bar = tqdm(pairs, desc="score", unit="scan", leave=False, disable=None)
         scans = {name: _score_files(arguments, *files) for name, files in bar}
         scores = _mean(scans)
     else:
-        scans, scores = {}, _score_files(arguments, predicted, truth)
+        scans, scores = {}, _score_files(arguments, predicted, ground_truth)
     if arguments.json:
         print(json.dumps({"scans": scans, "mean": scores} if are_folders else scores))
         return 0
@@ -109,13 +109,13 @@ def _is_data_set(path: Path) -> bool:
     return path.is_dir() and not is_scene(path)
 
 
-def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
+def _pair_scans(predicted: Path, ground_truth: Path) -> dict[str, tuple[Path, Path]]:
     """Pair the scans of two folders by name, in natural order."""
     ours, theirs = (
         {scene.name: scene.path for scene in FolderOfClouds(folder).scenes}
-        for folder in (predicted, truth)
+        for folder in (predicted, ground_truth)
     )
-    for folder, missing in ((truth, {*ours} - {*theirs}), (predicted, {*theirs} - {*ours})):
+    for folder, missing in ((ground_truth, {*ours} - {*theirs}), (predicted, {*theirs} - {*ours})):
         if missing:
             first, more = sorted(missing, key=natural_key)[:_MAX_NAMED], len(missing) - _MAX_NAMED
             raise FormatError(
@@ -125,28 +125,31 @@ def _pair_scans(predicted: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
     return {name: (path, theirs[name]) for name, path in ours.items()}
 
 
-def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
+def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> Scores:
     """Evaluate all parts present in both scans."""
-    check_columns(arguments.columns, (predicted, truth))
+    check_columns(arguments.columns, (predicted, ground_truth))
     ours, theirs = (
         read_result(path, columns=file_columns(path, arguments.columns)).cloud
-        for path in (predicted, truth)
+        for path in (predicted, ground_truth)
     )
     for cloud in (ours, theirs):
         for note in cloud.notes:
             warn(f"{cloud.source}: {note}.")
     scores: Scores = {}
     if arguments.match_distance is None:
-        _check_rows(predicted, truth, ours, theirs)
+        _check_rows(predicted, ground_truth, ours, theirs)
     else:
         ours, scores["match"] = _match_nearest(
-            arguments.match_distance, predicted, truth, ours, theirs
+            arguments.match_distance, predicted, ground_truth, ours, theirs
         )
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
-        for path, cloud, field in ((predicted, ours, "superpoint"), (truth, theirs, "labels")):
+        for path, cloud, field in (
+            (predicted, ours, "superpoint"),
+            (ground_truth, theirs, "labels"),
+        ):
             if field not in cloud.fields:
                 named = ", ".join(cloud.fields) or "points alone"
                 raise FormatError(
@@ -162,32 +165,33 @@ def _score_files(arguments: Arguments, predicted: Path, truth: Path) -> Scores:
         scores["superpoints"] = _defined(indices._asdict())
     if not scores.keys() - {"match"}:
         raise FormatError(
-            f"{predicted}: has neither labels nor normals in common with {truth}; pass a result of "
-            "torchrg segment, and ground truth with the field label or normals."
+            f"{predicted}: has neither labels nor normals in common with {ground_truth}; pass a "
+            "result of torchrg segment, and ground truth with the field label or normals."
         )
     return scores
 
 
-def _check_rows(predicted: Path, truth: Path, ours: Cloud, theirs: Cloud) -> None:
+def _check_rows(predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud) -> None:
     """Raise unless both scans have the same points in the same rows."""
     if len(ours) != len(theirs):
         raise FormatError(
-            f"{predicted}: expected {len(theirs):,} points as in {truth}, got {len(ours):,}; to "
-            "compare each point with the nearest one within D, pass --match-distance D."
+            f"{predicted}: expected {len(theirs):,} points as in {ground_truth}, got "
+            f"{len(ours):,}; to compare each point with the nearest one within D, "
+            "pass --match-distance D."
         )
     rows = differing_rows(ours, theirs)
     if len(rows):
         points = (cloud.coordinates[rows[0]] for cloud in (ours, theirs))
         got, expected = (" ".join(f"{value:.9g}" for value in point) for point in points)
         raise FormatError(
-            f"{predicted}: expected the same points as {truth} in every row, got "
+            f"{predicted}: expected the same points as {ground_truth} in every row, got "
             f"{len(rows):,} of {len(ours):,} that differ (row {rows[0]}: {got} for {expected}); to "
             "compare each point with the nearest one within D, pass --match-distance D."
         )
 
 
 def _match_nearest(
-    distance: float, predicted: Path, truth: Path, ours: Cloud, theirs: Cloud
+    distance: float, predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud
 ) -> tuple[Cloud, dict[str, float | None]]:
     """Transfer the results to the nearest ground-truth points, and count unmatched points."""
     rows = match_points(ours, theirs, distance)
@@ -195,13 +199,13 @@ def _match_nearest(
     num_lost = int(np.count_nonzero(~is_matched))
     if num_lost == len(rows):
         raise FormatError(
-            f"{predicted}: no points within the distance of {truth}; check position and unit of "
-            "both, or raise --match-distance."
+            f"{predicted}: no points within the distance of {ground_truth}; check position and "
+            "unit of both, or raise --match-distance."
         )
     if num_lost:
         warn(
-            f"{truth}: {num_lost:,} of {len(rows):,} points have no match in {predicted} and count "
-            "as unlabeled."
+            f"{ground_truth}: {num_lost:,} of {len(rows):,} points have no match in {predicted} "
+            "and count as unlabeled."
         )
     fields = {}
     for name in ("labels", "normals", "superpoint"):

@@ -112,7 +112,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _reject_images(argv)
     argv = flags.expand_counts(argv)
-    start = {"settings": flags.PlaneSettings.asked_for(argv)}
+    start = {"settings": flags.PlaneSettings.from_arguments(argv)}
     arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
     if arguments.layout not in (None, "pointcept"):
         arguments = dataclasses.replace(arguments, superpoints=True)
@@ -233,7 +233,7 @@ def _segment(
     if table is not None:
         write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))
     if picture is not None:
-        _draw(arguments, picture, Result.of(cloud, seg, superpoints))
+        _draw(arguments, picture, Result.from_segmentation(cloud, seg, superpoints))
     if superpoints is not None:
         levels = superpoints.by_level().values()
         counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)

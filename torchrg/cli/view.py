@@ -45,8 +45,8 @@ class Arguments:
     Examples:
         torchrg view planes.npz --out planes.png
         torchrg view planes.npz --out planes.html
-        torchrg view room.npz --beside planes.npz --out truth_and_result.png
-        torchrg view planes.npz --out compared.html --beside other.npz --truth room.npz
+        torchrg view room.npz --compare planes.npz --out truth_and_result.png
+        torchrg view planes.npz --out compared.html --compare other.npz --ground-truth room.npz
         torchrg view scan.ply --out normals.png --color normal --view above
     """
 
@@ -57,7 +57,7 @@ class Arguments:
     single file that works offline."""
     color: PageColorBy | None = None
     """Quantity shown as color; in a viewer, the initial one. Default: the planes, or the first
-    quantity in the file. error and normal-error require --truth and a viewer."""
+    quantity in the file. error and normal-error require --ground-truth and a viewer."""
     view: Literal["cutaway", "above", "outside", "sensor"] = "cutaway"
     """Camera. cutaway: from outside, without ceiling and near walls. above: from above, without
     ceiling. outside: from outside, with everything. sensor: from the origin along z, like a depth
@@ -68,9 +68,9 @@ class Arguments:
     """Azimuth of the camera about the up axis, in degrees. Default: chosen to show the most."""
     width: int = 1600
     """Width of the image in pixels, including both halves."""
-    beside: Path | None = None
+    compare: Path | None = None
     """Second cloud or result, shown in the right half; in a viewer both rotate together."""
-    truth: Path | None = None
+    ground_truth: Path | None = None
     """Ground truth for the same points, with labels or normals; shows errors in a viewer."""
     max_points: int = MAX_POINTS
     """Maximum points in the viewer; larger clouds are randomly downsampled, with a note."""
@@ -84,7 +84,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, render the cloud and write the output."""
     arguments = parse(Arguments, argv, prog="torchrg view")
     check_sidecar(arguments.out)
-    files = (arguments.file, arguments.beside, arguments.truth)
+    files = (arguments.file, arguments.compare, arguments.ground_truth)
     check_columns(arguments.columns, [path for path in files if path is not None])
     write = _write_page if is_viewer(arguments.out) else _write_picture
     summary = write(arguments, _read(arguments.file, arguments))
@@ -102,13 +102,13 @@ def _read(path: Path, arguments: Arguments) -> Result:
 
 def _write_picture(arguments: Arguments, result: Result) -> str:
     """Write an image, or two side by side, and return its description."""
-    if arguments.truth is not None:
+    if arguments.ground_truth is not None:
         raise ConfigError(
-            f"expected --truth with a viewer, got {arguments.out}; use --out PAGE.html."
+            f"expected --ground-truth with a viewer, got {arguments.out}; use --out PAGE.html."
         )
     halves = [_render(arguments, result)]
-    if arguments.beside is not None:
-        halves.append(_render(arguments, _read(arguments.beside, arguments), result))
+    if arguments.compare is not None:
+        halves.append(_render(arguments, _read(arguments.compare, arguments), result))
     height = max(len(half) for half in halves)
     level = [
         functional.pad(half, (0, 0, 0, 0, 0, height - len(half)), value=255) for half in halves
@@ -132,7 +132,7 @@ def _render(arguments: Arguments, result: Result, first: Result | None = None) -
         view=arguments.view,
         up=up,
         azimuth_deg=arguments.azimuth_deg,
-        width=arguments.width // (1 if arguments.beside is None else 2),
+        width=arguments.width // (1 if arguments.compare is None else 2),
     )
 
 
@@ -140,8 +140,10 @@ def _write_page(arguments: Arguments, result: Result) -> str:
     """Write a viewer and return its description."""
     page = make_page(
         result,
-        beside=None if arguments.beside is None else _read(arguments.beside, arguments),
-        truth=None if arguments.truth is None else _read(arguments.truth, arguments).cloud,
+        compare=None if arguments.compare is None else _read(arguments.compare, arguments),
+        ground_truth=None
+        if arguments.ground_truth is None
+        else _read(arguments.ground_truth, arguments).cloud,
         color=arguments.color,
         view=arguments.view,
         up=None if arguments.up is None else _direction(arguments.up),
@@ -165,7 +167,7 @@ def _colors(
         raise ConfigError(
             f"{cloud.source}: missing {COLOR_MODES[color][1]}, required by --color {color}; has "
             f"{', '.join(cloud.fields) or 'points alone'}."
-            + (" Errors require a viewer and --truth." if color.endswith("error") else "")
+            + (" Errors require a viewer and --ground-truth." if color.endswith("error") else "")
         )
     if color is None:
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)

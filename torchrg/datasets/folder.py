@@ -38,7 +38,7 @@ class SceneFiles(NamedTuple):
         path: The file or folder that is read.
         files: All input files in reading order; their bytes determine the result.
         dataset: The data set that defines the classes, empty if unknown; None for a plain cloud.
-        place: Path in the release, which some programs keep. Default: its name.
+        release_path: Path in the release, which some programs keep. Default: its name.
         num_points: Number of points from headers or file sizes, for ``convert``.
         item: Extra data for reading; plain, picklable values.
     """
@@ -47,7 +47,7 @@ class SceneFiles(NamedTuple):
     path: Path
     files: tuple[Path, ...]
     dataset: str | None = None
-    place: str = ""
+    release_path: str = ""
     num_points: int = 0
     item: Any = None
 
@@ -113,7 +113,7 @@ class SceneDataset(Dataset[Sample]):
         return estimate_points(scene.path / "coord.npy" if scene.path.is_dir() else scene.path)
 
     def describe(self) -> dict[str, Any]:
-        """Return the JSON-serializable parameters that affect what is read."""
+        """Return the JSON-serializable parameters that affect the samples."""
         return {}
 
     def check_output(self, layout: str, out: Path) -> None:
@@ -185,7 +185,7 @@ class FolderOfClouds(SceneDataset):
         first: dict[str, Path] = {}
         for name, path, *_ in self.scenes:
             if first.setdefault(name, path) != path:
-                one, other = (place.relative_to(self.root) for place in (first[name], path))
+                one, other = (file.relative_to(self.root) for file in (first[name], path))
                 raise FormatError(
                     f"{root}: expected one file per scan, got {one} and {other}; move or rename "
                     "one, or select files by suffix."
@@ -202,7 +202,7 @@ class FolderOfClouds(SceneDataset):
         return SceneFiles(inside.as_posix(), path, files, "ScanNet" if is_known else "")
 
     def describe(self) -> dict[str, Any]:
-        """Return the JSON-serializable parameters that affect what is read."""
+        """Return the JSON-serializable parameters that affect the samples."""
         return {} if self.columns is None else {"columns": list(self.columns)}
 
     def check_output(self, layout: str, out: Path) -> None:
@@ -323,8 +323,8 @@ def find_files(
     visit(folder, os.path.realpath(folder))
     while links:
         link = links.pop(0)
-        place, target = (Path(os.path.realpath(path)) for path in (link.parent, link))
-        if place.is_relative_to(target):
+        parent, target = (Path(os.path.realpath(path)) for path in (link.parent, link))
+        if parent.is_relative_to(target):
             skipped.append(link)
         else:
             visit(link, str(target))

@@ -68,7 +68,7 @@ class LayoutScan:
         normal: Unit normals, shape ``(N, 3)``.
         superpoint: Superpoint of each point, shape ``(N,)``.
         plane: Plane ID of each point, -1 for none, shape ``(N,)``.
-        given: Optional inputs: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the class
+        inputs: Optional inputs: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the class
             of each point, -1 for none, ``category``, its NYU40 ID, 0 for none, and ``instance``,
             its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
         objects: Result of :func:`torchrg.datasets.scannet.read_objects`; None if unknown.
@@ -151,13 +151,13 @@ def check_layout(layout: str, dataset: str, what: str) -> None:
         require("h5py", extra="nag", purpose="write layout nag")
 
 
-def check_stems(layout: str, places: Mapping[str, str]) -> None:
+def check_stems(layout: str, paths: Mapping[str, str]) -> None:
     """Raise FormatError if two scans would write the same files in a layout.
 
-    ``places`` contains the path of each scan in its data set, by name.
+    ``paths`` contains the path of each scan in its data set, by name.
     """
     owners: dict[str, str] = {}
-    for name, path in places.items() if layout != "pointcept" else ():
+    for name, path in paths.items() if layout != "pointcept" else ():
         stem = layout_stem(layout, name, path)
         other = owners.setdefault(normalize_file_name(stem), name)
         if other != name:
@@ -212,7 +212,7 @@ def write_scan(
     scan = LayoutScan(
         stem,
         split,
-        folder=scene.place or scene.name,
+        folder=scene.release_path or scene.name,
         dataset=scene.dataset if scene.dataset is not None else "ScanNet",
         coord=cloud.points.numpy(),
         normal=seg.normals.numpy(),
@@ -432,11 +432,11 @@ def _mask3d(scan: LayoutScan) -> Files:
     labels = None if scan.ground_truth is None else (scan.category, scan.ground_truth[1])
     # Mask3D identifies a scan by its mesh folder.
     entry = {"scene": scan.name, "raw_filepath": f"{scan.name}/{scan.name}_vh_clean_2.ply"}
-    places = (
+    paths = (
         f"{SPLIT_NAMES[scan.split]}/{_mask3d_name(scan.name)}",
         f"{SPLIT_NAMES[scan.split]}/{scan.name}",
     )
-    return _mask3d_files(scan, *places, labels, entry, first_class=0)
+    return _mask3d_files(scan, *paths, labels, entry, first_class=0)
 
 
 def _mask3d_s3dis(scan: LayoutScan) -> Files:

@@ -3,7 +3,7 @@
 ``coord`` float32, ``color`` uint8 and ``normal`` float32 of shape ``(N, 3)``; ``segment`` and
 ``instance`` int16 of shape ``(N, 1)``, ``(N, 3)`` for ScanNet++; ``segment20``, ``segment200`` and
 ``instance`` int64 of shape ``(N,)`` for ScanNet. torchrg adds ``plane`` int32 of shape ``(N,)``,
-``curvature`` float32 of shape ``(N, 1)`` (as Pointcept's features are), ``planes.json``, and
+``curvature`` float32 of shape ``(N, 1)`` (like Pointcept's features), ``planes.json``, and
 optionally ``superpoint`` int32. Pointcept ignores unknown files;
 ``import torchrg.transforms.pointcept`` makes it load these.
 """
@@ -51,7 +51,7 @@ _protected: ContextVar[Collection[str]] = ContextVar("_protected", default=())
 
 @contextmanager
 def protecting_files(names: Collection[str]) -> Iterator[None]:
-    """Prevent :func:`write_files` from removing files of these names, in this thread.
+    """Prevent :func:`write_files` from removing files with these names, in this thread.
 
     Callers identify files that a user has changed by fingerprints in records.
     """
@@ -100,8 +100,8 @@ def write_pointcept_scene(
     """Write a scene folder, or add results to a folder that Pointcept wrote.
 
     Files not written by this function are never changed: their arrays must have the same number of
-    rows, and coordinates must equal the sample's. Its own files, as listed in ``planes.json``, are
-    replaced or removed. All files are complete before the first one appears.
+    rows, and coordinates must equal the sample's. Files of an earlier call, as listed in
+    ``planes.json``, are replaced or removed. All files are complete before the first one appears.
 
     Args:
         folder: The scene, ``OUT/Area_i/<room>``; created if missing.
@@ -109,8 +109,7 @@ def write_pointcept_scene(
             ``segment20``, ``segment200``, ``instance``, as tensors or arrays. Default for
             ``normal``: the normals of the segmentation.
         segmentation: Result of :func:`torchrg.segment_planes` for ``coord``.
-        superpoint: Superpoint of each point, shape ``(N,)``, written as ``superpoint``, as for
-            ScanNet. Default: none are written.
+        superpoint: Superpoint of each point, shape ``(N,)``. Default: not written.
         origin: Origin of ``coord``, for the plane table; see
             :func:`torchrg.result.describe_planes`. Default: ``coord`` is in the coordinates of the
             data set.
@@ -120,12 +119,12 @@ def write_pointcept_scene(
 
     Raises:
         FormatError: If the folder contains another scene, or a ``plane``, ``curvature``,
-            ``superpoint`` or ``planes.json`` of other origin, or cannot be written.
+            ``superpoint`` or ``planes.json`` of another program, or is not writable.
     """
     target = Path(folder)
     arrays = _convert_arrays(target, sample, segmentation, superpoint=superpoint)
     torchrg_files = _torchrg_files(target)
-    # torchrg's own arrays are never kept as inputs: a file of other origin is an error.
+    # The arrays of torchrg are never kept as inputs: such a file of another program is an error.
     inputs = {
         name
         for name in arrays.keys() - {"plane", "curvature", "superpoint"}
@@ -203,7 +202,7 @@ def write_files(
     for name in torchrg_files - set(contents) - set(_protected.get()):
         (target / name).unlink(missing_ok=True)
     with ExitStack() as stack:
-        # Files are renamed in reverse order: the claim first, the coordinates last.
+        # Files are renamed in reverse order: the plane table first, the coordinates last.
         for name, content in contents.items():
             temporary = stack.enter_context(atomic_path(paths[name], within=target))
             with temporary.open("wb") as stream:

@@ -24,10 +24,10 @@ Value = TypeVar("Value")
 DEPTH_SUFFIXES = (".png", ".npy", ".pgm")
 """Suffixes of depth images."""
 _CONVERTERS = {
-    ".bag": "save its frames by Open3D's RGBDVideoReader",
-    ".mkv": "save its frames by Open3D's azure_kinect_mkv_reader.py",
-    ".r3d": "unzip it, and save what pyliblzfse reads of its .depth files as .npy, in metres",
-    ".exr": "save what OpenEXR reads of it as .npy, usually in metres",
+    ".bag": "extract its frames with Open3D's RGBDVideoReader",
+    ".mkv": "extract its frames with Open3D's azure_kinect_mkv_reader.py",
+    ".r3d": "unzip it, read its .depth files with pyliblzfse, save them as .npy in meters",
+    ".exr": "read it with OpenEXR, save it as .npy, usually in meters",
 }
 """How to convert unsupported recordings and images to frames, by suffix."""
 _PNG = b"\x89PNG"
@@ -39,7 +39,7 @@ _MAX_HEADER_BYTES = 512
 _MAX_8_BIT, _MAX_16_BIT = 255, 65535
 MAX_PIXELS = 1 << 26
 """Maximum pixels of an image, 8192 x 8192. No depth camera has more, and converting them to
-meters takes 1.5 GB. A library that runs out of memory ends the process."""
+meters takes 1.5 GB. Running out of memory in a library would end the process."""
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
 """Plausible range of the median depth, in meters. Depth cameras measure 0.1 to 20."""
 _SAMPLED = 20_000
@@ -55,7 +55,7 @@ def read_depth(
 
     Pixels without depth (0, negative, non-finite, or ``no_depth``, like 65535 in 7-Scenes) are 0.
     ``depth_scale`` is the number of depth units per meter: 1000 for millimeters, 5000 for TUM, 1
-    for meters. It is not stored in the files, and never guessed.
+    for meters. It is not stored in the files and never guessed.
 
     Warns:
         DepthWarning: If the median depth is below 5 cm or above 100 m.
@@ -86,7 +86,7 @@ def read_depth(
     if no_depth is not None:
         missing |= stored == no_depth
     valid = depth[~missing]
-    # A sample is enough to check the scale, and fast.
+    # A sample suffices to check the scale.
     valid = valid[:: len(valid) // _SAMPLED + 1] / depth_scale
     median = float(np.median(valid)) if len(valid) else _MIN_MEDIAN_DEPTH
     if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:
@@ -101,7 +101,7 @@ def read_depth(
 
 
 def refuse_recording(path: Path) -> None:
-    """Raise FormatError with conversion instructions if a file is an unsupported recording."""
+    """Raise FormatError with instructions if a file is an unsupported recording."""
     if (tool := _CONVERTERS.get(path.suffix.lower())) and not path.is_dir():
         raise FormatError(
             f"{path}: expected depth images, got {path.suffix}; {tool}, and pass the folder to "
@@ -132,7 +132,7 @@ def _read_png16(source: Path) -> NDArray[np.uint16]:
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 1:
         raise FormatError(
             f"{source}: expected a 16-bit gray PNG, got shape {image.shape} and {image.dtype}; "
-            "8 bits or colors cannot represent depth."
+            "8-bit or color images cannot represent depth."
         )
     values: NDArray[np.uint16] = image[..., 0]
     return values
@@ -146,7 +146,7 @@ def _read_image(source: Path, kinds: str) -> Array:
     if source.suffix.lower() == ".png" and (count := num_pixels(source)) > MAX_PIXELS:
         raise FormatError(
             f"{source}: expected an image of at most {MAX_PIXELS:,} pixels, got {count:,} in its "
-            "header; the file may be corrupt, or make it smaller."
+            "header; resize it, unless the file is corrupt."
         )
     with wrap_errors(f"{source}: expected a {kinds} image, got: ", Exception):
         # Without a mode argument, the library detects bit depth and channels.

@@ -62,11 +62,11 @@ _SCANNETPP_COLOR = {"width": 1920, "height": 1440}
 _NERFSTUDIO_UNIT = 0.001
 """nerfstudio's default depth unit, in meters."""
 _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
-"""Conversion from our camera axes to OpenGL's: x right, y up, z backwards."""
+"""Conversion between torchrg's camera axes and OpenGL's: x right, y up, z backwards."""
 
 
 class ListedFrame(NamedTuple):
-    """Frame listed in a folder, with its own camera and scale if the recording has none."""
+    """Frame listed in a folder, with a camera and scale if these differ per frame."""
 
     name: str
     depth: Path
@@ -78,19 +78,19 @@ class ListedFrame(NamedTuple):
 
 
 Camera = Callable[[Path], Pinhole]
-"""Returns the camera of a recording without a camera file."""
+"""Function that returns the camera of a recording without a camera file."""
 
 
 class FrameLayout(NamedTuple):
     """Layout of a folder of frames.
 
     Attributes:
-        frames: Yields the frames of a recording in natural order.
+        frames: Function that yields the frames of a recording in natural order.
         mark: Name pattern of an entry in every recording; empty if any folder is a recording.
         camera: Camera of a recording without a camera file; None if unknown or per frame.
         depth_scale: Depth units per meter; None if unknown or per frame.
         no_depth: See :class:`torchrg.datasets.RGBDFrame`.
-        places: Path patterns of recordings below a folder of several.
+        locations: Path patterns of recordings below the root folder.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
             ``("",)`` if the mark is enough, empty if the layout cannot be detected.
     """
@@ -176,7 +176,7 @@ def _color_image(path: Path) -> Path | None:
 
 
 def _fixed_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return a function that returns the same camera for every recording."""
+    """Return a function that returns one camera for all recordings."""
     return lambda folder: Pinhole(fx, fy, cx, cy, _KINECT_SIZE)
 
 

@@ -115,7 +115,7 @@ class S3DIS(SceneDataset):
         return round(sum(sizes.values()) * estimate_points(largest) / max(sizes[largest], 1))
 
     def describe(self) -> dict[str, Any]:
-        """Return the JSON-serializable parameters that affect what is read."""
+        """Return the JSON-serializable parameters that affect the samples."""
         return {"class_order": self.class_order}
 
     def check_output(self, layout: str, out: Path) -> None:

@@ -1,8 +1,8 @@
 """Plane segmentation of depth images.
 
 :func:`segment_depth` takes an image and a camera matrix. :func:`make_intrinsics` builds the matrix
-from four numbers; :func:`find_intrinsics` estimates it for an organized cloud. The module for data
-loaders is :class:`torchrg.transforms.SegmentDepth`.
+from four numbers; :func:`find_intrinsics` estimates it for an organized cloud. In data
+loaders, use :class:`torchrg.transforms.SegmentDepth`.
 """
 
 from torchrg.config import DepthConfig

@@ -25,7 +25,7 @@ _ALL_STEPS = (*_FORWARD_STEPS, *((-down, -right) for down, right in _FORWARD_STE
 _NUM_PASSES = 2
 """Passes of boundary assignment and merging: assigned pixels may make regions adjacent."""
 
-_ABSORB_REACH = 3.0
+_ASSIGN_REACH = 3.0
 """Maximum distance of a pixel to the plane of the adjacent flat region, in standard deviations of
 the noise: 99.7 % of its pixels are within."""
 
@@ -156,7 +156,7 @@ def _refine(
     grid = PixelGrid(cloud.seen.shape)
     for _ in range(_NUM_PASSES):
         planes = fit_inverse_planes(cloud, labels)
-        reach = planes.scale_thickness(_ABSORB_REACH)
+        reach = planes.scale_thickness(_ASSIGN_REACH)
         labels = assign_unlabeled_pixels(cloud, labels, planes, reach)
         hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
         pairs = zip(grid.contacts(labels), hidden, strict=True)
@@ -170,7 +170,7 @@ def _refine(
     if joined is not labels:
         labels = rank_by_size(joined, config.min_size)
         planes = fit_inverse_planes(cloud, labels)
-    reach = planes.scale_thickness(_ABSORB_REACH)
+    reach = planes.scale_thickness(_ASSIGN_REACH)
     moved = move_to_creases(cloud, labels, planes, reach)
     labels = rank_by_size(moved, config.min_size)
     return labels, fit_inverse_planes(cloud, labels)
@@ -198,24 +198,24 @@ def _ray_planes(fit: RegionPlanes) -> Tensor:
 
 
 def fit_inverse_planes(
-    cloud: InverseCloud, labels: Tensor, *, most: int = MAX_FITTED
+    cloud: InverseCloud, labels: Tensor, *, max_pixels: int = MAX_FITTED
 ) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, the only noisy one.
 
     A second fit uses Tukey's bisquare weights, as in :func:`torchrg.regions.fit.fit_planes`. The
     thickness, along the normals, is at least the mean noise of the region. Regions thicker than
-    noise and a slight bend explain are curved. Each fit uses up to ``most`` evenly spaced pixels
-    per region.
+    noise and a slight bend explain are curved. Each fit uses up to ``max_pixels`` evenly spaced
+    pixels per region.
     """
-    chunks = Segments(labels, most=most).chunks(len(labels) + 1)
+    chunks = Segments(labels, max_points=max_pixels).chunks(len(labels) + 1)
     parts = map_tasks(lambda chunk: _fit_chunk(cloud, chunk), chunks, labels.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _fit_chunk(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
     """Fit planes to one chunk of regions; see :func:`fit_inverse_planes`."""
-    noise = segments.mean(segments.take(cloud.noise))
-    columns = segments.take_columns(cloud.points)
+    noise = segments.mean(segments.gather(cloud.noise))
+    columns = segments.gather_columns(cloud.points)
     weights = torch.ones_like(columns[0])
     for _ in range(_NUM_FITS):
         center, covariance = segments.moments(columns, weights)

@@ -79,7 +79,7 @@ class PixelPlanes(NamedTuple):
         squares = self.squares[1].as_strided((size,), (1,))
         return [squares, self.narrow.flatten(), self.pixels]
 
-    def take(self, index: Tensor) -> Windows:
+    def select(self, index: Tensor) -> Windows:
         """Return the windows of pixels at row-major indices."""
         indices = self.choice.window.flatten()[index]
         tables = (*self.squares.values(), self.narrow)

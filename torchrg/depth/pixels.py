@@ -65,7 +65,7 @@ def describe_pixels(
         pass_over_rows("describe_pixels", len(y), *fixed, *found, *parameters)
         return found
     index = torch.arange(values.numel(), device=values.device)
-    windows = Windows(*(column.view(values.shape) for column in planes.take(index)))
+    windows = Windows(*(column.view(values.shape) for column in planes.select(index)))
     sides = planes.sides_and_centers(index)[0].view(2, *values.shape)
     noise = planes.noise.evaluate(values)
     valid = choice.flat | (seen & windows.deviation.isfinite())
@@ -116,7 +116,7 @@ def _join(
     here = nonzero_rows(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
     there = here + (width, 1)[axis]
     row, column = here // width, here % width
-    ours, theirs = planes.take(here), planes.take(there)
+    ours, theirs = planes.select(here), planes.select(there)
     u_slope, v_slope = ours.u_slope - theirs.u_slope, ours.v_slope - theirs.v_slope
     step = u_slope * image.u[column] + v_slope * image.v[row] + ours.origin - theirs.origin
     next_step = step + (v_slope, u_slope)[axis]

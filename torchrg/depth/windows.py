@@ -22,7 +22,7 @@ REACH = 2
 SIDE = 2 * REACH + 1
 """Cells along a side of a window."""
 NARROW = ((3, 9), (9, 3))
-"""Rows and columns of narrow windows in pixels; each has about as many as the smallest square."""
+"""Rows and columns of narrow windows in pixels; each has about the area of the smallest square."""
 _MIN_FRACTION = 0.4
 """Minimum fraction of seen pixels for a window to have a plane."""
 _MIN_SPREAD = 0.2

@@ -13,7 +13,7 @@ from torchrg.io.files import atomic_path
 from torchrg.structures import Cloud
 
 _RECORDS_PER_CHUNK = 1 << 20
-"""Records converted and written together, which bounds the memory."""
+"""Number of records converted and written at a time, which bounds the memory."""
 _LABELS = ("labels", backup_name("labels"))
 
 
@@ -40,8 +40,8 @@ class FieldNames(NamedTuple):
 def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str, Values]:
     """Convert a cloud to named columns: ``x y z`` first, then its fields.
 
-    Labels become int32 if that holds them, colors uint8 (or uint16 if the format stores it),
-    booleans uint8, half precision float32. A multi-column field is split into ``name_0``,
+    Labels become int32 if they fit, colors uint8 (or uint16 if the format supports it), booleans
+    uint8, and half precision float32. A multi-column field is split into ``name_0``,
     ``name_1`` and so on, unless the format has ``vectors``.
     """
     columns: dict[str, Values] = {axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")}
@@ -70,7 +70,7 @@ def check_length(path: Path, name: str, values: Values, num_points: int) -> None
 
 
 def _to_storable(path: Path, name: str, values: Values, field_names: FieldNames) -> Values:
-    """Return a field as real numbers of a type that files store."""
+    """Convert a field to real numbers of a dtype that files can store."""
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
         raise FormatError(
             f"{path}: expected field {name} to be real numbers of at most 64 bits, got "
@@ -119,14 +119,14 @@ def check_exact(path: Path, columns: Columns) -> None:
 
 
 def _is_64_bit(values: Values) -> bool:
-    """Whether values are 64-bit integers, and not empty."""
+    """Return whether values are 64-bit integers and not empty."""
     return values.dtype.kind in "iu" and values.dtype.itemsize == 8 and values.size > 0
 
 
 def narrow_integers(values: Values, codes: Collection[str]) -> Values:
     """Convert 64-bit integers to the first type of ``codes`` that holds them all.
 
-    Values that fit none of the types, and values of other types, are returned unchanged.
+    Values that fit none of these types, and values of other dtypes, are unchanged.
 
     Example:
         >>> narrow_integers(np.array([0, 2**31]), ("i4", "u4")).dtype

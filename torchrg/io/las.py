@@ -149,7 +149,7 @@ def _open_reader(laspy: ModuleType, path: Path) -> Iterator[Any]:
     message = f"{path}: expected a LAS or LAZ file, got: "
     errors = (laspy.errors.LaspyException, *PARSE_ERRORS)
     try:
-        # The parallel backend allocates as much memory as a corrupt chunk table requests.
+        # The parallel backend allocates any amount of memory that a corrupt chunk table requests.
         with (
             wrap_errors(message, *errors, repair=f"; {_REPAIR}"),
             laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,

@@ -1,11 +1,11 @@
-"""Loops over neighbourhoods in C++, beside their definitions in torch.
+"""C++ kernels for loops over neighborhoods.
 
-A kernel does what the function of its name does, in one pass over memory. It works on ordinary
-tensors of a CPU in single precision; for gradients, ``vmap``, other devices and types, and where
-the library is absent, the definition runs. Calls hold no lock of the interpreter.
+A kernel computes the same as the torch function of its name, in one pass over memory. Kernels serve
+plain float32 CPU tensors. The torch definition runs for gradients, ``vmap``, other devices and
+dtypes, and without the library. Calls release the GIL.
 
-The library is built with the package (``scripts/build_kernels.py``), once for any processor and
-once for those with AVX2. Both give the same bits.
+``scripts/build_kernels.py`` builds the library with the package, once for any processor and once
+for AVX2. Both are bit-identical.
 """
 
 import ctypes
@@ -22,8 +22,8 @@ from torch import Tensor
 from torchrg._checks import is_concrete
 
 MAX_NEIGHBORS = 512
-"""Maximum number of values of a row in kernels, ``MAX_WIDTH`` in ``plain.h``. The torch definitions
-serve longer rows."""
+"""Maximum number of values per row, ``MAX_WIDTH`` in ``plain.h``. Longer rows use the torch
+definitions."""
 
 SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
@@ -70,10 +70,10 @@ SIGNATURES = {
 }
 """Arguments and results of each kernel.
 
-A letter for the dtype (f and d float32 and float64, i and l int32 and int64, b bool, x and n a
-number with and without a fraction) and one for each axis, equal letters for equal lengths; a
-question mark behind what may be None; capital letters for what the kernel writes to.
-In C the lengths come first, in the order of their letters.
+One letter for the dtype (f float32, d float64, i int32, l int64, b bool; x is a float and n an
+integer scalar), and one letter per axis; equal letters mean equal lengths. A question mark marks an
+optional argument, a capital letter an argument that the kernel writes to. In C the lengths come
+first, in the order of their letters.
 """
 
 _DTYPES = {
@@ -83,18 +83,18 @@ _DTYPES = {
     "l": torch.int64,
     "b": torch.bool,
 }
-"""Types of the elements of a tensor, by their letters in a signature."""
+"""Dtypes by their letters in a signature."""
 
 
 def name_of_library() -> str | None:
-    """Return which library is in use, ``"base"`` or ``"avx2"``, None where there is none."""
+    """Return the library in use, ``"base"`` or ``"avx2"``, or None without a library."""
     return None if _library() is None else _kind()
 
 
 def serve(*tensors: Tensor | None, k: int = 1) -> bool:
-    """Tell whether kernels work on tensors, rows of ``k`` values among them.
+    """Return whether kernels can process tensors with rows of ``k`` values.
 
-    That is on what has values, on the CPU, of no gradient, and in single precision.
+    They must be concrete CPU tensors of 32-bit dtypes or bool that require no gradient.
 
     Example:
         >>> serve(torch.zeros(3, dtype=torch.float64))
@@ -115,11 +115,11 @@ def serve(*tensors: Tensor | None, k: int = 1) -> bool:
 
 
 def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
-    """Return what a kernel makes of tensors and numbers, in the order of its signature.
+    """Run a kernel and return its outputs in the order of its signature.
 
     Raises:
-        ValueError: If the arguments are not those of :data:`SIGNATURES`.
-        IndexError: If a list names a row that is not there.
+        ValueError: If the arguments do not match :data:`SIGNATURES`.
+        IndexError: If a neighbor index is out of range.
     """
     signature, library = _signature(name), _library()
     if library is None or len(arguments) != len(signature.inputs):
@@ -133,14 +133,14 @@ def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
     passed += [_pass(value) for value in (*taken, *outputs)]
     status = getattr(library, name)(*passed)
     if status == 1:
-        raise IndexError(f"{name}: a list of neighbors names a row that is not there.")
+        raise IndexError(f"{name}: expected neighbor indices of existing rows, got others.")
     if status:
         raise ValueError(f"{name}: expected rows of 1 to {MAX_NEIGHBORS} values, got {lengths}.")
     return outputs
 
 
 class _Argument(NamedTuple):
-    """What a signature says of an argument: its dtype, axes, and whether it may be left out."""
+    """Argument in a signature: dtype, axes, and whether it is optional."""
 
     dtype: str
     axes: str
@@ -149,7 +149,7 @@ class _Argument(NamedTuple):
     def check(
         self, name: str, value: Tensor | float | None, lengths: dict[str, int]
     ) -> Tensor | float | None:
-        """Return the argument, contiguous; note the lengths of its axes, which must agree."""
+        """Return the argument as contiguous; record and check the lengths of its axes."""
         if not self.axes and not self.optional and self.dtype in "nx":
             if isinstance(value, int | float):  # bool is one
                 return int(value) if self.dtype == "n" else float(value)
@@ -167,7 +167,7 @@ class _Argument(NamedTuple):
         raise ValueError(f"{name}: expected {self.dtype}[{self.axes}], got {shape}, {lengths}.")
 
     def allocate(self, lengths: dict[str, int]) -> Tensor:
-        """Return a tensor for what a kernel writes."""
+        """Allocate an output tensor."""
         shape = [int(axis) if axis.isdigit() else lengths[axis] for axis in self.axes]
         return torch.empty(shape, dtype=_DTYPES[self.dtype], device="cpu")
 
@@ -198,13 +198,13 @@ def _pass(value: object) -> object:
 
 
 def _kind() -> str:
-    """Return the library for this processor, by what torch says of it."""
+    """Return the name of the library for this processor, as torch detects it."""
     is_wide = torch.backends.cpu.get_cpu_capability().startswith("AVX")
     return "avx2" if is_wide else "base"
 
 
 def _is_stale(library: Path) -> bool:
-    """Tell whether sources beside a library, as in an editable install, are newer than it."""
+    """Return whether the sources, present in an editable install, are newer than the library."""
     sources = [*library.parent.glob("*.cpp"), *library.parent.glob("*.h")]
     built = library.stat().st_mtime if library.exists() else math.inf
     return any(source.stat().st_mtime > built for source in sources)
@@ -212,14 +212,14 @@ def _is_stale(library: Path) -> bool:
 
 @lru_cache(maxsize=1)
 def _library() -> ctypes.CDLL | None:
-    """Load the library, or say once that there is none."""
+    """Load the library, or warn once if it is missing."""
     if os.environ.get("TORCHRG_NO_KERNELS", "0") not in ("", "0"):
         return None
     path = Path(__file__).parent / f"libkernels-{_kind()}.library"
     if _is_stale(path):
         warnings.warn(
-            "torchrg runs without its kernels, which are older than their sources; install it "
-            "again: pip install -e .",
+            "torchrg runs without its kernels, which are older than their sources; run "
+            "pip install -e . again.",
             stacklevel=2,
         )
         return None
@@ -239,8 +239,8 @@ def _library() -> ctypes.CDLL | None:
         )
         return None
     warnings.warn(
-        "torchrg runs without its kernels, several times slower: install it where a C++ compiler "
-        "is, or with TORCHRG_KERNELS set as the guide says.",
+        "torchrg runs without its kernels, several times slower; install a C++ compiler and "
+        "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install).",
         stacklevel=2,
     )
     return None

@@ -1,11 +1,11 @@
-// Nearest neighbours by cells: torchrg/neighbors/knn.py.
+// Nearest neighbors on a cell grid: torchrg/neighbors/knn.py.
 #include "plain.h"
 
 namespace {
 
 constexpr int MAX_CANDIDATES = 4096;  // points of a cell and those around it
-constexpr int MAX_CHOSEN = 1024;      // of these, the ones that are sorted
-constexpr double SURELY = 1e-6;        // rounding of which cell a point at a border is in
+constexpr int MAX_CHOSEN = 1024;      // of these, the sorted ones
+constexpr double SURELY = 1e-6;        // rounding of the cell of a point at a boundary
 
 struct Candidates {
   alignas(32) double x[MAX_CANDIDATES], y[MAX_CANDIDATES], z[MAX_CANDIDATES],
@@ -16,12 +16,12 @@ struct Candidates {
   int32_t row_of[MAX_CHOSEN];
 };
 
-// Sorts chosen candidates by distance, then row; returns the distance of the last of k.
+// Sorts selected candidates by distance, then row; returns the k-th distance.
 INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
   const int width = padded(count);
   for (int i = 0; i < width; i++) {
-    const int place = all.chosen[i < count ? i : 0];
-    all.distance[i] = square_root(all.square[place]), all.row_of[i] = all.row[place];
+    const int candidate = all.chosen[i < count ? i : 0];
+    all.distance[i] = square_root(all.square[candidate]), all.row_of[i] = all.row[candidate];
     all.rank[i] = 0;
   }
   for (int j = 0; j < count; j++) {
@@ -46,7 +46,7 @@ INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
   return farthest;
 }
 
-// Puts two zero bits between the bits of a number below 2^21.
+// Inserts two zero bits between the bits of a number below 2^21.
 INLINE uint64_t spread(uint64_t bits) {
   bits = (bits | bits << 32) & 0x1F00000000FFFF;
   bits = (bits | bits << 16) & 0x1F0000FF0000FF;
@@ -80,7 +80,7 @@ KERNEL morton_codes_double(int64_t num_points, const double* points, double x, d
   return fill_codes(num_points, points, {x, y, z}, extent, codes);
 }
 
-// Sorts points by cells: `starts` gets the first place of each cell, of which the last is the end.
+// Sorts points by cell: `starts` receives the first index of each cell, then the end.
 KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, int32_t* starts,
                   int64_t width, int64_t height, double x, double y, double z, double size,
                   int32_t* rows, int32_t* cells, double* sorted) {
@@ -100,17 +100,17 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
   int32_t before = 0;
   for (int64_t c = 0; c < num_cells; c++) before += starts[c], starts[c] = before;
   for (int64_t i = num_points - 1; i >= 0; i--) {
-    const int64_t place = --starts[cells[i]];
-    rows[place] = int32_t(i);
-    for (int axis = 0; axis < 3; axis++) sorted[3 * place + axis] = points[3 * i + axis];
+    const int64_t position = --starts[cells[i]];
+    rows[position] = int32_t(i);
+    for (int axis = 0; axis < 3; axis++) sorted[3 * position + axis] = points[3 * i + axis];
   }
   return DONE;
 }
 
-// Writes the k nearest of the asked points in cells `from` to `to` to their rows of `found`, in the
-// order of rows `order` if there is one, and tells which are certain.
+// Writes the k nearest neighbors of the selected points in cells `from` to `to` to their rows of
+// `found`, renumbered by `order` if given; `certain` marks exact results.
 KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const double* sorted, Ints rows,
-                    Ints starts, Flagged asked, Longs order, int32_t* found, bool* certain,
+                    Ints starts, Flagged selected, Longs order, int32_t* found, bool* certain,
                     int64_t from, int64_t to, int64_t width, int64_t height, int64_t first_row,
                     double x, double y, double z, double size) {
   if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
@@ -140,19 +140,19 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
     }
     const double u = x + (double(c / step) - 0.5) * size, w = z + (double(c % height) - 0.5) * size,
                  v = y + (double(c / height % width) - 0.5) * size;
-    for (int64_t place = starts[c]; place < starts[c + 1]; place++) {
-      if (place < 0 || place >= num_points) return NO_SUCH_ROW;
-      const int32_t row = rows[place];
+    for (int64_t position = starts[c]; position < starts[c + 1]; position++) {
+      if (position < 0 || position >= num_points) return NO_SUCH_ROW;
+      const int32_t row = rows[position];
       if (!is_row(row, num_points)) return NO_SUCH_ROW;
-      if (!asked[row]) continue;
-      const double *own = sorted + 3 * place, px = own[0], py = own[1], pz = own[2];
+      if (!selected[row]) continue;
+      const double *query = sorted + 3 * position, px = query[0], py = query[1], pz = query[2];
       for (int t = 0; t < n; t++) {
         const double a = all.x[t] - px, b = all.y[t] - py, d = all.z[t] - pz;
         all.square[t] = a * a + b * b + d * d;
       }
       const double off = larger(larger(size_of(px - u), size_of(py - v)), size_of(pz - w));
-      const double border = (1.5 * size - off) * (1 - SURELY), most = border * border;
-      double within = guess > 0 && guess < most ? guess : most;
+      const double border = (1.5 * size - off) * (1 - SURELY), max_square = border * border;
+      double within = guess > 0 && guess < max_square ? guess : max_square;
       int count = 0;
       for (int turn = 0; turn < 8; turn++) {
         count = 0;
@@ -162,8 +162,8 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
         }
         if (count > MAX_CHOSEN)
           within *= 0.7;
-        else if (count < k && within < most)
-          within = smaller(within * 1.6, most);
+        else if (count < k && within < max_square)
+          within = smaller(within * 1.6, max_square);
         else
           break;
       }
@@ -172,7 +172,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
       if (to_row < 0 || to_row >= num_points) return NO_SUCH_ROW;
       int32_t* list = found + k * to_row;
       const double farthest = sort(all, count, int(k), list);
-      // Whether what is beyond could tie with the last one by rounding.
+      // Whether a point outside could tie with the last neighbor by rounding.
       if (!(farthest * (1 + SURELY) < square_root(within))) continue;
       for (int j = 0; j < k; j++)
         list[j] = int32_t((order ? order[list[j]] : int64_t(list[j])) + first_row);

@@ -1,13 +1,13 @@
-// The inner loops of consensus normals: one neighbourhood stays in the cache for all steps on it.
-// torchrg/normals/consensus/ defines and explains them, torchrg/normals/jet.py the paraboloids.
+// Inner loops of consensus normals: each neighborhood stays in the cache for all of its steps.
+// See torchrg/normals/consensus/ for definitions, and torchrg/normals/jet.py for paraboloids.
 #include "plain.h"
 
 namespace {
 
-// Of torchrg/normals/consensus/constants.py, in the order of its names here.
+// Constants of torchrg/normals/consensus/constants.py, in the order passed.
 struct Constants {
   float vote_reach, vote_falloff, fit_reach, fit_falloff, gap, corner_limit, corner_fraction;
-  float num_refits, num_alternations, least;
+  float num_refits, num_alternations, minimum;
 };
 
 struct Meeting {
@@ -27,21 +27,21 @@ INLINE float product(const float* a, const float* b, int width) {
   return total(lanes);
 }
 
-INLINE void residuals(const Patch& patch, const Plane& plane, float* rests) {
-  for (int j = 0; j < patch.width; j += LANES) store(rests + j, plane.residuals(patch, j));
+INLINE void residuals(const Patch& patch, const Plane& plane, float* distances) {
+  for (int j = 0; j < patch.width; j += LANES) store(distances + j, plane.residuals(patch, j));
 }
 
 // hypotheses._refit
 INLINE void refit(const Patch& patch, const float* weights, float reach, bool bisquare,
                   Plane& plane) {
-  alignas(32) float shares[MAX_WIDTH];
+  alignas(32) float voted_weights[MAX_WIDTH];
   for (int j = 0; j < patch.width; j += LANES) {
-    const Lanes rest = plane.residuals(patch, j) / reach;
-    Lanes near = positive(1 - rest * rest);
+    const Lanes residual = plane.residuals(patch, j) / reach;
+    Lanes near = positive(1 - residual * residual);
     if (bisquare) near *= near;
-    store(shares + j, load(weights + j) * near);
+    store(voted_weights + j, load(weights + j) * near);
   }
-  const Plane fitted = fit_plane(patch, shares, patch.width);
+  const Plane fitted = fit_plane(patch, voted_weights, patch.width);
   if (float(fitted.middle) > 1e-6f * float(fitted.high)) plane = fitted;
 }
 
@@ -49,7 +49,7 @@ INLINE void refit(const Patch& patch, const float* weights, float reach, bool bi
 Plane vote(const Patch& patch, const float* counted, float noise, const float* start,
            const int64_t* ranks, int64_t num_pairs, const Constants& constants) {
   alignas(32) float weights[MAX_WIDTH], nearness[MAX_WIDTH];
-  const float most = farthest(patch, counted), far = most > 0 ? most : 1;
+  const float maximum = farthest(patch, counted), far = maximum > 0 ? maximum : 1;
   for (int j = 0; j < patch.width; j += LANES) {
     const Lanes near = patch.sq_lengths(j) / far;
     store(nearness + j, near);
@@ -78,28 +78,28 @@ Plane vote(const Patch& patch, const float* counted, float noise, const float* s
   return plane;
 }
 
-// hypotheses._off_surface: the points off a surface, on the side with more; all of them count.
-INLINE void beyond(const Patch& patch, const float* rests, float gap, float* flags) {
+// hypotheses._off_surface: weights of the points off a surface, on its more populated side.
+INLINE void beyond(const Patch& patch, const float* distances, float gap, float* flags) {
   Lanes over{}, under{};
   for (int j = 0; j < patch.width; j += LANES) {
-    over += where(load(rests + j) > gap, load(patch.weight + j), all(0));
-    under += where(load(rests + j) < -gap, load(patch.weight + j), all(0));
+    over += where(load(distances + j) > gap, load(patch.weight + j), all(0));
+    under += where(load(distances + j) < -gap, load(patch.weight + j), all(0));
   }
   const float sign = total(under) <= total(over) ? 1 : -1;
   for (int j = 0; j < patch.width; j += LANES)
-    store(flags + j, where(load(rests + j) * sign > gap, load(patch.weight + j), all(0)));
+    store(flags + j, where(load(distances + j) * sign > gap, load(patch.weight + j), all(0)));
 }
 
-INLINE void near(const Patch& patch, const float* rests, float gap, const float* counted,
+INLINE void near(const Patch& patch, const float* distances, float gap, const float* counted,
                  float* flags) {
   for (int j = 0; j < patch.width; j += LANES)
-    store(flags + j, where(magnitude(load(rests + j)) <= gap, load(counted + j), all(0)));
+    store(flags + j, where(magnitude(load(distances + j)) <= gap, load(counted + j), all(0)));
 }
 
 INLINE float side(float sum) { return sum >= 0 ? 1 : -1; }
 
-// hypotheses.fit_wedges, and fit_corners where there is a third group of points: planes and their
-// points in turn. Leaves the points of each plane, and signed distances from the surface.
+// hypotheses.fit_wedges, or fit_corners if there is a third group of points. Alternates between
+// planes and their points; returns the points of each plane and signed distances to the surface.
 Meeting alternate(const Patch& patch, int count, float* first, float* second, float* third,
                   float* outer, const Constants& constants) {
   alignas(32) float r[MAX_WIDTH], s[MAX_WIDTH], t[MAX_WIDTH];
@@ -109,7 +109,7 @@ Meeting alternate(const Patch& patch, int count, float* first, float* second, fl
   Plane one, other, last;
   for (int turn = 0; turn <= constants.num_alternations; turn++) {
     const float fewest = smaller(sum(first, width), sum(second, width));
-    present &= (third ? smaller(fewest, sum(third, width)) : fewest) >= constants.least;
+    present &= (third ? smaller(fewest, sum(third, width)) : fewest) >= constants.minimum;
     if (turn == constants.num_alternations) break;
     one = fit_plane(patch, first, width), other = fit_plane(patch, second, width);
     residuals(patch, one, r), residuals(patch, other, s);
@@ -138,54 +138,54 @@ Meeting alternate(const Patch& patch, int count, float* first, float* second, fl
     }
   }
   const float freedom = count - (third ? 9 : 6), squares = product(outer, outer, width);
-  const Plane& own = third && third[0] > 0 ? last : second[0] > 0 ? other : one;
-  return {own, present ? square_root(squares / larger(freedom, 1.0f)) : INFINITE};
+  const Plane& result = third && third[0] > 0 ? last : second[0] > 0 ? other : one;
+  return {result, present ? square_root(squares / larger(freedom, 1.0f)) : INFINITE};
 }
 
 // hypotheses.fit_meeting_planes
 Meeting meet(const Patch& patch, const Plane& voted, float noise, int count, const int64_t* ranks,
              int64_t num_pairs, const Constants& constants) {
   alignas(32) float first[MAX_WIDTH], second[MAX_WIDTH], third[MAX_WIDTH];
-  alignas(32) float outer[MAX_WIDTH], rest[MAX_WIDTH];
+  alignas(32) float outer[MAX_WIDTH], remaining[MAX_WIDTH];
   const int width = patch.width;
   const float gap = constants.gap * noise;
-  residuals(patch, voted, rest);
-  near(patch, rest, gap, patch.weight, first), beyond(patch, rest, gap, second);
+  residuals(patch, voted, remaining);
+  near(patch, remaining, gap, patch.weight, first), beyond(patch, remaining, gap, second);
   const Meeting best = alternate(patch, count, first, second, nullptr, outer, constants);
   if (!(best.deviation > constants.corner_limit * noise)) return best;
-  const float least = constants.corner_fraction * best.deviation;
-  // Three planes from the two and what is off them.
+  const float minimum = constants.corner_fraction * best.deviation;
+  // Three planes: start from the two and the points off them.
   beyond(patch, outer, gap, third);
   for (int j = 0; j < width; j += LANES) {
     const Lanes on = 1 - load(third + j), is_first = load(first + j);
     store(second + j, (load(patch.weight + j) - is_first) * on), store(first + j, is_first * on);
   }
   const Meeting by_two = alternate(patch, count, first, second, third, outer, constants);
-  // Three planes from the voted one and that with the most votes of what it leaves.
+  // Three planes: start from the voted plane and the plane voted by the remaining points.
   residuals(patch, voted, outer);
   near(patch, outer, gap, patch.weight, first);
   int anchor = 0;
-  for (int j = 0; j < width; j++) rest[j] = patch.weight[j] - first[j];
-  while (anchor < width && rest[anchor] == 0) anchor++;
+  for (int j = 0; j < width; j++) remaining[j] = patch.weight[j] - first[j];
+  while (anchor < width && remaining[anchor] == 0) anchor++;
   if (anchor == width) anchor = 0;
   Patch moved = patch;
   for (int j = 0; j < width; j++) {
     moved.x[j] -= patch.x[anchor], moved.y[j] -= patch.y[anchor], moved.z[j] -= patch.z[anchor];
     if (patch.weight[j] == 0) moved.x[j] = moved.y[j] = moved.z[j] = 0;
   }
-  const Plane start = fit_plane(moved, rest, width);
+  const Plane start = fit_plane(moved, remaining, width);
   const float normal[3] = {start.a, start.b, start.c};
-  const Plane other = vote(moved, rest, noise, normal, ranks, num_pairs, constants);
+  const Plane other = vote(moved, remaining, noise, normal, ranks, num_pairs, constants);
   residuals(moved, other, outer);
-  near(moved, outer, gap, rest, second);
-  for (int j = 0; j < width; j++) third[j] = rest[j] - second[j];
+  near(moved, outer, gap, remaining, second);
+  for (int j = 0; j < width; j++) third[j] = remaining[j] - second[j];
   const Meeting by_votes = alternate(patch, count, first, second, third, outer, constants);
-  Meeting three = by_two.deviation < least ? by_two : Meeting{best.plane, least};
+  Meeting three = by_two.deviation < minimum ? by_two : Meeting{best.plane, minimum};
   if (by_votes.deviation < three.deviation) three = by_votes;
-  return three.deviation < least ? three : best;
+  return three.deviation < minimum ? three : best;
 }
 
-// Moves the points that count to the front, where nothing else is left; returns their number.
+// Compacts the points of nonzero weight to the front; returns their number.
 INLINE int compact(Patch& patch) {
   int count = 0;
   for (int j = 0; j < patch.width; j++) {
@@ -201,7 +201,8 @@ INLINE int compact(Patch& patch) {
 
 }  // namespace
 
-// surfaces.broken_planes: the plane of the votes, and that of two or three which meet. `pairs` are ranks of candidates for `k` counted neighbours.
+// surfaces.broken_planes: the voted plane, and the best of two or three intersecting planes.
+// `pairs` are ranks of candidates for `k` counted neighbors.
 KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t num_pairs,
                      int64_t num_constants, Floats points, Ints indices, Flagged mask, Floats noise,
                      Floats normals, Longs pairs, Floats numbers, float* voted,

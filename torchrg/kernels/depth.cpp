@@ -1,6 +1,6 @@
 // Planes at the pixels of a depth image: torchrg/depth/windows.py, normals.py and growth.py.
 //
-// Images are of float64 and by rows; a kernel that takes `from` and `to` does these rows alone.
+// Images are float64, row by row; a kernel with `from` and `to` processes only these rows.
 #include "plain.h"
 
 namespace {
@@ -8,9 +8,9 @@ namespace {
 typedef const double* Doubles;
 
 constexpr int REACH = 2, SIDE = 5, NUM_SIZES = 4, MOMENTS = 10, COLUMNS = 9;
-constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns that are fitted together
+constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns fitted together
 constexpr int LONG = 9, SHORT = 3;  // sides of narrow windows in pixels
-constexpr double FLAT = 1.35, OWN_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
+constexpr double FLAT = 1.35, SELF_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
 constexpr double BEND = 0.005, MAX_BEND = 0.03, STEEPEST = 4;
 constexpr double NONE = __builtin_inf();
 
@@ -24,22 +24,22 @@ INLINE bool are_rows_of(int64_t from, int64_t to, int64_t height) {
 template <int N>
 INLINE void solve(const double (&s)[MOMENTS][N], int j, double min_count, double min_spread,
                   double (&to)[5][N]) {
-  const double count = s[0][j], share = 1 / larger(count, 1.0);
-  const double u = s[1][j] * share, v = s[2][j] * share, w = s[3][j] * share;
-  const double uu = s[4][j] * share - u * u, uv = s[5][j] * share - u * v,
-               vv = s[6][j] * share - v * v, uw = s[7][j] * share - u * w,
-               vw = s[8][j] * share - v * w, ww = s[9][j] * share - w * w;
+  const double count = s[0][j], inverse = 1 / larger(count, 1.0);
+  const double u = s[1][j] * inverse, v = s[2][j] * inverse, w = s[3][j] * inverse;
+  const double uu = s[4][j] * inverse - u * u, uv = s[5][j] * inverse - u * v,
+               vv = s[6][j] * inverse - v * v, uw = s[7][j] * inverse - u * w,
+               vw = s[8][j] * inverse - v * w, ww = s[9][j] * inverse - w * w;
   const double determinant = uu * vv - uv * uv;
   const bool has_plane = (count >= min_count) & (determinant > min_spread);
   const double spread = has_plane ? determinant : 1;
   const double u_slope = (vv * uw - uv * vw) / spread, v_slope = (uu * vw - uv * uw) / spread;
-  const double rest = ww - u_slope * uw - v_slope * vw;
-  const double variance = (rest < 0 ? 0 : rest) * count / larger(count - 3, 1.0);
+  const double residual = ww - u_slope * uw - v_slope * vw;
+  const double variance = (residual < 0 ? 0 : residual) * count / larger(count - 3, 1.0);
   to[0][j] = u_slope, to[1][j] = v_slope, to[2][j] = w - u_slope * u - v_slope * v;
   to[3][j] = has_plane & (variance < NONE) ? square_root(variance) : NONE, to[4][j] = w;
 }
 
-// What a pixel adds to the sums of its windows, in place j.
+// Contribution of a pixel to the sums of its windows, at index j.
 template <int N>
 INLINE void write_moments(uint8_t seen, double u, double v, double value, double (*to)[N], int j) {
   const double one = seen, mu = one * u, mv = one * v, w = one > 0 ? value : 0;
@@ -47,8 +47,8 @@ INLINE void write_moments(uint8_t seen, double u, double v, double value, double
   to[5][j] = mu * v, to[6][j] = mv * v, to[7][j] = w * u, to[8][j] = w * v, to[9][j] = w * w;
 }
 
-// Fits planes (5, h, w) to the windows around cells, of which `read` gives the sums of a row's
-// columns, and adds cells up to those of twice the width.
+// Fits planes (5, h, w) to the windows around cells; `read` returns the column sums of a row. Also
+// sums cells to cells of twice the width.
 template <class Read>
 int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count,
                 double min_spread, double* planes, double* coarse, Read read) {
@@ -89,19 +89,19 @@ int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count
 struct Noise {
   double factor, constant, growth, rounding;
   INLINE_MEMBER double at(double w) const {
-    const double least = rounding * w;
-    return larger(factor * larger(growth + constant * (w * w), least), least);
+    const double lowest = rounding * w;
+    return larger(factor * larger(growth + constant * (w * w), lowest), lowest);
   }
 };
 
-// What is known of a window: see windows.WindowPlanes.
+// Fit of a window: see windows.WindowPlanes.
 enum Column { U_SLOPE, V_SLOPE, ORIGIN, DEVIATION, MEAN, NOISE, TOLERANCE, STRONGEST, RELATIVE };
 
 struct Window {
-  const double* numbers;  // one in each column, `step` apart
+  const double* numbers;  // one per column, `step` apart
   int64_t step;
   double rows, columns;
-  int64_t cell, across, wide;  // its middle is that of a cell, of so many pixels and cells a row
+  int64_t cell, across, wide;  // its center cell; pixels and cells per row
 
   INLINE_MEMBER double operator[](Column column) const { return numbers[column * step]; }
   INLINE_MEMBER bool holds(int64_t r, int64_t c) const {
@@ -111,7 +111,7 @@ struct Window {
   }
 };
 
-// The windows of an image: squares of all sizes, then n lying and n upright ones around pixels.
+// The windows of an image: squares of all sizes, then n horizontal and n vertical ones.
 struct Windows {
   int64_t width, first[NUM_SIZES + 1], columns[NUM_SIZES], n;
   const double *squares, *narrow;
@@ -145,7 +145,7 @@ INLINE double sq_slope_noise(const Window& window, double tolerance) {
 
 }  // namespace
 
-// The windows around pixels, as windows.fit_windows; `coarse` (10, p, q) gets cells of 2 pixels.
+// windows.fit_windows around pixels; `coarse` (10, p, q) receives the cells of 2 pixels.
 KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, Doubles values, Flagged seen,
                          Doubles u, Doubles v, double* planes, double* coarse, double min_count,
                          double min_spread, int64_t from, int64_t to) {
@@ -161,7 +161,7 @@ KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, 
                  });
 }
 
-// The same around larger cells.
+// windows.fit_windows around larger cells.
 KERNEL fit_cell_windows(int64_t m, int64_t h, int64_t w, int64_t p, int64_t q, Doubles cells,
                         double* planes, double* coarse, double min_count, double min_spread,
                         int64_t from, int64_t to) {
@@ -175,7 +175,8 @@ KERNEL fit_cell_windows(int64_t m, int64_t h, int64_t w, int64_t p, int64_t q, D
                  });
 }
 
-// normals.rate_windows: what windows may deviate by, and whether they and their quarters do.
+// normals.rate_windows: maximum deviations of windows, and whether windows or quarters exceed
+// them.
 KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, Doubles quarters,
                     double factor, double constant, double growth, double rounding,
                     double quarter_factor, double fx, double fy, double half, double jitter,
@@ -187,8 +188,8 @@ KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, D
   for (int column = 0; column < COLUMNS; column++) columns[column] = table + column * h * w;
   for (int64_t k = from * w; k < to * w; k++) {
     const double a = columns[U_SLOPE][k], b = columns[V_SLOPE][k], c = columns[ORIGIN][k],
-                 mean = columns[MEAN][k], usual = noise.at(mean);
-    const double by_noise = square_root(square(usual) + square(jitter) * (a * a + b * b));
+                 mean = columns[MEAN][k], expected = noise.at(mean);
+    const double by_noise = square_root(square(expected) + square(jitter) * (a * a + b * b));
     const double nearness = square(a * fx) + square(b * fy) + c * c;
     const double straight = nearness > square(STEEPEST * mean) ? 0 : nearness;
     const double bend = mean > 0 ? half * straight / mean : 0;
@@ -198,8 +199,8 @@ KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, D
   const double factor_of_quarters = 1 + SAME_NOISE / double(SIDE * size);
   for (int64_t i = from; i < to; i++)
     for (int64_t j = 0; j < w; j++) {
-      const int64_t own = i * w + j;
-      const double tolerance = columns[TOLERANCE][own], deviation = columns[DEVIATION][own];
+      const int64_t here = i * w + j;
+      const double tolerance = columns[TOLERANCE][here], deviation = columns[DEVIATION][here];
       bool is_flat = deviation / tolerance <= FLAT;
       if (p * q > 0 && is_flat) {
         double squares = 0, count = 0;
@@ -207,16 +208,16 @@ KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, D
           for (int64_t l = 2 * j - 2; l <= 2 * j + 3; l += SIDE)
             if (k >= 0 && k < p && l >= 0 && l < q && quarters[k * q + l] < NONE)
               squares += square(quarters[k * q + l]), count += 1;
-        double usual = square_root(count > 0 ? squares / count : NONE);
-        usual = usual * (columns[NOISE][own] / finer.at(columns[MEAN][own]));
-        is_flat = deviation <= factor_of_quarters * larger(usual, MIN_QUARTERS * tolerance);
+        double expected = square_root(count > 0 ? squares / count : NONE);
+        expected = expected * (columns[NOISE][here] / finer.at(columns[MEAN][here]));
+        is_flat = deviation <= factor_of_quarters * larger(expected, MIN_QUARTERS * tolerance);
       }
-      columns[RELATIVE][own] = is_flat ? deviation / tolerance : NONE;
+      columns[RELATIVE][here] = is_flat ? deviation / tolerance : NONE;
     }
   return DONE;
 }
 
-// normals.offer_windows: the window that pixels take, of one size, from number `first` on.
+// normals.offer_windows: the window of one size that each pixel takes, numbered from `first`.
 KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values, Flagged seen,
                      Doubles u, Doubles v, Doubles table, int64_t* windows, bool* flat, bool* edge,
                      int64_t size, int64_t first, int64_t from, int64_t to) {
@@ -226,8 +227,8 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
   const double *relative = table + RELATIVE * step, *tolerance = table + TOLERANCE * step;
   for (int64_t i = from; i < to; i++)
     for (int64_t j = 0; j < q; j++) {
-      const int64_t own = i * q + j;
-      int64_t flattest = -1;  // unknown; none is `own` if not flat
+      const int64_t here = i * q + j;
+      int64_t flattest = -1;  // unknown; `here` if no window is flat
       for (int64_t r = i * size; r < smaller((i + 1) * size, h); r++)
         for (int64_t c = j * size; c < smaller((j + 1) * size, w); c++) {
           const int64_t pixel = r * w + c;
@@ -237,20 +238,22 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
             return size_of(values[pixel] - (on_plane + table[ORIGIN * step + k])) <= reach;
           };
           int64_t taken = -1;
-          if (relative[own] < NONE && is_near(own, OWN_REACH * tolerance[own])) taken = own;
-          if (taken < 0 && size == 1 && table[DEVIATION * step + own] <= table[STRONGEST * step + own] &&
-              is_near(own, NONE))
-            taken = own;
+          if (relative[here] < NONE && is_near(here, SELF_REACH * tolerance[here])) taken = here;
+          if (taken < 0 && size == 1 &&
+              table[DEVIATION * step + here] <= table[STRONGEST * step + here] &&
+              is_near(here, NONE))
+            taken = here;
           if (taken < 0) {
             if (flattest < 0) {
-              flattest = own;
-              double least = NONE;
+              flattest = here;
+              double lowest = NONE;
               for (int64_t k = larger(i - REACH, int64_t(0)); k <= smaller(i + REACH, p - 1); k++)
                 for (int64_t l = larger(j - REACH, int64_t(0)); l <= smaller(j + REACH, q - 1); l++)
-                  if (relative[k * q + l] < least) least = relative[k * q + l], flattest = k * q + l;
+                  if (const int64_t at = k * q + l; relative[at] < lowest)
+                    lowest = relative[at], flattest = at;
             }
             const double reach =
-                larger(OWN_REACH * table[NOISE * step + flattest], tolerance[flattest]);
+                larger(SELF_REACH * table[NOISE * step + flattest], tolerance[flattest]);
             if (relative[flattest] < NONE && is_near(flattest, reach))
               taken = flattest, edge[pixel] = true;
           }
@@ -262,7 +265,7 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
 
 namespace {
 
-// Calls `visit` with the rows and columns of the pixels of a narrow window, lying (0) or upright.
+// Calls `visit` with the rows and columns of a narrow window, horizontal (0) or vertical (1).
 template <class Visit>
 INLINE void visit_narrow(int64_t h, int64_t w, int64_t pixel, int shape, const Visit& visit) {
   const int64_t row = pixel / w, tall = (shape ? LONG : SHORT) / 2;
@@ -274,7 +277,7 @@ INLINE void visit_narrow(int64_t h, int64_t w, int64_t pixel, int shape, const V
 
 }  // namespace
 
-// windows.fit_narrow_windows, lying (0) and upright (1), of pixels that `numbers` numbers.
+// windows.fit_narrow_windows, horizontal (0) and vertical (1), around numbered pixels.
 KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u, Doubles v,
                           Longs numbers, Longs pixels, double min_count, double min_spread,
                           double* planes, int64_t from, int64_t to) {
@@ -296,10 +299,10 @@ KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubl
   return DONE;
 }
 
-// normals.choose_narrow: of pixels the flatter narrow window around them, else the flattest that
-// holds them, or -1, and whether it is the latter.
+// normals.choose_narrow: the flatter narrow window around each pixel, else the flattest window that
+// contains it (`adjacent`), else -1.
 KERNEL choose_narrow(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u, Doubles v,
-                     Longs numbers, Longs pixels, Doubles table, int64_t* chosen, bool* beside,
+                     Longs numbers, Longs pixels, Doubles table, int64_t* chosen, bool* adjacent,
                      int64_t from, int64_t to) {
   if (!are_rows_of(from, to, n)) return TOO_WIDE;
   for (int64_t number = from; number < to; number++) {
@@ -310,32 +313,32 @@ KERNEL choose_narrow(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u,
     const auto is_near = [&](int64_t k) {
       const double on_plane = at(U_SLOPE, k) * u[column] + at(V_SLOPE, k) * v[row];
       return size_of(values[pixel] - (on_plane + at(ORIGIN, k))) <=
-             larger(OWN_REACH * at(NOISE, k), at(TOLERANCE, k));
+             larger(SELF_REACH * at(NOISE, k), at(TOLERANCE, k));
     };
     const int64_t flatter = at(RELATIVE, n + number) < at(RELATIVE, number) ? n + number : number;
     if (at(RELATIVE, flatter) < NONE && is_near(flatter)) {
-      chosen[number] = flatter, beside[number] = false;
+      chosen[number] = flatter, adjacent[number] = false;
       continue;
     }
-    double least = NONE;
+    double lowest = NONE;
     int64_t flattest = 2 * n;
     bool inside = true;
     for (int shape = 0; shape < 2; shape++)
       visit_narrow(h, w, pixel, shape, [&](int64_t r, int64_t c) {
         const int64_t other = numbers[r * w + c], k = shape * n + other;
         inside &= other < n;
-        if (other >= 0 && other < n && at(RELATIVE, k) < least && is_near(k))
-          least = at(RELATIVE, k), flattest = k;
+        if (other >= 0 && other < n && at(RELATIVE, k) < lowest && is_near(k))
+          lowest = at(RELATIVE, k), flattest = k;
       });
     if (!inside) return NO_SUCH_ROW;
-    beside[number] = flattest < 2 * n, chosen[number] = beside[number] ? flattest : -1;
+    adjacent[number] = flattest < 2 * n, chosen[number] = adjacent[number] ? flattest : -1;
   }
   return DONE;
 }
 
 namespace {
 
-// What a window tells of all its pixels.
+// Properties shared by all pixels of a window.
 struct Described {
   int64_t number = -1;
   Window window;
@@ -357,8 +360,8 @@ struct Described {
 
 }  // namespace
 
-// pixels.describe_pixels: noise, normals, curvature and validity by pixels' windows, and whether
-// pixels are on one surface with the next, to the right and below.
+// pixels.describe_pixels: noise, normals, curvature and validity from the windows of pixels, and
+// whether a pixel is on the same surface as its right and lower neighbor.
 KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Doubles values,
                        Flagged seen, Doubles u, Doubles v, Doubles x, Doubles y, Longs windows,
                        Flagged flat, Doubles squares, Doubles narrow, Longs pixels, double* normals,
@@ -371,53 +374,53 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
     return TOO_WIDE;
   for (int64_t pixel = from * w; pixel < smaller(to + 1, h) * w; pixel++)
     if (!all.has(windows[pixel])) return NO_SUCH_ROW;
-  const Noise usual = {factor, constant, growth, rounding};
+  const Noise expected = {factor, constant, growth, rounding};
   const double focal[2] = {fx, fy};
-  Described own, beside, below;  // neighbouring pixels mostly have the same window
+  Described here, next, below;  // neighboring pixels usually have the same window
   const auto are_joined = [&](int64_t r, int64_t c, Described& other, bool is_down) {
     const int64_t there = r * w + c + (is_down ? w : 1);
-    if (windows[there] == own.number) return true;
+    if (windows[there] == here.number) return true;
     other.look_at(all, windows[there], focal);
-    const double u_slope = own.slopes[0] - other.slopes[0],
-                 v_slope = own.slopes[1] - other.slopes[1];
-    const double step = u_slope * u[c] + v_slope * v[r] + own.origin - other.origin;
-    const double ours = own.tolerance(noise[r * w + c]),
-                 theirs = other.tolerance(usual.at(values[there]));
+    const double u_slope = here.slopes[0] - other.slopes[0],
+                 v_slope = here.slopes[1] - other.slopes[1];
+    const double step = u_slope * u[c] + v_slope * v[r] + here.origin - other.origin;
+    const double ours = here.tolerance(noise[r * w + c]),
+                 theirs = other.tolerance(expected.at(values[there]));
     const double limit = max_step * larger(ours, theirs);
     if (!(size_of(step) <= limit && size_of(step + (is_down ? v_slope : u_slope)) <= limit))
       return false;
-    const double *a = own.normal, *b = other.normal;
+    const double *a = here.normal, *b = other.normal;
     const double sign = __builtin_copysign(1.0, a[0] * b[0] + a[1] * b[1] + a[2] * b[2]);
     const double turned =
         square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
     if (turned <= max_sq_chord) return true;
-    const bool alike = u_slope * u_slope + v_slope * v_slope <=
-                       sq_slope_noise(own.window, ours) + sq_slope_noise(other.window, theirs);
-    return (alike || turned <= wider_sq_chord) && own.window.holds(r + is_down, c + !is_down) &&
+    const bool similar = u_slope * u_slope + v_slope * v_slope <=
+                       sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs);
+    return (similar || turned <= wider_sq_chord) && here.window.holds(r + is_down, c + !is_down) &&
            other.window.holds(r, c);
   };
   for (int64_t r = from; r < to; r++)
     for (int64_t c = 0; c < w; c++) {
       const int64_t pixel = r * w + c;
-      if (windows[pixel] == beside.number) own = beside;
-      own.look_at(all, windows[pixel], focal);
-      noise[pixel] = usual.at(values[pixel]);
-      right[pixel] = flat[pixel] && c + 1 < w && flat[pixel + 1] && are_joined(r, c, beside, false);
+      if (windows[pixel] == next.number) here = next;
+      here.look_at(all, windows[pixel], focal);
+      noise[pixel] = expected.at(values[pixel]);
+      right[pixel] = flat[pixel] && c + 1 < w && flat[pixel + 1] && are_joined(r, c, next, false);
       down[pixel] = flat[pixel] && r + 1 < h && flat[pixel + w] && are_joined(r, c, below, true);
-      valid[pixel] = flat[pixel] || (seen[pixel] && own.deviation < NONE);
+      valid[pixel] = flat[pixel] || (seen[pixel] && here.deviation < NONE);
       for (int axis = 0; axis < 3; axis++)
-        normals[3 * pixel + axis] = valid[pixel] ? own.normal[axis] : 0;
+        normals[3 * pixel + axis] = valid[pixel] ? here.normal[axis] : 0;
       curvature[pixel] = 0;
       if (!valid[pixel]) continue;
       const double z = 1 / (values[pixel] > 0 ? values[pixel] : 1);
       const double ray = x[c] * x[c] + y[r] * y[r] + 1;
-      const double across = square(z * own.deviation / own.length);
-      const double sides[2] = {own.window.columns, own.window.rows}, places[2] = {x[c], y[r]};
+      const double across = square(z * here.deviation / here.length);
+      const double sides[2] = {here.window.columns, here.window.rows}, positions[2] = {x[c], y[r]};
       double along = 0;
       for (int axis = 0; axis < 2; axis++) {
-        const double step = own.slopes[axis] * z, f = focal[axis];
+        const double step = here.slopes[axis] * z, f = focal[axis];
         along += (sides[axis] * sides[axis] - 1) / 12 *
-                 (step * step * ray - 2 / f * step * places[axis] + 1 / (f * f));
+                 (step * step * ray - 2 / f * step * positions[axis] + 1 / (f * f));
       }
       const double total = across + along * z * z;
       curvature[pixel] = smaller(across / (total > 0 ? total : 1), 1.0 / 3);
@@ -425,7 +428,7 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
   return DONE;
 }
 
-// growth.connect_pixels: the first pixel of each one's connected component.
+// growth.connect_pixels: the first pixel of the connected component of each pixel.
 KERNEL connect_pixels(int64_t h, int64_t w, Flagged flat, Flagged right, Flagged down,
                       int64_t* roots) {
   const auto root_of = [&](int64_t pixel) {
@@ -450,18 +453,18 @@ KERNEL connect_pixels(int64_t h, int64_t w, Flagged flat, Flagged right, Flagged
 
 namespace {
 
-// Pixels whose label may change in a turn, each once.
+// Queue of the pixels whose label may change in a pass, without duplicates.
 struct Front {
-  int64_t h, w, *rows, *marks, *chosen;  // (h * w) each; marks are the turns of coming in last
+  int64_t h, w, *rows, *marks, *chosen;  // (h * w) each; marks: last pass that queued it
   int64_t count = 0, turn = 0;
 
   Front(int64_t h, int64_t w, int64_t* rows, int64_t* marks, int64_t* chosen)
       : h(h), w(w), rows(rows), marks(marks), chosen(chosen) {
     for (int64_t i = 0; i < h * w; i++) marks[i] = -1;
   }
-  // The eight pixels around one, those outside of the image replaced by the nearest inside.
+  // The eight neighbors of a pixel, clamped to the image.
   template <class Visit>
-  INLINE_MEMBER void visit_around(int64_t pixel, const Visit& visit) const {
+  INLINE_MEMBER void visit_neighbors(int64_t pixel, const Visit& visit) const {
     const int64_t row = pixel / w, column = pixel % w;
     for (int64_t r = row - 1; r <= row + 1; r++)
       for (int64_t c = column - 1; c <= column + 1; c++)
@@ -472,8 +475,8 @@ struct Front {
     if (marks[pixel] == turn) return;
     marks[pixel] = turn, rows[count++] = pixel;
   }
-  // In each turn pixels take the label of the pixel around them at the least cost, of equal ones the
-  // smallest; those around them that may follow are next.
+  // In each pass, pixels take the label of the neighbor with the lowest cost (ties: the smallest
+  // label). Their neighbors that may change are queued for the next pass.
   template <class Cost, class Follows>
   INLINE_MEMBER void spread(int64_t* labels, int64_t num_turns, const Cost& cost,
                             const Follows& follows) {
@@ -481,12 +484,12 @@ struct Front {
       int64_t moved = 0;
       for (int64_t f = 0; f < count; f++) {
         const int64_t pixel = rows[f];
-        double least = NONE;
+        double lowest = NONE;
         int64_t best = -1;
-        visit_around(pixel, [&](int64_t other) {
+        visit_neighbors(pixel, [&](int64_t other) {
           const double away = cost(pixel, other);
-          if (away < least || (away == least && labels[other] < best))
-            least = away, best = labels[other];
+          if (away < lowest || (away == lowest && labels[other] < best))
+            lowest = away, best = labels[other];
         });
         if (best >= 0) rows[moved] = pixel, chosen[moved++] = best;
       }
@@ -495,7 +498,7 @@ struct Front {
       const auto add_next = [&](int64_t pixel) {
         if (follows(pixel)) add(pixel);
       };
-      for (int64_t f = 0; f < moved; f++) add_next(chosen[f]), visit_around(chosen[f], add_next);
+      for (int64_t f = 0; f < moved; f++) add_next(chosen[f]), visit_neighbors(chosen[f], add_next);
     }
   }
 };
@@ -508,7 +511,7 @@ INLINE bool are_labels(Longs labels, int64_t n, int64_t num) {
 
 }  // namespace
 
-// repair.assign_unlabeled beside pixels; points are (3, h w).
+// repair.assign_unlabeled for pixels; points are (3, h w).
 KERNEL assign_unlabeled_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, Flagged seen,
                      int64_t* labels, Doubles normals, Doubles centers, Doubles reach,
                      int64_t* rows, int64_t* marks, int64_t* chosen) {
@@ -529,7 +532,7 @@ KERNEL assign_unlabeled_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubl
   return DONE;
 }
 
-// growth.move_to_creases; planes (M, 3) are over rays, points (3, h w).
+// growth.move_to_creases; planes (M, 3) are per ray, points (3, h w).
 KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, int64_t* labels,
                        Doubles planes, Doubles middles, Doubles reach, int64_t num_turns,
                        double straight, int64_t* rows, int64_t* marks, int64_t* chosen) {
@@ -548,28 +551,28 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
       if (r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
     }
   front.spread(labels, num_turns, [&](int64_t pixel, int64_t q) {
-    const int64_t own = labels[pixel], other = labels[q];
-    if (other < 0 || other == own) return NONE;
-    const double *one = planes + 3 * own, *two = planes + 3 * other;
+    const int64_t label = labels[pixel], other = labels[q];
+    if (other < 0 || other == label) return NONE;
+    const double *one = planes + 3 * label, *two = planes + 3 * other;
     const double away = size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
     if (!(away <= reach[other])) return NONE;
     const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
     const auto over = [&](double u, double v) { return a * u + b * v + c; };
     const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
-    const double mine = over(middles[2 * own], middles[2 * own + 1]),
+    const double mine = over(middles[2 * label], middles[2 * label + 1]),
                  theirs = over(middles[2 * other], middles[2 * other + 1]);
     const double slope = square_root(a * a + b * b);
     const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
     const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
                       here * mine < 0 && mine * theirs < 0 && size_of(mine) > reach[other] &&
-                      size_of(theirs) > reach[own];
+                      size_of(theirs) > reach[label];
     return goes ? away : NONE;
   }, [&](int64_t pixel) { return labels[pixel] >= 0; });
   return DONE;
 }
 
-// faces.count_lines: along how many rows and columns, every so many, one of a pair of regions goes
-// on at the other past what is nearer; points are (3, h w).
+// faces.count_lines: number of sampled rows and columns along which one region of a pair continues
+// as the other behind a nearer object; points are (3, h w).
 KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Doubles points,
                    Flagged seen, Longs labels, Doubles normals, Doubles centers, Doubles reach,
                    Longs pairs, int64_t every, double min_nearer, int64_t* counts,
@@ -598,7 +601,7 @@ KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Double
         for (int64_t i = 0; i < length && !leads; i++) {
           const int64_t pixel = line * between + i * along, label = labels[pixel];
           const bool is_end = label == first || label == second;
-          // Before the first of either nothing counts.
+          // Pixels before the first of either region are ignored.
           if (!is_end && (previous < 0 || !seen[pixel])) continue;
           double height = 0;
           for (int axis = 0; axis < 3 && !is_end; axis++)

@@ -3,12 +3,12 @@
 
 namespace {
 
-// A forest of nodes. The root of a tree is its first node; signs are relative to the parent.
+// Disjoint-set forest. The root of a tree is its first node; signs are relative to the parent.
 struct Forest {
   int32_t* parents;
   bool *is_flipped, *is_contradictory;
 
-  // Moves a node to its root, halves its path, and returns whether its sign differs from the root.
+  // Replaces a node by its root with path halving; returns whether the signs of both differ.
   INLINE_MEMBER bool climb(int32_t& node) const {
     bool flipped = false;
     while (parents[node] != node) {
@@ -71,7 +71,7 @@ KERNEL link_nodes(int64_t num_links, int64_t num_nodes, Ints starts, Ints ends, 
   return DONE;
 }
 
-// Makes the root of each node its parent.
+// Points each node directly at its root.
 KERNEL flatten_nodes(int64_t num_nodes, int32_t* parents, bool* is_flipped,
                      bool* is_contradictory) {
   for (int64_t node = 0; node < num_nodes; node++) {

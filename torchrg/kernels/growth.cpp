@@ -1,14 +1,14 @@
-// Edges that regions grow along, and growth itself: torchrg/regions/edges.py and growth.py.
+// Region growing and its edges: torchrg/regions/growth.py and edges.py.
 #include "plain.h"
 
-// Places and normals in edges.accept_edges, from points and normals (3, N) to the neighbours of
-// some rows; limits below 0 are off.
+// edges.accept_edges: position and normal tests of edges to neighbors; points and normals (3, N);
+// limits below 0 are disabled.
 KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
                   Flagged valid, Floats reach, Ints indices, Flagged mask, Longs rows,
                   double max_sq_chord, double max_sq_distance, int64_t is_signed, bool* joins) {
   const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
   const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
-  const float most = float(max_sq_distance);
+  const float max_square = float(max_sq_distance);
   for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
     const int64_t i = rows[q];
     if (i < 0 || i >= num_points || !are_rows(indices, k, num_points)) return NO_SUCH_ROW;
@@ -20,7 +20,7 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
       bool passes = valid[i] & valid[t] & (t != i);
       passes &= !(max_sq_chord >= 0) | (da * da + db * db + dc * dc <= float(max_sq_chord));
       const float u = x[t] - x[i], v = y[t] - y[i], w = z[t] - z[i];
-      passes &= !(max_sq_distance >= 0) | (u * u + v * v + w * w <= most);
+      passes &= !(max_sq_distance >= 0) | (u * u + v * v + w * w <= max_square);
       if (reach) {
         passes &= size_of(u * a[i] + v * b[i] + w * c[i]) <= reach[i];
         passes &= size_of(u * a[t] + v * b[t] + w * c[t]) <= reach[t];
@@ -32,11 +32,11 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
   return DONE;
 }
 
-// growth.grow_fifo, with a bit for each neighbour that joins, in words of 64.
+// growth.grow_fifo, with one bit per neighbor in words of 64.
 //
-// A target becomes a seed by the bit of the edge, or where it is one itself. With `late` promotion
-// those that merely join do so when all seeds of the region are known. `roots` are -1 before the
-// first of `order`, and `queue` is for the kernel itself.
+// A target becomes a seed if the bit of the edge is set or it is a seed already. With `late`
+// promotion, other points join after all seeds of the region are known. `roots` start at -1, and
+// `queue` is working memory.
 KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t num_roots,
                     Ints indices, Longs joins, Longs makes_seed, Flagged is_seed, Flagged valid,
                     Ints order, int64_t late, int32_t* roots, int32_t* queue) {
@@ -71,25 +71,26 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   return DONE;
 }
 
-// torchrg.regions.adjacency._RegionEdges._at_boundary: which rows have a neighbour of another region.
-KERNEL at_boundary(int64_t num_points, int64_t num_rows, int64_t k, Ints labels, Ints own,
+// adjacency._RegionEdges._at_boundary: which rows have a neighbor of another region.
+KERNEL at_boundary(int64_t num_points, int64_t num_rows, int64_t k, Ints labels, Ints regions,
                    Ints indices, Flagged mask, bool* meets) {
   for (int64_t i = 0; i < num_rows; i++) {
     meets[i] = false;
     if (!are_rows(indices + i * k, k, num_points)) return NO_SUCH_ROW;
-    for (int64_t e = i * k; own[i] >= 0 && e < (i + 1) * k; e++) {
+    for (int64_t e = i * k; regions[i] >= 0 && e < (i + 1) * k; e++) {
       const int32_t other = labels[indices[e]];
-      meets[i] |= other != own[i] && other >= 0 && (!mask || mask[e]);
+      meets[i] |= other != regions[i] && other >= 0 && (!mask || mask[e]);
     }
   }
   return DONE;
 }
 
-// shared_neighbors.SharedNeighbors.connected: whether ends of edges from rows `first` on share
-// `least` neighbours. Lists of a block of rows are bits over the points that occur in them, its
-// members; `numbers` need no values before, as a number counts where the member so numbered is it.
+// shared_neighbors.SharedNeighbors.connected: whether both ends of edges from rows `first` on have
+// `min_shared` common neighbors. Neighbor lists of a block of rows are bit sets over its members.
+// `numbers` may be uninitialized: a number is valid only if the member with that number matches.
 KERNEL connected(int64_t num_points, int64_t k, int64_t num_rows, Ints indices, Flagged mask,
-                 Flagged asked, int32_t* numbers, int64_t first, int64_t least, bool* joined) {
+                 Flagged selected, int32_t* numbers, int64_t first, int64_t min_shared,
+                 bool* joined) {
   constexpr int WORDS = MAX_WIDTH / 64;
   if (k < 1 || k > MAX_WIDTH || first < 0 || num_rows > num_points - first) return TOO_WIDE;
   uint64_t bits[MAX_WIDTH][WORDS];
@@ -116,11 +117,12 @@ KERNEL connected(int64_t num_points, int64_t k, int64_t num_rows, Ints indices, 
       }
     }
     for (int64_t e = start * k, edge = e - first * k; e < stop * k; e++, edge++) {
-      const int own = asked[edge] ? find(e / k) : -1, other = asked[edge] ? find(indices[e]) : -1;
+      const int one = selected[edge] ? find(e / k) : -1,
+                other = selected[edge] ? find(indices[e]) : -1;
       int64_t shared = 0;
-      for (int word = 0; own >= 0 && other >= 0 && word < WORDS; word++)
-        shared += __builtin_popcountll(bits[own][word] & bits[other][word]);
-      joined[edge] = asked[edge] && shared >= least;
+      for (int word = 0; one >= 0 && other >= 0 && word < WORDS; word++)
+        shared += __builtin_popcountll(bits[one][word] & bits[other][word]);
+      joined[edge] = selected[edge] && shared >= min_shared;
     }
   }
   return DONE;

@@ -1,6 +1,6 @@
-// Moments and residuals of regions whose points lie side by side: torchrg/linalg/moments.py.
+// Moments and residuals of regions whose points are contiguous: torchrg/linalg/moments.py.
 //
-// Sums are of halves of halves, in NumPy's order.
+// Pairwise summation in NumPy's order.
 #include "plain.h"
 
 namespace {
@@ -9,7 +9,7 @@ typedef const double* Doubles;
 
 constexpr int BLOCK = 128;
 
-// Adds up the T terms of `count` points from one on; `term` writes those of a point.
+// Sums the T terms of `count` points from index `from` on; `term` writes the terms of one point.
 template <int T, class Term>
 void add_pairwise(int64_t from, int64_t count, const Term& term, double (&sums)[T]) {
   if (count > BLOCK) {
@@ -39,7 +39,7 @@ void add_pairwise(int64_t from, int64_t count, const Term& term, double (&sums)[
   }
 }
 
-// As NumPy's reduceat: the first term, and the sum of all others.
+// Like NumPy's reduceat: the first term plus the sum of the remaining terms.
 template <int T, class Term>
 void add_up(int64_t from, int64_t count, const Term& term, double (&sums)[T]) {
   double first[T];
@@ -48,17 +48,17 @@ void add_up(int64_t from, int64_t count, const Term& term, double (&sums)[T]) {
   for (int t = 0; t < T; t++) sums[t] = first[t] + sums[t];
 }
 
-// The value that k others precede; values move, without a branch for each.
+// Selects the value of rank k (from 0); partitions in place without branches.
 double select(double* values, int64_t count, int64_t k) {
   int64_t low = 0, high = count - 1;
   const auto move_down = [&](auto belongs) {
-    int64_t place = low;
+    int64_t position = low;
     for (int64_t i = low; i <= high; i++) {
       const double value = values[i];
-      values[i] = values[place], values[place] = value;
-      place += belongs(value);
+      values[i] = values[position], values[position] = value;
+      position += belongs(value);
     }
-    return place;
+    return position;
   };
   while (low < high) {
     const double a = values[low], b = values[low + (high - low) / 2], c = values[high];
@@ -75,8 +75,8 @@ double select(double* values, int64_t count, int64_t k) {
   return values[k];
 }
 
-// Calls `visit` with each run of equal labels, its first place and the one after its last: many are
-// long, and to count points one by one waits for every count to be written.
+// Calls `visit` with each run of equal labels and its first and past-the-end index. Many runs are
+// long, and counting point by point would wait for every write of a count.
 template <class Visit>
 void visit_runs(Longs labels, int64_t n, const Visit& visit) {
   for (int64_t from = 0, to = 0; from < n; from = to) {
@@ -85,7 +85,7 @@ void visit_runs(Longs labels, int64_t n, const Visit& visit) {
   }
 }
 
-// Calls `visit` with each region and the places of its first point and of the one after its last.
+// Calls `visit` with each region and the first and past-the-end index of its points.
 template <class Visit>
 int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) {
   int64_t start = 0;
@@ -98,11 +98,11 @@ int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) 
 
 }  // namespace
 
-// Segments.rows, counts and sizes: of regions of many points every so many, so that at most `most`
-// are taken.
-KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t* counts,
-                    int64_t* sizes, int64_t* places, int64_t* rows) {
-  if (most < 1) return TOO_WIDE;
+// Segments.rows, counts and sizes. Large regions are subsampled at a regular step to at most
+// `max_points`.
+KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t max_points, int64_t* counts,
+                    int64_t* sizes, int64_t* ends, int64_t* rows) {
+  if (max_points < 1) return TOO_WIDE;
   bool inside = true;
   for (int64_t i = 0; i < n; i++) inside &= labels[i] < num;
   if (!inside) return NO_SUCH_ROW;
@@ -110,22 +110,24 @@ KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t most, int64_t*
   visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
     if (m >= 0) sizes[m] += to - from;
   });
-  const auto step_of = [&](int64_t m) { return larger((sizes[m] + most - 1) / most, int64_t(1)); };
+  const auto step_of = [&](int64_t m) {
+    return larger((sizes[m] + max_points - 1) / max_points, int64_t(1));
+  };
   for (int64_t m = 0, start = 0; m < num; m++)
-    places[m] = start, start += (sizes[m] + step_of(m) - 1) / step_of(m);
-  // The count is of points up to the next one that is taken.
+    ends[m] = start, start += (sizes[m] + step_of(m) - 1) / step_of(m);
+  // counts[m] is the number of points up to the next sample.
   visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
     if (m < 0) return;
     const int64_t step = step_of(m);
     int64_t next = from + counts[m];
-    for (; next < to; next += step) rows[places[m]++] = next;
+    for (; next < to; next += step) rows[ends[m]++] = next;
     counts[m] = next - to;
   });
-  for (int64_t m = 0; m < num; m++) counts[m] = places[m] - (m ? places[m - 1] : 0);
+  for (int64_t m = 0; m < num; m++) counts[m] = ends[m] - (m ? ends[m - 1] : 0);
   return DONE;
 }
 
-// Segments.along: coordinates (A, n) of rows along the axes of their regions, about centers.
+// Segments.coordinates: coordinates (A, n) of rows along the axes of their regions, about centers.
 KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Doubles x,
                            Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
                            Doubles axes, double* coordinates) {
@@ -168,16 +170,16 @@ KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, 
       terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
       terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
     }, squares);
-    const int place[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
+    const int index[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
     for (int entry = 0; entry < 9; entry++)
-      covariances[9 * m + entry] = squares[place[entry]] / total;
+      covariances[9 * m + entry] = squares[index[entry]] / total;
   });
 }
 
 // Segments.reweigh: medians and mean squares of the distances of points from planes, and Tukey's
-// bisquare of these in units of `cut` medians, or of the least.
+// bisquare weights of the distances in units of `cut` medians, at least `min_scale`.
 KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Longs counts,
-                        Doubles means, Doubles axes, Doubles least, double mad, double cut,
+                        Doubles means, Doubles axes, Doubles min_scale, double mad, double cut,
                         double* weights, double* medians, double* squares) {
   return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
     const double *mean = means + 3 * m, *axis = axes + 3 * m, a = mean[0], b = mean[1], c = mean[2];
@@ -192,8 +194,8 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
     add_up(start, count, [&](int64_t i, double* term) { *term = weights[i] * weights[i]; }, sum);
     squares[m] = sum[0] / double(count);
     medians[m] = select(weights + start, count, (count - 1) / 2);
-    const double least_unit = cut * larger(mad * medians[m], least[m]);
-    const double unit = least_unit > 0 ? least_unit : 1;
+    const double min_unit = cut * larger(mad * medians[m], min_scale[m]);
+    const double unit = min_unit > 0 ? min_unit : 1;
     for (int64_t i = start; i < end; i++) {
       const double ratio = residual(i) / unit, weight = larger(1 - ratio * ratio, 0.0);
       weights[i] = weight * weight;
@@ -201,19 +203,19 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
   });
 }
 
-// table._outer_places of each region: whether its points (x, y) are outside of the octagon of the
-// farthest ones.
+// extents.hull_candidates: whether the points (x, y) of each region are outside the octagon of its
+// farthest points.
 KERNEL hull_candidates(int64_t n, int64_t num, Doubles x, Doubles y, Longs counts, double rounding,
                     bool* outer) {
   return visit_regions(n, num, counts, [&](int64_t, int64_t start, int64_t end) {
     int64_t farthest[8];
-    double most[8], largest = 0;
-    for (int e = 0; e < 8; e++) farthest[e] = start, most[e] = -double(INFINITE);
+    double maxima[8], largest = 0;
+    for (int e = 0; e < 8; e++) farthest[e] = start, maxima[e] = -double(INFINITE);
     for (int64_t i = start; i < end; i++) {
       const double along[4] = {x[i], x[i] + y[i], y[i], y[i] - x[i]};
       for (int e = 0; e < 4; e++) {
-        if (along[e] > most[e]) most[e] = along[e], farthest[e] = i;
-        if (-along[e] > most[e + 4]) most[e + 4] = -along[e], farthest[e + 4] = i;
+        if (along[e] > maxima[e]) maxima[e] = along[e], farthest[e] = i;
+        if (-along[e] > maxima[e + 4]) maxima[e + 4] = -along[e], farthest[e + 4] = i;
       }
       largest = larger(largest, larger(size_of(x[i]), size_of(y[i])));
     }

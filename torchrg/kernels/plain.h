@@ -1,7 +1,7 @@
-// What all kernels share. No header of the C++ library: any compiler builds them without one.
+// Common definitions of the kernels. No C++ library headers, so any compiler can build them.
 //
-// Eight fixed lanes add up every sum in the same order on every processor, and nothing is fused, so
-// that all libraries give the same bits. A kernel returns 0, or what went wrong: see __init__.py.
+// Sums use eight fixed lanes in the same order on every processor without fused operations, so all
+// libraries are bit-identical. A kernel returns 0 or an error code: see __init__.py.
 #pragma once
 #include <stdint.h>
 
@@ -9,7 +9,7 @@
 #define INLINE static inline __attribute__((always_inline))
 #define INLINE_MEMBER inline __attribute__((always_inline))
 
-// What kernels read.
+// Input arrays.
 typedef const float* Floats;
 typedef const int32_t* Ints;
 typedef const int64_t* Longs;
@@ -18,14 +18,14 @@ typedef const bool* Flagged;
 enum Status { DONE = 0, NO_SUCH_ROW = 1, TOO_WIDE = 2 };
 
 constexpr int LANES = 8;
-constexpr int MAX_WIDTH = 512;  // values of a row: neighbours of a point, points of a patch
+constexpr int MAX_WIDTH = 512;  // values per row: neighbors of a point, points of a patch
 constexpr float INFINITE = __builtin_inff();
 
 #ifdef __AVX__
 typedef float Lanes __attribute__((vector_size(32)));
 typedef int32_t Flags __attribute__((vector_size(32)));  // -1 for true
 #else
-// Two registers of four lanes each: of wider ones than there are, GCC compares lane by lane.
+// Two registers of four lanes: GCC compares vectors wider than the hardware lane by lane.
 typedef float FourFloats __attribute__((vector_size(16)));
 typedef int32_t FourFlags __attribute__((vector_size(16)));
 
@@ -45,15 +45,15 @@ typedef Pair<int32_t, FourFlags> Flags;
   INLINE Result operator operation(Operand a, Operand b) {                               \
     return Result(a.low operation b.low, a.high operation b.high);                       \
   }
-#define ON_BOTH_IN_PLACE(operation, Operand)                                             \
+#define ON_BOTH_ASSIGN(operation, Operand)                                             \
   ON_BOTH(Operand, operation, Operand)                                                   \
   INLINE Operand& operator operation##=(Operand& a, Operand b) { return a = a operation b; }
-ON_BOTH_IN_PLACE(+, Lanes)
-ON_BOTH_IN_PLACE(-, Lanes)
-ON_BOTH_IN_PLACE(*, Lanes)
-ON_BOTH_IN_PLACE(/, Lanes)
-ON_BOTH_IN_PLACE(+, Flags)
-ON_BOTH_IN_PLACE(-, Flags)
+ON_BOTH_ASSIGN(+, Lanes)
+ON_BOTH_ASSIGN(-, Lanes)
+ON_BOTH_ASSIGN(*, Lanes)
+ON_BOTH_ASSIGN(/, Lanes)
+ON_BOTH_ASSIGN(+, Flags)
+ON_BOTH_ASSIGN(-, Flags)
 ON_BOTH(Flags, &, Flags)
 ON_BOTH(Flags, ^, Flags)
 ON_BOTH(Flags, >>, Flags)
@@ -122,13 +122,13 @@ INLINE int total(Flags a) {
   return ((a[0] + a[4]) + (a[2] + a[6])) + ((a[1] + a[5]) + (a[3] + a[7]));
 }
 INLINE float largest(Lanes a) {
-  float most = a[0];
-  for (int lane = 1; lane < LANES; lane++) most = larger(most, a[lane]);
-  return most;
+  float maximum = a[0];
+  for (int lane = 1; lane < LANES; lane++) maximum = larger(maximum, a[lane]);
+  return maximum;
 }
 INLINE int padded(int count) { return (count + LANES - 1) / LANES * LANES; }
 
-// Neighbours about the first of them, each with its weight; what fills up the lanes has none.
+// Neighbors relative to the first one, with weights; padding lanes have weight 0.
 struct Patch {
   alignas(32) float x[MAX_WIDTH], y[MAX_WIDTH], z[MAX_WIDTH], weight[MAX_WIDTH];
   int width;
@@ -142,7 +142,7 @@ struct Patch {
   }
 };
 
-// Whether numbers name rows; a negative one names none, however many rows there are.
+// Whether all numbers are valid rows in [0, num_rows).
 INLINE bool is_row(int32_t number, int64_t num_rows) {
   return (number >= 0) & (int64_t(number) < num_rows);
 }
@@ -153,7 +153,7 @@ INLINE bool are_rows(const int32_t* numbers, int64_t count, int64_t num_rows) {
   return inside;
 }
 
-// Points (N, 3), lists of k of them each, and which of a list count: all where there is no mask.
+// Points (N, 3), neighbor lists of length k, and an optional mask of counted neighbors.
 struct Lists {
   int64_t num_points, num_lists, k;
   const float* points;
@@ -161,7 +161,7 @@ struct Lists {
   const bool* mask;
 };
 
-// Gathers the neighbours of a list; false if it names a point that is not there.
+// Gathers the neighbors of a list; false if an index is out of range.
 INLINE bool gather(const Lists& lists, int64_t i, Patch& patch) {
   const int k = int(lists.k);
   const float* points = lists.points;
@@ -183,7 +183,7 @@ INLINE bool gather(const Lists& lists, int64_t i, Patch& patch) {
   return true;
 }
 
-// Calls `visit` with each place, the row there and its patch: of all lists, or of n rows.
+// Calls `visit` with each index, its row and its patch, for all lists or n rows.
 template <class Visit>
 INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
   if (lists.k < 1 || lists.k > MAX_WIDTH) return TOO_WIDE;
@@ -196,7 +196,7 @@ INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Vi
   return DONE;
 }
 
-// A plane normal . q = offset, and the eigenvalues of the covariance it comes from.
+// A plane normal . q = offset, and the eigenvalues of its covariance.
 struct Plane {
   float a, b, c, offset;
   double low, middle, high;
@@ -220,7 +220,7 @@ INLINE Vector unit(Vector v) {
   return {v.x / length, v.y / length, v.z / length};
 }
 
-// As torchrg.linalg.eigen._across: a unit vector across the direction of a matrix of rank one.
+// torchrg.linalg.eigen._across: a unit vector orthogonal to the direction of a rank-one matrix.
 static Vector across(Vector first, Vector second, Vector third) {
   Vector row = second.y > first.x ? second : first;
   if (third.z > larger(first.x, second.y)) row = third;
@@ -232,7 +232,7 @@ static Vector across(Vector first, Vector second, Vector third) {
   return length > 0 ? unit(found) : Vector{i, j, k};
 }
 
-// As torchrg.linalg.smallest_eigenvector3, to the bit, of the covariance xx xy xz yy yz zz.
+// torchrg.linalg.smallest_eigenvector3, bit-identical, of the covariance xx xy xz yy yz zz.
 INLINE void decompose(const float* covariance, Plane& plane) {
   constexpr int FIRST_STEPS = 4, STEPS = 40;
   constexpr double CONVERGED = 1e-9, NEARLY_EQUAL = 1e-9;
@@ -266,14 +266,15 @@ INLINE void decompose(const float* covariance, Plane& plane) {
   const double u = normal.x, v = normal.y, w = normal.z;
   const double quotient =
       u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz;
-  const double low = larger(quotient, 0.0), rest = trace - low;
-  const double spread = square_root(larger(rest * rest - 4 * (minors - low * rest), 0.0));
+  const double low = larger(quotient, 0.0), remaining = trace - low;
+  const double square = larger(remaining * remaining - 4 * (minors - low * remaining), 0.0);
+  const double spread = square_root(square);
   plane.a = u, plane.b = v, plane.c = w;
-  plane.low = low * safe, plane.middle = larger((rest - spread) / 2, 0.0) * safe;
-  plane.high = larger((rest + spread) / 2, 0.0) * safe;
+  plane.low = low * safe, plane.middle = larger((remaining - spread) / 2, 0.0) * safe;
+  plane.high = larger((remaining + spread) / 2, 0.0) * safe;
 }
 
-// Mean (3) and covariance (6) of the points of a patch with weights, not negative; their sum.
+// Mean (3) and covariance (6) of a patch with nonnegative weights; returns the weight sum.
 INLINE float moments(const Patch& patch, const float* weights, int width, float* mean,
                      float* covariance) {
   Lanes sum{}, sx{}, sy{}, sz{};
@@ -287,35 +288,35 @@ INLINE float moments(const Patch& patch, const float* weights, int width, float*
   Lanes s[6] = {};
   for (int j = 0; j < width; j += LANES) {
     const Lanes x = load(patch.x + j) - mean[0], y = load(patch.y + j) - mean[1],
-                z = load(patch.z + j) - mean[2], share = load(weights + j) * inverse;
-    const Lanes wx = share * x, wy = share * y;
+                z = load(patch.z + j) - mean[2], scaled = load(weights + j) * inverse;
+    const Lanes wx = scaled * x, wy = scaled * y;
     s[0] += wx * x, s[1] += wx * y, s[2] += wx * z;
-    s[3] += wy * y, s[4] += wy * z, s[5] += share * z * z;
+    s[3] += wy * y, s[4] += wy * z, s[5] += scaled * z * z;
   }
   for (int i = 0; i < 6; i++) covariance[i] = total(s[i]);
   return count;
 }
 
 INLINE float farthest(const Patch& patch, const float* weights) {
-  Lanes most{};
+  Lanes maximum{};
   for (int j = 0; j < patch.width; j += LANES)
-    most = larger(most, patch.sq_lengths(j) * load(weights + j));
-  return largest(most);
+    maximum = larger(maximum, patch.sq_lengths(j) * load(weights + j));
+  return largest(maximum);
 }
 
-// torchrg.normals.consensus.hypotheses.support_scores of a plane whose numbers are per reach.
+// torchrg.normals.consensus.hypotheses.support_scores of a plane in units of the reach.
 INLINE float support(const Patch& patch, const float* weights, float a, float b, float c,
                      float offset) {
   Lanes near{}, over{}, under{};
   for (int j = 0; j < patch.width; j += LANES) {
-    const Lanes rest = patch.along(a, b, c, j) - offset, weight = load(weights + j);
-    near += positive(1 - rest * rest) * weight;
-    over += where(rest > 1, weight, all(0)), under += where(rest < -1, weight, all(0));
+    const Lanes residual = patch.along(a, b, c, j) - offset, weight = load(weights + j);
+    near += positive(1 - residual * residual) * weight;
+    over += where(residual > 1, weight, all(0)), under += where(residual < -1, weight, all(0));
   }
   return total(near) - smaller(total(over), total(under));
 }
 
-// As torchrg.linalg.moments.fit_weighted_planes.
+// torchrg.linalg.moments.fit_weighted_planes.
 INLINE Plane fit_plane(const Patch& patch, const float* weights, int width) {
   Plane plane;
   float mean[3], covariance[6];

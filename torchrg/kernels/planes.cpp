@@ -1,8 +1,8 @@
-// Planes of neighbourhoods by least squares: torchrg/normals/pca.py, and the noise about them.
+// Least-squares planes of neighborhoods (torchrg/normals/pca.py) and their noise.
 #include "plain.h"
 
-// torchrg.normals.pca.fit_normals_pca of lists of rows. Patches as narrow as their covariance's own
-// rounding are flagged and left to the definition, which looks at them again.
+// torchrg.normals.pca.fit_normals_pca. Patches as narrow as the rounding of their covariance are
+// flagged and recomputed by the torch definition.
 KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
                        Flagged mask, Floats resolution, double tolerance, double narrow_fraction,
                        float* normals, float* curvature, float* residual_rms, bool* valid,
@@ -25,7 +25,7 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
 
 namespace {
 
-// torchrg.normals.consensus.noise._small_deviations: of the first neighbours from their own plane.
+// torchrg.normals.consensus.noise._small_deviations: RMS residual of the first neighbors.
 INLINE float of_few(const Patch& patch, int count, float breadth) {
   alignas(32) float weights[MAX_WIDTH], inside[MAX_WIDTH];
   const int width = padded(count);
@@ -35,15 +35,16 @@ INLINE float of_few(const Patch& patch, int count, float breadth) {
   if (!(float(plane.middle) > breadth * float(plane.high))) return INFINITE;
   Lanes squares{};
   for (int j = 0; j < width; j += LANES) {
-    const Lanes rest = plane.residuals(patch, j);
-    squares += rest * rest * load(inside + j);
+    const Lanes residual = plane.residuals(patch, j);
+    squares += residual * residual * load(inside + j);
   }
   return square_root(total(squares) / float(count - 3));
 }
 
-// torchrg.normals.consensus.noise._layered_deviations: of the sides of a plane from two parallel
-// ones, without what is asked of the result.
-INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_refits, float least) {
+// torchrg.normals.consensus.noise._layered_deviations: residual of two parallel planes, without the
+// checks of the result.
+INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_refits,
+                       float min_count) {
   alignas(32) float sides[2][MAX_WIDTH];
   for (int turn = 0;; turn++) {
     float numbers[2], means[2][3], covariances[2][6], pooled[6];
@@ -55,7 +56,7 @@ INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_ref
     for (int side = 0; side < 2; side++)
       numbers[side] = moments(patch, sides[side], patch.width, means[side], covariances[side]);
     if (turn == num_refits)
-      return smaller(numbers[0], numbers[1]) < least ? INFINITE : float(plane.low);
+      return smaller(numbers[0], numbers[1]) < min_count ? INFINITE : float(plane.low);
     for (int i = 0; i < 6; i++)
       pooled[i] = numbers[0] / count * covariances[0][i] + numbers[1] / count * covariances[1][i];
     decompose(pooled, plane);
@@ -68,11 +69,12 @@ INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_ref
 
 }  // namespace
 
-// torchrg.normals.consensus.noise._measure_neighborhoods: deviations of all neighbours and of the `few` and the
-// `more` nearest ones, from a plane, and where these look `layered` from two.
+// torchrg.normals.consensus.noise._measure_neighborhoods: plane residuals of all neighbors and of
+// the `few` and `more` nearest ones; `layered`: residual of two planes for layered neighborhoods.
 KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
               Flagged mask, Floats normals, Flagged valid, int64_t few, int64_t more,
-              double breadth, double kurtosis, double share, int64_t num_refits, int64_t least,
+              double breadth, double kurtosis, double fraction, int64_t num_refits,
+              int64_t min_count,
               float* offsets, float* radius, float* whole, float* layered, bool* again,
               float* of_fewer, float* of_more) {
   if (few < 4 || more < 4 || uint64_t(num_refits) > MAX_WIDTH) return TOO_WIDE;
@@ -92,8 +94,8 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
     offsets[i] = total(sx) / some * a + total(sy) / some * b + total(sz) / some * c;
     Lanes second{}, fourth{};
     for (int j = 0; j < patch.width; j += LANES) {
-      const Lanes rest = patch.along(a, b, c, j) - offsets[i];
-      const Lanes square = rest * rest * load(patch.weight + j);
+      const Lanes residual = patch.along(a, b, c, j) - offsets[i];
+      const Lanes square = residual * residual * load(patch.weight + j);
       second += square, fourth += square * square;
     }
     const float s2 = total(second), s4 = total(fourth);
@@ -102,9 +104,10 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
     layered[i] = INFINITE;
     if (s4 * count < float(kurtosis) * s2 * s2 && is_finite(whole[i])) {
       const float square =
-          of_layers(patch, {a, b, c, offsets[i], 0, 0, 0}, count, int(num_refits), float(least));
+          of_layers(patch, {a, b, c, offsets[i], 0, 0, 0}, count, int(num_refits),
+                    float(min_count));
       const float deviation = square_root(square * count / larger(count - 4, 1.0f));
-      if (deviation <= float(share) * whole[i]) layered[i] = deviation;
+      if (deviation <= float(fraction) * whole[i]) layered[i] = deviation;
     }
     of_fewer[i] = few <= k ? of_few(patch, int(few), float(breadth)) : INFINITE;
     of_more[i] = more <= k ? of_few(patch, int(more), float(breadth)) : INFINITE;
@@ -113,7 +116,7 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
 
 namespace {
 
-// Whole numbers in the order of values, and back: those of negative ones descend otherwise.
+// Order-preserving integer keys of floats, and back; the bits of negative floats are inverted.
 INLINE int32_t as_key(float value) {
   int32_t key;
   __builtin_memcpy(&key, &value, sizeof key);
@@ -126,7 +129,7 @@ INLINE float of_key(int32_t key) {
   return value;
 }
 
-// The key of some rank, from 1, among the k of each lane.
+// The key of a given rank, from 1, among the k keys of each lane.
 INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
   Flags low = load(keys), high = low;
   for (int j = 1; j < k; j++) {
@@ -151,7 +154,7 @@ INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
 
 }  // namespace
 
-// torchrg.normals.consensus.noise._neighbor_quantiles of columns of values, a lane for each result.
+// torchrg.normals.consensus.noise._neighbor_quantiles of columns; one lane per result.
 KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_rows, int64_t k,
                           Floats values, Ints indices, Flagged mask, double quantile,
                           int64_t rank_of_all, float* found) {
@@ -160,10 +163,10 @@ KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_r
   const int64_t num_found = num_rows * num_columns;
   for (int64_t start = 0; start < num_found; start += LANES) {
     for (int lane = 0; lane < LANES; lane++) {
-      const int64_t place = smaller(start + lane, num_found - 1), i = place / num_columns;
+      const int64_t entry = smaller(start + lane, num_found - 1), i = entry / num_columns;
       const int32_t* row = indices + i * k;
       const bool* counted = mask ? mask + i * k : nullptr;
-      const float* column = values + place % num_columns;
+      const float* column = values + entry % num_columns;
       if (!are_rows(row, k, num_points)) return NO_SUCH_ROW;
       int count = 0;
       for (int j = 0; j < k; j++) {

@@ -1,17 +1,17 @@
-// Robust scales of short rows, as torchrg/robust/scale.py defines them, to the bit.
+// Robust scales of short rows, bit-identical to torchrg/robust/scale.py.
 #include "plain.h"
 
 namespace {
 
-constexpr int QUICK_PASSES = 3;     // passes that only count, at half the cost of the others
-constexpr float QUARTERS = 0.3336f;  // Qn's difference by that of the quartiles, of normal data
+constexpr int QUICK_PASSES = 3;     // counting passes, at half the cost of the other passes
+constexpr float QUARTERS = 0.3336f;  // normal data: Qn's difference / interquartile range
 
 struct Around {
   int count;           // differences at most the pivot
-  float below, above;  // the largest of them, and the smallest beyond; the pivot if not looked for
+  float below, above;  // the largest of them, and the smallest above; the pivot if not searched
 };
 
-// `row` ascends, with infinity behind its n values for as long as a window may reach.
+// `row` is sorted, followed by infinities as far as a window may reach.
 template <bool looks>
 INLINE Around look_around(const float* row, int n, float pivot) {
   Flags count{};
@@ -31,7 +31,7 @@ INLINE Around look_around(const float* row, int n, float pivot) {
 
 // The C(h, 2)-th smallest difference of a row.
 //
-// A pivot moves between differences that are too small (low) and those that are not (high).
+// Bisection: differences below the pivot are too small (low), the remaining ones are not (high).
 float majority_difference(const float* row, int n) {
   const int lags = n / 2, rank = lags * (lags + 1) / 2;
   const float num_all = lags * n - rank;
@@ -57,7 +57,7 @@ float majority_difference(const float* row, int n) {
     }
     const float middle = low + (high - low) * 0.5f;
     pivot = low + (high - low) * (rank - 0.5f - num_low) / larger(num_high - num_low, 1.0f);
-    // Small differences are evenly spread, the largest ones far apart.
+    // Small differences are evenly spaced, large ones sparse.
     if (num_high == num_all && num_low > 0) pivot = low * (rank - 0.5f) / num_low;
     const bool in_turn = turn > 2 * QUICK_PASSES && turn % 2;
     if (in_turn || !(pivot > low && pivot < high)) pivot = middle;

@@ -1,4 +1,4 @@
-// Borders of superpoints and what merging at them costs: torchrg/regions/superpoints.py.
+// Boundaries of superpoints and the cost of merging: torchrg/regions/superpoints.py.
 #include "plain.h"
 
 namespace {
@@ -11,7 +11,7 @@ INLINE void widen(const float* values, double* wide) {
   for (int axis = 0; axis < 3; axis++) wide[axis] = values[axis];
 }
 
-// Shell's sort: few rows, or many in next to no order, without memory.
+// Shellsort in place: rows are few, or almost sorted.
 void sort_by_second(int64_t count, int32_t* second, double* contacts, double* differences) {
   int64_t gap = 1;
   while (gap < count / 3) gap = 3 * gap + 1;
@@ -30,24 +30,24 @@ void sort_by_second(int64_t count, int32_t* second, double* contacts, double* di
 }  // namespace
 
 // superpoints._contact_differences
-KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floats places,
+KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floats points,
                            Floats normals, Longs planes, Longs rows, Ints nearest,
                            double step_weight, double plane_weight, double* differences) {
-  double own[3], other[3], way[3], change[3];
+  double normal[3], other[3], offset[3], change[3];
   for (int64_t q = 0; q < num_rows; q++, nearest += k, differences += k) {
     const int64_t i = rows[q];
     if (i < 0 || i >= num_points || !are_rows(nearest, k, num_points)) return NO_SUCH_ROW;
-    widen(normals + 3 * i, own);
+    widen(normals + 3 * i, normal);
     for (int64_t j = 0; j < k; j++) {
       const int64_t t = nearest[j];
       widen(normals + 3 * t, other);
-      const double sign = __builtin_copysign(1.0, dot(own, other));
+      const double sign = __builtin_copysign(1.0, dot(normal, other));
       for (int axis = 0; axis < 3; axis++) {
-        way[axis] = double(places[3 * t + axis]) - double(places[3 * i + axis]);
-        change[axis] = other[axis] - own[axis] * sign;
+        offset[axis] = double(points[3 * t + axis]) - double(points[3 * i + axis]);
+        change[axis] = other[axis] - normal[axis] * sign;
       }
-      const double here = dot(way, own), there = dot(way, other);
-      const double step = smaller(here * here, there * there) / dot(way, way);
+      const double here = dot(offset, normal), there = dot(offset, other);
+      const double step = smaller(here * here, there * there) / dot(offset, offset);
       const double is_other = planes[i] != planes[t];
       differences[j] = dot(change, change) + step_weight * step + plane_weight * is_other;
     }
@@ -55,8 +55,8 @@ KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floa
   return DONE;
 }
 
-// superpoints._aggregate: rows by the smaller of their regions, equal ones added up, then those
-// of a region sorted by the larger.
+// superpoints._aggregate: groups rows by the smaller region, sums equal pairs, and sorts the
+// rows of a region by the larger region.
 KERNEL aggregate_boundaries(int64_t num_rows, int64_t num_starts, Ints a, Ints b,
                       const double* contacts, const double* differences, int64_t* starts,
                       int64_t* slots, int64_t* order, int32_t* first, int32_t* second,
@@ -92,11 +92,11 @@ KERNEL aggregate_boundaries(int64_t num_rows, int64_t num_starts, Ints a, Ints b
 KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, int64_t num_borders,
                      const double* size, const double* means, const double* low,
                      const double* high, Ints first, Ints second, const double* contacts,
-                     const double* differences, double least, double bound, double* costs) {
+                     const double* differences, double min_cost, double bound, double* costs) {
   for (int64_t e = 0; e < num_borders; e++) {
     const int64_t a = first[e], b = second[e];
     if (a < 0 || b < 0 || a >= num_regions || b >= num_regions) return NO_SUCH_ROW;
-    double difference = differences[e] / contacts[e] + least;
+    double difference = differences[e] / contacts[e] + min_cost;
     for (int64_t f = 0; f < num_features; f++) {
       const double step = means[a * num_features + f] - means[b * num_features + f];
       difference += step * step;
@@ -114,13 +114,13 @@ KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, in
 
 // superpoints._cheapest
 KERNEL cheapest_boundaries(int64_t num_borders, int64_t num_regions, Ints first, Ints second,
-                        const double* costs, double* least, int64_t* best) {
+                        const double* costs, double* lowest, int64_t* best) {
   for (int64_t r = 0; r < num_regions; r++) best[r] = num_borders;
   for (int64_t e = 0; e < num_borders; e++)
     for (int end = 0; end < 2; end++) {
       const int64_t r = end ? second[e] : first[e];
       if (r < 0 || r >= num_regions) return NO_SUCH_ROW;
-      if (costs[e] < least[r]) least[r] = costs[e], best[r] = e;
+      if (costs[e] < lowest[r]) lowest[r] = costs[e], best[r] = e;
     }
   return DONE;
 }

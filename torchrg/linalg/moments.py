@@ -102,30 +102,32 @@ class Segments:
     """Points grouped by region, in the order of their rows.
 
     Sums run sequentially per region, without atomic additions, so they do not depend on threads or
-    device scheduling. ``labels`` ``(N,)`` are 0 to M-1, none missing, or negative. At most ``most``
-    points per region are taken, evenly spaced along their rows (default: all). Regions have
-    ``sizes`` ``(M,)`` points, of which ``counts`` are taken.
+    device scheduling. ``labels`` ``(N,)`` are 0 to M-1, none missing, or negative. At most
+    ``max_points`` points per region are taken, evenly spaced along their rows (default: all).
+    Regions have ``sizes`` ``(M,)`` points, of which ``counts`` are taken.
 
     Example:
         >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
         >>> segments.counts.tolist(), segments.rows.tolist()
         ([1, 2], [1, 0, 3])
-        >>> segments.mean(segments.take(torch.tensor([1.0, 2.0, 9.0, 3.0]))).tolist()
+        >>> segments.mean(segments.gather(torch.tensor([1.0, 2.0, 9.0, 3.0]))).tolist()
         [2.0, 2.0]
     """
 
-    def __init__(self, labels: Tensor, *, most: int | None = None) -> None:
+    def __init__(self, labels: Tensor, *, max_points: int | None = None) -> None:
         if labels.device.type == "cpu" and kernels.serve():
-            self._take_rows(labels, most)
+            self._take_rows(labels, max_points)
             return
         labels = labels.clamp(min=-1)
         num_unlabeled, *_ = counts = torch.bincount(labels + 1, minlength=1)
         self.rows = _ascending(labels)[num_unlabeled:]
         self.counts = self.sizes = counts[1:]
-        if most is not None:
+        if max_points is not None:
             ends = self.counts.cumsum(0).tolist()
             parts = [
-                torch.arange(end - count, end, max(-(-count // most), 1), device=labels.device)
+                torch.arange(
+                    end - count, end, max(-(-count // max_points), 1), device=labels.device
+                )
                 for end, count in zip(ends, self.counts.tolist(), strict=True)
             ]
             self.rows = self.rows[torch.cat(parts)] if parts else self.rows
@@ -133,22 +135,24 @@ class Segments:
             self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
         self.labels = torch.repeat_interleave(self.counts)
 
-    def _take_rows(self, labels: Tensor, most: int | None) -> None:
+    def _take_rows(self, labels: Tensor, max_points: int | None) -> None:
         num_regions = int(labels.max()) + 1 if len(labels) else 0
         self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
         self.sizes, indices = self.counts.new_empty(2, len(self.counts))
         written = self.counts, self.sizes, indices
-        (rows,) = kernels.call("segment_rows", labels.long(), most or len(labels) + 1, *written)
+        (rows,) = kernels.call(
+            "segment_rows", labels.long(), max_points or len(labels) + 1, *written
+        )
         self.rows = rows[: int(self.counts.sum())]
         self.labels = torch.repeat_interleave(self.counts)
 
-    def split(self, most: int) -> "list[Segments]":
-        """Split into parts of whole regions, renumbered from 0, of at most ``most`` points."""
+    def split(self, max_points: int) -> "list[Segments]":
+        """Split into parts of complete regions, renumbered from 0, of at most ``max_points``."""
         ends = self.counts.cumsum(0).tolist()
         parts: list[Segments] = []
         region = row = 0
         while region < len(ends) or not parts:
-            last = max(bisect.bisect_right(ends, row + most), min(region + 1, len(ends)))
+            last = max(bisect.bisect_right(ends, row + max_points), min(region + 1, len(ends)))
             segments = Segments.__new__(Segments)
             end = ends[last - 1] if last else 0
             segments.rows, segments.labels = self.rows[row:end], self.labels[row:end] - region
@@ -157,12 +161,12 @@ class Segments:
             region, row = last, end
         return parts
 
-    def chunks(self, most: int) -> "list[Segments]":
+    def chunks(self, max_points: int) -> "list[Segments]":
         """Split as :meth:`split`, into parts of about equal size for the threads."""
         size = max(len(self.rows) // allowed_threads() + 1, _MIN_POINTS)
-        return self.split(min(size, most))
+        return self.split(min(size, max_points))
 
-    def take(self, values: Tensor) -> Tensor:
+    def gather(self, values: Tensor) -> Tensor:
         """Gather the values of the points, region by region."""
         return values.index_select(0, self.rows)
 
@@ -170,15 +174,15 @@ class Segments:
         """Return the value of the first point of each region."""
         return values[self.rows[self.counts.cumsum(0) - self.counts]]
 
-    def spread(self, values: Tensor) -> Tensor:
-        """Broadcast a value per region to its points, in the order of :meth:`take`."""
+    def broadcast(self, values: Tensor) -> Tensor:
+        """Broadcast a value per region to its points, in the order of :meth:`gather`."""
         return values.index_select(0, self.labels)
 
-    def take_columns(self, vectors: Tensor) -> list[Tensor]:
-        """Apply :meth:`take` to the columns of vectors ``(N, 3)``, in float64."""
-        return [self.take(column).double() for column in vectors.unbind(dim=1)]
+    def gather_columns(self, vectors: Tensor) -> list[Tensor]:
+        """Apply :meth:`gather` to the columns of vectors ``(N, 3)``, in float64."""
+        return [self.gather(column).double() for column in vectors.unbind(dim=1)]
 
-    def along(self, vectors: Tensor, centers: Tensor, axes: Tensor) -> list[Tensor]:
+    def coordinates(self, vectors: Tensor, centers: Tensor, axes: Tensor) -> list[Tensor]:
         """Return coordinates relative to region centers ``(M, 3)`` along region axes.
 
         ``vectors`` are ``(N, 3)``, ``axes`` ``(M, A, 3)``; returns A columns ``(n,)``, float64.
@@ -191,24 +195,24 @@ class Segments:
             total = torch.zeros_like(about[0])
             # Separate products and sums: their rounding must not depend on block boundaries.
             for column, component in zip(about, axis.unbind(dim=1), strict=True):
-                total += column * self.spread(component)
+                total += column * self.broadcast(component)
             columns.append(total)
         return columns
 
     def gather_centered(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
-        """Apply :meth:`take` to vectors ``(N, 3)``, relative to region centers ``(M, 3)``."""
+        """Apply :meth:`gather` to vectors ``(N, 3)``, relative to region centers ``(M, 3)``."""
         if self.are_served(vectors) and centers.dtype == torch.float64:
             eye = torch.eye(3, dtype=torch.float64, device=centers.device)
-            return self.along(vectors, centers, eye.expand(len(centers), 3, 3))
+            return self.coordinates(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
-        return [self.take(column).double() - self.spread(center) for column, center in pairs]
+        return [self.gather(column).double() - self.broadcast(center) for column, center in pairs]
 
     def spread_columns(self, vectors: Tensor) -> list[Tensor]:
-        """Apply :meth:`spread` to the columns of vectors ``(M, 3)``."""
-        return [self.spread(column) for column in vectors.unbind(dim=1)]
+        """Apply :meth:`broadcast` to the columns of vectors ``(M, 3)``."""
+        return [self.broadcast(column) for column in vectors.unbind(dim=1)]
 
     def sum(self, values: Tensor) -> Tensor:
-        """Return the sum of the values of each region, given in the order of :meth:`take`."""
+        """Return the sum of the values of each region, given in the order of :meth:`gather`."""
         return reduce_runs(values, self.counts, "sum")
 
     def mean(self, values: Tensor) -> Tensor:
@@ -220,7 +224,7 @@ class Segments:
     ) -> tuple[Tensor, Tensor]:
         """Return the weighted mean ``(M, 3)`` and covariance ``(M, 3, 3)`` of each region.
 
-        The columns are as returned by :meth:`take_columns`; if not ``centered``, the mean is zero.
+        The columns are those of :meth:`gather_columns`; if not ``centered``, the mean is zero.
         """
         if self.are_served(weights):
             numbers = self.counts, centered
@@ -228,7 +232,7 @@ class Segments:
             return mean, covariance
         total = self.sum(weights)
         means = [self.sum(column * weights) / total * centered for column in columns]
-        about = [c - self.spread(mean) for c, mean in zip(columns, means, strict=True)]
+        about = [c - self.broadcast(mean) for c, mean in zip(columns, means, strict=True)]
         return torch.stack(means, dim=1), second_moments(about, weights, self.sum, total)
 
     def reweigh(
@@ -236,17 +240,17 @@ class Segments:
         columns: Sequence[Tensor],
         means: Tensor,
         axes: Tensor,
-        least: Tensor,
+        min_scale: Tensor,
         factors: tuple[float, float],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return Tukey's bisquare weights of the residuals along an axis of each region.
 
-        The scale is the first factor times the median absolute residual, at least ``least``
+        The scale is the first factor times the median absolute residual, at least ``min_scale``
         ``(M,)``. The weight is zero from the second factor times the scale. Returns weights
         ``(n,)``, median absolute residuals ``(M,)`` and mean squares ``(M,)``.
         """
         if self.are_served(means):
-            tables = self.counts, means, axes, least
+            tables = self.counts, means, axes, min_scale
             weights, medians, squares = kernels.call(
                 "reweigh_segments", *columns, *tables, *factors
             )
@@ -254,11 +258,11 @@ class Segments:
         residuals = torch.zeros_like(columns[0])
         # Separate products and sums: their rounding must not depend on memory block boundaries.
         for column, mean, component in zip(columns, means.T, axes.T, strict=True):
-            residuals += (column - self.spread(mean)) * self.spread(component)
+            residuals += (column - self.broadcast(mean)) * self.broadcast(component)
         medians = self.median(residuals.abs())
-        cut = factors[1] * torch.maximum(factors[0] * medians, least)
+        cut = factors[1] * torch.maximum(factors[0] * medians, min_scale)
         # A region with all points at the origin has cut 0, and residuals 0 too.
-        ratio = residuals / self.spread(torch.where(cut > 0, cut, 1.0))
+        ratio = residuals / self.broadcast(torch.where(cut > 0, cut, 1.0))
         weights = (1 - ratio * ratio).clamp(min=0).square()
         return weights, medians, self.mean(residuals * residuals)
 
@@ -367,10 +371,10 @@ def sq_lengths(columns: Columns) -> Tensor:
 
 def residuals(columns: Columns, normals: Tensor, offsets: Tensor) -> Tensor:
     """Return signed distances of the neighbors to planes ``normal . q = offset``, ``(n, K)``."""
-    return along(columns, normals).sub_(offsets[:, None])
+    return project(columns, normals).sub_(offsets[:, None])
 
 
-def along(columns: Columns, axes: Tensor) -> Tensor:
+def project(columns: Columns, axes: Tensor) -> Tensor:
     """Return coordinates of the neighbors along axes ``(*, n, 3)``, shape ``(*, n, K)``."""
     x, y, z = columns
     a, b, c = (component[..., None] for component in axes.unbind(dim=-1))

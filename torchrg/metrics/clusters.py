@@ -1,4 +1,4 @@
-"""Internal indices: compactness and separation of clusters of normals, without ground truth."""
+"""Compactness and separation of clusters of normals, without ground truth."""
 
 import math
 from typing import Any, NamedTuple
@@ -46,7 +46,7 @@ class ClusterScore(NamedTuple):
         points: Number of labeled points with a normal.
         invalid: Number of labeled points without a normal, which are ignored.
         sampled_clusters: Number of clusters whose term of ``dbi`` comes from a subsample.
-        dvi_exact: Whether ``dvi`` uses no subsample.
+        dvi_exact: Whether ``dvi`` is exact, without subsamples.
     """
 
     cp: float
@@ -79,21 +79,22 @@ def score_clusters(
     * CP: mean over the clusters of the mean distance to the center;
     * SP: mean distance over all pairs of centers;
     * DBI: mean over the clusters of ``max_j (w_i + w_j) / d(c_i, c_j)``;
-    * DVI: minimum distance between points of two clusters, over the maximum within one.
+    * DVI: minimum distance between two clusters, divided by the maximum diameter of a cluster.
 
     Convention:
         Two parallel walls have the same center on the sphere. In real rooms DBI therefore tends to
-        infinity and DVI to 0, and these values are returned. (The formulas bound DVI by (pi/2) /
-        CP, which the paper's printed 10.0 exceeds.) ``distinct_directions`` evaluates the
-        *directions* instead. Points labeled ``UNLABELED`` (-1), and labeled points with a zero or
-        non-finite normal, are ignored.
+        infinity and DVI to 0. (The formulas bound DVI by (pi/2) / CP; the 10.0 printed in the
+        paper exceeds this bound.) ``distinct_directions`` evaluates the *directions* instead.
+        Points labeled ``UNLABELED`` (-1), and labeled points with a zero or non-finite normal, are
+        ignored.
 
     Args:
         normals: Normals of any sign and length, shape ``(N, 3)``, floating point.
         labels: Cluster of each point, shape ``(N,)``, integers.
         min_size: Minimum number of points per cluster; smaller clusters count as unlabeled.
         distinct_directions: Whether to merge clusters with similar directions first.
-        max_angle_deg: Maximum angle between centers of one direction, in degrees, transitively.
+        max_angle_deg: Maximum angle between the centers of merged clusters, in degrees; merging is
+            transitive.
         sample_size: Maximum cluster size for exact evaluation. Larger clusters are subsampled to
             this size for ``w_i``, and for the diameter in DVI if it has more candidate end points
             (few on planes). Everything else is exact.
@@ -106,10 +107,6 @@ def score_clusters(
 
     Raises:
         ShapeError: If a shape, dtype or device is invalid.
-        ConfigError: If a setting is out of range.
-
-    Raises:
-        ShapeError: If a shape, dtype or device does not fit.
         ConfigError: If a setting is out of range.
 
     References:
@@ -163,7 +160,7 @@ def score_clusters(
 def _labeled_directions(
     normals: Tensor, labels: Tensor, min_size: int
 ) -> tuple[Tensor, Tensor, int]:
-    """Return unit normals and clusters of labeled points, and how many have no normal."""
+    """Return unit normals and clusters of labeled points, and the number without a normal."""
     sizes = torch.unique(labels, return_inverse=True, return_counts=True)[1:]
     labeled = (labels != UNLABELED) & (sizes[1] >= min_size)[sizes[0]]
     directions, exists = unit_vectors(normals[labeled])
@@ -210,11 +207,11 @@ def _dunn(closest: float, diameters: Tensor) -> float:
 def closest_between(directions: Tensor, clusters: Tensor) -> float:
     """Return the minimum angle between directions of different clusters, for eq. (15).
 
-    Exact for clouds of any size, in two steps. A grid on the sphere is refined step by step; cells
-    farther from all other clusters than a known close pair are dropped. This suffices for separated
-    clusters. The remaining points of many overlapping clusters go to kd-trees. Cluster indices
-    differ in at least one binary digit: for each digit, the directions are split by it, and the
-    closest pair across the split is found.
+    The search is exact for clouds of any size. First, a grid on the sphere is refined step by step,
+    and cells farther from all other clusters than the best pair so far are dropped. This suffices
+    for separated clusters. Kd-trees search the remaining points of overlapping clusters: cluster
+    indices differ in at least one binary digit, so the directions are split by each digit, and the
+    closest pair across each split is found.
 
     Unit vectors have shape ``(N, 3)``, float64; infinite for fewer than two clusters.
     """

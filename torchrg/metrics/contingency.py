@@ -48,7 +48,7 @@ class ContingencyTable(NamedTuple):
 
 def contingency_table(
     labels: Tensor | NDArray[Any],
-    truth: Tensor | NDArray[Any],
+    ground_truth: Tensor | NDArray[Any],
     *,
     min_size: int = 1,
     ignore: int | None = None,
@@ -57,12 +57,12 @@ def contingency_table(
 
     Convention:
         Labels are arbitrary integers; ``UNLABELED`` (-1) means no region in ``labels`` and no face
-        in ``truth``. Points without a face still count in the size of their region, points without
-        a region in that of their face.
+        in ``ground_truth``. Points without a face still count in the size of their region, points
+        without a region in that of their face.
 
     Args:
         labels: Predicted label of each point, shape ``(N,)``, integers.
-        truth: Ground-truth label of each point, shape ``(N,)``, integers.
+        ground_truth: Ground-truth label of each point, shape ``(N,)``, integers.
         min_size: Minimum number of points per region, before ``ignore`` is applied; smaller regions
             count as unlabeled. Faces of any size count.
         ignore: Ground-truth label of points to ignore. Default: none.
@@ -81,28 +81,28 @@ def contingency_table(
         >>> table.region_sizes.tolist(), table.face_sizes.tolist()
         ([2, 1], [1, 3])
     """
-    return count_overlaps("contingency_table", labels, truth, min_size, ignore)
+    return count_overlaps("contingency_table", labels, ground_truth, min_size, ignore)
 
 
 def count_overlaps(
     caller: str,
     labels: Tensor | NDArray[Any],
-    truth: Tensor | NDArray[Any],
+    ground_truth: Tensor | NDArray[Any],
     min_size: int,
     ignore: int | None,
 ) -> ContingencyTable:
     """Compute the table of :func:`contingency_table`; errors start with the caller."""
-    labels, truth = check_labels(caller, labels=labels, truth=truth)
+    labels, ground_truth = check_labels(caller, labels=labels, ground_truth=ground_truth)
     if min_size < 1:
         raise ConfigError(f"{caller}: expected min_size >= 1, got {min_size!r}.")
     if min_size > 1:
         _, rows, sizes = torch.unique(labels, return_inverse=True, return_counts=True)
         labels = labels.masked_fill((sizes < min_size)[rows], UNLABELED)
     if ignore is not None:
-        scored = is_not_ignored(truth, ignore)
-        labels, truth = labels[scored], truth[scored]
+        scored = is_not_ignored(ground_truth, ignore)
+        labels, ground_truth = labels[scored], ground_truth[scored]
     region_labels, regions = number_labels(labels)
-    face_labels, faces = number_labels(truth)
+    face_labels, faces = number_labels(ground_truth)
     both = (regions >= 0) & (faces >= 0)
     width = max(len(face_labels), 1)
     keys, overlaps = torch.unique(regions[both] * width + faces[both], return_counts=True)
@@ -132,14 +132,14 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
         if tensor.dtype not in INTEGERS:
             dtype = str(tensor.dtype).removeprefix("torch.")
             raise ShapeError(
-                f"{caller}: expected {name} of integers, got {dtype}; convert with .long()."
+                f"{caller}: expected integer {name}, got {dtype}; convert with .long()."
             )
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
     check_same_device(caller, **tensors)
     return [tensor.long() for tensor in tensors.values()]
 
 
-def is_not_ignored(truth: Tensor, ignore: int | None) -> Tensor:
+def is_not_ignored(ground_truth: Tensor, ignore: int | None) -> Tensor:
     """Return the mask of points without the ignored label; labels beyond int64 never match.
 
     Example:
@@ -147,8 +147,8 @@ def is_not_ignored(truth: Tensor, ignore: int | None) -> Tensor:
         (tensor([ True, False]), tensor([True]))
     """
     if ignore is None or not -(2**63) <= ignore < 2**63:
-        return torch.ones_like(truth, dtype=torch.bool)
-    return truth != ignore
+        return torch.ones_like(ground_truth, dtype=torch.bool)
+    return ground_truth != ignore
 
 
 def check_same_device(caller: str, **arguments: Tensor) -> None:

@@ -50,7 +50,7 @@ class LabelScore(NamedTuple):
 
 def score_labels(
     labels: Tensor | NDArray[Any],
-    truth: Tensor | NDArray[Any],
+    ground_truth: Tensor | NDArray[Any],
     *,
     min_size: int = 1,
     ignore: int | None = None,
@@ -81,7 +81,7 @@ def score_labels(
         >>> score.recall_iou50, score.fraction_labeled
         (0.5, 0.8)
     """
-    table = count_overlaps("score_labels", labels, truth, min_size, ignore)
+    table = count_overlaps("score_labels", labels, ground_truth, min_size, ignore)
     num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)
     precision, recall, num_pairs = paired_precision_recall(table)
     matched50, matched80 = (int((table.iou > bound).sum()) for bound in (0.5, 0.8))

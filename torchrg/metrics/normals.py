@@ -45,7 +45,7 @@ class NormalScore(NamedTuple):
 
 def score_normals(
     normals: Tensor | NDArray[Any],
-    truth: Tensor | NDArray[Any],
+    ground_truth: Tensor | NDArray[Any],
     *,
     valid: Tensor | NDArray[Any] | None = None,
 ) -> NormalScore:
@@ -61,7 +61,7 @@ def score_normals(
 
     Args:
         normals: Estimated normals of any length, shape ``(*, 3)``, floating point.
-        truth: Ground-truth normals, in the same form.
+        ground_truth: Ground-truth normals, in the same form.
         valid: Mask of points with an estimated normal, shape ``(*)``, bool. Default: all.
 
     Returns:
@@ -71,25 +71,32 @@ def score_normals(
         ShapeError: If a shape, dtype or device is invalid.
 
     Example:
-        >>> truth = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])
-        >>> score = score_normals(torch.tensor([[0.0, 0, -2], [0, 1, 1], [0, 0, 0]]), truth)
+        >>> ground_truth = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])
+        >>> score = score_normals(torch.tensor([[0.0, 0, -2], [0, 1, 1], [0, 0, 0]]), ground_truth)
         >>> round(score.msae, 6), round(score.mean, 6), score.under_5_deg, score.invalid
         (1012.5, 22.5, 0.5, 1)
     """
     normals = as_tensor("score_normals", "normals", normals)
-    truth = as_tensor("score_normals", "truth", truth)
+    ground_truth = as_tensor("score_normals", "ground_truth", ground_truth)
     check_floating("score_normals", normals=normals)
-    check_floating("score_normals", truth=truth)
+    check_floating("score_normals", ground_truth=ground_truth)
     mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if valid is None else valid
     mask = as_tensor("score_normals", "valid", mask)
-    check_shapes("score_normals", normals=(normals, "* 3"), truth=(truth, "* 3"), valid=(mask, "*"))
+    check_shapes(
+        "score_normals",
+        normals=(normals, "* 3"),
+        ground_truth=(ground_truth, "* 3"),
+        valid=(mask, "*"),
+    )
     if mask.dtype != torch.bool:
         dtype = str(mask.dtype).removeprefix("torch.")
         raise ShapeError(f"score_normals: expected valid of bool, got {dtype}.")
-    check_same_device("score_normals", normals=normals, truth=truth, valid=mask)
-    errors, scored, has_truth = _angle_errors(normals.reshape(-1, 3), truth.reshape(-1, 3))
+    check_same_device("score_normals", normals=normals, ground_truth=ground_truth, valid=mask)
+    errors, scored, has_ground_truth = _angle_errors(
+        normals.reshape(-1, 3), ground_truth.reshape(-1, 3)
+    )
     scored &= mask.reshape(-1)
-    invalid, errors = int((has_truth & ~scored).sum()), errors[scored]
+    invalid, errors = int((has_ground_truth & ~scored).sum()), errors[scored]
     count = len(errors)
     msae = float(errors.square().mean())
     middle = errors.sort().values[(count - 1) // 2 : count // 2 + 1] if count else errors
@@ -107,14 +114,16 @@ def score_normals(
     )
 
 
-def _angle_errors(normals: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _angle_errors(normals: Tensor, ground_truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return errors in degrees, and masks of evaluated points and of ground truth, ``(N,)``."""
     blocks = []
-    for estimates, truths in zip(
-        torch.split(normals, _CHUNK), torch.split(truth, _CHUNK), strict=True
+    for estimates, references in zip(
+        torch.split(normals, _CHUNK), torch.split(ground_truth, _CHUNK), strict=True
     ):
         estimated, has_estimate = unit_vectors(estimates)
-        true, has_truth = unit_vectors(truths)
-        blocks.append((unsigned_angle_deg(estimated, true), has_estimate & has_truth, has_truth))
-    errors, scored, has_truth = (torch.cat(parts) for parts in zip(*blocks, strict=True))
-    return errors, scored, has_truth
+        true, has_ground_truth = unit_vectors(references)
+        blocks.append(
+            (unsigned_angle_deg(estimated, true), has_estimate & has_ground_truth, has_ground_truth)
+        )
+    errors, scored, has_ground_truth = (torch.cat(parts) for parts in zip(*blocks, strict=True))
+    return errors, scored, has_ground_truth

@@ -50,7 +50,7 @@ class PartitionScore(NamedTuple):
 
 def score_partition(
     superpoints: Tensor | NDArray[Any],
-    truth: Tensor | NDArray[Any],
+    ground_truth: Tensor | NDArray[Any],
     points: Tensor | NDArray[np.floating] | None = None,
     *,
     boundary_distance: float | None = None,
@@ -70,7 +70,7 @@ def score_partition(
 
     Args:
         superpoints: Superpoint of each point, shape ``(N,)``, integers.
-        truth: Ground-truth object of each point, shape ``(N,)``, integers.
+        ground_truth: Ground-truth object of each point, shape ``(N,)``, integers.
         points: Points, shape ``(N, 3)``, for the boundary metrics, which ignore non-finite points.
             Default: boundary metrics are None.
         boundary_distance: Maximum distance of matching boundaries, in units of the cloud. Default:
@@ -96,24 +96,26 @@ def score_partition(
         >>> score.asa, round(score.oracle_miou, 3), score.count, score.points_per_superpoint
         (0.8, 0.667, 2, 2.5)
     """
-    superpoints, truth = check_labels("score_partition", superpoints=superpoints, truth=truth)
+    superpoints, ground_truth = check_labels(
+        "score_partition", superpoints=superpoints, ground_truth=ground_truth
+    )
     if boundary_distance is not None and not 0 < boundary_distance < float("inf"):
         raise ConfigError(
             f"score_partition: expected boundary_distance > 0, got {boundary_distance!r}."
         )
     if points is not None:
         points = as_tensor("score_partition", "points", points)
-        check_shapes("score_partition", points=(points, "N 3"), truth=(truth, "N"))
+        check_shapes("score_partition", points=(points, "N 3"), ground_truth=(ground_truth, "N"))
         check_floating("score_partition", points=points)
-    scored = (truth != UNLABELED) & is_not_ignored(truth, ignore)
+    scored = (ground_truth != UNLABELED) & is_not_ignored(ground_truth, ignore)
     has_one = superpoints != UNLABELED
     count = len(torch.unique(superpoints[has_one]))
-    num_right, miou = _score_oracle(superpoints[scored], truth[scored])
+    num_right, miou = _score_oracle(superpoints[scored], ground_truth[scored])
     recall = precision = None
     if points is not None:
         used = scored & points.isfinite().all(dim=1)
         recall, precision, boundary_distance = _score_boundaries(
-            superpoints[used], truth[used], points[used].detach(), boundary_distance
+            superpoints[used], ground_truth[used], points[used].detach(), boundary_distance
         )
     num_scored = int(scored.sum())
     return PartitionScore(
@@ -128,9 +130,9 @@ def score_partition(
     )
 
 
-def _score_oracle(superpoints: Tensor, truth: Tensor) -> tuple[int, float]:
+def _score_oracle(superpoints: Tensor, ground_truth: Tensor) -> tuple[int, float]:
     """Return the number of points with the most frequent object, and the mean IoU."""
-    table = contingency_table(superpoints, truth)
+    table = contingency_table(superpoints, ground_truth)
     num_parts = len(table.face_sizes)
     # Overlaps are sorted by superpoint, then by object, so ties go to the lowest label.
     max_overlaps = torch.zeros_like(table.region_sizes).scatter_reduce(
@@ -147,14 +149,14 @@ def _score_oracle(superpoints: Tensor, truth: Tensor) -> tuple[int, float]:
 
 
 def _score_boundaries(
-    superpoints: Tensor, truth: Tensor, points: Tensor, distance: float | None
+    superpoints: Tensor, ground_truth: Tensor, points: Tensor, distance: float | None
 ) -> tuple[float, float, float]:
     """Return recall and precision of superpoint boundaries, and the distance used."""
     from scipy.spatial import cKDTree
 
     # Duplicate points with the same labels count once.
-    rows = distinct_rows(points, superpoints, truth)
-    superpoints, truth, points = superpoints[rows], truth[rows], points[rows]
+    rows = distinct_rows(points, superpoints, ground_truth)
+    superpoints, ground_truth, points = superpoints[rows], ground_truth[rows], points[rows]
     if len(points) < 2:
         return 0.0, 0.0, distance or 0.0
     k = min(_NUM_NEIGHBORS + 1, len(points))
@@ -164,7 +166,7 @@ def _score_boundaries(
         distance = float(reach.median())
     ours, theirs = (
         points[(labels[indices] != labels[:, None]).any(dim=1)].double().cpu().numpy()
-        for labels in (superpoints, truth)
+        for labels in (superpoints, ground_truth)
     )
     if len(ours) == 0 or len(theirs) == 0:
         return 0.0, 0.0, distance

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrg.neighbors import canonical_order
 
 _MAX_PAIRS = 2**17
-"""Number of distances computed at a time, about as many as fit into a cache."""
+"""Number of distances computed at a time; about the size of a cache."""
 
 _ROUNDING = 1e-12
 """Maximum relative error by which an angle may be too large."""
@@ -171,8 +171,8 @@ def _diameter_candidates(directions: Tensor, center: Tensor) -> Tensor:
     radii = chord_to_angle(chords_between(directions, center))
     from_first = chord_to_angle(chords_between(directions, directions[radii.argmax()]))
     from_second = chord_to_angle(chords_between(directions, directions[from_first.argmax()]))
-    reached = from_second.max() * (1 - _ROUNDING)
-    return directions[radii >= reached - radii.max()]
+    attained = from_second.max() * (1 - _ROUNDING)
+    return directions[radii >= attained - radii.max()]
 
 
 def _subsample(directions: Tensor, size: int, seed: int) -> Tensor:

@@ -63,7 +63,7 @@ def search_knn(
     Convention:
         ``k`` includes the point itself, which always comes first, even with duplicates. Other
         neighbors are sorted by distance, ties by :func:`canonical_order`, never by the input order.
-        The search runs on the CPU with as many threads as torch uses.
+        The search runs on the CPU with the number of threads of torch.
 
     Args:
         points: Points, shape ``(N, 3)``, finite.
@@ -181,7 +181,7 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
 
 
 def restrict_to_groups(
-    neighbors: Neighbors, groups: Tensor, chunk_size: int, places: Rows = slice(None)
+    neighbors: Neighbors, groups: Tensor, chunk_size: int, position_rows: Rows = slice(None)
 ) -> Neighbors:
     """Restrict the neighbors of each point to its group, nearest first.
 
@@ -189,9 +189,9 @@ def restrict_to_groups(
 
     Args:
         neighbors: Neighbors of each position.
-        groups: Group of each point, shape ``(N,)``, from 0 if ``places`` are passed.
+        groups: Group of each point, shape ``(N,)``, from 0 if ``position_rows`` are passed.
         chunk_size: Points processed at a time.
-        places: Index of each point's position, shape ``(N,)``. Default: one point per position.
+        position_rows: Index of each point's position, shape ``(N,)``. Default: the row.
 
     Example:
         >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
@@ -206,18 +206,18 @@ def restrict_to_groups(
     shape, device = (len(groups), neighbors.indices.shape[1]), groups.device
     indices, valid = (scratch.empty(shape, kind) for kind in (np.int32, np.bool_))
     width = int(groups.max()) + 1 if len(groups) else 0
-    keys = None if isinstance(places, slice) else places * width + groups
+    keys = None if isinstance(position_rows, slice) else position_rows * width + groups
 
     def work(rows: slice) -> None:
-        if isinstance(places, slice) or keys is None:
+        if isinstance(position_rows, slice) or keys is None:
             near = neighbors.indices[rows]
-            same = neighbors.of(groups, rows) == groups[rows, None]
-            same &= neighbors.counted(rows)
+            same = neighbors.gather(groups, rows) == groups[rows, None]
+            same &= neighbors.mask(rows)
         else:
-            at = places[rows]
+            at = position_rows[rows]
             requested = neighbors.indices[at].long() * width + groups[rows, None]
             near = torch.searchsorted(keys, requested).clamp(max=len(keys) - 1)
-            same = (keys[near] == requested) & neighbors.counted(at)
+            same = (keys[near] == requested) & neighbors.mask(at)
         order = same.byte().argsort(dim=1, descending=True, stable=True)
         near, same = near.gather(1, order), same.gather(1, order)
         indices[rows] = torch.where(same, near, near[:, :1]).numpy(force=True)
@@ -282,9 +282,9 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
     """
     from scipy.spatial import cKDTree
 
-    places = points.astype(np.float64, copy=False)
-    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
-    return lambda rows: _query(tree, places[rows], k)[1]
+    positions = points.astype(np.float64, copy=False)
+    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    return lambda rows: _query(tree, positions[rows], k)[1]
 
 
 @sequential_operations()

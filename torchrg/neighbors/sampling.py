@@ -24,11 +24,11 @@ _STRIDE = 3
 _OUTLIER_FRACTION = 0.001
 """Fraction of the points excluded from the height on either side."""
 _DIGITS = 3
-"""Significant digits of a measure: fewer than another unit or origin changes by rounding."""
+"""Significant digits of a measure; another unit or origin changes only further digits."""
 
 
 def measure_sampling(points: Tensor, neighbors: Neighbors | SomeNeighbors) -> Sampling:
-    """Measure how a cloud samples its surfaces, on 600 points spread along the canonical order.
+    """Measure the surface sampling of a cloud at 600 points along the canonical order.
 
     Let ``s_k`` be the deviation of the k nearest points from their plane, with k - 3 degrees of
     freedom. It is the same for every k if noise is independent per point. It grows with k if
@@ -41,7 +41,7 @@ def measure_sampling(points: Tensor, neighbors: Neighbors | SomeNeighbors) -> Sa
     Args:
         points: Finite points in canonical order, shape ``(N, 3)``.
         neighbors: Neighbors of each point from :func:`torchrg.search_knn`, or a function that
-            returns the neighbors of given rows, as :func:`prepare_search` makes it.
+            returns the neighbors of rows, such as the result of :func:`prepare_search`.
 
     Returns:
         The measures, to three digits. They do not depend on the point order, threads, chunks or
@@ -111,7 +111,7 @@ def _nearest(
 
 
 def _deviations(patches: FloatArray) -> FloatArray:
-    """RMS distances of points ``(n, k, 3)`` to their plane, with k - 3 degrees of freedom."""
+    """Return RMS distances of points ``(n, k, 3)`` to their plane, k - 3 degrees of freedom."""
     centered = patches - patches.mean(axis=1, keepdims=True)
     moments = np.linalg.eigvalsh(centered.swapaxes(1, 2) @ centered)
     deviation: FloatArray = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))

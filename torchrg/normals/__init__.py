@@ -149,4 +149,4 @@ def estimate_normals(
         neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=tensor.device))
     else:
         neighbors = search_knn(distinct.points, size, max_distance=max_distance, canonical=True)
-    return estimate(distinct.points, neighbors, settings, chunk_size).each(distinct.restore)
+    return estimate(distinct.points, neighbors, settings, chunk_size).map(distinct.restore)

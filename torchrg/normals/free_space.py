@@ -48,7 +48,7 @@ def vote_free_side(
     2. From each point, the free path to the next marked cell is measured in each of the 26
        directions to neighboring cells. A path that leaves the bounding box counts half.
     3. A neighbor with a parallel normal that lies above the surface by more than 30 degrees ends
-       paths to the front; likewise to the back. Faces of thin plates are closer than cells.
+       paths to the front; the same to the back. Faces of thin plates are closer than cells.
     4. The vote is the sum of ``sign(n . d) (n . d)^2 f(path)`` over the directions ``d``, where
        ``f`` rises from 0 to 1 and is half at 8 cells.
 

@@ -54,7 +54,7 @@ class _Offsets(NamedTuple):
     z: Tensor
     counted: Tensor
 
-    def take(self, rows: Tensor | slice) -> "_Offsets":
+    def select(self, rows: Tensor | slice) -> "_Offsets":
         """Return the given rows."""
         return _Offsets(*(column[rows] for column in self))
 
@@ -81,7 +81,7 @@ class _Plane(NamedTuple):
     weighed_normal: Tensor
     weighed_mu: Tensor
 
-    def take(self, rows: Tensor | slice) -> "_Plane":
+    def select(self, rows: Tensor | slice) -> "_Plane":
         """Return the given rows."""
         return _Plane(*(column[rows] for column in self))
 
@@ -170,7 +170,7 @@ def fit_normals_irls(
         mu_decay,
         None if resolution is None else resolution.reshape(-1),
     )
-    return fit.each(lambda values: values.reshape(leading + values.shape[1:]))
+    return fit.map(lambda values: values.reshape(leading + values.shape[1:]))
 
 
 def estimate_irls(
@@ -200,7 +200,7 @@ def _fit_rows(
     noise = torch.maximum(noise, _MIN_NOISE * radius)
     is_flat = start.residual_rms <= noise
     flat = (start.valid & is_flat).nonzero().squeeze(-1)
-    plane = replace_rows(plane, flat, start.each(lambda values: values[flat]))
+    plane = replace_rows(plane, flat, start.map(lambda values: values[flat]))
 
     rows = (start.valid & ~is_flat).nonzero().squeeze(-1)
     x, y, z = offsets[rows].unbind(dim=-1)
@@ -223,7 +223,7 @@ def _fit_edges(
     normals, heavy = first.normal, first.heavy
 
     rows = (_cosine(start, normals) < _UNTURNED_COSINE).nonzero().squeeze(-1)
-    turned, current, limit = points.take(rows), normals[rows], limit[rows]
+    turned, current, limit = points.select(rows), normals[rows], limit[rows]
     axis = torch.linalg.cross(torch.linalg.cross(start[rows], current), current)
     across = axis / (axis * axis).sum(dim=-1, keepdim=True).sqrt()
     mu = _low_quantile(_sq_distances(turned, across), turned.counted)
@@ -304,16 +304,16 @@ def _fit_graduated(
     num_steps = _count_steps(plane.mu.detach(), limit, decay, stay_above=shift)
     order = num_steps.argsort(descending=True, stable=True)
     remaining = num_steps[order].tolist()
-    points, plane = points.take(order), plane.take(order)
+    points, plane = points.select(order), plane.select(order)
     active = len(remaining)
     for done in range(remaining[0] if remaining else 0):
         while remaining[active - 1] <= done:
             active -= 1
         active_rows = slice(0, active)
-        updated = step(points.take(active_rows), plane.take(active_rows), decay, shift)
-        finished = plane.take(slice(active, None))
+        updated = step(points.select(active_rows), plane.select(active_rows), decay, shift)
+        finished = plane.select(slice(active, None))
         plane = _Plane(*map(torch.cat, zip(updated, finished, strict=True)))
-    return plane.take(order.argsort())
+    return plane.select(order.argsort())
 
 
 def _weigh(distances: Tensor, mu: Tensor, counted: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrg._checks import disable_autocast
 from torchrg.linalg import rank_tolerance
 from torchrg.linalg.eigen import PrincipalFrame, root, square_root
-from torchrg.linalg.moments import Columns, along, sq_lengths, sum_neighbors
+from torchrg.linalg.moments import Columns, project, sq_lengths, sum_neighbors
 from torchrg.normals.pca import center_on_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
@@ -138,7 +138,7 @@ def fit_paraboloids(
     radius = square_root(sq_lengths(columns).mul_(counted).amax(dim=1))
     scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None] * counted
     first, second = _tangents(normals)
-    u, v, height = (along(columns, axis) * scale for axis in (first, second, normals))
+    u, v, height = (project(columns, axis) * scale for axis in (first, second, normals))
     terms = _quadratic_terms(counted, u, v)
     matrix = {
         (j, i): sum_neighbors(terms[i] * terms[j])

@@ -1,4 +1,4 @@
-"""Signs of normals: into rooms, to the front of a mesh, to a scanner, along an axis, or alike."""
+"""Normal orientation: interior, mesh front, scanner position, axis, or consistent."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from torchrg.structures import UNLABELED, Cloud, Neighbors, Points
 Orientation = Literal[
     "auto", "interior", "viewpoint", "consistent", "up", "+x", "-x", "+y", "-y", "+z", "-z", "none"
 ]
-"""Sides to which normals can point; see :func:`orient_normals`."""
+"""Modes of normal orientation; see :func:`orient_normals`."""
 
 NUM_NEIGHBORS = 20
-"""Nearest points that orientation uses, the point itself included."""
+"""Neighborhood size for orientation, including the point itself."""
 
 _NUM_VOTES = 256
-"""Points of a face that vote, about."""
+"""Approximate number of voting points per face."""
 
 _HASH, _HASHES = 2654435761, 2**32
-"""Knuth's multiplicative hash of a row, which decides whether its point votes."""
+"""Knuth's multiplicative hash of a row; it selects the voting points."""
 
 _THICKNESS = 0.5
-"""Root mean square height of a thin face by the side of a cell. Two faces farther apart have smooth
-patches of their own."""
+"""RMS height of a thin face, as a fraction of the cell width. Two faces farther apart have separate
+smooth patches."""
 
 _CLEARLY_OUTWARDS = 1e-3
-"""Fraction of its largest value beyond which a volume or a mean normal cannot be rounding."""
+"""Fraction of its maximum above which a volume or a mean normal is not a rounding error."""
 
 _FEW = 0.01
-"""Fraction of the points up to which points of unknown front, such as vertices of no face, follow
-their neighbors. More of them may be a part of the room, which decides for itself."""
+"""Maximum fraction of points with unknown front, such as vertices without faces, that follow their
+neighbors. More of them may form a part of the room and are oriented as ``"interior"``."""
 
 _AS_NEAR = 1 + 1e-6
-"""Ratio of distances that differ by rounding only."""
+"""Ratio below which two distances differ only by rounding."""
 
 
 @eager_only
@@ -66,43 +66,42 @@ def orient_normals(
 ) -> Tensor:
     """Choose the sign of each normal.
 
-    - ``"auto"``: to the front of the surface where it is known, as by the faces of a mesh or the
-      places of scanners, else as ``"interior"``.
-    - ``"interior"``: into the free space of rooms: floors up, ceilings down, walls into their own
-      room, furniture away from its inside. Points of each face vote by the free paths in front of
-      them and behind. Several rooms, storeys and missing ceilings are no obstacle; a wall between
-      two rooms is right if it is thicker than about two point spacings, a plate seen from both
-      sides if normals of its faces can be told apart. A lone object seen from outside is turned
-      inwards, as a room would be: use ``"consistent"`` for it.
-    - ``"viewpoint"``: towards where the scanner stood.
-    - ``"consistent"``: neighbors agree, over edges and across thin plates too; outwards for a
-      closed surface. Each connected surface is oriented on its own.
-    - ``"up"``, ``"+x"`` ... ``"-z"``: along an axis; up is ``"+z"``. ``"none"``: as they are.
+    - ``"auto"``: the front of the surface if known, from mesh faces or scanner positions, else
+      ``"interior"``.
+    - ``"interior"``: into the free space of rooms: floors up, ceilings down, walls into their room,
+      furniture outwards. Points of each face vote by the free paths in front and behind. Multiple
+      rooms, several floors and missing ceilings are supported. A wall between two rooms is correct
+      if it is thicker than about two point spacings, a plate seen from both sides if the normals of
+      its faces can be separated. A single object seen from outside is turned inwards like a room;
+      use ``"consistent"`` instead.
+    - ``"viewpoint"``: towards the scanner position.
+    - ``"consistent"``: neighbors agree, also over edges and across thin plates; outwards for closed
+      surfaces. Each connected surface is oriented independently.
+    - ``"up"``, ``"+x"`` ... ``"-z"``: along an axis; up is ``"+z"``. ``"none"``: unchanged.
 
     Convention:
-        The result does not depend on the signs of the input, nor on the order of the points. Copies
-        of a point count once, and look to one side. A normal for which neither sign is right (at
-        right angles to the axis, say) gets the one that makes the first of z, y, x that is not zero
-        positive.
+        The result does not depend on the input signs or the order of the points. Duplicates count
+        once and have one orientation. If neither sign is right, as for a normal orthogonal to the
+        axis, the first nonzero coordinate of z, y, x is made positive.
 
     Args:
         points: Points, shape ``(N, 3)``, or a cloud.
-        normals: Unit normals, shape ``(N, 3)``; zero where there is none.
-        orient: See above.
-        viewpoint: Where the scanner stood, shape ``(3,)``, or ``(N, 3)`` for several scans, in the
+        normals: Unit normals, shape ``(N, 3)``; zero for points without a normal.
+        orient: Orientation mode, see above. Default: ``"auto"``.
+        viewpoint: Scanner position, shape ``(3,)``, or ``(N, 3)`` for several scans, in the
             coordinates of the points or of the cloud. Only with ``orient="viewpoint"``.
-        front: Direction from each point to where its surface was seen from, shape ``(N, 3)``, as
-            :attr:`torchrg.Cloud.front`. A point whose front is zero follows the nearest others; if
-            these are more than one in a hundred, they are turned as by ``"interior"``. Default:
-            that of the cloud.
-        neighbors: Neighbors of all points, all of them finite, for faces. Default: searched.
+        front: Direction from each point to the side from which its surface was seen, shape
+            ``(N, 3)``, as :attr:`torchrg.Cloud.front`. Points with a zero front follow their
+            nearest neighbors; if they are more than 1 % of all points, they are oriented as
+            ``"interior"``. Default: that of the cloud.
+        neighbors: Neighbors of all points, which must be finite. Default: searched.
 
     Returns:
-        The normals, some of them reversed. Rows of points that are not finite stay as they are.
+        The normals, some of them reversed. Rows of points that are not finite are unchanged.
 
     Raises:
-        ConfigError: If ``orient`` is unknown, or ``viewpoint`` is missing or not wanted.
-        ShapeError: If a shape or dtype is not as above.
+        ConfigError: If ``orient`` is unknown, or ``viewpoint`` is missing or unexpected.
+        ShapeError: If a shape or dtype is wrong.
 
     Example:
         >>> cloud = Cloud(np.eye(3), front=np.array([[0, 0, -1]] * 3, np.float32))
@@ -130,7 +129,7 @@ def orient_normals(
         units = upright.detach()[usable]
         distinct = distinct_points(cloud[usable], units.unbind(dim=-1))
         turned = distinct.restore(turn_faces(distinct.points, units[distinct.rows], side))
-        # Copies of a point look to the side of the one that stands for them.
+        # Duplicates follow the orientation of their representative.
         return turn_towards(upright, upright.detach().index_copy(0, usable, turned))
 
     return choose_side(cloud, vectors, orient, directions, turn)
@@ -144,7 +143,7 @@ def find_directions(
     viewpoint: Points | Sequence[float] | None = None,
     front: Points | None = None,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return points ``(N, 3)`` and the directions from them that an orientation needs, or None.
+    """Return points ``(N, 3)`` and the front directions that an orientation needs, or None.
 
     See :func:`orient_normals` for the arguments and the errors.
     """
@@ -155,30 +154,32 @@ def find_directions(
         if viewpoint is None and front is None and (orient == "auto" or "scans" in points.header):
             front = points.front
         points = points.points
-    places = as_tensor(caller, "points", points).detach()
-    check_points(caller, places)
+    positions = as_tensor(caller, "points", points).detach()
+    check_points(caller, positions)
     if viewpoint is not None:
         if orient != "viewpoint":
             raise ConfigError(
                 f"{caller}: expected no viewpoint with orient={orient!r}, got one; pass "
-                "orient='viewpoint' to look at it."
+                "orient='viewpoint' to use it."
             )
         is_array = isinstance(viewpoint, Tensor | np.ndarray)
-        place = as_tensor(caller, "viewpoint", viewpoint if is_array else np.array(viewpoint))
+        position = as_tensor(caller, "viewpoint", viewpoint if is_array else np.array(viewpoint))
         check_shapes(
-            caller, points=(places, "N 3"), viewpoint=(place, "3" if place.ndim == 1 else "N 3")
+            caller,
+            points=(positions, "N 3"),
+            viewpoint=(position, "3" if position.ndim == 1 else "N 3"),
         )
-        return places, (place - origin.to(place.device)).to(places) - places
+        return positions, (position - origin.to(position.device)).to(positions) - positions
     if front is not None:
-        directions = as_tensor(caller, "front", front).to(places)
-        check_shapes(caller, points=(places, "N 3"), front=(directions, "N 3"))
-        return places, directions
+        directions = as_tensor(caller, "front", front).to(positions)
+        check_shapes(caller, points=(positions, "N 3"), front=(directions, "N 3"))
+        return positions, directions
     if orient == "viewpoint":
         raise ConfigError(
             f"{caller}: expected a viewpoint, or scanner poses as in an E57 file, got none; pass "
             "the viewpoint (--viewpoint X Y Z), or use interior."
         )
-    return places, None
+    return positions, None
 
 
 def choose_side(
@@ -188,9 +189,9 @@ def choose_side(
     front: Tensor | None,
     turn: Callable[[Orientation], Tensor],
 ) -> Tensor:
-    """Return normals that look to their side; see :func:`orient_normals`, whose checks are done.
+    """Return oriented normals; see :func:`orient_normals`, whose checks are done.
 
-    ``turn`` returns the normals turned face by face, "interior" or "consistent".
+    ``turn`` returns normals oriented face by face, "interior" or "consistent".
     """
     if orient == "none":
         return normals
@@ -205,19 +206,19 @@ def choose_side(
 
 
 def turn_towards(normals: Tensor, directions: Tensor) -> Tensor:
-    """Return normals at no more than a right angle to a direction, ``(3,)`` or ``(N, 3)``."""
+    """Return normals at an angle of at most 90 degrees to directions ``(3,)`` or ``(N, 3)``."""
     upright = _upright(normals)
     away = (upright * directions).sum(dim=-1, keepdim=True) < 0
     return torch.where(away, -upright, upright)
 
 
 def _upright(normals: Tensor) -> Tensor:
-    """Return normals whose first of z, y, x that is not zero is positive."""
+    """Return normals whose first nonzero coordinate of z, y, x is positive."""
     return torch.where((_leading(normals) < 0)[:, None], -normals, normals)
 
 
 def _leading(vectors: Tensor) -> Tensor:
-    """Return the first of z, y, x that is not zero."""
+    """Return the first nonzero coordinate of z, y, x."""
     x, y, z = vectors.unbind(dim=-1)
     return torch.where(z != 0, z, torch.where(y != 0, y, x))
 
@@ -225,7 +226,7 @@ def _leading(vectors: Tensor) -> Tensor:
 def _turn_to_front(
     points: Tensor, normals: Tensor, front: Tensor, turn: Callable[[Orientation], Tensor]
 ) -> Tensor:
-    """Return normals that look to the front, or as their neighbors where that is not known."""
+    """Orient normals to the front, or like their neighbors if the front is unknown."""
     from scipy.spatial import cKDTree
 
     turned, is_known = turn_towards(normals, front), (front != 0).any(dim=-1)
@@ -233,18 +234,18 @@ def _turn_to_front(
     lost = nonzero_rows(has_normal & ~is_known & points.isfinite().all(dim=-1))
     if len(lost) == 0:
         return turned
-    # Copies with one normal and one front count once.
+    # Duplicates with the same normal and front count once.
     rows = distinct_rows(points, *turned.unbind(dim=-1), *front.unbind(dim=-1))
     rows = rows[has_normal[rows]]
     seeing = rows[is_known[rows]]
     if len(rows) - len(seeing) > _FEW * len(rows):
         return turned.index_copy(0, lost, turn("interior")[lost])
-    tree, places = (cKDTree(points[seeing].numpy(force=True)), points[lost].numpy(force=True))
-    distance, _ = tree.query(places)
-    # All that are as near, so that their order does not matter.
-    near = tree.query_ball_point(places, distance * _AS_NEAR)
-    looks = torch.stack([turned[seeing[rows]].sum(dim=0) for rows in near])
-    return turned.index_copy(0, lost, turn_towards(normals[lost], looks))
+    tree, positions = (cKDTree(points[seeing].numpy(force=True)), points[lost].numpy(force=True))
+    distance, _ = tree.query(positions)
+    # Include all ties, so the order of the points does not matter.
+    near = tree.query_ball_point(positions, distance * _AS_NEAR)
+    sums = torch.stack([turned[seeing[rows]].sum(dim=0) for rows in near])
+    return turned.index_copy(0, lost, turn_towards(normals[lost], sums))
 
 
 def turn_faces(
@@ -255,10 +256,10 @@ def turn_faces(
     labels: Tensor | None = None,
     axes: Tensor | None = None,
 ) -> Tensor:
-    """Return normals turned face by face, "interior" or "consistent".
+    """Return normals oriented face by face, "interior" or "consistent".
 
-    Points ``(N, 3)`` are distinct and in canonical order. Neighbors are searched where they are
-    few. Planes by their ``labels`` ``(N,)`` and unit normals ``(M, 3)`` are faces of an interior.
+    Points ``(N, 3)`` are distinct and in canonical order. Neighbors are searched if there are too
+    few. Planes with ``labels`` ``(N,)`` and unit normals ``axes`` ``(M, 3)`` are interior faces.
     """
     upright = _upright(normals)
     if len(points) == 0:
@@ -266,22 +267,22 @@ def turn_faces(
     k = min(NUM_NEIGHBORS, len(points))
     if neighbors is None or neighbors.indices.shape[1] < k:
         neighbors = search_knn(points, k)
-    near, places, units = (
+    near, positions, units = (
         values.detach().cpu() for values in (neighbors.indices[:, :k], points, upright.to(points))
     )
     if side == "consistent":
-        signs = _turn_outwards(places, units, near)
+        signs = _turn_outwards(positions, units, near)
     else:
         labels = torch.full((len(points),), UNLABELED) if labels is None else labels.cpu()
-        axes = places.new_zeros(0, 3) if axes is None else axes.cpu()
-        signs = _turn_inside(places, units, near, labels, axes)
+        axes = positions.new_zeros(0, 3) if axes is None else axes.cpu()
+        signs = _turn_inside(positions, units, near, labels, axes)
     return upright * signs[:, None].to(upright)
 
 
 def _turn_inside(
     points: Tensor, normals: Tensor, near: Tensor, labels: Tensor, axes: Tensor
 ) -> Tensor:
-    """Return signs for the freer side, by the votes of some points of each face."""
+    """Return signs towards the freer side, voted by a sample of the points of each face."""
     width = cell_width(points, near)
     faces, signs = find_faces(points, normals, near, labels, axes, _THICKNESS * width)
     sizes = torch.bincount(faces)
@@ -293,14 +294,14 @@ def _turn_inside(
 
 
 def _turn_outwards(points: Tensor, normals: Tensor, near: Tensor) -> Tensor:
-    """Return consistent signs, by which each surface encloses a positive volume."""
+    """Return consistent signs for which each surface encloses a positive volume."""
     surfaces, signs = find_surfaces(points, normals, near)
     count = torch.bincount(surfaces)[:, None]
     agreed, local = (normals * signs[:, None]).double(), (points - points[:1]).double()
     arms = local - (_sum_by(surfaces, local) / count)[surfaces]
     volume = _sum_by(surfaces, (arms * agreed).sum(dim=-1))
     size = _sum_by(surfaces, (arms * arms).sum(dim=-1).sqrt())
-    # An open surface encloses nothing, and the rounding of its volume means nothing.
+    # An open surface encloses no volume; ignore its rounding error.
     mean = _sum_by(surfaces, agreed)
     mean = torch.where(mean.abs() > _CLEARLY_OUTWARDS * count, mean, 0.0)
     inwards = torch.where(volume.abs() > _CLEARLY_OUTWARDS * size, volume, _leading(mean)) < 0

@@ -108,9 +108,9 @@ def find_sharp_points(
     sharp = torch.empty(len(neighbors.indices), dtype=torch.bool, device=normals.device)
 
     def classify(block: slice) -> None:
-        near = neighbors.at(block)
-        counted = near.valid if valid is None else near.counted() & near.of(valid)
-        near_columns = [near.of(column) for column in columns]
+        near = neighbors.select(block)
+        counted = near.valid if valid is None else near.mask() & near.gather(valid)
+        near_columns = [near.gather(column) for column in columns]
         chords = sq_chords([component[:, :1] for component in near_columns], near_columns)
         exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
         sharp[block] = exceeds(chords, counted, angle_deg)

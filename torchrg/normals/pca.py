@@ -136,7 +136,7 @@ def fit_points_pca(
 
     def work(rows: slice) -> tuple[Tensor, ...]:
         resolution = coordinate_resolution(points[rows])
-        near = neighbors.at(rows)
+        near = neighbors.select(rows)
         return kernels.call("fit_normals_pca", positions, *near, resolution, tolerance, _MIN_RATIO)
 
     parts = map_chunks(work, len(points), chunk_size, points.device)
@@ -214,7 +214,7 @@ def fit_points(
 
     def fit_chunk(chunk: slice) -> NormalFit:
         chosen = chunk if rows is None else rows[chunk]
-        indices, mask = neighbors.at(chosen)
+        indices, mask = neighbors.select(chosen)
         patches = gather_patches(points, indices)
         extra = {name: values[chosen] for name, values in point_arguments.items()}
         return fit(patches, mask, resolution=coordinate_resolution(points[chosen]), **extra)

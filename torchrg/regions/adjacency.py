@@ -127,7 +127,7 @@ class KnnAdjacency:
 
     def neighbor_rows(self, rows: Rows) -> Tensor:
         """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
-        near, counted = self.neighbors.at(rows)
+        near, counted = self.neighbors.select(rows)
         if counted is None:
             return near
         indices = rows
@@ -216,20 +216,20 @@ class _RegionEdges:
 
     def _at_boundary(self, rows: slice) -> Tensor:
         """Return which points have a neighbor in another region, shape ``(n,)``."""
-        label, near = self._labels[rows], self._neighbors.at(rows)
+        label, near = self._labels[rows], self._neighbors.select(rows)
         if kernels.serve(label, *near):
             return kernels.call("at_boundary", self._labels, label, *near)[0]
         return self._crossing_neighbors(label, near)[0].any(dim=1)
 
     def _crossing_neighbors(self, label: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
         """Return a mask of the neighbors in another region, and their labels."""
-        other = near.of(self._labels)
+        other = near.gather(self._labels)
         crosses = (other != label[:, None]) & (other >= 0) & (label >= 0)[:, None]
         return crosses if near.valid is None else crosses & near.valid, other
 
     def _boundary_edges(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the flat list indices of boundary edges, the neighbor lists, and the pairs."""
-        label, near = self._labels[rows], self._neighbors.at(rows)
+        label, near = self._labels[rows], self._neighbors.select(rows)
         scratch.release()
         crosses, other = self._crossing_neighbors(label, near)
         flat_index = nonzero_rows(crosses)
@@ -302,7 +302,7 @@ def _unique_cells(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distance to the last contact neighbor of each point, and their number."""
-    nearest = KnnAdjacency(neighbors).neighbors.at(rows)
-    count = nearest.counted().sum(dim=1)
+    nearest = KnnAdjacency(neighbors).neighbors.select(rows)
+    count = nearest.mask().sum(dim=1)
     last = nearest.indices.gather(1, (count - 1).clamp(min=0)[:, None]).squeeze(1)
     return (points[last].double() - points[rows].double()).norm(dim=1), count

@@ -103,9 +103,9 @@ def _become_seeds(
     connected: Tensor | None,
 ) -> Tensor:
     """Return a mask of the edges that make the neighbor a seed, shape ``(n, K)``."""
-    target = cloud.neighbors.of(cloud.curvature, rows)
+    target = cloud.neighbors.gather(cloud.curvature, rows)
     if config.curvature_scope == "neighborhood":
-        counted = cloud.neighbors.counted(rows) & cloud.neighbors.of(cloud.valid, rows)
+        counted = cloud.neighbors.mask(rows) & cloud.neighbors.gather(cloud.valid, rows)
         limit = _curvature_limits(target, counted, config.curvature_quantile)
     if config.seed_rule == "increment":
         becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
@@ -138,7 +138,7 @@ def accept_edges(
     ids = rows
     if isinstance(ids, slice):
         ids = torch.arange(ids.start, ids.stop, device=cloud.points.device)
-    near, signed = cloud.neighbors.at(rows), cloud.signed_normals
+    near, signed = cloud.neighbors.select(rows), cloud.signed_normals
     max_angle_deg = cloud.angle_fraction * config.max_angle_deg
     angle = distance = None
     if max_angle_deg < 90 or signed:
@@ -165,7 +165,7 @@ def accept_edges(
     connected: Tensor | None = None
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
-            connected = connect(cloud.neighbors.counted(rows))
+            connected = connect(cloud.neighbors.mask(rows))
         mask = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
         joins &= ~mask | are_coplanar(cloud, rows, mask, connected, config.coplanarity_floor)
     if connect is not None:
@@ -191,7 +191,7 @@ def _shared_neighbors(cloud: GrowingInput, config: GrowingConfig) -> SharedNeigh
 
 def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
     """Return a mask of the edges between two different valid points."""
-    passed = near.of(valid) & valid[rows][:, None]
+    passed = near.gather(valid) & valid[rows][:, None]
     passed &= near.indices != rows[:, None]
     return passed if near.valid is None else passed & near.valid
 
@@ -201,7 +201,7 @@ def within_angle(
 ) -> Tensor:
     """Return a mask of neighbors whose normals ``(3, N)`` are within the angle limit, eq. (8)."""
     ours = [column[rows][:, None] for column in normals.unbind()]
-    theirs = [near.of(column) for column in normals.unbind()]
+    theirs = [near.gather(column) for column in normals.unbind()]
     return sq_chords(ours, theirs, signed=signed) <= max_sq_chord
 
 
@@ -211,7 +211,7 @@ def within_distance(
     """Return a mask of neighbors whose positions or colors ``(C, N)`` are within a distance."""
     total = values.new_zeros(())
     for column in values.unbind():
-        difference = near.of(column) - column[rows][:, None]
+        difference = near.gather(column) - column[rows][:, None]
         total = difference.mul_(difference).add_(total)
     return total <= max_sq_distance
 
@@ -222,11 +222,11 @@ def within_reach(
     """Return a mask of edges whose ends lie within ``reach`` ``(N,)`` of each other's planes."""
     ours = theirs = points.new_zeros(())
     for position, normal in zip(points.unbind(), normals.unbind(), strict=True):
-        offset = near.of(position) - position[rows][:, None]
+        offset = near.gather(position) - position[rows][:, None]
         ours = (offset * normal[rows][:, None]).add_(ours)
-        theirs = offset.mul_(near.of(normal)).add_(theirs)
+        theirs = offset.mul_(near.gather(normal)).add_(theirs)
     on_plane = ours.abs_() <= reach[rows][:, None]
-    return on_plane & (theirs.abs_() <= near.of(reach))
+    return on_plane & (theirs.abs_() <= near.gather(reach))
 
 
 def are_coplanar(
@@ -242,7 +242,7 @@ def are_coplanar(
     is a fraction of the distance to the farthest neighbor.
     """
     tested = (mask.sum(dim=1) > 0).nonzero().squeeze(-1)
-    indices, counted = cloud.neighbors.at(rows).at(tested)
+    indices, counted = cloud.neighbors.select(rows).select(tested)
     patches = gather_patches(cloud.points, indices)
     residuals = plane_residuals(patches, cloud.normals[rows][tested])
     floor = floor_fraction * patch_radii(patches, counted)

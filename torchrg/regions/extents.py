@@ -54,8 +54,8 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
     """Fit the minimum-area rectangle to each region.
 
     One side lies along an edge of the convex hull [1]. Ties go to the smallest angle to the plane
-    coordinates ``u`` and ``v``, which are in the order of :meth:`Segments.take`. A collinear region
-    has a short side of 0; for a single position both sides are 0.
+    coordinates ``u`` and ``v``, which are in the order of :meth:`Segments.gather`. A collinear
+    region has a short side of 0; for a single position both sides are 0.
 
     References:
         [1] H. Freeman, R. Shapira. Determining the minimum-area encasing rectangle for an arbitrary
@@ -176,8 +176,8 @@ def covered_areas(
     # A strip narrower than the spacing would have more cells than points.
     size = torch.maximum(size, boxes.sides[:, 0] / segments.counts)
     cosine, sine = boxes.directions[:, 0].unbind(dim=1)
-    c = segments.spread(cosine * math.cos(_CELL_ANGLE) - sine * math.sin(_CELL_ANGLE))
-    s = segments.spread(sine * math.cos(_CELL_ANGLE) + cosine * math.sin(_CELL_ANGLE))
+    c = segments.broadcast(cosine * math.cos(_CELL_ANGLE) - sine * math.sin(_CELL_ANGLE))
+    s = segments.broadcast(sine * math.cos(_CELL_ANGLE) + cosine * math.sin(_CELL_ANGLE))
     row = _cell_indices(segments, u * c + v * s, size)
     column = _cell_indices(segments, v * c - u * s, size)
     cells = _occupied_cells(segments.labels, row, column, segments.counts)
@@ -194,8 +194,8 @@ def covered_areas(
 
 def _cell_indices(segments: Segments, x: Tensor, size: Tensor) -> Tensor:
     """Return the cell index of each point along one axis, from 0 in each region."""
-    low = segments.spread(reduce_runs(x, segments.counts, "min"))
-    return ((x - low) / segments.spread(torch.where(size > 0, size, 1.0))).long()
+    low = segments.broadcast(reduce_runs(x, segments.counts, "min"))
+    return ((x - low) / segments.broadcast(torch.where(size > 0, size, 1.0))).long()
 
 
 def _occupied_cells(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) -> _Cells:

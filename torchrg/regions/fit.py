@@ -208,10 +208,10 @@ def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> R
     its thickness. In surfaces a few centimeters wide, noise also spreads normals. ``labels``
     ``(N,)`` are 0 to M-1, each at least once, or negative.
     """
-    segments = Segments(labels, most=MAX_FITTED)
+    segments = Segments(labels, max_points=MAX_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
     radii = map_tasks(
-        lambda rows: neighborhood_radii(cloud.points, cloud.neighbors.at(rows)),
+        lambda rows: neighborhood_radii(cloud.points, cloud.neighbors.select(rows)),
         torch.split(segments.rows, ROWS_IN_CACHE),
         labels.device,
     )
@@ -228,7 +228,7 @@ def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> R
         planes = planes.flattened(config.facet_tolerance)
     if cloud.reach is None:
         return planes
-    reach = segments.median(segments.take(cloud.reach)).double()
+    reach = segments.median(segments.gather(cloud.reach)).double()
     explained = torch.where(reach.isfinite(), torch.maximum(_BENT_FRACTION * reach, floor), floor)
     bent = planes.thickness > explained
     return planes._replace(curved=planes.curved & bent, reach=reach, bent=bent)

@@ -30,8 +30,8 @@ from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
 from torchrg.structures import UNLABELED, Colors, Neighbors, Points, Values
 
 _ROOTS_AT_ONCE = 1024
-"""Root points between two releases of memory-mapped arrays. Each root may map about 200 kB of
-lists."""
+"""Number of roots between two releases of memory-mapped arrays. Each root may map about 200 kB of
+neighbor lists."""
 
 
 @eager_only
@@ -56,9 +56,9 @@ def grow_regions(
 
     A region starts at the unassigned point of lowest curvature. Each seed claims its unassigned
     neighbors that pass the configured criteria; a claimed point becomes a seed if the seed rule
-    holds. With ``connectivity_scope="seed"`` the two must also be connected. If this fails for the
-    claiming seed, any later seed of the region may still promote the point; without this late
-    promotion regions fragment.
+    holds. With ``connectivity_scope="seed"``, the seed and the point must also be connected. If the
+    claiming seed is not connected to the point, a later seed of the region may still promote it;
+    without this late promotion, regions fragment.
 
     Convention:
         All limits are inclusive. The curvature limit is the value at index
@@ -76,8 +76,8 @@ def grow_regions(
             :func:`torchrg.segment_planes` does, because duplicates are neighbors of each other.
         config: A growing configuration, a dictionary, a complete configuration, or a preset name.
             Default: that of :func:`torchrg.load_config`, which requires ``residual_rms``.
-        valid: Points that have a normal, shape ``(N,)``, bool. Regions do not pass through invalid
-            points or points with a non-finite normal or curvature. Default: all.
+        valid: Mask of the points with a normal, shape ``(N,)``, bool. Invalid points, and points
+            with a non-finite normal or curvature, belong to no region. Default: all are valid.
         residual_rms: RMS distance of the neighbors to each point's plane, shape ``(N,)``, as in
             :class:`torchrg.structures.NormalFit`; required for ``plane_reach``.
         colors: Colors of the points, shape ``(N, C)``.
@@ -94,7 +94,7 @@ def grow_regions(
         smaller than ``min_size``.
 
     Raises:
-        ShapeError: If a shape, dtype or device is not as above.
+        ShapeError: If a shape, dtype or device is invalid.
         ConfigError: If required residuals or colors are missing, or a parameter is invalid.
 
     References:
@@ -226,15 +226,15 @@ def _add_colors(cloud: GrowingInput, colors: Colors | None, max_distance: float)
 
 
 def _reordered(cloud: GrowingInput, order: Tensor) -> GrowingInput:
-    """Return the cloud in the order of old rows ``(N,)``, with neighbor indices remapped."""
+    """Reorder the cloud by rows ``(N,)`` and remap its neighbor indices."""
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
-    neighbors = cloud.neighbors.at(order)
+    neighbors = cloud.neighbors.select(order)
     return cloud._replace(
         points=to_column_major(cloud.points[order]),
         normals=to_column_major(cloud.normals[order]),
         curvature=cloud.curvature[order],
-        neighbors=neighbors._replace(indices=neighbors.of(row_of)),
+        neighbors=neighbors._replace(indices=neighbors.gather(row_of)),
         valid=cloud.valid[order],
         reach=None if cloud.reach is None else cloud.reach[order],
         colors=None if cloud.colors is None else to_column_major(cloud.colors[order]),
@@ -285,9 +285,9 @@ def rank_by_count(labels: Tensor) -> Tensor:
 
 
 def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
-    """Return the root of each point's region ``(N,)``, i.e. its first point, or -1.
+    """Return the root of each point's region ``(N,)``, which is its first point, or -1.
 
-    Invalid points have none, nor do some points of regions below ``min_size``.
+    Invalid points, and some points of regions below ``min_size``, have no root.
     """
     growing, indices = cloud.curvature[cloud.valid], cloud.neighbors.indices.cpu()
     limit = curvature_limit(growing, config.curvature_quantile)
@@ -311,7 +311,7 @@ def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
 
 
 def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
-    """Return the lower quantile of curvatures ``(n,)``, an element of them; 0 if n is 0."""
+    """Return the lower quantile of curvatures ``(n,)``, which is one of them; 0 if n is 0."""
     if len(curvature) == 0:
         return curvature.new_zeros(())
     return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
@@ -329,13 +329,13 @@ def grow_fifo(
 ) -> Tensor:
     """Grow regions one after another, each from a FIFO queue of seeds (Algorithm 2).
 
-    A point belongs to the first seed in the queue that it joins. The claiming edge decides whether
-    it becomes a seed, or the point itself if ``makes_seed`` is None; :func:`mark_edges` returns
-    both masks. With ``late`` promotion any edge of its region may make a point a seed; points that
-    merely join are claimed after all seeds are known.
+    The first seed in the queue with an edge to a point claims it. The point becomes a seed if
+    ``makes_seed`` is set for this edge or, if it is None, if ``is_seed`` is set for the point.
+    :func:`mark_edges` returns ``joins`` and ``makes_seed``. With ``late`` promotion, any edge of
+    the region may promote a point; all other points are claimed after all seeds are known.
 
-    All waiting seeds are processed at once, their edges in queue order, which claims exactly the
-    same points as one seed after another. Returns the root of each point's region.
+    All queued seeds are processed at once with their edges in queue order. This claims the same
+    points as processing them one by one. Returns the root of each point's region.
     """
     lists, free, is_seed_itself = neighbors.numpy(), valid.numpy().copy(), is_seed.numpy()
     roots, slots = np.full(len(free), UNLABELED, dtype=np.int32), np.empty(len(free), np.int32)
@@ -378,7 +378,7 @@ def _unpack(
 
 
 def _unassigned(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
-    """Yield points unassigned when their chunk starts; a full list takes 36 bytes each."""
+    """Yield the unassigned points chunk by chunk; a full list would take 36 bytes per point."""
     for rows in split_rows(len(order), ROWS_AT_ONCE):
         chunk = order[rows]
         yield from chunk[free[chunk]].tolist()

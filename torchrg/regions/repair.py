@@ -90,7 +90,7 @@ def refine_regions(
             planes.scale_thickness(config.absorb_reach),
             valid=cloud.valid,
             normals=cloud.normals,
-            # Facet normals say little about the surface; the distance decides.
+            # Facet normals are unreliable; the distance decides.
             max_angle_deg=90.0 if config.faceted is True else config.absorb_angle_deg,
         )
         labels = _remove_small(labels, int(config.min_size))
@@ -122,11 +122,11 @@ def _remove_inconsistent(
     small = torch.bincount(labels + 1, minlength=1)[1:] < int(config.min_size)
     small = torch.cat([small, small.new_zeros(1)])
     segments = Segments(torch.where(small[labels], labels, UNLABELED))
-    ours, theirs = segments.take_columns(cloud.normals), segments.spread_columns(normal)
+    ours, theirs = segments.gather_columns(cloud.normals), segments.spread_columns(normal)
     is_consistent = segments.mean(sq_chords(ours, theirs)) <= deg_to_sq_chord(
         _NORMAL_AGREEMENT * config.max_angle_deg
     )
-    inconsistent = segments.rows[~segments.spread(is_consistent)]
+    inconsistent = segments.rows[~segments.broadcast(is_consistent)]
     return labels.index_fill(0, inconsistent, UNLABELED)
 
 
@@ -493,7 +493,7 @@ def _boundary_points(labels: Tensor, adjacency: KnnAdjacency) -> Tensor:
     narrow = labels.to(torch.int32)
     rows_of_chunks = []
     for chunk in split_rows(len(labels), ROWS_AT_ONCE):
-        near = Neighbors(adjacency.neighbor_rows(chunk)).of(narrow)
+        near = Neighbors(adjacency.neighbor_rows(chunk)).gather(narrow)
         is_adjacent = (near != narrow[chunk, None]) & (near >= 0)
         rows_of_chunks.append(chunk.start + nonzero_rows(is_adjacent.any(dim=1)))
     return torch.cat(rows_of_chunks)
@@ -548,9 +548,9 @@ def _overshoot(
     other: Tensor,
 ) -> Tensor:
     """Return how far the projections of points lie beyond the plane at which their region ends."""
-    near = cloud.neighbors.at(rows)
+    near = cloud.neighbors.select(rows)
     indices = near.indices.long()
-    inside = (labels[indices] == label[:, None]) & near.counted()
+    inside = (labels[indices] == label[:, None]) & near.mask()
     offset = torch.zeros_like(inside, dtype=torch.float64)
     columns = (cloud.points, planes.center[other], planes.normal[other])
     for x, start, slope in zip(*(values.unbind(dim=1) for values in columns), strict=True):

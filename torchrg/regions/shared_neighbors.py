@@ -15,7 +15,7 @@ matrix products."""
 
 _MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
 """Maximum number of neighbors for which the kernel is faster: a block of the kernel has at most
-eight times as many members."""
+eight times this number of members."""
 
 
 def min_shared_neighbors(connectivity: float, k: int) -> int:
@@ -82,9 +82,9 @@ class SharedNeighbors:
         column_of[members] = new_columns
         members = members[column_of[members] == new_columns]
         column_of[members] = new_columns[: len(members)]
-        near = self._neighbors.at(members)
+        near = self._neighbors.select(members)
         columns = column_of[near.indices.long()].long().clamp(max=len(members) - 1)
-        counted = (members[columns] == near.indices) & near.counted()
+        counted = (members[columns] == near.indices) & near.mask()
         occurs = torch.zeros(len(members), len(members) + 1, device=members.device)
         # Non-members are scattered into an extra last column.
         occurs.scatter_(1, torch.where(counted, columns, len(members)), 1.0)

@@ -196,7 +196,7 @@ def cut_bridges(
         return labels
     cores = torch.full_like(labels, UNLABELED).index_copy_(0, mixed.rows, grown)
     cores, on_core_plane = _add_plane_cores(labels, cores, mixed)
-    near_cores = cloud.neighbors.of(cores.to(torch.int32), rows)
+    near_cores = cloud.neighbors.gather(cores.to(torch.int32), rows)
     rows = rows[((near_cores >= 0) & (near_cores != cores[rows, None])).any(dim=1)]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
     cores = _join_curved(cloud, labels, cores, mixed.on_plane)
@@ -248,7 +248,7 @@ def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
 
 def _fit_cores(cloud: GrowingInput, cores: Tensor) -> RegionPlanes:
     """Fit planes to cores."""
-    return fit_planes(Segments(cores, most=MAX_FITTED), cloud.points, cloud.normals)
+    return fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
 
 
 def _are_smooth(
@@ -261,12 +261,12 @@ def _are_smooth(
         deg_to_sq_chord(max_angle_deg),
     )
     for chunk in split_rows(len(fractions), chunk_size):
-        near, counted = cloud.neighbors.at(chunk), cloud.neighbors.counted(chunk)
+        near, counted = cloud.neighbors.select(chunk), cloud.neighbors.mask(chunk)
         smooth = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
         fractions[chunk] = smooth.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
     segments = Segments(regions)
-    typical = segments.median(segments.take(fractions))
+    typical = segments.median(segments.gather(fractions))
     return fractions >= _MIN_SMOOTH_RATIO * typical[regions]
 
 
@@ -274,10 +274,10 @@ def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor) -> GrowingInput:
     """Return a subset of points as a cloud, with neighbors limited to the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
-    near = cloud.neighbors.at(rows)
-    local_rows = near.of(row_of)
-    counted = (near.of(labels.to(torch.int32)) == labels[rows, None]) & (local_rows >= 0)
-    counted &= near.counted()
+    near = cloud.neighbors.select(rows)
+    local_rows = near.gather(row_of)
+    counted = (near.gather(labels.to(torch.int32)) == labels[rows, None]) & (local_rows >= 0)
+    counted &= near.mask()
     itself = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
     return cloud._replace(
         points=cloud.points.T[:, rows].T,
@@ -294,8 +294,8 @@ def _find_edges(
     cloud: GrowingInput, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _InnerEdges:
     """Return the edges of the given points."""
-    near = cloud.neighbors.at(rows)
-    inside = (near.of(labels) == labels[rows, None]) & near.counted()
+    near = cloud.neighbors.select(rows)
+    inside = (near.gather(labels) == labels[rows, None]) & near.mask()
     passed = torch.zeros_like(inside)
     for chunk in split_rows(len(rows), chunk_size):
         passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0]
@@ -424,38 +424,40 @@ def _measure_residuals(
     The first two are ``(N,)``, 0 if unlabeled; the last is ``(M,)``, at least the floor.
     """
     segments, narrow = Segments(region), region.to(torch.int32)
-    (along,) = segments.along(cloud.points, planes.center, planes.normal[:, None])
+    (along,) = segments.coordinates(cloud.points, planes.center, planes.normal[:, None])
     residual, average = torch.zeros(2, len(region), dtype=torch.float32, device=region.device)
     residual[segments.rows] = along.float()
 
     def work(block: slice) -> None:
         rows = segments.rows[block]
-        near = Neighbors(cloud.neighbors.at(rows).indices[:, :_NUM_AVERAGED])
-        same = near.of(narrow) == narrow[rows, None]
-        average[rows] = sum_neighbors(near.of(residual) * same) / same.sum(dim=1)
+        near = Neighbors(cloud.neighbors.select(rows).indices[:, :_NUM_AVERAGED])
+        same = near.gather(narrow) == narrow[rows, None]
+        average[rows] = sum_neighbors(near.gather(residual) * same) / same.sum(dim=1)
 
     map_chunks(work, len(segments.rows), ROWS_IN_CACHE, region.device)
     floor = planes.floor.float()
-    level = segments.spread(_main_level(segments, segments.take(average), floor))
+    level = segments.broadcast(_main_level(segments, segments.gather(average), floor))
     residual[segments.rows] -= level
     average[segments.rows] -= level
-    noise = segments.quantile(segments.take(residual.abs()), _NOISE_QUANTILE)
+    noise = segments.quantile(segments.gather(residual.abs()), _NOISE_QUANTILE)
     return residual, average, torch.maximum(_NOISE_FACTOR * noise, floor)
 
 
 def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
     """Return the mode of the averaged residuals of each region, as the mean around their peak."""
     middle = segments.median(average)
-    offset = average - segments.spread(middle)
+    offset = average - segments.broadcast(middle)
     width = torch.maximum(MAD_FACTOR * segments.median(offset.abs()), floor)
     width = torch.where(width > 0, width, 1.0)
-    bins = (2 * offset / segments.spread(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
+    bins = (
+        (2 * offset / segments.broadcast(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
+    )
     bins += segments.labels * _BINS + _BINS // 2
     counts = torch.bincount(bins, minlength=len(width) * _BINS).view(-1, 1, _BINS)
     window = counts.new_tensor(_WINDOW).view(1, 1, -1)
     peak = torch.conv1d(counts, window, padding=len(_WINDOW) // 2).argmax(dim=2).squeeze(1)
     peak = (peak - _BINS // 2 + 0.5) * width / 2
-    near = (offset - segments.spread(peak)).abs() <= _PEAK_WIDTH * segments.spread(width)
+    near = (offset - segments.broadcast(peak)).abs() <= _PEAK_WIDTH * segments.broadcast(width)
     total = segments.sum(torch.where(near, offset, 0.0).double())
     return (middle + total / segments.sum(near.double()).clamp(min=1)).float()
 
@@ -481,7 +483,7 @@ def _components(chosen: Tensor, groups: Tensor, adjacency: KnnAdjacency) -> Tens
 def _median_steps(level: Tensor, residual: Tensor) -> Tensor:
     """Return the median absolute residual of each level, plus infinity for unlabeled points."""
     segments = Segments(level)
-    steps = segments.median(segments.take(residual.abs()))
+    steps = segments.median(segments.gather(residual.abs()))
     return torch.cat([steps, steps.new_tensor([torch.inf])])
 
 

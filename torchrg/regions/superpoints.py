@@ -30,7 +30,7 @@ _RADIUS_SPACINGS = 1.6
 
 _COLOR_WEIGHT = 3.0
 """Weight of a squared color difference, channels in [0, 1], relative to unit normals. Colors a
-third of the range apart in each channel weigh as much as a squared normal difference of 1."""
+third of the range apart in each channel weigh the same as a squared normal difference of 1."""
 
 _PLANE_FRACTION, _MAX_SPREAD_DEG = 0.5, 20.0
 """Fraction by which a point normal is turned to the mean normal of its plane, and the maximum RMS
@@ -43,7 +43,7 @@ that are flush with a wall."""
 
 _STEP_WEIGHT = 0.25
 """Weight of the squared sine of the angle between a contact and the surface. A perpendicular
-contact, as at a step, weighs as much as normals that differ by 29 degrees."""
+contact, as at a step, weighs the same as normals that differ by 29 degrees."""
 
 _PLANE_WEIGHT = 0.25
 """Weight of a contact between points of different planes, equal to normals that differ by 29
@@ -211,7 +211,7 @@ def _blend_with_planes(normals: Tensor, labels: Tensor) -> Tensor:
     plane = torch.unique(labels[rows], return_inverse=True)[1]
     inputs = normals[rows].double()
     segments, columns = Segments(plane), inputs.unbind(dim=1)
-    products = [segments.mean(segments.take(a * b)) for a in columns for b in columns]
+    products = [segments.mean(segments.gather(a * b)) for a in columns for b in columns]
     values, axes = eigh3_lapack(torch.stack(products, dim=1).view(-1, 3, 3))
     flat = values[:, 2] >= math.cos(math.radians(_MAX_SPREAD_DEG)) ** 2
     shared = torch.where(flat[:, None], axes[:, :, 2], 0.0)[plane]

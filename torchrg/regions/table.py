@@ -154,7 +154,7 @@ def _measure(
     A frame is the centers ``(M, 3)`` and the axes ``(M, 3, 3)``: two in the plane, then its normal.
     The mean is in space.
     """
-    u, v, height = segments.along(points, *frame)
+    u, v, height = segments.coordinates(points, *frame)
     mean = torch.stack([segments.mean(column) for column in (u, v, height)], dim=1)
     mean = (mean[:, None] @ frame[1]).squeeze(1)
     del height

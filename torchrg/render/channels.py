@@ -74,7 +74,7 @@ class Channel(NamedTuple):
 
 def make_channels(
     fields: Mapping[str, Tensor],
-    truth: Mapping[str, Tensor],
+    ground_truth: Mapping[str, Tensor],
     palettes: Mapping[str, tuple[Tensor, Tensor]],
 ) -> Iterator[Channel]:
     """Yield the available color channels, in the order of :data:`COLOR_MODES`.
@@ -82,7 +82,7 @@ def make_channels(
     Args:
         fields: Fields of n points; see :class:`torchrg.structures.Cloud`. Labels and superpoints
             are consecutive.
-        truth: Ground-truth ``labels`` or ``normals`` of the same points.
+        ground_truth: Ground-truth ``labels`` or ``normals`` of the same points.
         palettes: Results of :func:`torchrg.render.colors.palette_of_planes` for the available modes
             of ``plane`` and ``superpoint``, with rows of the n points.
     """
@@ -100,13 +100,13 @@ def make_channels(
         colors = color_sharp(torch.tensor([False, True])).numpy()
         legend = [(colors[0].tolist(), "smooth"), (colors[1].tolist(), "sharp")]
         yield Channel("sharp", fields["sharp"].numpy().astype(np.uint8), colors, legend)
-    if "labels" in fields and "labels" in truth:
-        values = point_outcomes(fields["labels"], truth["labels"]).numpy().astype(np.uint8)
+    if "labels" in fields and "labels" in ground_truth:
+        values = point_outcomes(fields["labels"], ground_truth["labels"]).numpy().astype(np.uint8)
         meanings = [(list(color), meaning) for color, meaning in OUTCOMES.values()]
         colors = np.array([color for color, _ in meanings], dtype=np.uint8)
         yield Channel("error", values, colors, meanings)
-    if "normals" in fields and "normals" in truth:
-        yield _angle_channel(unsigned_angle_deg(fields["normals"], truth["normals"]))
+    if "normals" in fields and "normals" in ground_truth:
+        yield _angle_channel(unsigned_angle_deg(fields["normals"], ground_truth["normals"]))
 
 
 def _region_channel(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Channel:
@@ -159,13 +159,13 @@ def _angle_channel(angles_deg: Tensor) -> Channel:
 
 
 def point_outcomes(
-    labels: Tensor | NDArray[np.integer], truth: Tensor | NDArray[np.integer]
+    labels: Tensor | NDArray[np.integer], ground_truth: Tensor | NDArray[np.integer]
 ) -> Tensor:
     """Return the outcome of each point as an index of :data:`OUTCOMES`.
 
     Args:
         labels: Regions, shape ``(N,)``.
-        truth: Ground-truth planes, shape ``(N,)``.
+        ground_truth: Ground-truth planes, shape ``(N,)``.
 
     Returns:
         Shape ``(N,)``, int64: 0 if the region matches the point's plane, 1 if it is another region
@@ -179,7 +179,7 @@ def point_outcomes(
         >>> point_outcomes(torch.tensor([0, 0, 0, 1, 2, -1]), torch.tensor([5, 5, 5, 5, 6, 6]))
         tensor([0, 0, 0, 1, 0, 3])
     """
-    regions, faces = check_labels("point_outcomes", labels=labels, truth=truth)
+    regions, faces = check_labels("point_outcomes", labels=labels, ground_truth=ground_truth)
     table = contingency_table(regions, faces)
     pairs = match_regions(table)
     partner = torch.full_like(table.region_labels, UNLABELED - 1)

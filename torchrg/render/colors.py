@@ -65,8 +65,8 @@ _MIN_LARGE_FRACTION = 0.03
 _SIMILAR = 120.0
 """Squared distance in CIE Lab of two colors that look about the same."""
 _DICHROMACY_WEIGHT = 0.5
-"""Weight of color vision deficiency. With less, adjacent planes look alike to color-blind viewers;
-with more, to all other viewers."""
+"""Weight of color vision deficiency. With less, adjacent planes look the same to color-blind
+viewers; with more, to all other viewers."""
 _DICHROMACY_AXES = ((0.0, 1.0), (1.07, 0.56))
 """Directions in the a-b plane of CIE Lab visible without one kind of cones: blue-yellow without the
 long or middle ones, red-cyan without the short ones. Fitted to the palette under the model of

@@ -1,4 +1,4 @@
-"""Content of a viewer: axes, displayed points, planes and outer sides."""
+"""Content of a viewer: axes, displayed points, planes, and outer sides of surfaces."""
 
 from dataclasses import replace
 from importlib.util import find_spec
@@ -24,13 +24,13 @@ from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
 NUM_STRATA = 8
 """Number of random strata of the points, each sorted along a Morton curve. While the camera moves,
-slow machines draw only the first strata; sorting compresses positions to two thirds."""
+slow machines draw only the first strata. Sorting compresses positions to two thirds."""
 PAGE_EXTENT = 10.0
 """Longest side of a cloud in a viewer; independent of the unit."""
-_OUTLINE_POINTS = 200_000
+_POLYGON_POINTS = 200_000
 """Number of points from which polygons are traced; enough for display."""
 _OMITTED_COLUMNS = ("id", "centroid", "axes", "center", "outline")
-"""Columns of the plane table that a viewer draws or omits."""
+"""Columns of the plane table that are drawn or omitted."""
 _MEDIAN_RADIUS = 128
 """Encoded median radius, in the middle of the byte range."""
 _STEPS_PER_OCTAVE = 16
@@ -40,7 +40,7 @@ _MAX_SPACING_RATIO = 3.0
 
 
 class PageFrame(NamedTuple):
-    """Axes of a viewer: z up, the center of the first cloud at the origin.
+    """Axes of a viewer: z up, origin at the center of the first cloud.
 
     Attributes:
         origin: Origin in file coordinates, shape ``(3,)``, float64.
@@ -65,8 +65,8 @@ class PointSample(NamedTuple):
         rows: Displayed rows, by strata, shape ``(n,)``.
         levels: Cumulative number of points of the strata.
         points: Points in viewer axes, shape ``(n, 3)``, float32.
-        fields: Fields of those points; normals are in viewer axes, labels are consecutive.
-        surface: Surface of those points, in viewer axes.
+        fields: Fields of the points; normals are in viewer axes, labels are consecutive.
+        surface: Surface of the points, in viewer axes.
         sides: Outer sides of the surface.
     """
 
@@ -97,7 +97,7 @@ def make_frame(cloud: Cloud, up: tuple[float, float, float]) -> PageFrame:
 
 
 def choose_points(result: Result, frame: PageFrame, max_points: int) -> PointSample:
-    """Sample the points to display, in random strata, independent of their order."""
+    """Sample the points to display, in random strata."""
     cloud = result.cloud
     finite = finite_rows(cloud.points)
     shuffled = torch.from_numpy(np.random.default_rng(0).permutation(len(finite))[:max_points])
@@ -185,7 +185,7 @@ def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, .
     outlines: list[tuple[Tensor, ...]] = [() for _ in planes.count]
     if find_spec("shapely") is None:
         return outlines
-    rows = rows[:_OUTLINE_POINTS]
+    rows = rows[:_POLYGON_POINTS]
     numbers, labels = number_labels(result.labels[rows])
     points = result.cloud.points[rows]
     normals = result.fields.get("normals", torch.zeros_like(result.cloud.points))[rows]
@@ -203,6 +203,6 @@ def _rectangles(planes: Planes) -> Tensor:
 
 
 def rounded(values: Tensor) -> object:
-    """Round numbers for JSON, to a hundred-thousandth of the cloud."""
+    """Round numbers for JSON, to 1e-5 of the cloud extent."""
     numbers: object = np.round(values.numpy(force=True).astype(np.float64), 4).tolist()
     return numbers

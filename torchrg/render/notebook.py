@@ -34,7 +34,7 @@ def _result_of(segmentation: Segmentation) -> Result:
             "dataclasses.replace(seg, points=points)."
         )
     points = segmentation.points.numpy(force=True).reshape(-1, 3)
-    return Result.of(Cloud(points, source="segmentation"), segmentation)
+    return Result.from_segmentation(Cloud(points, source="segmentation"), segmentation)
 
 
 def as_frame(planes: Planes) -> Any:  # noqa: ANN401

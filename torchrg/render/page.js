@@ -101,7 +101,7 @@ const RADIANS = Math.PI / 180;
 const page = JSON.parse($("description").textContent);
 const state = {
   mode: page.mode, cut: page.cut, outlines: false, normals: false, loose: true,
-  top: 0, near: 0, size: 0, picked: null, share: 1, moving: false,
+  top: 0, near: 0, size: 0, picked: null, fraction: 1, moving: false,
   sort: { by: "points", down: true }, minArea: 0,
   camera: { target: [0, 0, 0], rotationOrbit: 0, rotationX: 30, zoom: 5 },
 };
@@ -297,7 +297,7 @@ function layersOf({ PathLayer, LineLayer }) {
     const { bits, ahead, top, near } = limits(cloud);
     const { toward, right, up } = axesOfView();
     const light = unit(plus(plus(scaled(right, -0.45), scaled(up, 0.7)), scaled(toward, 0.55)));
-    const level = Math.max(1, Math.round(state.share * cloud.levels.length));
+    const level = Math.max(1, Math.round(state.fraction * cloud.levels.length));
     const length = cloud.levels[level - 1] ?? 0;
     // Fewer points are larger, but leave gaps: without a GPU, the time goes to pixels.
     const growth = (cloud.shown / Math.max(length, 1)) ** 0.25;
@@ -380,9 +380,9 @@ function moved() {
   if (!state.moving) { state.moving = true; lastFrame = 0; }
   stillTimer = setTimeout(() => {
     state.moving = false;
-    if (state.share < 1) { state.lastShare = state.share; state.share = 1; draw(); }
+    if (state.fraction < 1) { state.lastFraction = state.fraction; state.fraction = 1; draw(); }
   }, STILL_MS);
-  if (state.share === 1 && state.lastShare) { state.share = state.lastShare; state.lastShare = 0; }
+  if (state.fraction === 1 && state.lastFraction) { state.fraction = state.lastFraction; state.lastFraction = 0; }
   draw();
 }
 
@@ -393,8 +393,8 @@ function afterFrame() {
     const time = now - lastFrame;
     frames.push(time);
     if (frames.length > 120) frames.shift();
-    if (time > SLOW_MS) state.share = Math.max(0.125, state.share * Math.max(0.3, FAST_MS / time));
-    else if (time < FAST_MS) state.share = Math.min(1, state.share * 1.2);
+    if (time > SLOW_MS) state.fraction = Math.max(0.125, state.fraction * Math.max(0.3, FAST_MS / time));
+    else if (time < FAST_MS) state.fraction = Math.min(1, state.fraction * 1.2);
   }
   lastFrame = now;
 }

@@ -83,8 +83,8 @@ class Page(NamedTuple):
 def make_page(
     result: Result,
     *,
-    beside: Result | None = None,
-    truth: Cloud | None = None,
+    compare: Result | None = None,
+    ground_truth: Cloud | None = None,
     title: str | None = None,
     color: str | None = None,
     view: View = "cutaway",
@@ -101,9 +101,9 @@ def make_page(
 
     Args:
         result: Result to show. Points with NaN or Inf are omitted and counted.
-        beside: Another result in the same coordinates, for the right half. With the same points,
+        compare: Another result in the same coordinates, for the right half. With the same points,
             matching planes have the same color.
-        truth: Ground truth for the same points, with ``labels`` or ``normals``, to show errors.
+        ground_truth: Cloud of the same points with ``labels`` or ``normals``, to show errors.
         title: Title. Default: the names of the files.
         color: Initial color mode, a key of :data:`torchrg.render.channels.COLOR_MODES`.
             Default: the first available one.
@@ -123,18 +123,18 @@ def make_page(
         MissingDependencyError: If pydeck is not installed.
     """
     cloud = result.cloud
-    up = _check_settings(cloud, truth, up, view, max_points)
+    up = _check_settings(cloud, ground_truth, up, view, max_points)
     library = _read_library()
     frame = make_frame(cloud, up)
-    true_fields = {} if truth is None else Result(truth).fields
+    true_fields = {} if ground_truth is None else Result(ground_truth).fields
     shown = choose_points(result, frame, max_points)
     described = [_describe_cloud(result, shown, true_fields, None, frame)]
-    if beside is not None:
-        same = np.array_equal(cloud.coordinates, beside.cloud.coordinates, equal_nan=True)
+    if compare is not None:
+        same = np.array_equal(cloud.coordinates, compare.cloud.coordinates, equal_nan=True)
         reference = result.labels if same and "labels" in result.fields else None
-        others = choose_points(beside, frame, max_points)
+        others = choose_points(compare, frame, max_points)
         described += [
-            _describe_cloud(beside, others, true_fields if same else {}, reference, frame)
+            _describe_cloud(compare, others, true_fields if same else {}, reference, frame)
         ]
     scenes, blobs = [scene for scene, _ in described], [blob for _, blob in described]
     modes = [mode for mode in COLOR_MODES if any(mode in scene["channels"] for scene in scenes)]
@@ -142,9 +142,9 @@ def make_page(
         required = (
             COLOR_MODES[color][1] if color in COLOR_MODES else f"one of {', '.join(COLOR_MODES)}"
         )
-        truth_hint = " and ground truth" if color.endswith("error") else ""
+        hint = " and ground truth" if color.endswith("error") else ""
         raise ConfigError(
-            f"{cloud.source or 'make_page'}: expected {required}{truth_hint} for color={color!r}, "
+            f"{cloud.source or 'make_page'}: expected {required}{hint} for color={color!r}, "
             f"got {', '.join(cloud.fields) or 'points alone'}."
         )
     description = {
@@ -176,7 +176,7 @@ def _guess_unit(cloud: Cloud, up: tuple[float, float, float]) -> str:
 
 def _check_settings(
     cloud: Cloud,
-    truth: Cloud | None,
+    ground_truth: Cloud | None,
     up: tuple[float, float, float] | None,
     view: View,
     max_points: int,
@@ -187,10 +187,10 @@ def _check_settings(
         raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
     if up is not None:
         unit_direction("make_page", up)
-    if truth is not None and len(truth) != len(cloud):
+    if ground_truth is not None and len(ground_truth) != len(cloud):
         raise ConfigError(
-            f"{truth.source or 'make_page'}: expected ground truth for {len(cloud):,} points, got "
-            f"{len(truth):,}; pass the same points in the same order."
+            f"{ground_truth.source or 'make_page'}: expected ground truth for {len(cloud):,} "
+            f"points, got {len(ground_truth):,}; pass the same points in the same order."
         )
     return up or ((0.0, -1.0, 0.0) if view == "sensor" else (0.0, 0.0, 1.0))
 
@@ -225,13 +225,17 @@ def _read_library() -> str:
 def _describe_cloud(
     result: Result,
     shown: PointSample,
-    truth: Mapping[str, Tensor],
+    ground_truth: Mapping[str, Tensor],
     reference: Tensor | None,
     frame: PageFrame,
 ) -> tuple[dict[str, Any], str]:
     """Return the entry of a result in the description, and the packed arrays of its points."""
     cloud = result.cloud
-    true_fields = {name: truth[name][shown.rows] for name in ("labels", "normals") if name in truth}
+    true_fields = {
+        name: ground_truth[name][shown.rows]
+        for name in ("labels", "normals")
+        if name in ground_truth
+    }
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     palettes = _palettes(result, shown, reference)

@@ -35,7 +35,7 @@ _CHUNK_POINTS = 131_072
 _RADIUS = 1.3
 """Radius of a disc, in local spacings; leaves only a few gaps in a surface."""
 _MAX_RADIUS_RATIO = 4
-"""Maximum radius of a disc in a plane, in median radii; elsewhere the median is the maximum."""
+"""Maximum radius of a disc in a plane, in median radii; outside planes it is 1."""
 _RADIUS_FRACTION = 0.02
 """Maximum radius of a disc, as a fraction of the image width; bounds the drawing time."""
 _SMALL_RADIUS, _MAX_RADIUS = 8.0, 64.0

@@ -2,8 +2,8 @@
 
 The first pass finds the nearest disc of each pixel. Discs extend beyond the edge of their surface
 and hide the surface behind it. The second pass therefore chooses, for each pixel, the disc with the
-nearest center in the image, among those that the nearest disc may wrongly hide. Such a disc is at
-most a disc diameter behind. Unlike for a real occluder, the center of the nearest disc is not in
+nearest center in the image, among the discs that the nearest disc may wrongly hide. Such a disc is
+at most a disc diameter behind. Unlike for a real occluder, the center of the nearest disc is not in
 front of its plane. Ties are broken by color, not by the order of the points.
 """
 
@@ -78,7 +78,7 @@ class Discs(NamedTuple):
         """Return the inverse depth of the planes at the pixels of the centers."""
         return self.inverse_depth - (self.slopes * self.pixel_offsets()).sum(dim=1)
 
-    def at(self, rows: Tensor) -> "Discs":
+    def select(self, rows: Tensor) -> "Discs":
         """Return the selected discs."""
         discs = Discs(*(values.index_select(0, rows) for values in self))
         # Contiguous columns are faster to read.
@@ -137,7 +137,7 @@ class DepthBuffer:
         centers = torch.cat([discs.pixels, discs.inverse_depth[:, None]], dim=1)
         self._centers = torch.cat([self._centers, centers])
         order, sizes, indices = self._by_size(discs)
-        shown, number = discs.at(order), number.index_select(0, order)
+        shown, number = discs.select(order), number.index_select(0, order)
         start = shown.pixel_depths()
         dome = _DOME * shown.max_change / sizes.clamp(min=1).square_()
         for dx, dy, count in _pixels_of(sizes):
@@ -156,7 +156,7 @@ class DepthBuffer:
     def paint(self, discs: Discs) -> None:
         """Second pass: color the covered pixels."""
         order, sizes, indices = self._by_size(discs)
-        shown = discs.at(order)
+        shown = discs.select(order)
         away_x, away_y = shown.pixel_offsets().T.contiguous()
         start = shown.pixel_depths()
         slope_x, slope_y = shown.slopes.T

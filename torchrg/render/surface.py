@@ -69,7 +69,7 @@ class VisibleSurface(NamedTuple):
         """Return the spacing that the disc of each of the n points must cover, shape ``(n,)``.
 
         It is at most ``cap`` times the median for points in a plane, and at most the median
-        elsewhere, so that outliers stay small.
+        for other points, so that outliers stay small.
 
         Args:
             cap: Maximum ratio to the median spacing.

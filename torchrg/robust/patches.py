@@ -93,7 +93,7 @@ class _Frame(NamedTuple):
     unit: Tensor
     zoom: Tensor
 
-    def of(self, rows: Tensor) -> "_Frame":
+    def select(self, rows: Tensor) -> "_Frame":
         """Select the frames of patches."""
         return _Frame(*(field[rows] for field in self))
 
@@ -209,7 +209,7 @@ def _fit_groups(
             block = block.gather(1, order[..., None].expand(-1, -1, size))
             _store(out, chosen, _spread(fit(block), order, num_points))
 
-        map_chunks(work, len(rows), chunk_size, patches.device, least=_MIN_PATCHES)
+        map_chunks(work, len(rows), chunk_size, patches.device, min_rows=_MIN_PATCHES)
     return out
 
 
@@ -249,12 +249,12 @@ def _fit_chunk(
         return columns if len(rows) == num_patches else take_lanes(columns, rows)
 
     def store_exact(rows: Tensor, members: Tensor) -> None:
-        _store(out, rows, _exact_fit(lanes_of(rows), members, frame.of(rows)))
+        _store(out, rows, _exact_fit(lanes_of(rows), members, frame.select(rows)))
 
     regular = torch.nonzero(dimension == size).squeeze(1)
     if len(regular):
         estimate = estimator(lanes_of(regular), tolerance[regular] ** 2, subset)
-        _store(out, regular, _general_fit(estimate, frame.of(regular)))
+        _store(out, regular, _general_fit(estimate, frame.select(regular)))
         # Concentration may find a plane that no simplex lies on.
         thin = torch.nonzero(estimate.singular).squeeze(1)
         if len(thin):

@@ -1,4 +1,4 @@
-"""Starts of the searches: deterministic scatters, planes and random sets."""
+"""Initial sets of robust searches: deterministic scatters, planes and random sets."""
 
 from functools import lru_cache
 from itertools import combinations
@@ -33,7 +33,7 @@ Starts = Literal["paper", "robustbase", "planes"]
 MCDStarts = Literal[Starts, "more"]
 
 _MIN_TAU_VALUES = 1000
-"""Number of values from which tau replaces Qn, which needs all differences, as in robustbase."""
+"""Number of values from which tau replaces Qn, as in robustbase, because Qn needs all pairs."""
 
 _STARTS_PER_CHUNK = 3
 """Number of starts processed at a time, so that their data fits into the cache."""
@@ -49,7 +49,7 @@ _PLANES_PER_CHUNK = 8
 
 
 def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> tuple[Tensor, int]:
-    """Initial sets ``(K, S, M)`` of the chosen starts, as masks of 0 and 1, and their size."""
+    """Return the initial sets of the chosen starts as 0/1 masks ``(K, S, M)``, and their size."""
     if starts == "planes":
         return _plane_starts(columns, size), size
     if starts == "paper":
@@ -206,11 +206,11 @@ def _score_table(count: int) -> tuple[float, ...]:
 
 
 def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
-    """Choose the sets nearest to the best of 64 planes through P points each.
+    """Choose the points nearest to the best of 64 planes, each through P points.
 
     The best planes have the smallest ``size``-th distance (least median of squares). With a
     minority of outliers, some planes pass through clean points only, wherever the outliers are.
-    This takes only sums and one sort per plane, compared with 27 Qn for the published starts.
+    This needs only sums and one sort per plane, while the published starts need 27 Qn.
     """
     num_points, num_lanes = columns[0].shape
     sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
@@ -287,7 +287,7 @@ def random_subsets(sets: Tensor, size: int, seed: int) -> Tensor:
 
 
 def draw_seed(generator: torch.Generator | None) -> int:
-    """Take one seed from a generator; without one the seed is 0."""
+    """Draw a seed from a generator; 0 without a generator."""
     if generator is None:
         return 0
     return int(torch.randint(2**62, (), generator=generator, device=generator.device))

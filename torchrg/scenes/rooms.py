@@ -189,24 +189,24 @@ def furnish(
     middles = [walls[wall].moved((a + b) / 2, 0, 0).origin for wall, (a, b, _, _) in doorways]
     parts = [_shell(layout, room, holes, with_floor)]
     is_flat = [surface.plane is not None for surface in parts[0].surfaces[-len(walls) :]]
-    wall_places = [
+    wall_slots = [
         (wall, along)
         for wall, along in _wall_cells(layout.size)
         if is_flat[wall] and _is_away(walls[wall].moved(along), middles, _DOORWAY_AISLE)
     ]
-    wall_places = [wall_places[row] for row in rng.permutation(len(wall_places))]
-    floor_places = [
+    wall_slots = [wall_slots[row] for row in rng.permutation(len(wall_slots))]
+    floor_slots = [
         (x, y)
         for x, y in _floor_cells(layout.size)
         if _is_away(room.moved(x, y), middles, _DOORWAY_SPACE)
     ]
-    floor_places = [floor_places[row] for row in rng.permutation(len(floor_places))]
+    floor_slots = [floor_slots[row] for row in rng.permutation(len(floor_slots))]
 
     def add(drawn: Iterator[Part]) -> None:
         parts.append(_first_separated(drawn, parts, layout.min_plane_gap))
 
     def open_wall(kind: str, draw_hole: Callable[[np.random.Generator, float], Hole]) -> None:
-        wall, middle = _take(wall_places, "walls")
+        wall, middle = _take(wall_slots, "walls")
         holes[wall].append((0, 0, 0, 0))
 
         def recesses() -> Iterator[Part]:
@@ -232,17 +232,17 @@ def furnish(
         (layout.num_panels, partial(draw.draw_panel, thickness=layout.panel_thickness)),
     ]
     for draw_at in (draw_at for number, draw_at in on_walls for _ in range(number)):
-        wall, along = _take(wall_places, "walls")
+        wall, along = _take(wall_slots, "walls")
         add(draw_at(rng, walls[wall], along + between(rng, -0.1, 0.1)) for _ in count())
     for number in range(layout.num_tables):
-        middle = _take(floor_places, "floor")
+        middle = _take(floor_slots, "floor")
         add(draw.draw_table(rng, standing(middle, 12), plate) for _ in count())
         if number < layout.num_small_boxes:
             [top] = [surface for surface in parts[-1].surfaces if surface.kind == "table top"]
             middle_of_top = Frame.upright(top.bounds.mean(axis=0))
             add(draw.draw_small_box(rng, middle_of_top) for _ in count())
     for draw_on in (draw_on for number, draw_on in layout.furniture() for _ in range(number)):
-        middle = _take(floor_places, "floor")
+        middle = _take(floor_slots, "floor")
         add(draw_on(rng, standing(middle, 90)) for _ in count())
     return tuple(parts)
 
@@ -310,7 +310,7 @@ def _floor_cells(size: Triple) -> list[tuple[float, float]]:
 
 
 def _cell_centers(length: float, cell: float) -> list[float]:
-    """Return the centers of as many equal cells of at least ``cell`` as fit into a length."""
+    """Split a length into equal cells of at least ``cell`` and return their centers."""
     count = max(int(length / cell), 0)
     return [length * (number + 0.5) / count for number in range(count)]
 

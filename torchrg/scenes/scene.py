@@ -17,7 +17,7 @@ from torchrg.structures import FARTHEST, MAX_POINTS
 
 NoiseDirection = Literal["normal", "isotropic"]
 
-PLACES, NOISE = range(2)
+POSITIONS, NOISE = range(2)
 """Purposes of the random numbers; positions do not depend on the noise."""
 _CLEARANCE = 1e-7
 """Free space required in front of a visible surface, as a fraction of the scene size."""
@@ -150,7 +150,7 @@ def sample_scene(
             f"sample_scene: expected noise_direction to be one of {options}, got "
             f"{noise_direction!r}."
         )
-    rng = seeded_generator(seed, PLACES)
+    rng = seeded_generator(seed, POSITIONS)
     points, normals, labels = _sample_faces(model, num_points, rng)
     if noise > 0:
         shake = seeded_generator(seed, NOISE)

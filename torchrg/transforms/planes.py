@@ -155,7 +155,7 @@ class EstimateNormals(OrientedTransform):
         def turn(side: Orientation) -> Tensor:
             return distinct.restore(turn_faces(distinct.points, found.normals, side, neighbors))
 
-        fit = found.each(distinct.restore)
+        fit = found.map(distinct.restore)
         normals = choose_side(points, fit.normals, self.orient, front, turn)
         added = {"normal": normals, "curvature": fit.curvature}
         return {**added, "residual": fit.residual_rms} if self.residual else added

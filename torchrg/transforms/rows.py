@@ -160,8 +160,9 @@ def select_points(
     in_rows, ambiguous = _classify_keys(entries, num_points, skip)
     if ambiguous:
         raise ConfigError(
-            f"{caller}: cannot tell whether {', '.join(map(str, ambiguous))} of the sample has one "
-            f"row per point ({num_points}); make it an array named in {LIST_KEY!r}, or remove it."
+            f"{caller}: cannot decide whether {', '.join(map(str, ambiguous))} of the sample has "
+            f"one row per point ({num_points}); make it an array named in {LIST_KEY!r}, or "
+            "remove it."
         )
     selected: SampleDict = {key: _select(entries[key], rows) for key in in_rows}
     ends = torch.tensor(_cloud_ends(sample, num_points), device=rows.device)

@@ -1,6 +1,6 @@
 """Constants of consensus normals: value, unit, meaning and reason, by stage.
 
-Each docstring begins with the unit (a share is at most 1). ``s`` is the local noise, a standard
+Each docstring begins with the unit (a fraction is at most 1). ``s`` is the local noise, a standard
 deviation. All constants are read when the estimator is called. ``scripts/sensitivity.py`` measures
 how halving or doubling each one changes the scores, in ``sensitivity.json`` next to it.
 """

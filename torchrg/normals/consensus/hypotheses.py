@@ -13,9 +13,9 @@ from torchrg.linalg import above, at_most
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
     Columns,
-    along,
     fit_planes_to_each,
     fit_weighted_planes,
+    project,
     residuals,
     sq_lengths,
     sum_neighbors,
@@ -78,7 +78,7 @@ def _best_normals(
     candidates, spanned = _planes_through(columns, ranks)
     candidates = torch.cat([start[:, None], candidates], dim=1)
     x, y, z = columns
-    distances = along((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
+    distances = project((x[:, None], y[:, None], z[:, None]), candidates / reach[:, None, None])
     scores = support_scores(distances, weights[:, None])
     spanned = torch.cat([torch.ones_like(spanned[:, :1]), spanned], dim=1)
     best = torch.where(spanned, scores, -torch.inf).argmax(dim=1, keepdim=True)

@@ -11,10 +11,10 @@ from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, nonzero_row
 from torchrg.linalg import above, coordinate_resolution
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
-    along,
     dot,
     fit_parallel_planes,
     fit_weighted_planes,
+    project,
     residuals,
     split_columns,
     sq_lengths,
@@ -66,12 +66,12 @@ def estimate_noise(
     deviations = points.new_empty(len(points), 2 + len(constants.NOISE_COUNTS))
 
     def work(block: slice) -> None:
-        near = neighbors.at(block)
+        near = neighbors.select(block)
         offsets[block], radius[block], single, layered, repeats, *nearest = _measure_neighborhoods(
             points, near, fit.normals[block], fit.valid[block]
         )
         if len(rows := nonzero_rows(repeats)):
-            patches, counted = _move_duplicates(points, near.at(rows))
+            patches, counted = _move_duplicates(points, near.select(rows))
             for values, size in zip(nearest, constants.NOISE_COUNTS, strict=True):
                 values[rows] = _small_deviations(patches, counted, size)
         torch.stack([single, layered, *nearest], dim=1, out=deviations[block])
@@ -153,7 +153,7 @@ def _measure_neighborhoods(
     offsets, radius, single, looks_layered, repeats = _deviations(points, *near, normals, valid)
     layered = torch.full_like(single, torch.inf)
     if len(rows := nonzero_rows(looks_layered)):
-        layered[rows] = _layered_deviations(points, near.at(rows), normals[rows], single[rows])
+        layered[rows] = _layered_deviations(points, near.select(rows), normals[rows], single[rows])
     nearest = [_nearest_deviations(points, near, count) for count in counts]
     return offsets, radius, single, layered, repeats, *nearest
 
@@ -182,14 +182,14 @@ def _deviations(
 def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, single: Tensor) -> Tensor:
     """Return deviations from two parallel planes, the faces of a plate; inf if there are none."""
     columns = gather_columns(points, near.indices)
-    counted = near.counted().to(points.dtype)
+    counted = near.mask().to(points.dtype)
     count = counted.sum(dim=1)
     center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
     offsets = dot(normals, torch.stack(center, dim=-1))
     upper = above(residuals(columns, normals, offsets), 0) * counted
     for _ in range(constants.NUM_REFITS):
         normals, two, squares = fit_parallel_planes(columns, (upper, counted - upper))
-        upper = above(along(columns, normals), two.mean(dim=0)[:, None]) * counted
+        upper = above(project(columns, normals), two.mean(dim=0)[:, None]) * counted
     num_upper = upper.sum(dim=1)
     deviations = square_root(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
@@ -199,7 +199,7 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, single
 
 def _move_duplicates(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
     """Move duplicates of the previous neighbor to the end, where they do not count."""
-    patches, counted = gather_patches(points, near.indices), near.counted()
+    patches, counted = gather_patches(points, near.indices), near.mask()
     repeats = torch.zeros_like(counted)
     repeats[:, 1:] = (patches[:, 1:] == patches[:, :-1]).all(dim=-1)
     order = repeats.to(torch.uint8).argsort(dim=1, stable=True)
@@ -210,7 +210,7 @@ def _move_duplicates(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
 def _nearest_deviations(points: Tensor, near: Neighbors, count: int) -> Tensor:
     """Return deviations of the ``count`` nearest points from their plane."""
     patches = gather_patches(points, near.indices[:, :count])
-    return _small_deviations(patches, near.counted()[:, :count].to(points.dtype), count)
+    return _small_deviations(patches, near.mask()[:, :count].to(points.dtype), count)
 
 
 def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
@@ -235,12 +235,12 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
     rank = max(math.ceil(quantile * k), 1)
 
     def work(block: slice) -> None:
-        near = neighbors.at(block)
+        near = neighbors.select(block)
         if kernels.serve(values, *near, k=k):
             (quantiles[block],) = kernels.call("neighbor_quantiles", values, *near, quantile, rank)
             return
         for column, out in zip(values.unbind(dim=1), quantiles[block].unbind(dim=1), strict=True):
-            near_values = near.of(column)
+            near_values = near.gather(column)
             if near.valid is None and values.device.type == "cpu":
                 # Ten times faster than torch.
                 near_values.numpy().partition(rank - 1, axis=1)

@@ -9,9 +9,9 @@ from torchrg.linalg import signs
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
     Columns,
-    along,
     dot,
     fit_weighted_planes,
+    project,
     residuals,
     sq_lengths,
     sum_neighbors,
@@ -88,15 +88,15 @@ def _smooth_rows(
     rows: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the smoothed planes of points; ``parts`` are the columns of all normals."""
-    near = Neighbors(indices, valid).at(rows)
+    near = Neighbors(indices, valid).select(rows)
     columns = gather_columns(points, near.indices)
-    x, y, z = (near.of(column) for column in parts.unbind())
+    x, y, z = (near.gather(column) for column in parts.unbind())
     a, b, c = (column.index_select(0, rows)[:, None] for column in parts.unbind())
     cosines = x * a + y * b + z * c
     sign = signs(cosines)
-    distances = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.of(offsets)
+    distances = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.gather(offsets)
     sq_chords = 2 * (1 - cosines.abs())
-    sq_error = near.of(errors).square()
+    sq_error = near.gather(errors).square()
     sq_angle = constants.SMOOTHING_AGREEMENT**2 * (sq_error + sq_error[:, :1])
     reach = constants.SMOOTHING_REACH * noise[rows][:, None]
     weights = (1 - sq_chords / sq_angle).clamp_(min=0).square_() * (sq_error[:, :1] / sq_error)
@@ -152,7 +152,7 @@ def choose_planes(
                 "choose_planes", table, *neighbors, points, chosen, *parameters
             )
             return
-        normals[chosen], offsets[chosen] = _chosen(
+        normals[chosen], offsets[chosen] = _best_neighbor_planes(
             points, *neighbors, *planes, noise, chosen, ranks
         )
 
@@ -161,7 +161,7 @@ def choose_planes(
     return TangentPlanes(normals, offsets)
 
 
-def _chosen(
+def _best_neighbor_planes(
     points: Tensor,
     indices: Tensor,
     valid: Tensor | None,
@@ -172,7 +172,7 @@ def _chosen(
     ranks: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the best planes of points among the planes of their neighbors at ``ranks``."""
-    near = Neighbors(indices, valid).at(rows)
+    near = Neighbors(indices, valid).select(rows)
     columns = gather_columns(points, near.indices)
     weights = _distance_weights(columns, constants.VOTE_FALLOFF)
     if near.valid is not None:
@@ -184,7 +184,7 @@ def _chosen(
     new_offsets = offsets[other] + dot(axes, positions)
     reach = constants.VOTE_REACH * scale
     x, y, z = (column[:, None] for column in columns)
-    distances = along((x, y, z), axes / reach[:, :, None]) - (new_offsets / reach)[:, :, None]
+    distances = project((x, y, z), axes / reach[:, :, None]) - (new_offsets / reach)[:, :, None]
     offset_ratio = new_offsets / scale
     support = support_scores(distances, weights[:, None]) / sum_neighbors(weights)[:, None]
     score = support - constants.CHOICE_COST * offset_ratio * offset_ratio
@@ -266,7 +266,7 @@ def _inliers(
     columns = gather_columns(points, indices[rows])
     distances = residuals(columns, normals[rows], offsets[rows]).abs()
     near = distances <= (constants.INLIER_REACH * noise[rows])[:, None]
-    weights = (near & Neighbors(indices, valid).counted(rows)).to(points.dtype)
+    weights = (near & Neighbors(indices, valid).mask(rows)).to(points.dtype)
     return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 

@@ -68,7 +68,7 @@ def fit_surfaces(
 
     def split(rows: Tensor) -> None:
         scale = noise[rows]
-        voted, planes = broken_planes(points, neighbors.at(rows), scale, fit.normals[rows])
+        voted, planes = broken_planes(points, neighbors.select(rows), scale, fit.normals[rows])
         by_votes.normals[rows], by_votes.offsets[rows] = voted
         meeting.normals[rows], meeting.offsets[rows] = planes.normals, planes.offsets
         explained[rows] = planes.deviations <= constants.MEETING_LIMIT * scale
@@ -141,7 +141,7 @@ def _paraboloids(
     arguments = points, indices, valid, normals
     if kernels.serve(*arguments, k=indices.shape[1]):
         return kernels.call("fit_paraboloids", *arguments, rows, FLAT_PIVOT)
-    counted = Neighbors(indices, valid).counted(rows).to(points.dtype)
+    counted = Neighbors(indices, valid).mask(rows).to(points.dtype)
     return fit_paraboloids(gather_columns(points, indices[rows]), normals[rows], counted)
 
 
@@ -177,7 +177,7 @@ def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> T
     means = torch.empty_like(values)
 
     def work(chunk: slice) -> None:
-        near = Neighbors(neighbors.indices[chunk, : constants.NUM_POOLED]).of(values)
+        near = Neighbors(neighbors.indices[chunk, : constants.NUM_POOLED]).gather(values)
         if neighbors.valid is None:
             means[chunk] = near.mean(dim=1)
             return
