@@ -2,13 +2,11 @@
 
 import importlib
 import inspect
-import warnings
 from pathlib import Path
 
 import pytest
 
 import torchrg
-from torchrg._deprecated import warn_deprecated
 
 FILE = Path(__file__).with_name("public_names.txt")
 LISTED = {
@@ -43,18 +41,3 @@ def test_signatures_show_the_names_of_types():
         assert "Points" in text
         assert "numpy" not in text
         assert "typing" not in text
-
-
-def test_deprecation_names_the_replacement_the_removal_and_the_calling_line():
-    def old():
-        warn_deprecated("old()", "new()", removal="0.3.0")
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        old()
-    (warning,) = caught
-    assert warning.category is DeprecationWarning
-    assert str(warning.message) == (
-        "old() is deprecated and will be removed in torchrg 0.3.0; use new()."
-    )
-    assert (warning.filename, warning.lineno) == (__file__, inspect.currentframe().f_lineno - 6)

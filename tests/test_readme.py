@@ -124,7 +124,7 @@ def test_figures_are_medians_means_and_what_lies_between_two_partitions():
     import readme_tables
 
     def run(neighbors, total):
-        return {"seconds": {"normals": neighbors}, "total": total}
+        return {"seconds": {"normals": neighbors}, "total": total, "whole": total + 1.0}
 
     names = {name.split()[0] for names in readme_tables.WORK.values() for name in names}
     by = {name: [run(1.0, 2.0)] for name in names}
@@ -144,6 +144,7 @@ def test_figures_are_medians_means_and_what_lies_between_two_partitions():
     section = readme_tables.to_section(figures)
     assert "| planes, `paper` | 1 | 3.0 | 1.0 | 3.0 | 1.0 |" in section
     assert "| normals, `pca` | 1 | 2.0 | 1.0 | 2.0 | 1.0 |" in section
+    assert "| from file to file, `classic` | 1 | 2.3 | 1.0 | 2.3 | 1.0 |" in section
     assert (
         "| synthetic rooms, seven noise levels and densities | 0.70 | 0.30 | 0.30 | 0.30 |  |"
         in section

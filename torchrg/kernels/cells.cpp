@@ -5,7 +5,7 @@ namespace {
 
 constexpr int MAX_CANDIDATES = 4096;  // points of a cell and those around it
 constexpr int MAX_CHOSEN = 1024;      // of these, the sorted ones
-constexpr double SURELY = 1e-6;        // rounding of the cell of a point at a boundary
+constexpr double SURELY = 1e-6;       // rounding of the cell of a point at a boundary
 
 struct Candidates {
   alignas(32) double x[MAX_CANDIDATES], y[MAX_CANDIDATES], z[MAX_CANDIDATES],
@@ -109,10 +109,10 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
 
 // Writes the k nearest neighbors of the selected points in cells `from` to `to` to their rows of
 // `found`, renumbered by `order` if given; `certain` marks exact results.
-KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const double* sorted, Ints rows,
-                    Ints starts, Flagged selected, Longs order, int32_t* found, bool* certain,
-                    int64_t from, int64_t to, int64_t width, int64_t height, int64_t first_row,
-                    double x, double y, double z, double size) {
+KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const double* sorted,
+                    Ints rows, Ints starts, Flagged selected, Longs order, int32_t* found,
+                    bool* certain, int64_t from, int64_t to, int64_t width, int64_t height,
+                    int64_t first_row, double x, double y, double z, double size) {
   if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
   if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
   if (num_points > INT32_MAX || num_cells > INT32_MAX) return TOO_WIDE;

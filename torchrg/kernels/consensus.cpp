@@ -120,8 +120,7 @@ Meeting alternate(const Patch& patch, int count, float* first, float* second, fl
     }
     if (third) {
       last = fit_plane(patch, third, width), residuals(patch, last, t);
-      for (int j = 0; j < width; j += LANES)
-        store(first + j, load(first + j) + load(second + j));
+      for (int j = 0; j < width; j += LANES) store(first + j, load(first + j) + load(second + j));
       const float w = side(product(t, first, width));
       if (cuts == 0) cuts = side(product(outer, third, width));
       for (int j = 0; j < width; j += LANES) {
@@ -215,17 +214,18 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
   if (!(turns >= 1 && turns < MAX_WIDTH && constants.num_refits < MAX_WIDTH)) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   bool inside = true;
-  const int64_t status = visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, Patch& patch) {
-    const int count = compact(patch);
-    for (int64_t rank = 0; rank < 2 * num_pairs; rank++)
-      inside &= pairs[rank] >= 0 && pairs[rank] < count;
-    if (!inside) return;
-    const Plane plane =
-        vote(patch, patch.weight, noise[i], normals + 3 * i, pairs, num_pairs, constants);
-    const Meeting found = meet(patch, plane, noise[i], count, pairs, num_pairs, constants);
-    write(plane, voted, i), write(found.plane, meeting, i);
-    voted_offsets[i] = plane.offset, meeting_offsets[i] = found.plane.offset;
-    deviations[i] = found.deviation;
-  });
+  const int64_t status =
+      visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, Patch& patch) {
+        const int count = compact(patch);
+        for (int64_t rank = 0; rank < 2 * num_pairs; rank++)
+          inside &= pairs[rank] >= 0 && pairs[rank] < count;
+        if (!inside) return;
+        const Plane plane =
+            vote(patch, patch.weight, noise[i], normals + 3 * i, pairs, num_pairs, constants);
+        const Meeting found = meet(patch, plane, noise[i], count, pairs, num_pairs, constants);
+        write(plane, voted, i), write(found.plane, meeting, i);
+        voted_offsets[i] = plane.offset, meeting_offsets[i] = found.plane.offset;
+        deviations[i] = found.deviation;
+      });
   return inside ? status : NO_SUCH_ROW;
 }

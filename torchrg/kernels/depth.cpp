@@ -9,7 +9,7 @@ typedef const double* Doubles;
 
 constexpr int REACH = 2, SIDE = 5, NUM_SIZES = 4, MOMENTS = 10, COLUMNS = 9;
 constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns fitted together
-constexpr int LONG = 9, SHORT = 3;  // sides of narrow windows in pixels
+constexpr int LONG = 9, SHORT = 3;                 // sides of narrow windows in pixels
 constexpr double FLAT = 1.35, SELF_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
 constexpr double BEND = 0.005, MAX_BEND = 0.03, STEEPEST = 4;
 constexpr double NONE = __builtin_inf();
@@ -50,8 +50,8 @@ INLINE void write_moments(uint8_t seen, double u, double v, double value, double
 // Fits planes (5, h, w) to the windows around cells; `read` returns the column sums of a row. Also
 // sums cells to cells of twice the width.
 template <class Read>
-int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count,
-                double min_spread, double* planes, double* coarse, Read read) {
+int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count, double min_spread,
+                double* planes, double* coarse, Read read) {
   alignas(32) double ring[SIDE][MOMENTS][WIDE], down[WIDE], sums[MOMENTS][TILE], solved[5][TILE];
   const int64_t coarse_w = (w + 1) / 2, coarse_size = (h + 1) / 2 * coarse_w;
   for (int64_t left = 0; left < w; left += TILE) {
@@ -59,8 +59,10 @@ int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count
     for (int64_t row = from - REACH; row < to + REACH; row++) {
       auto& newest = ring[(row + SIDE) % SIDE];
       __builtin_memset(newest, 0, sizeof newest);
-      const int64_t first = larger(left - REACH, int64_t(0)), last = smaller(left + width + REACH, w);
-      if (row >= 0 && row < h) read(row, first, int(last - first), newest, int(first - left) + REACH);
+      const int64_t first = larger(left - REACH, int64_t(0)),
+                    last = smaller(left + width + REACH, w);
+      if (row >= 0 && row < h)
+        read(row, first, int(last - first), newest, int(first - left) + REACH);
       const int64_t i = row - REACH;
       if (i < from) continue;
       const auto &middle = ring[(i + 5) % SIDE], &above = ring[(i + 4) % SIDE],
@@ -146,9 +148,9 @@ INLINE double sq_slope_noise(const Window& window, double tolerance) {
 }  // namespace
 
 // windows.fit_windows around pixels; `coarse` (10, p, q) receives the cells of 2 pixels.
-KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, Doubles values, Flagged seen,
-                         Doubles u, Doubles v, double* planes, double* coarse, double min_count,
-                         double min_spread, int64_t from, int64_t to) {
+KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, Doubles values,
+                         Flagged seen, Doubles u, Doubles v, double* planes, double* coarse,
+                         double min_count, double min_spread, int64_t from, int64_t to) {
   if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
     return TOO_WIDE;
   const auto* ones = reinterpret_cast<const uint8_t*>(seen);
@@ -234,7 +236,8 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
           const int64_t pixel = r * w + c;
           if (flat[pixel] || !seen[pixel]) continue;
           const auto is_near = [&](int64_t k, double reach) {
-            const double on_plane = table[U_SLOPE * step + k] * u[c] + table[V_SLOPE * step + k] * v[r];
+            const double on_plane =
+                table[U_SLOPE * step + k] * u[c] + table[V_SLOPE * step + k] * v[r];
             return size_of(values[pixel] - (on_plane + table[ORIGIN * step + k])) <= reach;
           };
           int64_t taken = -1;
@@ -367,8 +370,8 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
                        Flagged flat, Doubles squares, Doubles narrow, Longs pixels, double* normals,
                        double* curvature, double* noise, bool* valid, bool* right, bool* down,
                        double fx, double fy, double factor, double constant, double growth,
-                       double rounding, double max_step, double max_sq_chord,
-                       double wider_sq_chord, int64_t from, int64_t to) {
+                       double rounding, double max_step, double max_sq_chord, double wider_sq_chord,
+                       int64_t from, int64_t to) {
   const Windows all(h, w, n, squares, narrow, pixels);
   if (N != COLUMNS * all.first[NUM_SIZES] || M != COLUMNS * 2 * n || !are_rows_of(from, to, h))
     return TOO_WIDE;
@@ -395,7 +398,7 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
         square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
     if (turned <= max_sq_chord) return true;
     const bool similar = u_slope * u_slope + v_slope * v_slope <=
-                       sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs);
+                         sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs);
     return (similar || turned <= wider_sq_chord) && here.window.holds(r + is_down, c + !is_down) &&
            other.window.holds(r, c);
   };
@@ -512,23 +515,26 @@ INLINE bool are_labels(Longs labels, int64_t n, int64_t num) {
 }  // namespace
 
 // repair.assign_unlabeled for pixels; points are (3, h w).
-KERNEL assign_unlabeled_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, Flagged seen,
-                     int64_t* labels, Doubles normals, Doubles centers, Doubles reach,
-                     int64_t* rows, int64_t* marks, int64_t* chosen) {
+KERNEL assign_unlabeled_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points,
+                               Flagged seen, int64_t* labels, Doubles normals, Doubles centers,
+                               Doubles reach, int64_t* rows, int64_t* marks, int64_t* chosen) {
   const int64_t n = h * w;
   if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
   Front front(h, w, rows, marks, chosen);
   const auto may_join = [&](int64_t pixel) { return labels[pixel] < 0 && seen[pixel]; };
   for (int64_t i = 0; i < n; i++)
     if (may_join(i)) front.add(i);
-  front.spread(labels, n, [&](int64_t pixel, int64_t other) {
-    const int64_t m = labels[other];
-    if (m < 0) return NONE;
-    double away = 0;
-    for (int axis = 0; axis < 3; axis++)
-      away += (points[axis * n + pixel] - centers[3 * m + axis]) * normals[3 * m + axis];
-    return size_of(away) <= reach[m] ? size_of(away) : NONE;
-  }, may_join);
+  front.spread(
+      labels, n,
+      [&](int64_t pixel, int64_t other) {
+        const int64_t m = labels[other];
+        if (m < 0) return NONE;
+        double away = 0;
+        for (int axis = 0; axis < 3; axis++)
+          away += (points[axis * n + pixel] - centers[3 * m + axis]) * normals[3 * m + axis];
+        return size_of(away) <= reach[m] ? size_of(away) : NONE;
+      },
+      may_join);
   return DONE;
 }
 
@@ -550,24 +556,27 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
       if (r + 1 < h) compare(i, i + w);
       if (r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
     }
-  front.spread(labels, num_turns, [&](int64_t pixel, int64_t q) {
-    const int64_t label = labels[pixel], other = labels[q];
-    if (other < 0 || other == label) return NONE;
-    const double *one = planes + 3 * label, *two = planes + 3 * other;
-    const double away = size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
-    if (!(away <= reach[other])) return NONE;
-    const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
-    const auto over = [&](double u, double v) { return a * u + b * v + c; };
-    const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
-    const double mine = over(middles[2 * label], middles[2 * label + 1]),
-                 theirs = over(middles[2 * other], middles[2 * other + 1]);
-    const double slope = square_root(a * a + b * b);
-    const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
-    const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
-                      here * mine < 0 && mine * theirs < 0 && size_of(mine) > reach[other] &&
-                      size_of(theirs) > reach[label];
-    return goes ? away : NONE;
-  }, [&](int64_t pixel) { return labels[pixel] >= 0; });
+  front.spread(
+      labels, num_turns,
+      [&](int64_t pixel, int64_t q) {
+        const int64_t label = labels[pixel], other = labels[q];
+        if (other < 0 || other == label) return NONE;
+        const double *one = planes + 3 * label, *two = planes + 3 * other;
+        const double away = size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
+        if (!(away <= reach[other])) return NONE;
+        const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
+        const auto over = [&](double u, double v) { return a * u + b * v + c; };
+        const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
+        const double mine = over(middles[2 * label], middles[2 * label + 1]),
+                     theirs = over(middles[2 * other], middles[2 * other + 1]);
+        const double slope = square_root(a * a + b * b);
+        const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
+        const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
+                          here * mine < 0 && mine * theirs < 0 && size_of(mine) > reach[other] &&
+                          size_of(theirs) > reach[label];
+        return goes ? away : NONE;
+      },
+      [&](int64_t pixel) { return labels[pixel] >= 0; });
   return DONE;
 }
 
@@ -575,8 +584,8 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
 // as the other behind a nearer object; points are (3, h w).
 KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Doubles points,
                    Flagged seen, Longs labels, Doubles normals, Doubles centers, Doubles reach,
-                   Longs pairs, int64_t every, double min_nearer, int64_t* counts,
-                   int64_t* firsts, int64_t* lasts) {
+                   Longs pairs, int64_t every, double min_nearer, int64_t* counts, int64_t* firsts,
+                   int64_t* lasts) {
   if (every < 1) return TOO_WIDE;
   if (P != h * w || !are_labels(labels, P, M)) return NO_SUCH_ROW;
   for (int64_t q = 0; q < 2 * p; q++)

@@ -24,8 +24,8 @@ struct Forest {
 }  // namespace
 
 // faces._compare: agreement of normals along links, and the bend of links.
-KERNEL compare_links(int64_t num_points, int64_t num_rows, int64_t k, Floats points,
-                     Floats normals, Longs rows, Ints ends, float* cosines, float* bends) {
+KERNEL compare_links(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
+                     Longs rows, Ints ends, float* cosines, float* bends) {
   if (!are_rows(ends, num_rows * k, num_points)) return NO_SUCH_ROW;
   for (int64_t i = 0; i < num_rows; i++) {
     if (rows[i] < 0 || rows[i] >= num_points) return NO_SUCH_ROW;

@@ -156,20 +156,26 @@ KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, 
                        Longs counts, int64_t is_centered, double* means, double* covariances) {
   return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
     double sums[4], squares[6], *mean = means + 3 * m;
-    add_up(start, end - start, [&](int64_t i, double* terms) {
-      const double weight = weights[i];
-      terms[0] = x[i] * weight, terms[1] = y[i] * weight, terms[2] = z[i] * weight;
-      terms[3] = weight;
-    }, sums);
+    add_up(
+        start, end - start,
+        [&](int64_t i, double* terms) {
+          const double weight = weights[i];
+          terms[0] = x[i] * weight, terms[1] = y[i] * weight, terms[2] = z[i] * weight;
+          terms[3] = weight;
+        },
+        sums);
     const double total = sums[3];
     for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total : 0;
     const double a = mean[0], b = mean[1], c = mean[2];
-    add_up(start, end - start, [&](int64_t i, double* terms) {
-      const double u = x[i] - a, v = y[i] - b, w = z[i] - c;
-      const double wu = weights[i] * u, wv = weights[i] * v, ww = weights[i] * w;
-      terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
-      terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
-    }, squares);
+    add_up(
+        start, end - start,
+        [&](int64_t i, double* terms) {
+          const double u = x[i] - a, v = y[i] - b, w = z[i] - c;
+          const double wu = weights[i] * u, wv = weights[i] * v, ww = weights[i] * w;
+          terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
+          terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
+        },
+        squares);
     const int index[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
     for (int entry = 0; entry < 9; entry++)
       covariances[9 * m + entry] = squares[index[entry]] / total;
@@ -184,7 +190,9 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
   return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
     const double *mean = means + 3 * m, *axis = axes + 3 * m, a = mean[0], b = mean[1], c = mean[2];
     const double p = axis[0], q = axis[1], r = axis[2];
-    const auto residual = [&](int64_t i) { return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r; };
+    const auto residual = [&](int64_t i) {
+      return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r;
+    };
     for (int64_t i = start; i < end; i++) {
       const double away = size_of(residual(i));
       weights[i] = away < double(INFINITE) ? away : double(INFINITE);
@@ -206,7 +214,7 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
 // extents.hull_candidates: whether the points (x, y) of each region are outside the octagon of its
 // farthest points.
 KERNEL hull_candidates(int64_t n, int64_t num, Doubles x, Doubles y, Longs counts, double rounding,
-                    bool* outer) {
+                       bool* outer) {
   return visit_regions(n, num, counts, [&](int64_t, int64_t start, int64_t end) {
     int64_t farthest[8];
     double maxima[8], largest = 0;
@@ -227,8 +235,8 @@ KERNEL hull_candidates(int64_t n, int64_t num, Doubles x, Doubles y, Longs count
     for (int e = 0; e < corners; e++) {
       const int64_t one = octagon[e], next = octagon[(e + 1) % corners];
       u[e] = y[one] - y[next], v[e] = x[next] - x[one];
-      offset[e] = u[e] * x[one] + v[e] * y[one] +
-                  rounding * larger(size_of(u[e]), size_of(v[e])) * largest;
+      offset[e] =
+          u[e] * x[one] + v[e] * y[one] + rounding * larger(size_of(u[e]), size_of(v[e])) * largest;
     }
     for (int64_t i = start; i < end; i++) {
       bool inside = corners > 2;

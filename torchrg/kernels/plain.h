@@ -41,13 +41,13 @@ struct Pair {
 typedef Pair<float, FourFloats> Lanes;
 typedef Pair<int32_t, FourFlags> Flags;
 
-#define ON_BOTH(Result, operation, Operand)                                              \
-  INLINE Result operator operation(Operand a, Operand b) {                               \
-    return Result(a.low operation b.low, a.high operation b.high);                       \
+#define ON_BOTH(Result, operation, Operand)                        \
+  INLINE Result operator operation(Operand a, Operand b) {         \
+    return Result(a.low operation b.low, a.high operation b.high); \
   }
-#define ON_BOTH_ASSIGN(operation, Operand)                                             \
-  ON_BOTH(Operand, operation, Operand)                                                   \
-  INLINE Operand& operator operation##=(Operand& a, Operand b) { return a = a operation b; }
+#define ON_BOTH_ASSIGN(operation, Operand) \
+  ON_BOTH(Operand, operation, Operand)     \
+  INLINE Operand& operator operation## = (Operand & a, Operand b) { return a = a operation b; }
 ON_BOTH_ASSIGN(+, Lanes)
 ON_BOTH_ASSIGN(-, Lanes)
 ON_BOTH_ASSIGN(*, Lanes)

@@ -74,9 +74,8 @@ INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_ref
 KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Ints indices,
               Flagged mask, Floats normals, Flagged valid, int64_t few, int64_t more,
               double breadth, double kurtosis, double fraction, int64_t num_refits,
-              int64_t min_count,
-              float* offsets, float* radius, float* whole, float* layered, bool* again,
-              float* of_fewer, float* of_more) {
+              int64_t min_count, float* offsets, float* radius, float* whole, float* layered,
+              bool* again, float* of_fewer, float* of_more) {
   if (few < 4 || more < 4 || uint64_t(num_refits) > MAX_WIDTH) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
@@ -103,9 +102,8 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
     whole[i] = valid[i] && count > 3 ? square_root(s2 / larger(count - 3, 1.0f)) : INFINITE;
     layered[i] = INFINITE;
     if (s4 * count < float(kurtosis) * s2 * s2 && is_finite(whole[i])) {
-      const float square =
-          of_layers(patch, {a, b, c, offsets[i], 0, 0, 0}, count, int(num_refits),
-                    float(min_count));
+      const float square = of_layers(patch, {a, b, c, offsets[i], 0, 0, 0}, count, int(num_refits),
+                                     float(min_count));
       const float deviation = square_root(square * count / larger(count - 4, 1.0f));
       if (deviation <= float(fraction) * whole[i]) layered[i] = deviation;
     }

@@ -3,7 +3,7 @@
 
 namespace {
 
-constexpr int QUICK_PASSES = 3;     // counting passes, at half the cost of the other passes
+constexpr int QUICK_PASSES = 3;      // counting passes, at half the cost of the other passes
 constexpr float QUARTERS = 0.3336f;  // normal data: Qn's difference / interquartile range
 
 struct Around {

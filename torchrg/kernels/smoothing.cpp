@@ -125,8 +125,8 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
                                            c * (other[2] - first[2]));
       const float shift = moved / noise;
       if (!(size_of(shift) < float(inlier_reach)) || !(a * a + b * b + c * c > 0)) continue;
-      const float voted = support(patch, weights, a / within, b / within, c / within,
-                                  moved / within);
+      const float voted =
+          support(patch, weights, a / within, b / within, c / within, moved / within);
       const float score = voted / all_weights - float(cost) * shift * shift;
       if (score > highest) highest = score, best = other, best_offset = moved;
     }

@@ -58,9 +58,9 @@ KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floa
 // superpoints._aggregate: groups rows by the smaller region, sums equal pairs, and sorts the
 // rows of a region by the larger region.
 KERNEL aggregate_boundaries(int64_t num_rows, int64_t num_starts, Ints a, Ints b,
-                      const double* contacts, const double* differences, int64_t* starts,
-                      int64_t* slots, int64_t* order, int32_t* first, int32_t* second,
-                      double* sum_contacts, double* sum_differences, int64_t* count) {
+                            const double* contacts, const double* differences, int64_t* starts,
+                            int64_t* slots, int64_t* order, int32_t* first, int32_t* second,
+                            double* sum_contacts, double* sum_differences, int64_t* count) {
   for (int64_t r = 0; r < num_starts; r++) starts[r] = 0, slots[r] = -1;
   for (int64_t e = 0; e < num_rows; e++) {
     const int64_t low = smaller(a[e], b[e]), high = larger(a[e], b[e]);
@@ -90,9 +90,9 @@ KERNEL aggregate_boundaries(int64_t num_rows, int64_t num_starts, Ints a, Ints b
 
 // superpoints._merge_costs
 KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, int64_t num_borders,
-                     const double* size, const double* means, const double* low,
-                     const double* high, Ints first, Ints second, const double* contacts,
-                     const double* differences, double min_cost, double bound, double* costs) {
+                     const double* size, const double* means, const double* low, const double* high,
+                     Ints first, Ints second, const double* contacts, const double* differences,
+                     double min_cost, double bound, double* costs) {
   for (int64_t e = 0; e < num_borders; e++) {
     const int64_t a = first[e], b = second[e];
     if (a < 0 || b < 0 || a >= num_regions || b >= num_regions) return NO_SUCH_ROW;
@@ -114,7 +114,7 @@ KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, in
 
 // superpoints._cheapest
 KERNEL cheapest_boundaries(int64_t num_borders, int64_t num_regions, Ints first, Ints second,
-                        const double* costs, double* lowest, int64_t* best) {
+                           const double* costs, double* lowest, int64_t* best) {
   for (int64_t r = 0; r < num_regions; r++) best[r] = num_borders;
   for (int64_t e = 0; e < num_borders; e++)
     for (int end = 0; end < 2; end++) {
