@@ -33,11 +33,15 @@ WORK = {
     "planes, `paper`": ("torchrg-paper", "pclrg", "open3d-planes"),
     "planes, `consensus` (default)": ("torchrg-consensus", "pclrg", "open3d-planes"),
     "normals, `pca`": ("torchrg-pca", "pclrg normals", "open3d-pca"),
-    "from file to file, `classic`": ("torchrg-classic-command", "pclrg whole", "open3d-command"),
-    "from file to file, `consensus`": (
-        "torchrg-consensus-command",
+    "from file to file, `classic`": (
+        "torchrg-classic-command whole",
         "pclrg whole",
-        "open3d-command",
+        "open3d-command whole",
+    ),
+    "from file to file, `consensus`": (
+        "torchrg-consensus-command whole",
+        "pclrg whole",
+        "open3d-command whole",
     ),
 }
 """Rows of the time table: the contender of each column."""
