@@ -12,7 +12,7 @@ The guide with recipes for other programs shows how their loaders use these resu
 
 To add a data set, derive from :class:`SceneDataset`: it works in a loader, and
 :class:`torchrg.batch.sources.CloudSource` converts it. To add a layout of depth frames, add a row
-to :data:`~torchrg.datasets.rgbd_layouts.LAYOUTS`.
+to :data:`~torchrg.datasets.rgbd_layouts.FRAME_LAYOUTS`.
 """
 
 from torchrg.datasets.collate import collate_offset
