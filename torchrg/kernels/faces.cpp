@@ -11,11 +11,16 @@ struct Forest {
   // Replaces a node by its root with path halving; returns whether the signs of both differ.
   INLINE_MEMBER bool climb(int32_t& node) const {
     bool flipped = false;
-    while (parents[node] != node) {
-      const int32_t parent = parents[node];
+    // Parents come before their children; a node of a broken forest becomes -1.
+    for (int32_t parent = parents[node]; parent != node; parent = parents[node]) {
+      const int32_t above = parent >= 0 && parent < node ? parents[parent] : -1;
+      if (above < 0 || above > parent) {
+        node = -1;
+        return false;
+      }
       is_flipped[node] ^= is_flipped[parent];  // A root is not flipped.
-      parents[node] = parents[parent];
-      flipped ^= is_flipped[node], node = parents[node];
+      parents[node] = above;
+      flipped ^= is_flipped[node], node = above;
     }
     return flipped;
   }
@@ -50,13 +55,13 @@ KERNEL compare_links(int64_t num_points, int64_t num_rows, int64_t k, Floats poi
 
 KERNEL link_nodes(int64_t num_links, int64_t num_nodes, Ints starts, Ints ends, Flagged flips,
                   int32_t* parents, bool* is_flipped, bool* is_contradictory) {
-  if (!are_rows(starts, num_links, num_nodes) || !are_rows(ends, num_links, num_nodes) ||
-      !are_rows(parents, num_nodes, num_nodes))
+  if (!are_rows(starts, num_links, num_nodes) || !are_rows(ends, num_links, num_nodes))
     return NO_SUCH_ROW;
   const Forest forest = {parents, is_flipped, is_contradictory};
   for (int64_t i = 0; i < num_links; i++) {
     int32_t low = starts[i], high = ends[i];
     const bool differs = forest.climb(low) ^ forest.climb(high) ^ flips[i];
+    if (low < 0 || high < 0) return NO_SUCH_ROW;
     if (low == high) {
       is_contradictory[low] |= differs;
       continue;
