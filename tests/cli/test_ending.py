@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 LINE = "torchrg: interrupted; every file written is complete.\n"
@@ -165,3 +166,14 @@ def test_a_signal_at_any_time_is_one_line_or_comes_too_late(room, tmp_path, undi
             assert len(list(out.iterdir())) == len(files)
         check_whole(out, files)
     assert 130 in codes
+
+
+def test_the_garbage_collector_runs_again_once_a_command_is_loaded(tmp_path):
+    np.save(tmp_path / "a.npy", np.eye(3))
+    code = (
+        "import gc; from torchrg.__main__ import main; was_on = gc.isenabled(); main(); "
+        "print(was_on, gc.isenabled(), gc.get_freeze_count() > 0)"
+    )
+    command = [sys.executable, "-c", code, "info", str(tmp_path / "a.npy")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False True True"
