@@ -68,7 +68,7 @@ def run(benchmark: Benchmark) -> None:
 
 
 def measure(benchmark: Benchmark) -> tuple[Results, bool]:
-    """Return all figures, including those of the file, and whether they are complete."""
+    """Return all figures, also from the file, and whether they are complete."""
     contenders = benchmark.contenders()
     unknown = set(benchmark.only) - set(contenders)
     if unknown:

@@ -168,7 +168,7 @@ def _blocks(run: Run, records: list[Record]) -> list[Block]:
             "gives neither the numbers of points nor the values of Figure 4. At 1.2 % and more "
             "the noise of these clouds is as large as their neighborhoods. MSAE is a mean of "
             "squares: an error of 90 degrees weighs as much as twenty of 20 degrees, so the "
-            "mean angle is given as well."
+            "mean angle is shown too."
         ),
         figure(
             "figures/figure3.png",

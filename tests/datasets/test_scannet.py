@@ -267,7 +267,7 @@ def test_what_two_objects_claim_is_told_and_the_later_has_it(scans, tmp_path):
 def test_two_objects_of_one_number_are_told(tree):
     path = tree / "scans" / "scene0010_00" / GROUPS
     path.write_text(groups(segments=[40]))
-    with pytest.warns(UserWarning, match=r"ID of another and are merged with it: 0\.$"):
+    with pytest.warns(UserWarning, match=r"ID with an earlier one and are merged into it: 0\.$"):
         assert ScanNet(tree)[1]["instance"].tolist() == [0, 0, 0, 0, -1, -1, -1, -1]
 
 

@@ -414,7 +414,7 @@ def _groups(
             member_ids.tolist(),
             np.flatnonzero(np.isin(vertex_segments, member_ids)),
         )
-    _warn_entries(path, "objects have the ID of another and are merged with it", repeated)
+    _warn_entries(path, "objects share an ID with an earlier one and are merged into it", repeated)
 
 
 def _warn_entries(path: Path, what: str, entries: Sequence[object]) -> None:

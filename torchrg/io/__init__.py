@@ -167,7 +167,7 @@ def write_cloud(
 
     Convention:
         A segmentation is written as ``label``, normals and ``curvature`` of each point, next to the
-        cloud's fields. The names are those of Open3D, CloudCompare, PCL and PDAL. A cloud field
+        cloud's fields. The names match Open3D, CloudCompare, PCL and PDAL. A cloud field
         with the name of a result is renamed to ``label_input``, ``normals_input`` and so on; if
         the cloud already has such a field, that field is kept instead.
         ``.npz`` contains ``points``, the cloud's ``color``, ``labels``, ``normals``, ``curvature``,
