@@ -8,11 +8,10 @@ or more.
 import ctypes
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from contextvars import Context, ContextVar, copy_context
+from contextvars import ContextVar, copy_context
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -153,29 +152,29 @@ def map_tasks(
         if num_threads < 2:
             return [work(task) for task in tasks]
         results, waiting = {}, iter(list(enumerate(tasks)))
+        grad_enabled, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
         def take_tasks() -> None:
+            token = _THREADS.set(1)
             try:
-                for index, task in waiting:
-                    results[index] = work(task)
+                with torch.inference_mode(inference), torch.set_grad_enabled(grad_enabled):
+                    for index, task in waiting:
+                        results[index] = work(task)
             finally:
                 # Drain the queue after an error, so that no further task starts.
                 for _ in waiting:
                     pass
-
-        # The calling thread also processes tasks.
-        settings = torch.is_grad_enabled(), torch.is_inference_mode_enabled(), copy_context()
-        with ThreadPoolExecutor(
-            num_threads - 1, initializer=_init_thread, initargs=settings
-        ) as pool:
-            others = [pool.submit(take_tasks) for _ in range(num_threads - 1)]
-            token = _THREADS.set(1)
-            try:
-                take_tasks()
-            finally:
                 _THREADS.reset(token)
-            for other in others:
-                other.result()
+
+        pool = _started_threads()
+        others = [pool.submit(copy_context().run, take_tasks) for _ in range(num_threads - 1)]
+        try:
+            # The calling thread also processes tasks.
+            take_tasks()
+        finally:
+            wait(others)
+        for other in others:
+            other.result()
         return [results[index] for index in range(len(tasks))]
 
 
@@ -197,17 +196,23 @@ def sequential_operations() -> Iterator[None]:
     if _THREADS.get() is not None:
         yield
         return
-    token = _THREADS.set(torch.get_num_threads())
+    token, pool_token = _THREADS.set(torch.get_num_threads()), _POOL.set([])
     before = _set_thread_counts([1] * (1 + len(_openmp_libraries())))
     try:
         yield
     finally:
+        for pool in _POOL.get():
+            pool.shutdown()
         _set_thread_counts(before)
+        _POOL.reset(pool_token)
         _THREADS.reset(token)
 
 
 _THREADS: ContextVar[int | None] = ContextVar("threads", default=None)
 """Number of threads for the tasks of this call; None outside of calls."""
+
+_POOL: ContextVar[list[ThreadPoolExecutor]] = ContextVar("pool")
+"""The threads of this call, empty until the first of them starts."""
 
 
 def allowed_threads() -> int:
@@ -220,22 +225,19 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_THREAD_LOCAL = threading.local()
+def _started_threads() -> ThreadPoolExecutor:
+    """Return the threads of this call; starting them for every stage would cost a millisecond."""
+    pools = _POOL.get()
+    if not pools:
+        pools.append(ThreadPoolExecutor(allowed_threads() - 1, initializer=_init_thread))
+    return pools[0]
 
 
-def _init_thread(grad_enabled: bool, inference: bool, context: Context) -> None:
-    """Limit a worker thread to sequential operations, with the settings of its parent."""
-    for variable, value in context.items():
-        variable.set(value)
-    _THREADS.set(1)
+def _init_thread() -> None:
+    """Limit a worker thread to sequential operations."""
     # Torch sets the number of threads of a thread at its first query.
     torch.get_num_threads()
     _set_thread_counts([1] * (1 + len(_openmp_libraries())))
-    torch.set_grad_enabled(grad_enabled)
-    if inference:
-        # The mode lasts as long as its guard, here as long as the thread.
-        _THREAD_LOCAL.inference = torch.inference_mode()
-        _THREAD_LOCAL.inference.__enter__()
 
 
 def _set_thread_counts(numbers: Sequence[int]) -> list[int]:

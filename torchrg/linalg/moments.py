@@ -18,7 +18,7 @@ from torchrg._checks import check_floating, check_shapes
 from torchrg._parallel import allowed_threads
 from torchrg.linalg.eigen import smallest_eigenvector3
 
-_MIN_POINTS = 2**16
+_MIN_POINTS = 2**14
 """Minimum number of points per thread."""
 
 _SORTED_SIZE = 50

@@ -5,12 +5,14 @@ normal and with the opposite one, and a link joins the copies that agree. A conn
 contains one copy of each of its nodes and is a face.
 """
 
+from threading import Lock
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, map_tasks, nonzero_rows
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
@@ -149,20 +151,26 @@ def _join_patches(
     limit = min(max(_BEND_FACTOR * typical, _MIN_BEND), _MAX_BEND)
     node = torch.full((len(points),), -1, dtype=torch.int32)
     node[rows] = torch.arange(len(rows), dtype=torch.int32)
-    patches = _Components(len(rows))
-    for chunk in torch.split(rows, ROWS_AT_ONCE):
+    patches, lock = _Components(len(rows)), Lock()
+
+    def link(chunk: Tensor) -> None:
         ends = gather_lists(near, chunk, ranks)
         cosine, bend = _compare(points, normals, chunk, ends)
         there = node[ends]
         is_smooth = (bend <= limit) & (there >= 0)
         starts = node[chunk].repeat_interleave(is_smooth.sum(dim=1))
-        patches.link(starts, there[is_smooth], cosine[is_smooth] < 0)
+        links = starts, there[is_smooth], cosine[is_smooth] < 0
+        # The components do not depend on the order of the links.
+        with lock:
+            patches.link(*links)
+
+    map_tasks(link, torch.split(rows, ROWS_AT_ONCE), rows.device)
     patch, sign = patches.find()
     del node, patches
     faces, signs = faces.clone(), signs.clone()
     faces[rows], signs[rows] = num_faces + patch, sign.to(signs)
-    links = []
-    for chunk in torch.split(rows, ROWS_AT_ONCE):
+
+    def compare(chunk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         ends = gather_lists(near, chunk, ranks)
         is_between = faces[ends] != faces[chunk, None]
         has_any = is_between.any(dim=1)
@@ -172,7 +180,9 @@ def _join_patches(
         ends = ends[is_between]
         trust = (1 - bend / 2).clamp(min=0) ** _TRUST_POWER
         agreement = trust * cosine.sign() * signs[starts] * signs[ends]
-        links.append((faces[starts], faces[ends], agreement))
+        return faces[starts], faces[ends], agreement
+
+    links = map_tasks(compare, torch.split(rows, ROWS_AT_ONCE), rows.device)
     low, high, agreement = (torch.cat(parts) for parts in zip(*links, strict=True))
     sizes = torch.bincount(faces)
     joined, flips = _join_faces(low, high, agreement, sizes, strong)

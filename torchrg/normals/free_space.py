@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, map_tasks
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks
 from torchrg.linalg.moments import dot, kth_smallest
 from torchrg.normals.faces import gather_lists
 
@@ -66,7 +66,12 @@ def vote_free_side(
     at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell])
     cell = np.searchsorted(cells, codes[rows].numpy())
     normal = normals[rows]
-    front, back = _find_obstacles(points, normals, near, rows, width)
+    obstacles = map_tasks(
+        lambda chunk: _find_obstacles(points, normals, near, chunk, width),
+        torch.split(rows, ROWS_IN_CACHE),
+        points.device,
+    )
+    front, back = (torch.cat(side) for side in zip(*obstacles, strict=True))
 
     def vote(steps: tuple[int, ...]) -> Tensor:
         stride = math.sqrt(sum(step * step for step in steps))
