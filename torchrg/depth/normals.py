@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import nonzero_rows
+from torchrg._parallel import map_tasks, nonzero_rows
 from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import (
     CELL_SIZES,
@@ -134,7 +134,7 @@ def fit_pixels(
         Biomedical Images, 1976.
     """
     squares = fit_windows(image)
-    noises = noise_by_size(squares, noise, dtype)
+    noises, jitter = _measure_noise(squares, noise, dtype)
     window = torch.arange(image.seen.numel(), device=image.seen.device).view(image.seen.shape)
     choice = Choice(window, torch.zeros_like(image.seen), torch.zeros_like(image.seen))
     first = sum(math.prod(table.shape[1:]) for table in squares.values())
@@ -149,9 +149,7 @@ def fit_pixels(
     indices = torch.full_like(choice.window, -1)
     indices.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
     narrow = fit_narrow_windows(image, indices, pixels)
-    rate_windows(
-        {1: narrow}, 1, noises, focal, jitter=find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)
-    )
+    rate_windows({1: narrow}, 1, noises, focal, jitter=jitter)
     chosen, off_center = choose_narrow(image, indices, pixels, narrow)
     is_taken = chosen >= 0
     pixel = pixels[is_taken]
@@ -159,6 +157,20 @@ def fit_pixels(
     choice.flat.view(-1)[pixel] = True
     choice.edge.view(-1)[pixel] = off_center[is_taken]
     return PixelPlanes(choice, squares, narrow, pixels, noises[CELL_SIZES[0]])
+
+
+def _measure_noise(
+    squares: Mapping[int, Tensor], noise: tuple[float, float] | None, dtype: torch.dtype
+) -> tuple[dict[int, WindowNoise], float]:
+    """Return the noise of windows of each size and the jitter of rays, measured in threads."""
+    noises: dict[int, WindowNoise] = {}
+    jitter: list[float] = []
+    tasks = [
+        lambda: noises.update(noise_by_size(squares, noise, dtype)),
+        lambda: jitter.append(find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)),
+    ]
+    map_tasks(lambda task: task(), tasks, squares[_STEEP_SIZE].device)
+    return noises, jitter[0]
 
 
 def rate_windows(
