@@ -119,7 +119,44 @@ int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) 
   return DONE;
 }
 
+// Segments.coordinates: coordinates (A, n) of rows along the axes of their regions, about centers.
+template <class T>
+int64_t project(int64_t P, int64_t n, int64_t num, int64_t num_axes, const T* x, const T* y,
+                const T* z, Longs rows, Longs counts, Doubles centers, Doubles axes,
+                double* coordinates) {
+  for (int64_t i = 0; i < n; i++)
+    if (rows[i] < 0 || rows[i] >= P) return NO_SUCH_ROW;
+  double u[BLOCK], v[BLOCK], w[BLOCK];
+  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
+    const double *center = centers + 3 * m, *axis = axes + 3 * num_axes * m;
+    for (int64_t from = start; from < end; from += BLOCK) {
+      const int count = int(smaller(end - from, int64_t(BLOCK)));
+      for (int j = 0; j < count; j++) {
+        const int64_t row = rows[from + j];
+        u[j] = x[row] - center[0], v[j] = y[row] - center[1], w[j] = z[row] - center[2];
+      }
+      for (int64_t a = 0; a < num_axes; a++) {
+        const double p = axis[3 * a], q = axis[3 * a + 1], r = axis[3 * a + 2];
+        for (int j = 0; j < count; j++)
+          coordinates[a * n + from + j] = u[j] * p + v[j] * q + w[j] * r;
+      }
+    }
+  });
+}
+
 }  // namespace
+
+KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Floats x, Floats y,
+                           Floats z, Longs rows, Longs counts, Doubles centers, Doubles axes,
+                           double* coordinates) {
+  return project(P, n, num, num_axes, x, y, z, rows, counts, centers, axes, coordinates);
+}
+
+KERNEL segment_coordinates_double(int64_t P, int64_t n, int64_t num, int64_t num_axes, Doubles x,
+                                  Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
+                                  Doubles axes, double* coordinates) {
+  return project(P, n, num, num_axes, x, y, z, rows, counts, centers, axes, coordinates);
+}
 
 // Segments.rows, counts and sizes. Large regions are subsampled at a regular step to at most
 // `max_points`.
@@ -148,30 +185,6 @@ KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t max_points, in
   });
   for (int64_t m = 0; m < num; m++) counts[m] = ends[m] - (m ? ends[m - 1] : 0);
   return DONE;
-}
-
-// Segments.coordinates: coordinates (A, n) of rows along the axes of their regions, about centers.
-KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Doubles x,
-                           Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
-                           Doubles axes, double* coordinates) {
-  for (int64_t i = 0; i < n; i++)
-    if (rows[i] < 0 || rows[i] >= P) return NO_SUCH_ROW;
-  double u[BLOCK], v[BLOCK], w[BLOCK];
-  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
-    const double *center = centers + 3 * m, *axis = axes + 3 * num_axes * m;
-    for (int64_t from = start; from < end; from += BLOCK) {
-      const int count = int(smaller(end - from, int64_t(BLOCK)));
-      for (int j = 0; j < count; j++) {
-        const int64_t row = rows[from + j];
-        u[j] = x[row] - center[0], v[j] = y[row] - center[1], w[j] = z[row] - center[2];
-      }
-      for (int64_t a = 0; a < num_axes; a++) {
-        const double p = axis[3 * a], q = axis[3 * a + 1], r = axis[3 * a + 2];
-        for (int j = 0; j < count; j++)
-          coordinates[a * n + from + j] = u[j] * p + v[j] * q + w[j] * r;
-      }
-    }
-  });
 }
 
 // Segments.moments: means and covariances of weighted points, about zero if not centered.

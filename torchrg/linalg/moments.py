@@ -21,6 +21,12 @@ from torchrg.linalg.eigen import smallest_eigenvector3
 _MIN_POINTS = 2**14
 """Minimum number of points per thread."""
 
+_COORDINATE_KERNELS = {
+    torch.float32: "segment_coordinates",
+    torch.float64: "segment_coordinates_double",
+}
+"""Kernels for the coordinates of vectors, by dtype."""
+
 _SORTED_SIZE = 50
 """Mean number of points per region below which one sort of all values is faster than a selection
 per region."""
@@ -187,9 +193,9 @@ class Segments:
 
         ``vectors`` are ``(N, 3)``, ``axes`` ``(M, A, 3)``; returns A columns ``(n,)``, float64.
         """
-        if self.are_served(vectors) and centers.dtype == torch.float64:
-            tables = self.rows, self.counts, centers, axes
-            return list(kernels.call("segment_coordinates", *vectors.unbind(dim=1), *tables)[0])
+        if self.are_served(centers) and vectors.dtype in _COORDINATE_KERNELS:
+            name, tables = _COORDINATE_KERNELS[vectors.dtype], (self.rows, self.counts)
+            return list(kernels.call(name, *vectors.unbind(dim=1), *tables, centers, axes)[0])
         about, columns = self.gather_centered(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
@@ -201,7 +207,7 @@ class Segments:
 
     def gather_centered(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Apply :meth:`gather` to vectors ``(N, 3)``, relative to region centers ``(M, 3)``."""
-        if self.are_served(vectors) and centers.dtype == torch.float64:
+        if self.are_served(centers) and vectors.dtype in _COORDINATE_KERNELS:
             eye = torch.eye(3, dtype=torch.float64, device=centers.device)
             return self.coordinates(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)

@@ -116,11 +116,11 @@ def _split_plates(
     def mean(values: Tensor) -> Tensor:
         return torch.bincount(faces, values, minlength=len(axes)) / counts
 
-    height = dot(points, axes[faces]).double()
-    middle = height - mean(height)[faces]
+    middle = dot(points, axes[faces]).double()
+    middle -= mean(middle)[faces]
     for _ in range(2):
-        reach = _MAX_HEIGHT_FACTOR * mean(middle.abs())[faces]
-        middle = torch.minimum(torch.maximum(middle, -reach), reach)
+        reach = (_MAX_HEIGHT_FACTOR * mean(middle.abs()))[faces]
+        middle.clamp_(max=reach).clamp_(min=reach.neg_())
         middle -= mean(middle)[faces]
     squares = mean(middle * middle)
     is_thin = squares <= max_thickness * max_thickness
@@ -146,27 +146,7 @@ def _join_patches(
     """
     rows, num_faces = nonzero_rows(faces < 0), int(faces.max()) + 1
     ranks = [rank for rank in _RANKS if rank < near.shape[1]]
-    bend = _compare(points, normals, rows[::8], gather_lists(near, rows[::8], ranks))[1]
-    typical = float(bend.median()) if bend.numel() else 0.0
-    limit = min(max(_BEND_FACTOR * typical, _MIN_BEND), _MAX_BEND)
-    node = torch.full((len(points),), -1, dtype=torch.int32)
-    node[rows] = torch.arange(len(rows), dtype=torch.int32)
-    patches, lock = _Components(len(rows)), Lock()
-
-    def link(chunk: Tensor) -> None:
-        ends = gather_lists(near, chunk, ranks)
-        cosine, bend = _compare(points, normals, chunk, ends)
-        there = node[ends]
-        is_smooth = (bend <= limit) & (there >= 0)
-        starts = node[chunk].repeat_interleave(is_smooth.sum(dim=1))
-        links = starts, there[is_smooth], cosine[is_smooth] < 0
-        # The components do not depend on the order of the links.
-        with lock:
-            patches.link(*links)
-
-    map_tasks(link, torch.split(rows, ROWS_AT_ONCE), rows.device)
-    patch, sign = patches.find()
-    del node, patches
+    patch, sign = _grow_patches(points, normals, near, rows, ranks)
     faces, signs = faces.clone(), signs.clone()
     faces[rows], signs[rows] = num_faces + patch, sign.to(signs)
 
@@ -187,6 +167,32 @@ def _join_patches(
     sizes = torch.bincount(faces)
     joined, flips = _join_faces(low, high, agreement, sizes, strong)
     return joined[faces], signs * flips[faces].to(signs)
+
+
+def _grow_patches(
+    points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, ranks: list[int]
+) -> tuple[Tensor, Tensor]:
+    """Return the smooth patch of each of the points ``rows`` ``(n,)``, and its sign in it."""
+    bend = _compare(points, normals, rows[::8], gather_lists(near, rows[::8], ranks))[1]
+    typical = float(bend.median()) if bend.numel() else 0.0
+    limit = min(max(_BEND_FACTOR * typical, _MIN_BEND), _MAX_BEND)
+    node = torch.full((len(points),), -1, dtype=torch.int32)
+    node[rows] = torch.arange(len(rows), dtype=torch.int32)
+    patches, lock = _Components(len(rows)), Lock()
+
+    def link(chunk: Tensor) -> None:
+        ends = gather_lists(near, chunk, ranks)
+        cosine, bend = _compare(points, normals, chunk, ends)
+        there = node[ends]
+        is_smooth = (bend <= limit) & (there >= 0)
+        starts = node[chunk].repeat_interleave(is_smooth.sum(dim=1))
+        links = starts, there[is_smooth], cosine[is_smooth] < 0
+        # The components do not depend on the order of the links.
+        with lock:
+            patches.link(*links)
+
+    map_tasks(link, torch.split(rows, ROWS_AT_ONCE), rows.device)
+    return patches.find()
 
 
 def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:

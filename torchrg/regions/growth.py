@@ -16,6 +16,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
 from torchrg._parallel import (
     CHUNK_SIZE,
     ROWS_AT_ONCE,
+    map_chunks,
     sequential_operations,
     split_rows,
 )
@@ -204,7 +205,13 @@ def checked_cloud(
         check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
         check_floating(caller, points=points, residual_rms=residual_rms)
         # The noise is unknown if the fit is exact.
-        floor = config.coplanarity_floor * neighborhood_radii(points, neighbors)
+        radii = map_chunks(
+            lambda rows: neighborhood_radii(points, neighbors.select(rows)),
+            len(points),
+            ROWS_AT_ONCE,
+            points.device,
+        )
+        floor = config.coplanarity_floor * torch.cat(radii)
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid

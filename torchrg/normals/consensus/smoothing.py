@@ -46,9 +46,8 @@ def smooth_planes(
     Returns all planes.
     """
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
-    parts = planes.normals.T.contiguous()
     are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
-    table = _table(points, planes, errors) if are_served else points
+    table = _table(points, planes, errors) if are_served else planes.normals.T.contiguous()
     parameters = (
         constants.SMOOTHING_AGREEMENT,
         constants.SMOOTHING_REACH,
@@ -65,7 +64,7 @@ def smooth_planes(
             )
             return
         normals[chosen], offsets[chosen] = _smooth_rows(
-            points, *neighbors, parts, planes.offsets, noise, errors, chosen
+            points, *neighbors, table, planes.offsets, noise, errors, chosen
         )
 
     map_chunks(work, len(rows), chunk_size, rows.device)
