@@ -68,8 +68,8 @@ def find_faces(
     faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
     rows = nonzero_rows(labels >= 0)
     label, axes = labels[rows].long(), axes.to(points)
-    cosine = dot(normals[rows], axes[label])
-    side, is_thin = _split_plates(points[rows], label, axes, max_thickness)
+    cosine = _project(normals, rows, axes, label)
+    side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
     is_on_plane = is_thin[label] & (cosine.abs() > _MIN_COSINE)
     rows = rows[is_on_plane]
     faces[rows], signs[rows] = (2 * label + side)[is_on_plane], cosine[is_on_plane].sign()
@@ -81,7 +81,7 @@ def find_faces(
     sums = normals.new_zeros(len(indices), 3)
     sums.index_add_(0, patch, normals[rows] * signs[rows, None])
     axes = torch.nn.functional.normalize(sums, dim=1)
-    side, _ = _split_plates(points[rows], patch, axes, max_thickness)
+    side, _ = _split_plates(points, rows, patch, axes, max_thickness)
     joined[rows] += len(has_plane) * side
     return joined, signs
 
@@ -105,18 +105,18 @@ def find_surfaces(points: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor
 
 
 def _split_plates(
-    points: Tensor, faces: Tensor, axes: Tensor, max_thickness: float
+    points: Tensor, rows: Tensor, faces: Tensor, axes: Tensor, max_thickness: float
 ) -> tuple[Tensor, Tensor]:
     """Return the side of each point ``(n,)``, 0 or 1 on a plate, and a mask of thin faces ``(M,)``.
 
-    Faces ``(n,)`` are rows of their axes ``(M, 3)``.
+    The points ``rows`` ``(n,)`` are on ``faces`` ``(n,)``, rows of the ``axes`` ``(M, 3)``.
     """
     counts = torch.bincount(faces, minlength=len(axes)).clamp(min=1)
 
     def mean(values: Tensor) -> Tensor:
         return torch.bincount(faces, values, minlength=len(axes)) / counts
 
-    middle = dot(points, axes[faces]).double()
+    middle = _project(points, rows, axes, faces).double()
     middle -= mean(middle)[faces]
     for _ in range(2):
         reach = (_MAX_HEIGHT_FACTOR * mean(middle.abs()))[faces]
@@ -126,6 +126,17 @@ def _split_plates(
     is_thin = squares <= max_thickness * max_thickness
     is_plate = is_thin & (mean(middle.abs()) ** 2 > _MIN_TWO_SIDED * squares)
     return ((middle > 0) & is_plate[faces]).long(), is_thin
+
+
+def _project(vectors: Tensor, rows: Tensor, axes: Tensor, faces: Tensor) -> Tensor:
+    """Return the coordinates ``(n,)`` of some of the vectors along the axes of their faces."""
+    parts = map_chunks(
+        lambda part: dot(vectors[rows[part]], axes[faces[part]]),
+        len(rows),
+        ROWS_AT_ONCE,
+        vectors.device,
+    )
+    return torch.cat(parts)
 
 
 def _join_patches(

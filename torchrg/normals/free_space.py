@@ -55,16 +55,7 @@ def vote_free_side(
     Points ``(N, 3)`` are in canonical order, ``near`` ``(N, K)`` are rows of their neighbors, and
     ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive if the normal points to the freer side.
     """
-    low = points.amin(dim=0)
-    codes = torch.zeros(len(points), dtype=torch.int64)
-    for axis in range(3):
-        codes *= _MAX_CELLS
-        codes += ((points[:, axis] - low[axis]) / width).long()
-    cells = np.sort(torch.unique_consecutive(codes).numpy())
-    cells = cells[np.append(True, cells[1:] != cells[:-1])]
-    x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
-    at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell])
-    cell = np.searchsorted(cells, codes[rows].numpy())
+    at, cell = _mark_cells(points, rows, width)
     normal = normals[rows]
     obstacles = map_tasks(
         lambda chunk: _find_obstacles(points, normals, near, chunk, width),
@@ -85,6 +76,22 @@ def vote_free_side(
         return cosine * cosine.abs() * (ahead - behind)
 
     return reduce(torch.add, map_tasks(vote, _HALF_DIRECTIONS, points.device))
+
+
+def _mark_cells(
+    points: Tensor, rows: Tensor, width: float
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Return the occupied cells ``(3, C)`` of a grid, and the index of the cell of some points."""
+    low = points.amin(dim=0)
+    codes = torch.zeros(len(points), dtype=torch.int64)
+    for axis in range(3):
+        codes *= _MAX_CELLS
+        codes += ((points[:, axis] - low[axis]) / width).long()
+    cells = np.sort(torch.unique_consecutive(codes).numpy())
+    cells = cells[np.append(True, cells[1:] != cells[:-1])]
+    x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
+    at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell]).astype(np.int32)
+    return at, np.searchsorted(cells, codes[rows].numpy())
 
 
 def cell_width(points: Tensor, near: Tensor) -> float:
@@ -120,23 +127,24 @@ def _find_obstacles(
 
 
 def _free_paths(
-    at: NDArray[np.int64], steps: tuple[int, ...], stride: float
+    at: NDArray[np.int32], steps: tuple[int, ...], stride: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the weights of the free paths from cells ``(3, C)`` in a direction and its opposite.
 
     Each is ``(C,)``. Gaps between the cells of a line are paths, without a grid of empty cells.
     """
-    sides = at.max(axis=1) + 1
+    sides = (at.max(axis=1) + 1).tolist()
     a = next(axis for axis in range(3) if steps[axis])
     b, c = (axis for axis in range(3) if axis != a)
     first, second = (at[axis] - steps[axis] * at[a] + sides[a] for axis in (b, c))
-    order = np.argsort((first * (sides[c] + 2 * sides[a]) + second) * sides[a] + at[a])
+    lines = first.astype(np.int64) * (sides[c] + 2 * sides[a]) + second
+    order = np.argsort(lines * sides[a] + at[a])
     first, second, along = first[order], second[order], at[a][order]
     is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
     gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)
 
-    def score(gap: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
-        free = np.empty(len(order), np.int64)
+    def score(gap: NDArray[np.int32], sign: int) -> NDArray[np.float32]:
+        free = np.empty(len(order), np.int32)
         free[order] = gap
         to_ends = [
             sides[axis] - 1 - at[axis] if steps[axis] * sign > 0 else at[axis]
