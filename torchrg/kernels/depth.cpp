@@ -344,8 +344,8 @@ namespace {
 // Properties shared by all pixels of a window.
 struct Described {
   int64_t number = -1;
-  Window window;
-  double slopes[2], origin, deviation, limit, length, normal[3];
+  Window window = {};
+  double slopes[2] = {}, origin = 0, deviation = 0, limit = 0, length = 1, normal[3] = {};
 
   INLINE_MEMBER void look_at(const Windows& all, int64_t window_number, const double* focal) {
     if (number == window_number) return;

@@ -88,12 +88,12 @@ double select(double* values, int64_t count, int64_t k) {
   for (int j = 0; j < SAMPLES; j++) samples[j] = values[count / SAMPLES * j + count / SAMPLES / 2];
   const int64_t middle = k * SAMPLES / count;
   const double low = select_by_parts(samples, SAMPLES, larger(middle - MARGIN, int64_t(0))),
-               high = select_by_parts(samples, SAMPLES, smaller(middle + MARGIN, int64_t(SAMPLES - 1)));
+               high = select_by_parts(samples, SAMPLES,
+                                      smaller(middle + MARGIN, int64_t(SAMPLES - 1)));
   int64_t below = 0;
   for (int64_t i = 0; i < count; i++) below += values[i] < low;
-  const int64_t within = move_down(values, 0, count - 1, [&](double value) {
-    return (value >= low) & (value <= high);
-  });
+  const int64_t within = move_down(values, 0, count - 1,
+                                   [&](double value) { return (value >= low) & (value <= high); });
   const bool is_within = k >= below && k < below + within;
   return is_within ? select_by_parts(values, within, k - below) : select_by_parts(values, count, k);
 }
