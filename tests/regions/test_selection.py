@@ -18,6 +18,7 @@ from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import write_cloud
+from torchrg.regions.selection import keep_planes
 from torchrg.result import read_result
 from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Cloud
 from torchrg.transforms import SegmentDepth, SegmentPlanes
@@ -79,23 +80,25 @@ def test_adjacency_and_outlines_follow(whole, points):
     outlined = torchrg.segment_planes(
         points, "classic", **{"planes.up": "z", "planes.outline": True}
     )
-    chosen = torchrg.select_planes(outlined, **ASKED)
-    old = [int(outlined.labels[chosen.labels == row][0]) for row in range(len(chosen.planes))]
     met = {
         tuple(pair): (float(length), float(angle))
         for pair, length, angle in zip(
             outlined.planes.adjacency.pairs.tolist(), *outlined.planes.adjacency[1:], strict=True
         )
     }
-    pairs, *sizes = chosen.planes.adjacency
-    for (a, b), *values in zip(pairs.tolist(), *sizes, strict=True):
-        assert a < b
-        assert met[tuple(sorted((old[a], old[b])))] == tuple(map(float, values))
-    assert pairs.tolist() == sorted(pairs.tolist())
-    assert len(pairs) == sum(set(pair) <= set(old) for pair in met)
-    assert len(pairs) > 3
-    for outline, row in zip(chosen.planes.outline, old, strict=True):
-        assert outline is outlined.planes.outline[row]
+    # In reversed order the planes of every pair are exchanged.
+    backwards = torch.arange(len(outlined.planes)).flip(0)
+    for chosen in (torchrg.select_planes(outlined, **ASKED), keep_planes(outlined, backwards)):
+        old = [int(outlined.labels[chosen.labels == row][0]) for row in range(len(chosen.planes))]
+        pairs, *sizes = chosen.planes.adjacency
+        for (a, b), *values in zip(pairs.tolist(), *sizes, strict=True):
+            assert a < b
+            assert met[tuple(sorted((old[a], old[b])))] == tuple(map(float, values))
+        assert pairs.tolist() == sorted(pairs.tolist())
+        assert len(pairs) == sum(set(pair) <= set(old) for pair in met)
+        assert len(pairs) > 3
+        for outline, row in zip(chosen.planes.outline, old, strict=True):
+            assert outline is outlined.planes.outline[row]
 
 
 def test_order_by_points_and_by_area(whole):
