@@ -7,7 +7,7 @@ import torch
 
 from torchrg.datasets import RGBDFrames
 from torchrg.depth import depth_to_points, segment_depth
-from torchrg.depth.camera import Pinhole, make_intrinsics
+from torchrg.depth.camera import Pinhole, describe_improbable_view, make_intrinsics
 from torchrg.errors import ConfigError, DepthWarning
 from torchrg.render import write_png
 from torchrg.transforms import DepthToCloud, SegmentDepth, fuse_depth
@@ -154,3 +154,10 @@ def test_images_without_rows_or_columns_have_no_planes(shape):
     assert SegmentDepth()(sample)["plane"].shape == (2, *shape)
     assert DepthToCloud()(sample)["color"].shape == (0, 3)
     assert depth_to_points(batch[:, 0], camera.expand(2, 3, 3)).shape == (2, *shape, 3)
+
+
+@pytest.mark.parametrize("shift", [-6.6, -6.4, 6.4, 6.6])
+def test_an_axis_is_off_the_center_equally_on_both_sides(shift):
+    """0.15 of 40 pixels and half a pixel, from the center at 19.5."""
+    camera = Pinhole(30.0, 30.0, 19.5 + shift, 19.5)
+    assert bool(describe_improbable_view("f", camera, (40, 40))) == (abs(shift) > 6.5)
