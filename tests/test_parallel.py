@@ -6,12 +6,14 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from threading import Event, Thread
+from threading import Barrier, Event, Thread, current_thread
+from time import sleep
 
 import pytest
 import torch
 
 import torchrg
+from torchrg._parallel import map_tasks, sequential_operations
 from torchrg.robust import fit_detmcd
 
 ALL_WORK = """
@@ -136,3 +138,48 @@ def test_inference_mode_holds_in_all_threads(set_threads):
     with torch.inference_mode():
         fit = fit_detmcd(patches)
     assert torch.equal(fit.location, expected.location)
+
+
+def thread_states(look, number=2):
+    """Call ``look`` once in each of several threads at the same time."""
+    together = Barrier(number)
+
+    def work(_):
+        together.wait(timeout=60)
+        return look()
+
+    return map_tasks(work, range(number), torch.device("cpu"))
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_tasks_have_the_gradient_mode_of_their_caller(enabled, set_threads):
+    set_threads(2)
+    with torch.set_grad_enabled(enabled):
+        assert thread_states(torch.is_grad_enabled) == [enabled] * 2
+    with torch.inference_mode(enabled):
+        assert thread_states(torch.is_inference_mode_enabled) == [enabled] * 2
+
+
+def test_threads_start_once_in_a_call_and_end_with_it(set_threads):
+    set_threads(2)
+    with sequential_operations():
+        first, second = ({*thread_states(current_thread)} for _ in range(2))
+    assert first == second
+    assert len(first) == 2
+    assert [thread for thread in first if thread.is_alive()] == [current_thread()]
+
+
+def test_an_error_waits_for_the_tasks_of_other_threads(set_threads):
+    set_threads(2)
+    caller, ended = current_thread(), []
+
+    def look():
+        if current_thread() is caller:
+            raise ValueError("here")
+        sleep(0.2)
+        ended.append(True)
+
+    with sequential_operations():
+        with pytest.raises(ValueError, match="here"):
+            thread_states(look)
+        assert ended == [True]
