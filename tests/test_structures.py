@@ -1,12 +1,16 @@
-"""Results are shown in one line."""
+"""Clouds, segmentations and planes as objects."""
 
 import numpy as np
 import pytest
 import torch
 
 import torchrg
-from torchrg.config import DepthConfig, NormalsConfig, SuperpointsConfig, load_config
+from tests.regions.test_table import columns_of
 from torchrg.depth import segment_depth
+from torchrg.errors import ShapeError
+from torchrg.pipeline import segment_planes
+from torchrg.scenes import make_room
+from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Cloud
 
 
 @pytest.fixture(scope="module")
@@ -41,17 +45,51 @@ def test_a_segmentation_is_no_tuple(seg):
         assert not hasattr(seg, name)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        load_config(),
-        load_config("classic", **{"growing.min_size": 7}),
-        NormalsConfig(method="pca", k=9),
-        SuperpointsConfig(counts=(30,)),
-        DepthConfig(max_depth=4.0),
-    ],
-)
-def test_settings_are_shown_as_the_call_that_makes_them(config):
-    names = (load_config, NormalsConfig, SuperpointsConfig, DepthConfig)
-    assert eval(repr(config), {name.__name__: name for name in names}) == config
-    assert len(repr(config)) < 100
+def test_a_table_is_gone_through_plane_by_plane():
+    pytest.importorskip("shapely", reason="needs torchrg[outline]")
+    points = make_room(3000, noise=0.003, seed=0).points
+    seg = segment_planes(points, "classic", **{"planes.up": "z", "planes.outline": True})
+    planes = seg.planes
+    assert len(planes) == len(planes.normal) == len(list(planes)) > 5
+    for row, plane in enumerate(planes):
+        assert plane.id == row
+        assert plane.count == int((seg.labels == row).sum())
+        assert plane.kind == PLANE_KINDS[planes.kind[row]]
+        assert plane.outline is planes.outline[row]
+        for name in PLANE_COLUMNS:
+            one, column = getattr(plane, name), getattr(planes, name)[row]
+            assert type(one) in (torch.Tensor, float, int, bool)
+            assert torch.equal(torch.as_tensor(one, dtype=column.dtype), column)
+    assert planes[-1].id == len(planes) - 1
+    assert planes[torch.tensor(2)].id == 2
+    with pytest.raises(IndexError, match=f"expected a row below {len(planes)}, got 99"):
+        planes[99]
+    with pytest.raises(TypeError, match="got slice; index columns with slices and masks"):
+        planes[:3]
+
+
+def test_a_segmentation_goes_to_a_device_whole():
+    seg = segment_planes(make_room(2000, seed=0).points, "classic", keep_neighbors=True)
+    away = seg.to("meta")
+    tensors = [
+        away.labels,
+        away.normals,
+        away.points,
+        away.neighbors.indices,
+        *columns_of(away.planes),
+    ]
+    assert {part.device.type for part in (*tensors, *away.planes.adjacency)} == {"meta"}
+    back = seg.cpu()
+    assert torch.equal(back.labels, seg.labels)
+    assert torch.equal(back.planes.normal, seg.planes.normal)
+    assert back.sampling == seg.sampling
+
+
+def test_a_cloud_takes_tensors():
+    front = torch.ones(3, 3)
+    cloud = Cloud(torch.eye(3), {"labels": torch.arange(3)}, front=front)
+    values = cloud.coordinates, cloud.fields["labels"], cloud.front
+    assert all(isinstance(value, np.ndarray) for value in values)
+    assert torch.equal(cloud.points, torch.eye(3))
+    with pytest.raises(ShapeError, match=r"got list; use numpy\.array"):
+        Cloud([[0.0, 0.0, 1.0]])

@@ -8,9 +8,7 @@ import torch
 
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
-from torchrg.pipeline import segment_planes
 from torchrg.regions import summarize_planes
-from torchrg.scenes import make_room
 from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS
 
 
@@ -258,43 +256,3 @@ def test_rounding_does_not_decide_the_sign_of_a_normal():
             unit * flat, truth.expand(200, 3), torch.zeros(200, dtype=torch.int64)
         )
         assert torch.allclose(planes.normal[0], truth, atol=1e-9)
-
-
-def test_a_table_is_gone_through_plane_by_plane():
-    pytest.importorskip("shapely", reason="needs torchrg[outline]")
-    points = make_room(3000, noise=0.003, seed=0).points
-    seg = segment_planes(points, "classic", **{"planes.up": "z", "planes.outline": True})
-    planes = seg.planes
-    assert len(planes) == len(planes.normal) == len(list(planes)) > 5
-    for row, plane in enumerate(planes):
-        assert plane.id == row
-        assert plane.count == int((seg.labels == row).sum())
-        assert plane.kind == PLANE_KINDS[planes.kind[row]]
-        assert plane.outline is planes.outline[row]
-        for name in PLANE_COLUMNS:
-            one, column = getattr(plane, name), getattr(planes, name)[row]
-            assert type(one) in (torch.Tensor, float, int, bool)
-            assert torch.equal(torch.as_tensor(one, dtype=column.dtype), column)
-    assert planes[-1].id == len(planes) - 1
-    assert planes[torch.tensor(2)].id == 2
-    with pytest.raises(IndexError, match=f"expected a row below {len(planes)}, got 99"):
-        planes[99]
-    with pytest.raises(TypeError, match="got slice; index columns with slices and masks"):
-        planes[:3]
-
-
-def test_a_segmentation_goes_to_a_device_whole():
-    seg = segment_planes(make_room(2000, seed=0).points, "classic", keep_neighbors=True)
-    away = seg.to("meta")
-    tensors = [
-        away.labels,
-        away.normals,
-        away.points,
-        away.neighbors.indices,
-        *columns_of(away.planes),
-    ]
-    assert {part.device.type for part in (*tensors, *away.planes.adjacency)} == {"meta"}
-    back = seg.cpu()
-    assert torch.equal(back.labels, seg.labels)
-    assert torch.equal(back.planes.normal, seg.planes.normal)
-    assert back.sampling == seg.sampling
