@@ -1,4 +1,4 @@
-"""Neighbors, edges and growth by kernels are those of the definitions to the bit."""
+"""Neighbors and growth by kernels are those of the definitions to the bit."""
 
 import dataclasses
 
