@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg._optional import require
-from torchrg.errors import MissingDependencyError, ShapeError, TorchrgError
+from torchrg.errors import ShapeError
 
 
 def test_letters_are_shared_between_arguments():
@@ -50,10 +49,3 @@ def test_other_things_are_refused(values):
 def test_mixed_precision_is_refused():
     with pytest.raises(ShapeError, match="a and b of one dtype, got float32 and float64"):
         check_floating("f", a=torch.zeros(1), b=torch.zeros(1, dtype=torch.float64))
-
-
-def test_missing_package_names_the_extra():
-    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[las\]'") as info:
-        require("no_such_package", extra="las", purpose="read LAS files")
-    assert isinstance(info.value, TorchrgError)
-    assert isinstance(info.value, ImportError)

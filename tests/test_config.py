@@ -13,6 +13,7 @@ from torchrg.config import (
     GrowingConfig,
     NormalsConfig,
     PipelineConfig,
+    SuperpointsConfig,
     load_config,
     preset_names,
 )
@@ -317,3 +318,19 @@ def test_settings_that_are_assigned_say_how_others_are_made(config):
 def test_checkpoints_hold_settings_without_trust(tmp_path):
     torch.save({"config": load_config("paper")}, tmp_path / "a.ckpt")
     assert torch.load(tmp_path / "a.ckpt", weights_only=True)["config"] == load_config("paper")
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        load_config(),
+        load_config("classic", **{"growing.min_size": 7}),
+        NormalsConfig(method="pca", k=9),
+        SuperpointsConfig(counts=(30,)),
+        DepthConfig(max_depth=4.0),
+    ],
+)
+def test_settings_are_shown_as_the_call_that_makes_them(config):
+    names = (load_config, NormalsConfig, SuperpointsConfig, DepthConfig)
+    assert eval(repr(config), {name.__name__: name for name in names}) == config
+    assert len(repr(config)) < 100

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import torchrg
-from tests.test_transformations import FUNCTIONS
+from tests.test_opaque import FUNCTIONS
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.normals import ESTIMATORS, orient_normals

@@ -7,7 +7,7 @@ import pytest
 
 from torchrg.batch.run import REPORT, make_plan, run_plan, write_report
 from torchrg.batch.scans import convert_scan
-from torchrg.cli.report import format_costs, format_report, format_table
+from torchrg.cli.report import format_costs, format_report
 from torchrg.io.files import remove_leftovers, run_mark
 
 
@@ -96,7 +96,3 @@ def test_a_long_table_shows_failures_only(faults, tmp_path, monkeypatch):
     assert "8_b" in table
     assert "9_a" not in table
     assert "1 scans have notes; see report.json" in table
-
-
-def test_an_empty_table_is_its_head():
-    assert format_table(["scan", "points"], []) == "scan  points"

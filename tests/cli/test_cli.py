@@ -13,15 +13,9 @@ import pytest
 
 from torchrg import kernels
 from torchrg.cli import COMMANDS, main
-from torchrg.io import read_cloud, write_cloud
-from torchrg.structures import Cloud
+from torchrg.io import read_cloud
 
 CLASSIC = ("--preset", "classic")
-
-
-@pytest.fixture(scope="module")
-def room_file(folder_of_clouds):
-    return folder_of_clouds("room.npz", num_points=6000) / "room.npz"
 
 
 @pytest.fixture(scope="module")
@@ -61,35 +55,6 @@ def test_equal_runs_write_equal_bytes_and_say_how_many_points(room_file, result,
     again = tmp_path / "b.npz"
     assert "6,000 points" in run("segment", room_file, "--out", again, *CLASSIC).out
     assert again.read_bytes() == result.read_bytes()
-
-
-def test_flags_win_over_the_file_and_the_file_over_the_defaults(room_file, tmp_path, run):
-    config, out = tmp_path / "my.yaml", tmp_path / "seg.npz"
-    config.write_text(
-        "normals: {method: pca, k: 30}\ngrowing: {min_size: 77, merge_tolerance: 1.5}\n"
-    )
-    flags = ("--growing.min-size", "10", "--growing.max-angle-deg=7")
-    assert run("segment", room_file, "--out", out, "--config", config, *flags).code == 0
-    normals, growing = config_of(out)["normals"], config_of(out)["growing"]
-    assert (normals["k"], normals["method"]) == (30, "pca")
-    assert (growing["min_size"], growing["max_angle_deg"]) == (10, 7.0)
-    # A setting that has no flag.
-    assert growing["merge_tolerance"] == 1.5
-
-
-@pytest.mark.parametrize(
-    ("flags", "angles"),
-    [
-        (["--angle-deg", "8"], (8.0, 8.0)),
-        (["--angle_deg=8", "--growing.max-angle-deg", "3"], (8.0, 3.0)),
-        (["--normals.sharp-angle-deg", "2"], (2.0, 5.0)),
-    ],
-)
-def test_one_flag_moves_both_angles(room_file, tmp_path, run, flags, angles):
-    out = tmp_path / "seg.npz"
-    assert run("segment", room_file, "--out", out, "--preset", "paper", *flags).code == 0
-    used = config_of(out)
-    assert (used["normals"]["sharp_angle_deg"], used["growing"]["max_angle_deg"]) == angles
 
 
 @pytest.mark.parametrize("command", [("segment", *CLASSIC), ("normals", "--method", "pca")])
@@ -228,33 +193,6 @@ def test_every_command_is_named_by_help_and_to_those_who_misspell_one(run):
     assert all(name in wrong.error and name in run("--help").out for name in COMMANDS)
 
 
-def test_info_says_what_a_file_holds_and_where_it_is(room_file, tmp_path, run):
-    shown = run("info", room_file).out
-    assert "6,000 of float32" in shown
-    assert "labels" in shown
-    surfaces = next(line[12:] for line in shown.splitlines() if line.startswith("surfaces"))
-    assert surfaces in run("segment", room_file, "--out", tmp_path / "a.npz").out
-    far = np.array([[500000.125, 4000000.25, 1], [500001.375, 4000000.5, 2]])
-    np.save(tmp_path / "far.npy", far)
-    shown = run("info", tmp_path / "far.npy").out
-    assert "lowest      500000.125 4000000.25 1" in shown
-    assert "extent      1.25 0.25 1" in shown
-
-
-@pytest.fixture
-def leica(room_file, tmp_path):
-    """Points, intensity, color and no names, and what the colors are."""
-    cloud = read_cloud(room_file)
-    values = np.random.default_rng(0).integers(0, 256, (len(cloud), 4))
-    (tmp_path / "in").mkdir()
-    path = tmp_path / "in" / "leica.txt"
-    np.savetxt(path, np.hstack([cloud.coordinates, values]), fmt="%.9g")
-    return path, values
-
-
-NAMES = ("--columns", "x,y,z,intensity,r,g,b")
-
-
 @pytest.mark.filterwarnings("default")
 def test_a_run_without_kernels_says_once_and_in_one_line_how_to_get_them(
     room_file, tmp_path, run, monkeypatch
@@ -270,64 +208,6 @@ def test_a_run_without_kernels_says_once_and_in_one_line_how_to_get_them(
         assert (code, "_library()" in err) == (0, False)
 
 
-def test_columns_are_named_by_a_rule_that_is_shown_or_by_a_flag(leica, tmp_path, run):
-    path, values = leica
-    taken = "its columns have no names and are taken as x y z column_4 column_5 column_6 column_7"
-    note = f"note        {taken}; if they are others, name them with --columns"
-    assert note in run("info", path).out
-    shown = run("info", path, *NAMES).out
-    assert "note" not in shown
-    assert "color       3 uint8" in shown
-    out = tmp_path / "out.ply"
-    for command in (("segment", *CLASSIC), ("normals", "--method", "pca")):
-        assert taken in run(*command, path, "--out", out).err
-        assert "color" not in read_cloud(out).fields
-        assert run(*command, path, "--out", out, *NAMES).err == ""
-        fields = read_cloud(out).fields
-        np.testing.assert_array_equal(fields["color"], values[:, 1:])
-        np.testing.assert_array_equal(fields["intensity"], values[:, 0])
-
-
-def test_names_of_columns_count_for_each_file_without_its_own(tmp_path, run):
-    rng = np.random.default_rng(0)
-    flat = np.hstack([rng.random((2_000, 2)), np.zeros((2_000, 1))])
-    np.save(tmp_path / "a.npy", np.hstack([flat, rng.random((2_000, 1))]))
-    write_cloud(tmp_path / "b.ply", Cloud(flat[:100] + np.eye(3)[2], {"d": flat[:100, 0]}))
-    inputs, out = (tmp_path / "a.npy", tmp_path / "b.ply"), tmp_path / "r.npz"
-    shown = run("segment", *inputs, "--merge", *CLASSIC, "--out", out, "--columns", "x,y,z,d")
-    assert "(without the input fields d)" in shown.out
-    assert shown.err == ""
-    with np.load(out) as result:
-        np.testing.assert_array_equal(result["points"][:2_000], flat)
-        assert (result["labels"][:2_000] == 0).mean() > 0.9
-        assert json.loads(str(result["provenance"]))["columns"] == "x,y,z,d"
-
-
-def test_commands_that_read_truth_or_draw_take_names_too(leica, tmp_path, run):
-    path, _ = leica
-    assert "f1" in run("score", path, path, "--columns", "x,y,z,label,_,_,_").out
-    assert "has neither labels nor normals in common" in run("score", path, path).err
-    picture = ("--out", tmp_path / "a.png", "--width", "99")
-    assert run("view", path, *picture, *NAMES, "--color", "color").code == 0
-    convert = ("convert", "folder", path.parent, tmp_path / "out", *CLASSIC, "--workers", "1")
-    note = "leica: its columns have no names and are taken as x y z column_4"
-    assert note in run(*convert).out
-    assert not (tmp_path / "out" / "leica" / "color.npy").exists()
-    # Other names are other results.
-    assert "options changed" in run(*convert, *NAMES, "--dry-run").out
-
-
-def test_names_for_files_that_have_their_own_are_wrong_use(room_file, tmp_path, run):
-    for command in (
-        ("info", room_file),
-        ("segment", room_file, "--out", tmp_path / "a.ply"),
-        ("normals", room_file, "--out", tmp_path / "a.ply"),
-        ("convert", "folder", room_file.parent, tmp_path / "out"),
-    ):
-        error = run(*command, "--columns", "x,y,z").error
-        assert "expected text or .npy input for --columns, got files with" in error
-
-
 def test_what_gives_way_to_a_result_is_told(room_file, tmp_path, run):
     out = tmp_path / "a.ply"
     names = "label as label_input, normals as normals_input"
@@ -340,31 +220,6 @@ def test_what_gives_way_to_a_result_is_told(room_file, tmp_path, run):
     shown = run("segment", room_file, *CLASSIC, "--out", tmp_path / "a.npz")
     assert shown.err == ""
     assert shown.out.endswith("a.npz (without the input fields labels, normals)\n")
-
-
-def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
-    far = room(6000, seed=2).points.double().numpy() + np.array([5e5, 5.4e6, 300])
-    np.save(tmp_path / "whole.npy", far)
-    far[[3, 5]], far[[9, 11], 2] = [[np.nan], [1e30]], (-3.4028235e38, 1e200)
-    np.save(tmp_path / "codes.npy", far)
-    labels = []
-    for name in ("whole", "codes"):
-        out = tmp_path / f"{name}.npz"
-        done = run("segment", tmp_path / f"{name}.npy", "--out", out, *CLASSIC)
-        with np.load(out) as result:
-            labels.append(result["labels"])
-    assert np.array_equal(np.load(out)["points"], far, equal_nan=True)
-    reported = "4 of 6,000 points are not finite or beyond 1e+12; they stay unlabeled"
-    assert reported in done.err
-    assert (labels[1][[3, 5, 9, 11]] == -1).all()
-    assert (labels[1] != labels[0]).sum() < 60
-    assert labels[1].max() == labels[0].max() >= 3
-    np.save(tmp_path / "huge.npy", far * 1e20)
-    line = run("segment", tmp_path / "huge.npy", "--out", tmp_path / "a.npz").error
-    assert (
-        "huge.npy: expected finite points, got none in 6,000 points; coordinates beyond 1e+12"
-        in line
-    )
 
 
 def test_single_points_far_off_that_cost_precision_are_told(room_file, tmp_path, run):

@@ -12,11 +12,10 @@ from tqdm import tqdm
 from tests.batch.test_interruptions import results_of
 from tests.datasets.s3dis_tree import write_clean_room
 from torchrg.batch.records import RECORD
-from torchrg.batch.run import BatchReport, lock_folder
+from torchrg.batch.run import lock_folder
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
 from torchrg.cli.loop import Progress
-from torchrg.cli.report import format_report
 from torchrg.config import load_config
 from torchrg.io import read_cloud
 from torchrg.pipeline import segment_planes
@@ -167,13 +166,6 @@ def test_progress_is_scans_points_a_second_and_time_left(unit, bar_unit, sizes, 
         progress(TaskReport("a", "failed"))
         bar.refresh()
     assert all(word in shown.getvalue().splitlines()[-1] for word in words)
-
-
-def test_depth_frames_are_counted_by_the_second():
-    scans = (TaskReport("a", "converted", num_points=640), TaskReport("b", "failed"))
-    report = BatchReport(scans, started=0.0, seconds=4.0, engine="local", workers=1)
-    reported = "640 points in 4.0 s: 160 points, 0.25 frames a second"
-    assert reported in format_report(report, unit="frame")
 
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")

@@ -15,8 +15,8 @@ from torchrg.cli.flags import parse_intrinsics
 from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrames
 from torchrg.depth import segment_depth
-from torchrg.depth.camera import Pinhole, depth_to_points, make_intrinsics
-from torchrg.errors import DepthWarning, FormatError
+from torchrg.depth.camera import depth_to_points, make_intrinsics
+from torchrg.errors import DepthWarning
 from torchrg.io import read_cloud, write_cloud
 from torchrg.render import write_png
 from torchrg.result import RECORD
@@ -273,16 +273,6 @@ def test_a_matrix_file_is_a_camera(tmp_path, frame, run, name, content):
     for suffix in (".png", ".json"):
         expected = (tmp_path / f"expected{suffix}").read_bytes()
         assert (tmp_path / f"labels{suffix}").read_bytes() == expected
-
-
-def test_a_matrix_of_numpy_is_a_camera(tmp_path):
-    for array in (INTRINSICS.numpy(), INTRINSICS.numpy().ravel(), np.array([50, 50, 39.5, 29.5])):
-        np.save(tmp_path / "K.npy", array)
-        assert parse_intrinsics(f"{tmp_path / 'K.npy'}") == Pinhole(50.0, 50.0, 39.5, 29.5)
-    for array in (np.zeros((60, 80)), np.array(["a"]), np.zeros(9, complex)):
-        np.save(tmp_path / "K.npy", array)
-        with pytest.raises(FormatError, match=r"K\.npy: expected the numbers of a camera, got: "):
-            parse_intrinsics(f"{tmp_path / 'K.npy'}")
 
 
 @pytest.mark.parametrize(("scale", "median"), [("1", "2,000 m"), ("1e6", "0.002 m")])

@@ -9,9 +9,7 @@ import torch
 
 from tests.datasets.captures_tree import (
     FRAMES,
-    HEIGHT,
     SIZE,
-    WIDTH,
     WRITERS,
     write_depth,
     write_nerfstudio,
@@ -22,7 +20,6 @@ from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import RGBDSource
 from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrames
-from torchrg.datasets.rgbd_files import image_size, read_depth
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.depth.camera import unproject_image
 from torchrg.errors import FormatError
@@ -246,35 +243,3 @@ def test_layouts_are_found_by_what_is_there(tmp_path):
     (tmp_path / "capture").mkdir()
     with pytest.raises(FormatError, match=r"expected depth images \(.png .npy .pgm\), got none"):
         RGBDFrames.from_folder(tmp_path / "capture")
-
-
-def test_portable_graymaps_are_read_as_they_are_stored(tmp_path):
-    path = tmp_path / "a.pgm"
-    path.write_bytes(b"P5\n# a comment 3 4\n3 2\n65535\n" + bytes(range(12)))
-    assert image_size(path) == (3, 2)
-    expected = [[0x0001, 0x0203, 0x0405], [0x0607, 0x0809, 0x0A0B]]
-    assert (read_depth(path, depth_scale=1024) * 1024 == torch.tensor(expected)).all()
-    for content, message in (
-        (b"P5\n3 2\n65535\n" + bytes(11), "expected 12 bytes for its pixels, got 11"),
-        (b"P5\n2 2\n65535\n" + bytes(12), "expected 8 bytes for 2 x 2 pixels, got 12; correct"),
-        (b"P5\n3 2\n255\n" + bytes(6), "expected a 16-bit binary PGM, P5, got b'P5"),
-        (b"P2\n1 1\n65535\n7\n", "expected a 16-bit binary PGM, P5, got b'P2"),
-        (b"P5\n0 2\n65535\n", "expected a 16-bit binary PGM"),
-        (b"P5\n99999999 99999999\n65535\n", "for its pixels, got 0; the file is truncated"),
-        (b"P5 # " + b"9 " * 1000, "expected a 16-bit binary PGM"),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(FormatError, match=message):
-            read_depth(path, depth_scale=1)
-
-
-def test_sizes_are_read_from_the_beginning_or_not_at_all(tmp_path):
-    for name in ("a.png", "a.npy", "a.pgm"):
-        write_depth(tmp_path / name, FRAMES[0].depth)
-        assert image_size(tmp_path / name) == (WIDTH, HEIGHT)
-        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:9])
-        assert image_size(tmp_path / name) is None
-        (tmp_path / name).unlink()
-        assert image_size(tmp_path / name) is None
-    np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
-    assert image_size(tmp_path / "cube.npy") is None

@@ -3,11 +3,7 @@
 import pytest
 import torch
 
-from torchrg.depth.normals import fit_pixels, min_in_windows
-from torchrg.depth.pixels import contain
 from torchrg.depth.windows import CELL_SIZES, Image, Windows, fit_windows, noise_by_size
-
-FOCAL = (525.0, 525.0)
 
 
 def coordinates(height, width):
@@ -56,16 +52,6 @@ def test_windows_without_enough_pixels_or_along_a_line_have_no_plane():
         assert planes.deviation.isinf().all()
 
 
-def test_least_in_windows_is_that_of_a_literal_search(rng):
-    image = torch.rand(7, 9, generator=rng)
-    values, places = min_in_windows(image, 2)
-    for row in range(7):
-        for column in range(9):
-            window = image[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-            assert values[row, column] == window.min()
-    assert torch.equal(image.flatten()[places], values)
-
-
 def test_noise_of_depth_is_found_whatever_its_growth(rng):
     u, v = coordinates(240, 320)
     inverse = 0.25 + (u + 160) * 0.004 + 0 * v[:, None]
@@ -87,41 +73,3 @@ def test_noise_that_is_given_is_taken(rng):
     noise = noise_by_size(fit_windows(Image(inverse, seen, u, v)), (0.01, 0.02), torch.float32)
     torch.testing.assert_close(noise[2].evaluate(inverse), 0.02 + 0.01 * inverse**2)
     assert noise[2] == noise[8]
-
-
-def test_windows_beside_a_step_are_flat_and_tell_the_edge():
-    u, v = coordinates(30, 40)
-    inverse = torch.where(u < 0, 0.5, 0.4).double().expand(30, 40)
-    seen = torch.ones(30, 40, dtype=torch.bool)
-    image = Image(inverse, seen, u, v)
-    found = fit_pixels(image, focal=FOCAL, noise=None, dtype=torch.float32).choice
-    assert found.flat.all()
-    assert found.edge[0].any()
-    assert not found.edge.all()
-
-
-def test_a_window_holds_the_pixels_of_its_square(rng):
-    height, width = 26, 37
-    u, v = coordinates(height, width)
-    image = 1 + 0.05 * torch.randn(height, width, generator=rng, dtype=torch.float64)
-    image += torch.where(u < 3, 0.0, 2.0)
-    seen = torch.ones(height, width, dtype=torch.bool)
-    found = fit_pixels(Image(image, seen, u, v), focal=FOCAL, noise=None, dtype=torch.float32)
-    squares = [
-        (size * (row - 2), size * (row + 3), size * (column - 2), size * (column + 3))
-        for size in sorted(CELL_SIZES)
-        for row in range(-(-height // size))
-        for column in range(-(-width // size))
-    ]
-    pixels, others = torch.randint(height * width, (2, 400), generator=rng)
-    sides, middles = found.sides_and_centers(pixels)
-    expected, lengths = [], []
-    for pixel, other in zip(pixels.tolist(), others.tolist(), strict=True):
-        top, bottom, left, right = squares[int(found.choice.window.flatten()[pixel])]
-        row, column = divmod(other, width)
-        expected.append(top <= row < bottom and left <= column < right)
-        lengths.append([bottom - top, right - left])
-    assert sides.T.tolist() == lengths
-    assert contain(sides, middles, others, width).tolist() == expected
-    assert any(expected)
-    assert not all(expected)

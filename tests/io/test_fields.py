@@ -7,7 +7,6 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.columns import narrow_integers
 from torchrg.io.fields import assemble_cloud
 from torchrg.structures import Cloud
 
@@ -98,23 +97,6 @@ def test_coordinates_need_their_names_and_one_number_each():
         assemble_cloud(PATH, {"x": np.zeros(2), "y": np.zeros(2)})
     with pytest.raises(FormatError, match="expected x, y, z of one number per point"):
         assemble_cloud(PATH, {axis: np.zeros((2, 2)) for axis in "xyz"})
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "code"),
-    [
-        (-(2**31), 2**31 - 1, "i4"),
-        (0, 2**31, "u4"),
-        (-1, 2**31, "i8"),
-        (-(2**31) - 1, 0, "i8"),
-        (0, 2**32, "i8"),
-    ],
-)
-def test_integers_are_narrowed_only_where_all_fit(low, high, code):
-    values = np.array([low, 0, high])
-    found = narrow_integers(values, ("i4", "u4"))
-    assert found.dtype == code
-    assert found.tolist() == values.tolist()
 
 
 @pytest.mark.parametrize(

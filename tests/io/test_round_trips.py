@@ -393,13 +393,3 @@ def test_points_alone_are_a_cloud(given, tmp_path):
     assert np.array_equal(read_cloud(tmp_path / "points.ply").coordinates, np.eye(3))
     with pytest.raises(ShapeError, match=r"write_cloud: expected cloud of shape \(N, 3\)"):
         write_cloud(tmp_path / "points.ply", given[:, :2])
-
-
-def test_a_cloud_takes_tensors():
-    front = torch.ones(3, 3)
-    cloud = Cloud(torch.eye(3), {"labels": torch.arange(3)}, front=front)
-    values = cloud.coordinates, cloud.fields["labels"], cloud.front
-    assert all(isinstance(value, np.ndarray) for value in values)
-    assert torch.equal(cloud.points, torch.eye(3))
-    with pytest.raises(ShapeError, match=r"got list; use numpy\.array"):
-        Cloud([[0.0, 0.0, 1.0]])

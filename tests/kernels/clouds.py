@@ -6,11 +6,18 @@ from unittest import mock
 import torch
 
 from torchrg import kernels
-from torchrg.neighbors import search_knn
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.neighbors import canonical_order, search_knn
+from torchrg.normals.pca import fit_points_pca
+from torchrg.regions.edges import GrowingInput
+from torchrg.regions.growth import to_column_major
 from torchrg.scenes import make_room
 from torchrg.structures import Neighbors
 
 needs_library = kernels.name_of_library() is not None
+MIN_EQUAL = 0.98
+"""Share of the points at which a choice, as that of a best plane, is the same: rounding may decide
+between two that are as good."""
 
 
 @contextlib.contextmanager
@@ -50,3 +57,33 @@ def lists(points, k, masked):
     counted[:4] = torch.arange(indices.shape[1]) < torch.arange(4)[:, None]
     own = torch.arange(len(points), dtype=torch.int32)[:, None]
     return Neighbors(torch.where(counted, indices, own), counted)
+
+
+def growing_cloud(points, k, masked, reach=None, **settings):
+    points = points[canonical_order(points)]
+    near = lists(points, k, masked)
+    with definitions():
+        fit = fit_points_pca(points, near)
+    valid = fit.valid.clone()
+    valid[::17] = False
+    if reach is not None:
+        reach = reach * fit.residual_rms
+        reach[::5] = torch.inf
+    columns = to_column_major(points), to_column_major(fit.normals)
+    return GrowingInput(*columns, fit.curvature, near, valid, reach, **settings)
+
+
+def both(function, *arguments, **settings):
+    """Return what a function returns by kernels and by definition."""
+    found = function(*arguments, **settings)
+    with definitions():
+        return found, function(*arguments, **settings)
+
+
+def assert_same_planes(found, expected, unit, fraction=1.0, rows=slice(None)):
+    """Compare normals and offsets, by angle and to a share of a unit for each row."""
+    angle = unsigned_angle_deg(found[0], expected[0])[rows]
+    turned = torch.where((found[0] * expected[0]).sum(dim=1) < 0, -1.0, 1.0)
+    error = ((found[1] * turned - expected[1]).abs() / unit)[rows]
+    same = (angle < 0.1) & (error < 1e-3)
+    assert same.float().mean() >= fraction, (angle.max(), error.max())

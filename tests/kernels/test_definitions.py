@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.kernels.clouds import clouds, definitions, lists, needs_library
+from tests.kernels.clouds import both, clouds, lists, needs_library
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.normals.consensus.noise import _measure_neighborhoods, _neighbor_quantiles
 from torchrg.normals.pca import fit_points_pca
@@ -27,13 +27,6 @@ def points(name):
 @pytest.fixture(params=[False, True], ids=["all", "masked"])
 def masked(request):
     return request.param
-
-
-def both(function, *arguments, **settings):
-    """Return what a function returns by kernels and by definition."""
-    found = function(*arguments, **settings)
-    with definitions():
-        return found, function(*arguments, **settings)
 
 
 def assert_close(found, expected, unit, tolerance=1e-5):

@@ -1,17 +1,15 @@
-"""Neighbors, edges and growth by kernels are those of the definitions to the bit."""
+"""Neighbors and growth by kernels are those of the definitions to the bit."""
 
 import dataclasses
 
 import pytest
 import torch
 
-from tests.kernels.clouds import clouds, definitions, lists, needs_library
-from torchrg.config import GrowingConfig, load_config
+from tests.kernels.clouds import clouds, definitions, growing_cloud, lists, needs_library
+from torchrg.config import load_config
 from torchrg.neighbors import canonical_order, search_knn
-from torchrg.normals.pca import fit_points_pca
 from torchrg.regions.adjacency import find_region_pairs
-from torchrg.regions.edges import GrowingInput, accept_edges
-from torchrg.regions.growth import grow, to_column_major
+from torchrg.regions.growth import grow
 from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.scenes import make_room
 from torchrg.structures import Sampling
@@ -48,36 +46,6 @@ def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition
         expected = search_knn(batch, 20, offset=ends), search_knn(ordered, 20, canonical=True)
     for one, other in zip(found, expected, strict=True):
         assert torch.equal(one.indices, other.indices)
-
-
-def growing_cloud(points, k, masked, reach=None, **settings):
-    points = points[canonical_order(points)]
-    near = lists(points, k, masked)
-    with definitions():
-        fit = fit_points_pca(points, near)
-    valid = fit.valid.clone()
-    valid[::17] = False
-    if reach is not None:
-        reach = reach * fit.residual_rms
-        reach[::5] = torch.inf
-    columns = to_column_major(points), to_column_major(fit.normals)
-    return GrowingInput(*columns, fit.curvature, near, valid, reach, **settings)
-
-
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("signed", [False, True])
-@pytest.mark.parametrize("name", CLOUDS)
-def test_edges_are_those_of_the_definition(name, signed, masked):
-    for reach, distance, angle in ((None, None, 5.0), (2.0, None, 90.0), (2.0, 0.3, 15.0)):
-        cloud = growing_cloud(CLOUDS[name], 50, masked, reach, signed_normals=signed)
-        config = GrowingConfig(
-            max_angle_deg=angle, max_distance=distance, coplanarity=False, connectivity=None
-        )
-        for rows in (slice(0, len(cloud.points)), torch.arange(0, len(cloud.points), 3)):
-            found, _ = accept_edges(cloud, config, rows, None)
-            with definitions():
-                expected, _ = accept_edges(cloud, config, rows, None)
-            assert torch.equal(found, expected)
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from tests.kernels.clouds import both, clouds, lists, needs_library
 from tests.made import make_shape
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
@@ -15,6 +16,8 @@ from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.jet import fit_normals_jet
 from torchrg.normals.pca import fit_normals_pca, fit_points
 from torchrg.structures import Neighbors
+
+CLOUDS = {name: points for name, points in clouds().items() if name != "line"}
 
 
 def in_order(points, truth):
@@ -131,3 +134,14 @@ def test_few_neighbors_give_pca():
 def test_adaptive_k_must_not_be_below_k():
     with pytest.raises(ConfigError, match="adaptive_k"):
         dataclasses.replace(NormalsConfig(), adaptive_k=20)
+
+
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("points", CLOUDS.values(), ids=CLOUDS)
+def test_normals_of_a_cloud_are_the_same(points):
+    near = lists(points, 50, masked=False)
+    found, expected = both(estimate_consensus, points, near, NormalsConfig(), 1024)
+    # Double precision hides that roots in torch are off by a bit, but not from each of many points.
+    for one, other in zip(found, expected, strict=True):
+        same = one.nan_to_num() == other.nan_to_num()
+        assert same.float().mean() > 0.9995

@@ -11,7 +11,7 @@ from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions import grow_regions
 from torchrg.regions.adjacency import MIN_CONTACTS, KnnAdjacency
 from torchrg.regions.edges import GrowingInput
-from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
+from torchrg.regions.fit import fit_planes, fit_regions
 from torchrg.regions.growth import label_regions
 from torchrg.regions.repair import assign_unlabeled, merge_facets, refine_regions
 from torchrg.structures import UNLABELED, Neighbors
@@ -155,16 +155,6 @@ def test_entries_that_are_no_neighbours_are_beside_no_point():
     assert adjacency.contacts(torch.tensor([0, 1, 2]))[0].tolist() == [[0, 1]]
 
 
-def test_planes_are_fitted_again_only_when_labels_have_changed():
-    cloud, _ = flat_cloud(sheet(np.random.default_rng(0)))
-    fits = RegionFits(cloud, OFF)
-    labels = (cloud.points[:, 0] > 0.5).long()
-    planes = fits.get(labels)
-    assert fits.get(labels.clone()) is planes
-    other = (cloud.points[:, 0] > 0.6).long()
-    assert torch.equal(fits.get(other).center, fit_regions(cloud, other, OFF).center)
-
-
 def test_touching_pieces_of_one_plane_are_merged():
     cloud, _ = flat_cloud(sheet(np.random.default_rng(6), 3000))
     labels = (cloud.points[:, 0] * 4).long() + 4 * (cloud.points[:, 1] * 3).long()
@@ -230,22 +220,6 @@ def test_curved_regions_are_neither_merged_nor_fed():
     assert torch.equal(refine_regions(cloud, labels, config), labels)
 
 
-def test_planes_of_large_regions_are_those_of_all_their_points():
-    points = sheet(np.random.default_rng(11), 20_000)
-    points[::2] = points[::2, [2, 1, 0]]
-    cloud, order = flat_cloud(points)
-    labels = order % 2
-    normals = torch.eye(3, dtype=torch.float64)[torch.where(labels == 0, 0, 2)]
-    cloud = cloud._replace(normals=normals)
-    found = fit_regions(cloud, labels, OFF)
-    full = fit_planes(Segments(labels), cloud.points, cloud.normals)
-    assert found.num_points.tolist() == [10_000, 10_000]
-    torch.testing.assert_close(found.thickness, full.thickness, rtol=0.03, atol=0)
-    assert (found.normal * full.normal).sum(dim=1).min() > np.cos(np.radians(0.02))
-    away = found.distances(cloud.points, labels)
-    assert (away - full.distances(cloud.points, labels)).abs().max() < 1e-3
-
-
 def faceted_face(rng, height, bend):
     """Points exactly on the facets of a mesh of a face that bends, and the number of their facet.
 
@@ -306,49 +280,11 @@ def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, faces
     assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == faces
 
 
-def test_faces_of_facets_are_at_least_as_thick_as_these_may_lie_apart():
-    rng = np.random.default_rng(20)
-    cloud, _ = flat_cloud(sheet(rng, 3000, 0.0))
-    labels = torch.zeros(3000, dtype=torch.long)
-    assert fit_regions(cloud, labels, with_settings()).thickness < 1e-3
-    found = fit_regions(cloud, labels, with_settings(facet_tolerance=0.009))
-    torch.testing.assert_close(found.thickness, torch.tensor([0.006], dtype=torch.float64))
-
-
 def scattered(rng, count, angle_deg):
     """Upward normals that are off by some degrees along both axes."""
     slopes = np.tan(np.radians(angle_deg)) * rng.normal(size=(count, 2))
     normals = np.concatenate([slopes, np.ones((count, 1))], axis=1)
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-
-def test_scattered_normals_make_a_region_curved_only_where_noise_does_not_explain_its_thickness():
-    rng = np.random.default_rng(12)
-    strip = sheet(rng, 400) * [1, 0.04, 1]
-    cloud, _ = flat_cloud(strip, normals=scattered(rng, 400, 10.0))
-    whole = torch.zeros(400, dtype=torch.int64)
-    reach = torch.full((400,), 4 * 0.002)
-    assert fit_regions(cloud, whole, OFF).curved.tolist() == [True]
-    found = fit_regions(cloud._replace(reach=reach), whole, OFF)
-    assert (found.curved.tolist(), found.bent.tolist()) == ([False], [False])
-    assert found.noise.item() == pytest.approx(0.002, rel=0.2)
-    for unknown in (reach / 4, torch.full_like(reach, torch.inf)):
-        found = fit_regions(cloud._replace(reach=unknown), whole, OFF)
-        assert (found.curved.tolist(), found.noise.tolist()) == ([True], [0.0])
-
-
-@pytest.mark.parametrize("width", [0.2, 1.0])
-def test_a_bend_is_thick_for_its_width_and_scatter_is_not(width):
-    rng = np.random.default_rng(16)
-    turn, along = rng.uniform(-0.3, 0.3, 2000), rng.uniform(0, 1, 2000)
-    radius = width / 0.6
-    arc = np.stack([radius * np.sin(turn), along, radius * np.cos(turn)], axis=1)
-    normals = np.stack([np.sin(turn), 0 * turn, np.cos(turn)], axis=1)
-    flat = sheet(rng, 2000) * [width, 1, 1]
-    for points, own, curved in ((arc, normals, True), (flat, scattered(rng, 2000, 8.0), False)):
-        segments = Segments(torch.zeros(2000, dtype=torch.int64))
-        fit = fit_planes(segments, torch.tensor(points), torch.tensor(own))
-        assert fit.curved.tolist() == [curved]
 
 
 @pytest.mark.parametrize("scatter_deg", [0.0, 12.0])

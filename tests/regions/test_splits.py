@@ -156,16 +156,6 @@ def bumpy(rng, radius, count=4000):
     return points, scattered(rng, count, 15.0)
 
 
-@pytest.mark.parametrize(("radius", "curved"), [(1e9, False), (0.5, True)])
-def test_points_decide_whether_a_faceted_region_is_flat(radius, curved):
-    points, normals = bumpy(np.random.default_rng(8), radius)
-    cloud, _ = flat_cloud(points, normals=normals)
-    labels = torch.zeros(len(points), dtype=torch.int64)
-    for faceted, expected in ((True, curved), (False, True), ("auto", True)):
-        config = dataclasses.replace(CONFIG, faceted=faceted)
-        assert fit_regions(cloud, labels, config).curved.tolist() == [expected]
-
-
 @pytest.mark.parametrize(("tolerance", "curved"), [(None, True), (0.005, False)])
 def test_the_table_calls_a_faceted_face_a_plane(tolerance, curved):
     points, normals = (torch.from_numpy(each) for each in bumpy(np.random.default_rng(8), 1e9))

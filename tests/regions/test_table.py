@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.errors import ConfigError, MissingDependencyError, ShapeError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
-from torchrg.pipeline import segment_planes
 from torchrg.regions import summarize_planes
-from torchrg.scenes import make_room
 from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS
 
 
@@ -239,42 +237,6 @@ def test_kinds_follow_the_up_direction():
     assert summarize_planes(points, normals, labels).kind is None
 
 
-def test_outline_of_a_frame_has_a_hole_and_its_area():
-    shapely = pytest.importorskip("shapely")
-    rng = np.random.default_rng(15)
-    turn = rotation(rng)
-    flat = rng.uniform(-1, 1, (12000, 3)) * [1, 1, 0]
-    flat = flat[np.abs(flat[:, :2]).max(axis=1) > 0.5]
-    points = torch.from_numpy(flat @ turn.T + 100)
-    normals = torch.from_numpy(turn[:, 2]).expand(len(points), 3)
-    planes = summarize_planes(points, normals, one_region(points), outline=True)
-    outer, hole = planes.outline[0]
-    residual = (torch.cat([outer, hole]) * planes.normal[0]).sum(1) - planes.offset[0]
-    assert residual.abs().max() < 1e-9
-    back = [(ring.numpy() - 100) @ turn[:, :2] for ring in (outer, hole)]
-    polygon = shapely.Polygon(back[0], [back[1]])
-    assert math.isclose(polygon.area, 3.0, rel_tol=0.03)
-    sign = torch.sign(planes.normal[0] @ torch.from_numpy(turn[:, 2]))
-    assert shapely.LinearRing(back[0]).is_ccw == (sign > 0)
-    assert shapely.LinearRing(back[1]).is_ccw != (sign > 0)
-
-
-def test_outlines_of_points_and_lines_are_empty():
-    pytest.importorskip("shapely")
-    points = torch.zeros(6, 3)
-    points[:5, 0] = torch.arange(5.0)
-    labels = torch.tensor([0] * 5 + [1])
-    planes = summarize_planes(points, torch.eye(3)[[2] * 6], labels, outline=True)
-    assert planes.outline == ((), ())
-
-
-def test_outlines_without_shapely_say_how_to_get_it(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "shapely", None)
-    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
-    with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[outline\]'"):
-        summarize_planes(points, points, one_region(points), outline=True)
-
-
 def test_wrong_arguments_are_refused():
     points = torch.rand(5, 3)
     with pytest.raises(ShapeError, match=r"summarize_planes: expected labels of shape \(N\)"):
@@ -294,43 +256,3 @@ def test_rounding_does_not_decide_the_sign_of_a_normal():
             unit * flat, truth.expand(200, 3), torch.zeros(200, dtype=torch.int64)
         )
         assert torch.allclose(planes.normal[0], truth, atol=1e-9)
-
-
-def test_a_table_is_gone_through_plane_by_plane():
-    pytest.importorskip("shapely", reason="needs torchrg[outline]")
-    points = make_room(3000, noise=0.003, seed=0).points
-    seg = segment_planes(points, "classic", **{"planes.up": "z", "planes.outline": True})
-    planes = seg.planes
-    assert len(planes) == len(planes.normal) == len(list(planes)) > 5
-    for row, plane in enumerate(planes):
-        assert plane.id == row
-        assert plane.count == int((seg.labels == row).sum())
-        assert plane.kind == PLANE_KINDS[planes.kind[row]]
-        assert plane.outline is planes.outline[row]
-        for name in PLANE_COLUMNS:
-            one, column = getattr(plane, name), getattr(planes, name)[row]
-            assert type(one) in (torch.Tensor, float, int, bool)
-            assert torch.equal(torch.as_tensor(one, dtype=column.dtype), column)
-    assert planes[-1].id == len(planes) - 1
-    assert planes[torch.tensor(2)].id == 2
-    with pytest.raises(IndexError, match=f"expected a row below {len(planes)}, got 99"):
-        planes[99]
-    with pytest.raises(TypeError, match="got slice; index columns with slices and masks"):
-        planes[:3]
-
-
-def test_a_segmentation_goes_to_a_device_whole():
-    seg = segment_planes(make_room(2000, seed=0).points, "classic", keep_neighbors=True)
-    away = seg.to("meta")
-    tensors = [
-        away.labels,
-        away.normals,
-        away.points,
-        away.neighbors.indices,
-        *columns_of(away.planes),
-    ]
-    assert {part.device.type for part in (*tensors, *away.planes.adjacency)} == {"meta"}
-    back = seg.cpu()
-    assert torch.equal(back.labels, seg.labels)
-    assert torch.equal(back.planes.normal, seg.planes.normal)
-    assert back.sampling == seg.sampling

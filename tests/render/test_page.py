@@ -1,10 +1,8 @@
 """Pages without a browser: what is in the file, what is escaped, and what is refused."""
 
 import base64
-import csv
 import functools
 import gzip
-import io
 import json
 import re
 
@@ -15,9 +13,7 @@ import torch
 pytest.importorskip("pydeck", reason="needs the extra view")
 
 from torchrg.errors import ConfigError, MissingDependencyError
-from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.channels import decode_directions, encode_directions
-from torchrg.render.content import NUM_STRATA
+from torchrg.render.channels import decode_directions
 from torchrg.render.page import Page, make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room
@@ -125,55 +121,12 @@ def test_pages_do_not_depend_on_unit_and_origin(factor):
         assert np.abs(residuals).max() < 0.05 * factor
 
 
-def test_a_sample_is_stated_and_strata_are_spread_evenly():
-    page = make_page(Result(room(4000)), max_points=800)
-    cloud = described(page)["clouds"][0]
-    assert page.num_points == (800,)
-    assert (cloud["count"], cloud["shown"], cloud["levels"][-1]) == (4000, 800, 800)
-    assert cloud["levels"][0] == 800 / NUM_STRATA
-    assert sum(plane["count"] for plane in cloud["planes"]) == 4000
-    whole = places(make_page(Result(room(4000))))
-    first = whole[: 4000 // NUM_STRATA]
-    error = whole.std(axis=0) / np.sqrt(len(first))
-    assert (np.abs(first.mean(axis=0) - whole.mean(axis=0)) < 4 * error).all()
-
-
 def test_what_the_same_planes_have_beside_each_other_is_one_colour():
     cloud = room()
     other = room(labels=cloud.fields["labels"].max() - cloud.fields["labels"])
     page = make_page(Result(cloud), compare=Result(other))
     first, second = (unpacked(page, place)["plane colors"] for place in (0, 1))
     assert (first[:-1] == second[:-1][::-1]).all()
-
-
-@pytest.mark.parametrize("mode", ["plane", "superpoint", "normal", "curvature", "sharp"])
-def test_colours_are_those_of_pictures(mode):
-    """Of a sample of the points, with another axis up, as far as the page's numbers are as fine."""
-    cloud = room()
-    fields = {name: torch.from_numpy(values) for name, values in cloud.fields.items()}
-    colors = {
-        "plane": color_planes(fields["labels"], cloud.points),
-        "superpoint": color_planes(fields["superpoint"], cloud.points),
-        "normal": color_normals(fields["normals"], up=(0.0, 1.0, 0.0)),
-        "curvature": color_curvature(fields["curvature"]),
-        "sharp": color_sharp(fields["sharp"]),
-    }[mode]
-    page = make_page(Result(cloud), max_points=700, up=(0.0, 1.0, 0.0))
-    arrays, found = unpacked(page), places(page)
-    rows = [np.abs(cloud.coordinates - place).max(axis=1).argmin() for place in found]
-    shown = arrays[f"{mode} colors"][arrays[mode][:, 0]]
-    differences = np.abs(shown.astype(int) - colors[rows].numpy())
-    assert differences.max() <= (12 if mode in ("normal", "curvature") else 0)
-
-
-def test_errors_are_shown_against_a_truth():
-    cloud = room()
-    wrong = cloud.fields["labels"].copy()
-    wrong[:100] = -1
-    page = make_page(Result(room(labels=wrong)), ground_truth=cloud, color="error")
-    assert described(page)["mode"] == "error"
-    assert (unpacked(page)["error"] == 3).sum() == 100
-    assert (unpacked(page)["normal-error"] == 0).all()
 
 
 def test_nothing_from_a_file_is_markup():
@@ -222,14 +175,6 @@ def test_odd_clouds_give_a_page(cloud):
     page = make_page(Result(cloud))
     assert page.num_points == (int(cloud.finite.sum()),)
     assert described(page)["clouds"][0]["count"] == len(cloud)
-
-
-def test_directions_survive_two_bytes():
-    directions = torch.randn(2000, 3, generator=torch.Generator().manual_seed(0))
-    directions = torch.nn.functional.normalize(directions, dim=1)
-    found = decode_directions(encode_directions(directions))
-    cosines = (found * directions.numpy()).sum(axis=1)
-    assert np.degrees(np.arccos(cosines.clip(-1, 1))).max() < 1.0
 
 
 @pytest.mark.parametrize(
@@ -288,51 +233,3 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, run, arguments, message
     assert done.code == 2
     assert message in done.error
     assert not list(tmp_path.glob("page.*"))
-
-
-def test_walls_of_an_open_scan_are_cut_away_from_outside_alone():
-    """A floor, and two walls with a gap between them: nothing closes the cloud."""
-    rng = np.random.default_rng(0)
-    flat = rng.random((3, 900, 2)) * 4
-    zero = np.zeros(900)
-    floor = np.stack([flat[0, :, 0], flat[0, :, 1], zero], axis=1)
-    west = np.stack([zero, flat[1, :, 0], flat[1, :, 1] / 2], axis=1)
-    middle = np.stack([zero + 2, flat[2, :, 0], flat[2, :, 1] / 2], axis=1)
-    cloud = Cloud(np.concatenate([floor, west, middle]), {"labels": np.repeat([0, 1, 2], 900)})
-    what = described(make_page(Result(cloud)))["clouds"][0]
-    outward = [
-        [where for bit, where in enumerate(what["surfaces"]) if plane["sides"] >> bit & 1]
-        for plane in what["planes"]
-    ]
-    assert outward[0] in ([], [pytest.approx([0, 0, -1], abs=0.01)])  # Seen from below, if at all.
-    assert outward[1] == [pytest.approx([-1, 0, 0], abs=0.01)]
-    assert outward[2] == []
-
-
-def test_points_are_as_large_as_the_space_around_them():
-    rng = np.random.default_rng(0)
-    dense, sparse = rng.random((4000, 3)), rng.random((4000, 3)) * 2 + 5
-    dense[:, 2] = sparse[:, 2] = 0
-    points = np.concatenate([dense, sparse])
-    page = make_page(Result(Cloud(points)))
-    radii = unpacked(page)["radii"][:, 0]
-    is_sparse = places(page)[:, 0] > 3
-    octaves = (np.median(radii[is_sparse]) - np.median(radii[~is_sparse])) / 16
-    assert octaves == pytest.approx(1, abs=0.25)
-    unlabeled = make_page(Result(Cloud(points, {"labels": np.full(8000, -1)})))
-    assert unpacked(unlabeled)["radii"].max() <= 128
-
-
-def test_the_table_as_csv_names_planes_as_the_file_does():
-    cloud = room()
-    labels = np.where(cloud.fields["labels"] >= 0, cloud.fields["labels"] * 3 + 4, -1)
-    page = make_page(Result(Cloud(cloud.coordinates, {**cloud.fields, "labels": labels})))
-    text = unpacked(page)["table"].astype(np.uint8).tobytes().decode()
-    rows = list(csv.DictReader(io.StringIO(text)))
-    names, counts = np.unique(labels[labels >= 0], return_counts=True)
-    assert [int(row["id"]) for row in rows] == names.tolist()
-    assert [int(row["count"]) for row in rows] == counts.tolist()
-    shown = described(page)["clouds"][0]["planes"]
-    assert [float(row["area"]) for row in rows] == [plane["area"] for plane in shown]
-    bare = make_page(Result(Cloud(cloud.coordinates)))
-    assert "table" not in {entry["name"] for entry in described(bare)["clouds"][0]["arrays"]}

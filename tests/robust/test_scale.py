@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.robust.oracle_cases import load_oracles, local_float32
 from torchrg.errors import ShapeError
 from torchrg.robust import mad, median, qn, qn_exceeds, tau
-from torchrg.robust.scale import qn_sample_factor
+from torchrg.robust.scale import qn_sample_factor, sum_points
 
 
 def literal_qn(values):
@@ -181,3 +181,12 @@ def test_refusals():
         median(torch.zeros(3), dim=2)
     with pytest.raises(ShapeError, match=r"mad: expected mask of shape \(\*\) with \*=\(3,\)"):
         mad(torch.zeros(3), mask=torch.ones(4, dtype=torch.bool))
+
+
+def test_sums_do_not_depend_on_the_place_of_a_lane(dtype, rng):
+    values = torch.randn(53, 37, generator=rng, dtype=dtype)
+    expected = sum_points(values)
+    for start in range(0, 37, 5):
+        for stop in (start + 1, start + 2, 37):
+            assert torch.equal(sum_points(values[:, start:stop]), expected[start:stop])
+    assert torch.equal(sum_points(values.t().contiguous().t()), expected)

@@ -1,33 +1,14 @@
-"""Covariances, 3x3 eigenvectors and angles against NumPy and torch.linalg."""
+"""Eigenvalues and eigenvectors of 3x3 matrices, and tolerances."""
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from torchrg.linalg import (
-    covariance,
-    deg_to_sq_chord,
-    eigh3,
-    eigh3_lapack,
-    flatness_tolerance,
-    second_moments,
-    smallest_eigenvector3,
-    sq_chord_to_deg,
-    sq_chords,
-    unsigned_angle_deg,
-)
+from torchrg.linalg import eigh3, eigh3_lapack, flatness_tolerance, smallest_eigenvector3
 from torchrg.linalg.eigen import principal_frame
-from torchrg.linalg.moments import (
-    Segments,
-    fit_planes_to_each,
-    fit_weighted_planes,
-    residuals,
-    split_columns,
-)
 
-PACKAGE = Path(__file__).parents[1] / "torchrg"
+PACKAGE = Path(__file__).parents[2] / "torchrg"
 # The largest number that a file can hold.
 MAY_ASK_FOR_PRECISION = {"datasets/s3dis.py"}
 EIGEN_TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-14}
@@ -127,19 +108,6 @@ def test_gradient_of_the_smallest_eigenvalue_is_that_of_its_direction():
     assert matrix.grad.diagonal().tolist() == [0.0, 1.0, 0.0]
 
 
-def test_planes_are_those_of_the_neighbors_with_a_weight():
-    columns = split_columns(torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]]))
-    weights = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
-    normals, offsets, values = fit_weighted_planes(columns, weights[0])
-    assert normals.abs().tolist() == [[0.0, 0.0, 1.0]]
-    assert values[0, 0] == 0
-    assert residuals(columns, normals, offsets).abs().tolist() == [[0.0, 0.0, 0.0, 1.0]]
-    first, second = fit_planes_to_each(columns, weights)
-    assert torch.equal(first[0], normals)
-    assert second[0].abs().tolist() == [[0.0, 1.0, 0.0]]
-    assert not second[1].any()
-
-
 def test_eigenvectors_do_not_depend_on_the_batch(rng):
     matrices = random_symmetric(rng, torch.float32, count=257)
     values, vectors = eigh3(matrices)
@@ -152,66 +120,6 @@ def test_eigenvectors_do_not_depend_on_the_batch(rng):
         part_values, part_vectors = smallest_eigenvector3(matrices[start : start + 77])
         assert torch.equal(part_values, values[start : start + 77])
         assert torch.equal(part_vectors, vectors[start : start + 77])
-
-
-def test_covariance_is_that_of_numpy(rng):
-    patches = torch.randn(7, 12, 4, generator=rng, dtype=torch.float64) + 1e6
-    mean, matrix = covariance(patches)
-    for row in range(7):
-        points = patches[row].numpy()
-        assert np.allclose(mean[row], points.mean(axis=0), rtol=1e-14)
-        assert np.allclose(matrix[row], np.cov(points, rowvar=False, bias=True), rtol=1e-9)
-
-
-def test_masked_points_do_not_count_whatever_they_hold(rng):
-    patches = torch.randn(5, 10, 3, generator=rng, dtype=torch.float64)
-    mask = torch.rand(5, 10, generator=rng) < 0.6
-    mask[4] = False
-    spoiled = torch.where(mask[..., None], patches, torch.nan)
-    mean, matrix = covariance(spoiled, mask)
-    for row in range(4):
-        kept = patches[row][mask[row]]
-        assert torch.allclose(mean[row], kept.mean(dim=0))
-        assert torch.allclose(matrix[row], torch.cov(kept.T, correction=0))
-    assert not mean[4].any()
-    assert not matrix[4].any()
-
-
-def test_weighted_moments_are_those_of_numpy_in_every_layout(rng):
-    points = torch.randn(3, 20, 4, generator=rng, dtype=torch.float64)
-    weights = torch.rand(3, 20, generator=rng, dtype=torch.float64)
-    expected = torch.einsum("nk,nkp,nkq->npq", weights, points, points)
-    rows = second_moments(points.unbind(dim=-1), weights)
-    columns = points.permute(2, 1, 0).unbind(dim=0)
-    lanes = second_moments(columns, weights.T, lambda column: column.sum(dim=0))
-    scaled = second_moments(points.unbind(dim=-1), weights, total=weights.sum(dim=1))
-    assert torch.allclose(rows, expected)
-    assert torch.allclose(lanes, expected)
-    assert torch.allclose(scaled, expected / weights.sum(dim=1)[:, None, None])
-
-
-def test_angles_are_those_of_the_arc_cosine():
-    angles = torch.linspace(0, 180, 1801, dtype=torch.float64)
-    a = torch.tensor([1.0, 0, 0], dtype=torch.float64).expand(len(angles), 3)
-    radians = torch.deg2rad(angles)
-    b = torch.stack([radians.cos(), radians.sin(), torch.zeros_like(radians)], dim=-1)
-    expected = torch.minimum(angles, 180 - angles)
-    assert (unsigned_angle_deg(a, b) - expected).abs().max() < 1e-7
-    assert (unsigned_angle_deg(a.float(), b.float()) - expected).abs().max() < 2e-5
-
-
-def test_small_angles_keep_their_digits_in_float32():
-    for degrees in (1e-4, 1e-3, 1e-2):
-        sq_chord = torch.tensor((2 * np.sin(np.radians(degrees) / 2)) ** 2, dtype=torch.float32)
-        assert sq_chord_to_deg(sq_chord).item() == pytest.approx(degrees, rel=1e-6)
-
-
-def test_chords_are_those_of_the_angles(rng):
-    a, b = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=rng).double(), dim=-1)
-    chords = sq_chords(a[:, :, None].unbind(dim=1), b[:, :, None].unbind(dim=1)).squeeze(1)
-    assert torch.allclose(sq_chord_to_deg(chords), unsigned_angle_deg(a, b), atol=1e-6)
-    limits = torch.tensor([deg_to_sq_chord(float(angle)) for angle in unsigned_angle_deg(a, b)])
-    assert torch.allclose(chords, limits.double(), atol=1e-7)
 
 
 def test_tolerance_of_a_plane_grows_with_the_distance_from_the_origin(dtype):
@@ -228,19 +136,3 @@ def test_tolerances_stand_here_alone():
         if "finfo" in path.read_text() and path.parent.name != "linalg"
     }
     assert asking <= MAY_ASK_FOR_PRECISION
-
-
-@pytest.mark.parametrize("size", [3, 200])
-def test_quantiles_of_small_and_large_regions_are_those_of_sorted_values(size: int) -> None:
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.randint(-1, 40, (40 * size,), generator=generator)
-    labels[:40] = torch.arange(40)
-    values = torch.rand(len(labels), generator=generator)
-    segments = Segments(labels)
-    for fraction in (0.0, 0.33, 0.5, 1.0):
-        found = segments.quantile(segments.gather(values), fraction)
-        expected = []
-        for label in range(40):
-            ascending = values[labels == label].sort().values
-            expected.append(ascending[int(fraction * (len(ascending) - 1))])
-        assert torch.equal(found, torch.stack(expected))

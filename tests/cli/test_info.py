@@ -1,0 +1,16 @@
+"""Summary of a file by ``torchrg info``."""
+
+import numpy as np
+
+
+def test_info_says_what_a_file_holds_and_where_it_is(room_file, tmp_path, run):
+    shown = run("info", room_file).out
+    assert "6,000 of float32" in shown
+    assert "labels" in shown
+    surfaces = next(line[12:] for line in shown.splitlines() if line.startswith("surfaces"))
+    assert surfaces in run("segment", room_file, "--out", tmp_path / "a.npz").out
+    far = np.array([[500000.125, 4000000.25, 1], [500001.375, 4000000.5, 2]])
+    np.save(tmp_path / "far.npy", far)
+    shown = run("info", tmp_path / "far.npy").out
+    assert "lowest      500000.125 4000000.25 1" in shown
+    assert "extent      1.25 0.25 1" in shown

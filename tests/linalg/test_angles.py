@@ -1,0 +1,31 @@
+"""Angles and chords between directions."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.linalg import deg_to_sq_chord, sq_chord_to_deg, sq_chords, unsigned_angle_deg
+
+
+def test_angles_are_those_of_the_arc_cosine():
+    angles = torch.linspace(0, 180, 1801, dtype=torch.float64)
+    a = torch.tensor([1.0, 0, 0], dtype=torch.float64).expand(len(angles), 3)
+    radians = torch.deg2rad(angles)
+    b = torch.stack([radians.cos(), radians.sin(), torch.zeros_like(radians)], dim=-1)
+    expected = torch.minimum(angles, 180 - angles)
+    assert (unsigned_angle_deg(a, b) - expected).abs().max() < 1e-7
+    assert (unsigned_angle_deg(a.float(), b.float()) - expected).abs().max() < 2e-5
+
+
+def test_small_angles_keep_their_digits_in_float32():
+    for degrees in (1e-4, 1e-3, 1e-2):
+        sq_chord = torch.tensor((2 * np.sin(np.radians(degrees) / 2)) ** 2, dtype=torch.float32)
+        assert sq_chord_to_deg(sq_chord).item() == pytest.approx(degrees, rel=1e-6)
+
+
+def test_chords_are_those_of_the_angles(rng):
+    a, b = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=rng).double(), dim=-1)
+    chords = sq_chords(a[:, :, None].unbind(dim=1), b[:, :, None].unbind(dim=1)).squeeze(1)
+    assert torch.allclose(sq_chord_to_deg(chords), unsigned_angle_deg(a, b), atol=1e-6)
+    limits = torch.tensor([deg_to_sq_chord(float(angle)) for angle in unsigned_angle_deg(a, b)])
+    assert torch.allclose(chords, limits.double(), atol=1e-7)

@@ -1,0 +1,44 @@
+"""Voxels against a loop over points."""
+
+import numpy as np
+import torch
+
+from torchrg.neighbors import sample_voxels
+
+
+def voxels_by_loop(points, size):
+    """The point nearest to the middle of each cell, and the cell of each point."""
+    low = points.min(axis=0)
+    nearest, cell_of = {}, []
+    for row, point in enumerate(points):
+        scaled = (point - low) / size
+        cell = tuple(np.floor(scaled).astype(int))
+        distance = ((scaled - np.floor(scaled) - 0.5) ** 2).sum()
+        cell_of.append(cell)
+        if cell not in nearest or distance < nearest[cell][0]:
+            nearest[cell] = (distance, row)
+    rows = sorted(row for _, row in nearest.values())
+    place = {cell: rows.index(row) for cell, (_, row) in nearest.items()}
+    return rows, [place[cell] for cell in cell_of]
+
+
+def test_voxels_are_those_of_a_loop_over_points(rng):
+    points = torch.rand(400, 3, generator=rng, dtype=torch.float64) * 3 - 1e6
+    rows, inverse = sample_voxels(points, 0.5)
+    expected_rows, expected_inverse = voxels_by_loop(points.numpy(), 0.5)
+    assert rows.tolist() == expected_rows
+    assert inverse.tolist() == expected_inverse
+
+
+def test_more_cells_than_whole_numbers_count_are_told_apart():
+    corner = 2.0**30 - 1
+    points = torch.tensor([[0.0, 0, 0], [16, 0, 0], [corner] * 3], dtype=torch.float64)
+    assert sample_voxels(points, 1.0).inverse.tolist() == [0, 1, 2]
+
+
+def test_chosen_points_do_not_depend_on_the_order(rng):
+    points = torch.rand(500, 3, generator=rng).mul(8).round() / 8
+    chosen = points[sample_voxels(points, 0.3).rows]
+    moved = points[torch.randperm(500, generator=rng)]
+    again = moved[sample_voxels(moved, 0.3).rows]
+    assert set(map(tuple, chosen.tolist())) == set(map(tuple, again.tolist()))

@@ -1,0 +1,56 @@
+"""Robust fits of many patches at a time."""
+
+import pytest
+import torch
+
+from torchrg.robust import fit_detmcd, qn
+
+
+def assert_equal_fits(found, expected):
+    for name, field in found._asdict().items():
+        assert torch.equal(field, getattr(expected, name)), name
+
+
+def test_batch_is_a_loop_of_singles(estimator, patches):
+    fit = estimator(patches)
+    for row in range(0, 12, 5):
+        single = estimator(patches[row])
+        assert_equal_fits(single, type(fit)(*(field[row] for field in fit)))
+
+
+def test_result_does_not_depend_on_chunks_and_batch(estimator, patches):
+    fit = estimator(patches)
+    for chunk_size in (1, 5):
+        assert_equal_fits(estimator(patches, chunk_size=chunk_size), fit)
+    assert_equal_fits(
+        estimator(patches.flip(0).reshape(2, 3, 2, 40, 3)),
+        type(fit)(*(f.flip(0).reshape(2, 3, 2, *f.shape[1:]) for f in fit)),
+    )
+
+
+def test_result_does_not_depend_on_threads(patches, set_threads):
+    results = []
+    for threads in (1, 3):
+        set_threads(threads)
+        results.append((fit_detmcd(patches, chunk_size=5), qn(patches.repeat(80, 1, 1))))
+    assert torch.get_num_threads() == 3
+    assert_equal_fits(results[0][0], results[1][0])
+    assert torch.equal(results[0][1], results[1][1])
+
+
+def test_exact_shifts_change_nothing_but_the_location(estimator, patches):
+    shift = torch.tensor([64.0, -128.0, 32.0], dtype=patches.dtype)
+    fit, moved = estimator(patches), estimator(patches + shift)
+    assert torch.equal(moved.location, fit.location + shift)
+    for name in ("covariance", "support", "sq_distances", "raw_covariance", "log_det"):
+        assert torch.equal(getattr(moved, name), getattr(fit, name)), name
+
+
+@pytest.mark.parametrize("power", [-20, 20])
+def test_powers_of_two_scale_bit_for_bit(estimator, patches, power):
+    unit = 2.0**power
+    fit, scaled = estimator(patches), estimator(patches * unit)
+    assert torch.equal(scaled.location, fit.location * unit)
+    assert torch.equal(scaled.covariance, fit.covariance * unit * unit)
+    for name in ("support", "sq_distances", "raw_support"):
+        assert torch.equal(getattr(scaled, name), getattr(fit, name)), name

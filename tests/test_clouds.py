@@ -1,0 +1,30 @@
+"""Codes for missing points in clouds."""
+
+import numpy as np
+
+from tests.cli.test_cli import CLASSIC
+
+
+def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
+    far = room(6000, seed=2).points.double().numpy() + np.array([5e5, 5.4e6, 300])
+    np.save(tmp_path / "whole.npy", far)
+    far[[3, 5]], far[[9, 11], 2] = [[np.nan], [1e30]], (-3.4028235e38, 1e200)
+    np.save(tmp_path / "codes.npy", far)
+    labels = []
+    for name in ("whole", "codes"):
+        out = tmp_path / f"{name}.npz"
+        done = run("segment", tmp_path / f"{name}.npy", "--out", out, *CLASSIC)
+        with np.load(out) as result:
+            labels.append(result["labels"])
+    assert np.array_equal(np.load(out)["points"], far, equal_nan=True)
+    reported = "4 of 6,000 points are not finite or beyond 1e+12; they stay unlabeled"
+    assert reported in done.err
+    assert (labels[1][[3, 5, 9, 11]] == -1).all()
+    assert (labels[1] != labels[0]).sum() < 60
+    assert labels[1].max() == labels[0].max() >= 3
+    np.save(tmp_path / "huge.npy", far * 1e20)
+    line = run("segment", tmp_path / "huge.npy", "--out", tmp_path / "a.npz").error
+    assert (
+        "huge.npy: expected finite points, got none in 6,000 points; coordinates beyond 1e+12"
+        in line
+    )
