@@ -135,14 +135,20 @@ def test_moments_and_weights_of_regions_are_those_of_the_definition(size, rng):
     segments, columns = Segments(labels), torch.randn(3, 3 * size, generator=rng).double()
     columns[:, ::3] += 1e3
     columns[0, : size // 2] = columns[0, 0]
-    weights = torch.rand(3 * size, generator=rng).double()
+    weights, order = (
+        torch.rand(3 * size, generator=rng).double(),
+        torch.randperm(3 * size, generator=rng),
+    )
     axes, least = torch.eye(3).double(), torch.tensor([0.0, 1e-3, 1.0]).double()
 
     def stages():
         mean, covariance = segments.moments(list(columns), weights)
         _, about_zero = segments.moments(list(columns), weights, centered=False)
-        reweighed = segments.reweigh(list(columns), mean, axes, least, (1.48, 4.7))
-        return [mean, covariance, about_zero, *reweighed]
+        periodic, mixed = (
+            segments.reweigh(list(values), mean, axes, least, (1.48, 4.7))
+            for values in (columns, columns[:, order])
+        )
+        return [mean, covariance, about_zero, *periodic, *mixed]
 
     found = stages()
     with definitions():

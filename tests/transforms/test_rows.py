@@ -119,6 +119,12 @@ def test_in_a_tiny_cloud_only_names_tell():
         KeepFinite()({"coord": torch.rand(16, 3), "camera": torch.eye(4).flatten()})
 
 
+@pytest.mark.parametrize("key", ["color", "normal", "front", "intensity", "displacement"])
+def test_known_names_are_per_point_in_a_tiny_cloud(key):
+    sample = {"coord": torch.tensor([[torch.nan, 0, 0], [1, 1, 1]]), key: torch.arange(2)}
+    assert KeepFinite()(sample)[key].tolist() == [1]
+
+
 @pytest.mark.parametrize(
     "transform", [CenterCloud(), EstimateNormals(), KeepFinite(), SampleVoxels(0.1)]
 )
