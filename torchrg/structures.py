@@ -255,7 +255,13 @@ class Neighbors(NamedTuple):
 
     def select(self, rows: Rows) -> "Neighbors":
         """Return the neighbors of the selected points."""
-        return Neighbors(self.indices[rows], None if self.valid is None else self.valid[rows])
+
+        def take(table: Tensor) -> Tensor:
+            if isinstance(rows, Tensor) and rows.dtype == torch.int64:
+                return table.index_select(0, rows)  # A third faster than indexing.
+            return table[rows]
+
+        return Neighbors(take(self.indices), None if self.valid is None else take(self.valid))
 
     def gather(self, values: Tensor, rows: Rows = slice(None)) -> Tensor:
         """Gather the values ``(N,)`` of the neighbors of the selected points, shape ``(n, K)``.

@@ -88,9 +88,9 @@ def find_faces(
 
 def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
     """Return the neighbors of points at the given ranks; releases memory-mapped lists."""
-    parts = []
+    parts, columns = [], torch.tensor(ranks, dtype=torch.int64)
     for chunk in torch.split(rows, ROWS_IN_CACHE):
-        parts.append(near[chunk][:, ranks])
+        parts.append(near.index_select(0, chunk).index_select(1, columns))
         scratch.release()
     return torch.cat(parts) if parts else near[:0, ranks]
 
@@ -163,12 +163,17 @@ def _join_patches(
 
     def compare(chunk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         ends = gather_lists(near, chunk, ranks)
-        is_between = faces[ends] != faces[chunk, None]
-        has_any = is_between.any(dim=1)
-        chunk, ends, is_between = chunk[has_any], ends[has_any], is_between[has_any]
-        cosine, bend = (values[is_between] for values in _compare(points, normals, chunk, ends))
-        starts = chunk.repeat_interleave(is_between.sum(dim=1))
-        ends = ends[is_between]
+        there = faces.index_select(0, ends.view(-1)).view(ends.shape)
+        is_between = there != faces[chunk, None]
+        some = nonzero_rows(is_between.any(dim=1))
+        chunk, ends = chunk.index_select(0, some), ends.index_select(0, some)
+        links = nonzero_rows(is_between.index_select(0, some))
+        cosine, bend = (
+            values.view(-1).index_select(0, links)
+            for values in _compare(points, normals, chunk, ends)
+        )
+        starts = chunk.index_select(0, links // len(ranks))
+        ends = ends.view(-1).index_select(0, links)
         trust = (1 - bend / 2).clamp(min=0) ** _TRUST_POWER
         agreement = trust * cosine.sign() * signs[starts] * signs[ends]
         return faces[starts], faces[ends], agreement
@@ -194,13 +199,13 @@ def _grow_patches(
     def link(chunk: Tensor) -> None:
         ends = gather_lists(near, chunk, ranks)
         cosine, bend = _compare(points, normals, chunk, ends)
-        there = node[ends]
-        is_smooth = (bend <= limit) & (there >= 0)
-        starts = node[chunk].repeat_interleave(is_smooth.sum(dim=1))
-        links = starts, there[is_smooth], cosine[is_smooth] < 0
+        there = node.index_select(0, ends.view(-1))
+        links = nonzero_rows((bend.view(-1) <= limit) & (there >= 0))
+        starts = node.index_select(0, chunk.index_select(0, links // len(ranks)))
+        is_flipped = cosine.view(-1).index_select(0, links) < 0
         # The components do not depend on the order of the links.
         with lock:
-            patches.link(*links)
+            patches.link(starts, there.index_select(0, links), is_flipped)
 
     map_tasks(link, torch.split(rows, ROWS_AT_ONCE), rows.device)
     return patches.find()

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg import deg_to_sq_chord, eigh3_lapack, sq_chords, unsigned_angle_deg
 from torchrg.linalg.moments import Segments
@@ -491,12 +491,14 @@ def _boundary_points(labels: Tensor, adjacency: KnnAdjacency) -> Tensor:
     """Return the boundary points: points with a nearest neighbor in another region."""
     # int32 indexing is three times faster.
     narrow = labels.to(torch.int32)
-    rows_of_chunks = []
-    for chunk in split_rows(len(labels), ROWS_AT_ONCE):
+
+    def find(chunk: slice) -> Tensor:
         near = Neighbors(adjacency.neighbor_rows(chunk)).gather(narrow)
         is_adjacent = (near != narrow[chunk, None]) & (near >= 0)
-        rows_of_chunks.append(chunk.start + nonzero_rows(is_adjacent.any(dim=1)))
-    return torch.cat(rows_of_chunks)
+        rows: Tensor = chunk.start + nonzero_rows(is_adjacent.any(dim=1))
+        return rows
+
+    return torch.cat(map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device))
 
 
 def _choose_regions(
@@ -549,12 +551,11 @@ def _overshoot(
 ) -> Tensor:
     """Return how far the projections of points lie beyond the plane at which their region ends."""
     near = cloud.neighbors.select(rows)
-    indices = near.indices.long()
-    inside = (labels[indices] == label[:, None]) & near.mask()
+    inside = (near.gather(labels) == label[:, None]) & near.mask()
     offset = torch.zeros_like(inside, dtype=torch.float64)
     columns = (cloud.points, planes.center[other], planes.normal[other])
     for x, start, slope in zip(*(values.unbind(dim=1) for values in columns), strict=True):
-        offset += (x[indices].double() - start[:, None]) * slope[:, None]
+        offset += (near.gather(x).double() - start[:, None]) * slope[:, None]
     offset *= inside
     total = offset.sum(dim=1)
     rounding = _ROUNDING * planes.thickness[label] * inside.sum(dim=1)
