@@ -127,6 +127,10 @@ INLINE float of_key(int32_t key) {
   return value;
 }
 
+constexpr int QUICK_TURNS = 4;
+
+INLINE Flags middle_of(Flags low, Flags high) { return (low & high) + ((low ^ high) >> 1); }
+
 // The key of a given rank, from 1, among the k keys of each lane.
 INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
   Flags low = load(keys), high = low;
@@ -134,8 +138,16 @@ INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
     const Flags key = load(keys + LANES * j);
     low = smaller(key, low), high = larger(key, high);
   }
+  // Halve the range without its keys first, at a fourth of the cost.
+  for (int turn = 0; turn < QUICK_TURNS; turn++) {
+    const Flags middle = middle_of(low, high);
+    Flags missing = ranks;
+    for (int j = 0; j < k; j++) missing += load(keys + LANES * j) <= middle;
+    const Flags is_high = missing <= 0;
+    low = where(is_high, low, smaller(middle + 1, high)), high = where(is_high, middle, high);
+  }
   while (total(low < high)) {
-    const Flags middle = (low & high) + ((low ^ high) >> 1);
+    const Flags middle = middle_of(low, high);
     Flags count{}, below = low, above = high;
     for (int j = 0; j < k; j++) {
       const Flags key = load(keys + LANES * j), within = key <= middle;
