@@ -17,5 +17,8 @@ fi
 library() { "${CXX:-g++}" -print-file-name="$1"; }
 export LD_PRELOAD="$(library libasan.so) $(library libstdc++.so)" ASAN_OPTIONS=detect_leaks=0
 python -c 'from torchrg import kernels; assert kernels.name_of_library()'
+# Tests of other folders also compare kernels with their definitions.
+files=$(grep -rl "tests.kernels.clouds import" tests --include="test_*.py" | grep -v "^tests/kernels/")
 # A fault ends the process; -s shows its report, and one process runs all tests.
-python -m pytest -q -s -n 0 -p no:cacheprovider tests/kernels "$@"
+# shellcheck disable=SC2086
+python -m pytest -q -s -n 0 -p no:cacheprovider tests/kernels $files "$@"
