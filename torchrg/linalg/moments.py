@@ -104,6 +104,11 @@ def second_moments(
     return torch.stack(rows, dim=-2)
 
 
+def to_column_major(vectors: Tensor) -> Tensor:
+    """Return vectors ``(N, C)`` in column-major layout, which regions read without a copy."""
+    return vectors.T.contiguous().T
+
+
 class Segments:
     """Points grouped by region, in the order of their rows.
 

@@ -22,6 +22,7 @@ from torchrg._parallel import (
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
+from torchrg.linalg.moments import to_column_major
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
@@ -246,11 +247,6 @@ def _reordered(cloud: GrowingInput, order: Tensor) -> GrowingInput:
         reach=None if cloud.reach is None else cloud.reach[order],
         colors=None if cloud.colors is None else to_column_major(cloud.colors[order]),
     )
-
-
-def to_column_major(vectors: Tensor) -> Tensor:
-    """Return vectors ``(N, C)`` in column-major layout."""
-    return vectors.T.contiguous().T
 
 
 def rank_by_size(regions: Tensor, min_size: int) -> Tensor:

@@ -13,7 +13,7 @@ from torchrg._parallel import map_tasks, nonzero_rows
 from torchrg.config import Auto
 from torchrg.errors import ShapeError
 from torchrg.linalg import eigh3_lapack, unit_direction
-from torchrg.linalg.moments import Segments
+from torchrg.linalg.moments import Segments, to_column_major
 from torchrg.neighbors import check_neighbors, distinct_rows, mark_distinct
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.classes import classify_planes
@@ -78,8 +78,9 @@ def summarize_planes(
     if neighbors is not None and not canonical:
         check_neighbors("summarize_planes", neighbors, points)
     rows = _distinct_rows(points, labels, canonical=canonical)
-    segments, positions = Segments(labels[rows]), points[rows]
-    fit = fit_planes(segments, positions, normals[rows]).flattened(facet_tolerance)
+    segments, positions = Segments(labels[rows]), to_column_major(points[rows])
+    fit = fit_planes(segments, positions, to_column_major(normals[rows]))
+    fit = fit.flattened(facet_tolerance)
     planes = measure_planes(segments, positions, fit, outline=outline)
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
