@@ -183,3 +183,40 @@ def test_an_error_waits_for_the_tasks_of_other_threads(set_threads):
         with pytest.raises(ValueError, match="here"):
             thread_states(look)
         assert ended == [True]
+
+
+@pytest.mark.parametrize("startable", [0, 1])
+def test_tasks_run_at_a_limit_of_threads(startable, set_threads, monkeypatch):
+    """As in a container, and while the interpreter exits."""
+    set_threads(4)
+    start, started = Thread.start, []
+
+    def start_few(thread):
+        if len(started) == startable:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    def work(number):
+        sleep(0.01)
+        return number
+
+    monkeypatch.setattr(Thread, "start", start_few)
+    for _ in range(2):
+        assert map_tasks(work, range(20), torch.device("cpu")) == [*range(20)]
+        started.clear()
+    assert not [thread for thread in started if thread.is_alive()]
+
+
+def test_a_thread_segments_at_the_end_of_a_script():
+    script = """
+import threading, time, torch, torchrg
+torch.set_num_threads(2)
+points = torchrg.scenes.make_room(20_000, noise=0.003, seed=0).points
+def segment():
+    time.sleep(0.3)  # The main thread has ended.
+    print(len(torchrg.segment_planes(points, "classic").labels))
+threading.Thread(target=segment).start()
+"""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.stdout == "20000\n", run.stderr

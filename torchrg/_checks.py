@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg._parallel import sequential_operations
 from torchrg.errors import ConfigError, ShapeError
 
 Arguments = ParamSpec("Arguments")
@@ -197,7 +198,8 @@ def eager_only(function: Callable[Arguments, Returned]) -> Callable[Arguments, R
     """Exclude a function of clouds from compilation, and reject tensors without data.
 
     A compiler breaks its graph there and compiles the remaining model. Tensors are created on the
-    CPU, as by :func:`default_device_cpu`, and tensor subclasses become plain tensors.
+    CPU, as by :func:`default_device_cpu`, tensor subclasses become plain tensors, and each
+    operation runs on one thread; see :func:`torchrg._parallel.sequential_operations`.
     """
 
     @wraps(function)
@@ -211,7 +213,7 @@ def eager_only(function: Callable[Arguments, Returned]) -> Callable[Arguments, R
                 f"{function.__name__}: expected points with values, got a tensor of vmap, "
                 "torch.func or the meta device; call it outside of them."
             )
-        with default_device_cpu():
+        with default_device_cpu(), sequential_operations():
             plain: Callable[..., Returned] = function
             return plain(*map(_plain, args), **{name: _plain(kwargs[name]) for name in kwargs})
 

@@ -9,8 +9,8 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar, copy_context
 from functools import lru_cache
 from pathlib import Path
@@ -166,13 +166,20 @@ def map_tasks(
                     pass
                 _THREADS.reset(token)
 
-        pool = _started_threads()
-        others = [pool.submit(copy_context().run, take_tasks) for _ in range(num_threads - 1)]
+        pool, others = _started_threads(), list[Future[None]]()
         try:
+            # No thread starts while the interpreter exits, or at the limit of a container.
+            with suppress(RuntimeError):
+                for _ in range(num_threads - 1):
+                    others.append(pool.submit(copy_context().run, take_tasks))
             # The calling thread also processes tasks.
             take_tasks()
         finally:
             wait(others)
+            if len(others) < num_threads - 1:
+                # A started thread may hold the task whose own thread did not start.
+                _POOL.get().remove(pool)
+                pool.shutdown()
         for other in others:
             other.result()
         return [results[index] for index in range(len(tasks))]
@@ -277,6 +284,19 @@ def _retain_freed_memory() -> None:
     """
     block = torch.empty(_RETAINED_BYTES, dtype=torch.uint8)
     del block
+
+
+def _limit_forked_child() -> None:
+    """Give torch one thread in a forked process, as data loaders do.
+
+    OpenMP does not survive a fork: an operation of the child that wants threads waits forever for
+    those of the parent.
+    """
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_limit_forked_child)
 
 
 def return_freed_memory() -> None:

@@ -4,6 +4,8 @@ All exceptions derive from :class:`TorchrgError`; messages contain the requireme
 the fix.
 """
 
+import sys
+
 __all__ = [
     "ConfigError",
     "DepthWarning",
@@ -30,6 +32,22 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError) and any(word in str(error) for word in words)
     )
+
+
+def add_note(error: BaseException, note: str) -> None:
+    """Add a line to an error; to its message in Python 3.10, which has no notes.
+
+    Example:
+        >>> import traceback
+        >>> error = ValueError("expected a floor")
+        >>> add_note(error, "This was room 3.")
+        >>> "room 3" in "".join(traceback.format_exception(error))
+        True
+    """
+    if sys.version_info >= (3, 11):
+        error.add_note(note)
+    else:
+        error.args = (f"{error} {note}",)
 
 
 class TorchrgError(Exception):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchrg import scratch
 from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
-from torchrg._parallel import return_freed_memory, sequential_operations
+from torchrg._parallel import return_freed_memory
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.io import read_cloud
@@ -63,7 +63,6 @@ meshed depth frames get about the same number of superpoints as Segmentator's se
 
 
 @eager_only
-@sequential_operations()
 def segment_planes(
     points: Points | Cloud | FilePath,
     config: AnyConfig | None = None,
@@ -322,7 +321,6 @@ def _has_auto(config: PipelineConfig) -> bool:
 
 
 @eager_only
-@sequential_operations()
 def make_superpoints(
     points: Points,
     seg: Segmentation | None = None,

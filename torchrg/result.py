@@ -21,7 +21,7 @@ from torchrg.errors import ShapeError
 from torchrg.io import atomic_path, read_cloud
 from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.fields import add_result_fields, are_integers
-from torchrg.io.files import PARSE_ERRORS
+from torchrg.io.files import PARSE_ERRORS, local_path
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import distinct_rows, search_knn
@@ -312,7 +312,7 @@ def read_result(path: FilePath, *, columns: Sequence[str] | None = None) -> Resu
         >>> result.planes.count.tolist(), result.segmentation.labels.unique().tolist()
         ([81], [0])
     """
-    source = Path(path)
+    source = local_path(path)
     if source.is_dir():
         cloud, extras = _read_folder(source)
     else:

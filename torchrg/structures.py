@@ -621,3 +621,9 @@ class Superpoints:
             "superpoint" if i == 0 else f"superpoint_{i}": level.numpy(force=True).astype(np.int32)
             for i, level in enumerate((self.labels, *self.levels))
         }
+
+
+# Lets torch.load(weights_only=True) read results and samples.
+torch.serialization.add_safe_globals(
+    [Neighbors, NormalFit, Plane, PlaneAdjacency, Planes, Sampling, Segmentation, Superpoints]
+)

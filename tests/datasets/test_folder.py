@@ -1,12 +1,14 @@
 """A folder of clouds lists every readable file, in natural order, by a name of its own."""
 
+import traceback
 import warnings
 
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
-from torchrg.datasets import FolderOfClouds
+from torchrg.datasets import FolderOfClouds, RGBDFrames
 from torchrg.datasets.folder import natural_key
 from torchrg.errors import FormatError
 from torchrg.io import write_cloud
@@ -158,3 +160,40 @@ def test_the_transform_is_called(root):
 def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(FormatError, match="no such folder"):
         FolderOfClouds(tmp_path / "scans")
+
+
+def raise_of_third(sample):
+    if sample["name"] == "scan_9":
+        raise IndexError("no rows")
+    return sample
+
+
+@pytest.mark.parametrize("num_workers", [None, 0, 1])
+def test_an_error_of_the_transform_names_the_scan(root, num_workers):
+    data = FolderOfClouds(root, transform=raise_of_third)
+    loader = data
+    if num_workers is not None:
+        loader = DataLoader(data, batch_size=None, num_workers=num_workers)
+    with pytest.raises(IndexError) as info:
+        list(loader)
+    text = "".join(traceback.format_exception(info.value))
+    assert f"Sample 2, scan_9, was read from {root / 'scan_9.PCD'}." in text
+
+
+def test_an_index_error_does_not_end_a_loop(root):
+    seen = []
+    with pytest.raises(IndexError, match="no rows"):
+        seen.extend(sample["name"] for sample in FolderOfClouds(root, transform=raise_of_third))
+    with pytest.raises(IndexError, match="list index"):
+        FolderOfClouds(root)[4]
+
+
+def test_slices_are_subsets(root):
+    data = FolderOfClouds(root, transform=lambda sample: sample["name"])
+    assert [*data[1:3]] == [data[1], data[2]]
+    assert len(data[:-1]) == 3
+
+
+def test_a_data_set_is_shown_by_its_folder(root):
+    assert repr(FolderOfClouds(root)) == f"FolderOfClouds('{root}', 4 scenes)"
+    assert repr(RGBDFrames([])) == "RGBDFrames(0 scenes)"

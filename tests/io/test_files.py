@@ -1,17 +1,21 @@
 """Files appear whole or not at all."""
 
 import gc
+import io
 import os
 import resource
 import signal
 import stat
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from torchrg.datasets import FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
 from torchrg.io.files import atomic_path
+from torchrg.result import read_result
 from torchrg.structures import Cloud
 
 WRITTEN = [kind for kind, row in FORMATS.items() if row.write]
@@ -90,3 +94,37 @@ def test_links_are_followed(tmp_path):
     write_cloud(tmp_path / "link.ply", Cloud(np.zeros((2, 3))))
     assert (tmp_path / "link.ply").is_symlink()
     assert len(read_cloud(tmp_path / "real" / "a.ply")) == 2
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("s3://bucket/room.ply", "got a URL; copy it first"),
+        ("file:///scans/room.ply", "got a URL; copy it first"),
+        (Path("memory://room.ply"), "got a URL; copy it first"),
+        (io.BytesIO(b"ply"), "got BytesIO; write its content to a temporary file"),
+        (b"ply", "got bytes; write its content to a temporary file"),
+    ],
+)
+@pytest.mark.parametrize(
+    "read", [read_cloud, read_result, FolderOfClouds, RGBDFrames.from_folder, ScanNet]
+)
+def test_urls_and_open_files_are_named(source, message, read):
+    with pytest.raises(FormatError, match=f"expected .*local.*{message}"):
+        read(source)
+
+
+def test_a_local_folder_may_look_like_a_url(tmp_path, monkeypatch):
+    (tmp_path / "s3:").mkdir()
+    write_cloud(tmp_path / "s3:" / "a.ply", Cloud(np.eye(3, dtype=np.float32)))
+    monkeypatch.chdir(tmp_path)
+    assert len(read_cloud("s3:/a.ply")) == 3
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_only_regular_files_are_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    (tmp_path / "zero.ply").symlink_to("/dev/zero")
+    for name in ("pipe.ply", "zero.ply"):
+        with pytest.raises(FormatError, match="expected a regular file, got a pipe or a device"):
+            read_cloud(tmp_path / name)

@@ -1,11 +1,13 @@
 """Transforms call the functions, rename keys, and never change what they are given."""
 
+import inspect
 import pickle
 
 import pytest
 import torch
 from torch import nn
 
+from torchrg import transforms
 from torchrg.config import (
     GrowingConfig,
     NormalsConfig,
@@ -155,14 +157,16 @@ def test_wrong_settings_are_refused_at_once_and_in_one_line(make, message):
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        (SegmentPlanes(), "SegmentPlanes(load_config('consensus'), orient='auto')"),
+        (SegmentPlanes(), "SegmentPlanes(load_config('consensus'))"),
         (
             SegmentPlanes("paper", orient="none", **{"normals.k": 30}),
             "SegmentPlanes(load_config('paper', **{'normals.k': 30}), orient='none')",
         ),
-        (EstimateNormals(k=9), "EstimateNormals(NormalsConfig(k=9), orient='auto')"),
-        (GrowRegions(max_angle_deg=7.0), "GrowRegions(GrowingConfig(max_angle_deg=7.0), k=50)"),
+        (EstimateNormals(k=9), "EstimateNormals(NormalsConfig(k=9))"),
+        (GrowRegions(max_angle_deg=7.0), "GrowRegions(GrowingConfig(max_angle_deg=7.0))"),
+        (GrowRegions(k=30), "GrowRegions(GrowingConfig(), k=30)"),
         (MakeSuperpoints(), "MakeSuperpoints(SuperpointsConfig())"),
+        (MakeSuperpoints(white=1.0), "MakeSuperpoints(SuperpointsConfig(), white=1.0)"),
     ],
 )
 def test_transforms_are_shown_in_one_line(module, line):
@@ -192,3 +196,53 @@ def test_superpoints_read_colours_where_they_are_asked_to(coord):
         MakeSuperpoints(white=0)
     with pytest.raises(ConfigError, match="expected a sample with 'plane'"):
         MakeSuperpoints()({"coord": coord, "normal": coord})
+
+
+ARGUMENTS = {
+    "keys": {"coord": "pos"},
+    "keep_neighbors": True,
+    "orient": "up",
+    "residual": False,
+    "chunk_size": 100,
+    "k": 11,
+    "white": 1.0,
+    "up": (0.0, 1.0, 0.0),
+    "size": 0.25,
+    "planes": True,
+}
+"""A value of each argument that is not its default."""
+
+
+@pytest.mark.parametrize("name", [name for name in transforms.__all__ if name[0].isupper()])
+def test_every_argument_is_shown(name):
+    """PyG compares the text with that of processed data."""
+    kind = getattr(transforms, name)
+    required = {"size": 0.1} if name == "SampleVoxels" else {}
+    names = set(inspect.signature(kind).parameters) - {"config", "changes", "viewpoint"}
+    for argument in names & {*ARGUMENTS}:
+        changed = kind(**{**required, argument: ARGUMENTS[argument]})
+        assert f"{argument}={ARGUMENTS[argument]!r}" in repr(changed)
+    if "viewpoint" in inspect.signature(kind).parameters:
+        shown = repr(kind(orient="viewpoint", viewpoint=(1, 2, 3)))
+        assert "orient='viewpoint', viewpoint=(1.0, 2.0, 3.0)" in shown
+    assert names <= {*ARGUMENTS}
+
+
+@pytest.mark.parametrize("name", [name for name in transforms.__all__ if name[0].isupper()])
+def test_checkpoints_of_transforms_load(name, tmp_path):
+    """As Lightning's do, with ``weights_only``."""
+    kind = getattr(transforms, name)
+    module = kind(0.1) if name == "SampleVoxels" else kind()
+    torch.save({"transform": module}, tmp_path / "a.ckpt")
+    again = torch.load(tmp_path / "a.ckpt", weights_only=True)["transform"]
+    assert repr(again) == repr(module)
+
+
+def test_samples_and_results_load(coord, tmp_path):
+    sample = SegmentPlanes("classic", keep_neighbors=True)({"coord": coord})
+    seg = segment_planes(coord, "classic")
+    torch.save([sample, seg, make_superpoints(coord, seg)], tmp_path / "a.pt")
+    again, planes, superpoints = torch.load(tmp_path / "a.pt", weights_only=True)
+    assert torch.equal(again["plane"], planes.labels)
+    assert torch.equal(planes.planes.offset, seg.planes.offset)
+    assert len(superpoints.labels) == len(coord)

@@ -3,20 +3,21 @@
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, overload
 
 import numpy as np
 import torch
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Subset
 
 from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, FormatError, add_note
 from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.colors import read_colors
+from torchrg.io.files import local_path
 from torchrg.io.npy import map_folder
 from torchrg.structures import Cloud
 from torchrg.transforms.rows import Sample, SampleDict
@@ -69,7 +70,7 @@ class SceneDataset(Dataset[Sample]):
         >>> class TextScans(SceneDataset):
         ...     kind = "text-scans"
         ...     def __init__(self, root):
-        ...         self.root = Path(root)
+        ...         self.root = local_path(root)
         ...         paths = sorted(self.root.glob("*.txt"))
         ...         self.scenes = [SceneFiles(path.stem, path, (path,), "") for path in paths]
         ...     def read_scene(self, scene):
@@ -123,10 +124,34 @@ class SceneDataset(Dataset[Sample]):
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def __getitem__(self, index: int) -> Sample:
-        """Return a transformed sample."""
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> Subset[Sample]: ...
+    def __getitem__(self, index: int | slice) -> Sample | Subset[Sample]:
+        """Return a transformed sample, or the subset of a slice.
+
+        An error of the transform has a note with the name, index and path of the scene.
+        """
+        if isinstance(index, slice):
+            return Subset(self, range(len(self))[index])
         sample = self.read_sample(index)
-        return sample if self.transform is None else self.transform(sample)
+        if self.transform is None:
+            return sample
+        try:
+            return self.transform(sample)
+        except Exception as error:
+            scene = self.scenes[index]
+            add_note(error, f"Sample {index}, {scene.name}, was read from {scene.path}.")
+            raise
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield all samples; Python's default takes an IndexError of the transform for the end."""
+        return (self[index] for index in range(len(self)))
+
+    def __repr__(self) -> str:
+        root = [repr(str(self.root))] if hasattr(self, "root") else []
+        return f"{type(self).__name__}({', '.join([*root, f'{len(self):,} scenes'])})"
 
 
 class FolderOfClouds(SceneDataset):
@@ -168,7 +193,7 @@ class FolderOfClouds(SceneDataset):
         columns: Sequence[str] | None = None,
         transform: Transform | None = None,
     ) -> None:
-        self.root = Path(root)
+        self.root = local_path(root)
         self.transform = transform
         self.columns = columns
         endings = {suffix.lower() for suffix in suffixes}
@@ -257,7 +282,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
         FormatError: If the folder is missing, contains no scene, or a file is corrupt.
         ShapeError: If the arrays of the scenes differ.
     """
-    paths = [path for path in find_files(Path(folder), is_item=is_scene) if path.is_dir()]
+    paths = [path for path in find_files(local_path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
         raise FormatError(
             f"{folder}: expected folders with coord.npy, got none; pass the folder of an area."
@@ -284,7 +309,7 @@ def check_outside(root: Path, out: Path, why: str = "so that no result is read a
 
 def check_folder(folder: Path) -> None:
     """Raise FormatError if a folder does not exist."""
-    if not folder.is_dir():
+    if not local_path(folder).is_dir():
         raise FormatError(f"{folder}: no such folder; check the spelling.")
 
 

@@ -25,7 +25,7 @@ from torchrg._checks import as_tensor
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.colors import narrow_colors, read_colors
-from torchrg.io.files import PARSE_ERRORS, create_folder
+from torchrg.io.files import PARSE_ERRORS, create_folder, local_path
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, describe_planes
 from torchrg.structures import Array, Segmentation
@@ -76,7 +76,7 @@ def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
     Raises:
         FormatError: If coordinates are missing, a file is corrupt, or lengths differ.
     """
-    arrays = map_folder(Path(folder), POINT_ARRAYS)
+    arrays = map_folder(local_path(folder), POINT_ARRAYS)
     if arrays["coord"].ndim != 2:
         shape = arrays["coord"].shape
         raise FormatError(f"{Path(folder) / 'coord.npy'}: expected shape (N, 3), got {shape}.")

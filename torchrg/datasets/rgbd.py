@@ -24,6 +24,7 @@ from torchrg.datasets.rgbd_files import (
 from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, find_layout, find_recordings
 from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view
 from torchrg.errors import ConfigError, DepthWarning, FormatError
+from torchrg.io.files import local_path
 from torchrg.transforms.rows import SampleDict
 
 
@@ -163,7 +164,7 @@ class RGBDFrames(SceneDataset):
         Warns:
             DepthWarning: If a camera is built in, or implausible for an image.
         """
-        folder = Path(root)
+        folder = local_path(root)
         refuse_recording(folder)
         if folder.is_file():
             raise FormatError(f"{root}: expected a folder of frames, got a file; pass its folder.")

@@ -17,7 +17,14 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io.colors import narrow_colors
-from torchrg.io.files import PARSE_ERRORS, check_available, check_file, decode_file, wrap_errors
+from torchrg.io.files import (
+    PARSE_ERRORS,
+    check_available,
+    check_file,
+    decode_file,
+    local_path,
+    wrap_errors,
+)
 from torchrg.structures import FARTHEST, Array
 
 Value = TypeVar("Value")
@@ -69,7 +76,7 @@ def read_depth(
     """
     if not 0 < depth_scale < float("inf"):
         raise ConfigError(f"read_depth: expected depth_scale > 0, got {depth_scale}.")
-    source = Path(path)
+    source = local_path(path)
     refuse_recording(source)
     readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16}
     reader = readers.get(source.suffix.lower())

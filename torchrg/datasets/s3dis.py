@@ -26,7 +26,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
 from torchrg.io.colors import find_white, narrow_colors, read_colors
-from torchrg.io.files import check_file
+from torchrg.io.files import check_file, local_path
 from torchrg.structures import Cloud
 
 CLASS_ORDERS = {
@@ -98,7 +98,7 @@ class S3DIS(SceneDataset):
         class_order: str = "pointcept",
         transform: Transform | None = None,
     ) -> None:
-        self.root = Path(root)
+        self.root = local_path(root)
         self.class_order = class_order
         self.classes = class_names(class_order)
         self.transform = transform

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import read_cloud
-from torchrg.io.files import PARSE_ERRORS, decode_file, wrap_errors
+from torchrg.io.files import PARSE_ERRORS, decode_file, local_path, wrap_errors
 from torchrg.plane_table import Arrays
 from torchrg.structures import Cloud
 from torchrg.transforms.rows import SampleDict
@@ -118,7 +118,7 @@ class ScanNet(SceneDataset):
             raise ConfigError(
                 f"ScanNet: expected split to be one of {', '.join(_SPLITS)}, got {split!r}."
             )
-        self.root = Path(root)
+        self.root = local_path(root)
         self.transform = transform
         check_folder(self.root)
         scenes = [_scene(self.root, mesh) for mesh in _meshes(self.root)]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes, eager_only
-from torchrg._parallel import nonzero_rows, sequential_operations
+from torchrg._parallel import nonzero_rows
 from torchrg.config import DepthConfig, settings_of
 from torchrg.depth.camera import check_view, has_depth, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
@@ -27,7 +27,6 @@ from torchrg.structures import Segmentation
 
 @eager_only
 @torch.no_grad()
-@sequential_operations()
 def segment_depth(
     depth: Tensor,
     intrinsics: Tensor,

@@ -14,7 +14,7 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import check_length
 from torchrg.io.e57 import count_e57, read_e57
 from torchrg.io.fields import add_result_fields, convert_coordinates
-from torchrg.io.files import ARCHIVE_ERRORS, atomic_path, check_file, check_writable
+from torchrg.io.files import ARCHIVE_ERRORS, atomic_path, check_file, check_writable, local_path
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
@@ -120,7 +120,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
         >>> cloud.coordinates.shape, cloud.fields["color"].tolist()
         ((2, 3), [[255, 0, 0], [0, 255, 0]])
     """
-    source = Path(path)
+    source = local_path(path)
     size, fmt = check_file(source), _get_format(source)
     if columns is not None and not fmt.takes_columns:
         raise FormatError(

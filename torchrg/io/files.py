@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from torchrg.errors import OUT_OF_MEMORY, FormatError, is_out_of_memory
+from torchrg.structures import FilePath
 
 PARSE_ERRORS = (
     ValueError,
@@ -44,6 +45,8 @@ _PROBE_BYTES = 1 << 20
 fit if its last write failed."""
 _CHECKED_END = 1 << 16
 """Bytes checked after the last record. Padding to a page is shorter."""
+_URL = re.compile(r"(?:^|/)[A-Za-z][A-Za-z0-9+.-]+:/")
+"""A URL, also as a path, which has a single slash. Drives of Windows have one letter."""
 _mark: ContextVar[str | None] = ContextVar("_mark", default=None)
 """Mark in the temporary file names of :func:`atomic_path` in this context."""
 
@@ -211,8 +214,24 @@ def check_space(folder: Path, needed: int, what: str, *, repair: str = "") -> No
         )
 
 
+def local_path(source: FilePath) -> Path:
+    """Return the path of a local file or folder; raise FormatError for URLs and open files."""
+    if isinstance(source, bytes | bytearray) or hasattr(source, "read"):
+        raise FormatError(
+            f"expected the path of a local file, got {type(source).__name__}; write its content to "
+            "a temporary file with the suffix of its format."
+        )
+    path = Path(source)
+    if _URL.search(str(source)) and not os.path.lexists(path):
+        raise FormatError(
+            f"{source}: expected a local path, got a URL; copy it first, for example with "
+            "fsspec.open_local('simplecache::' + url, simplecache={'same_names': True})."
+        )
+    return path
+
+
 def check_file(path: Path) -> int:
-    """Check that a path is a non-empty file, and return its size in bytes."""
+    """Check that a path is a non-empty regular file, and return its size in bytes."""
     try:
         status = path.stat()
     except FileNotFoundError as error:
@@ -223,6 +242,8 @@ def check_file(path: Path) -> int:
         ) from error
     if stat.S_ISDIR(status.st_mode):
         raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
+    if not stat.S_ISREG(status.st_mode):
+        raise FormatError(f"{path}: expected a regular file, got a pipe or a device; remove it.")
     if status.st_size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; copy or write it again.")
     return status.st_size

@@ -49,7 +49,6 @@ _MAX_CELLS_PER_POINT = 8
 
 
 @eager_only
-@sequential_operations()
 def search_knn(
     points: Points,
     k: int,

@@ -27,7 +27,7 @@ from typing import Any
 import torch
 
 from torchrg._checks import as_tensor, check_points, eager_only
-from torchrg._parallel import CHUNK_SIZE, sequential_operations
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.neighbors import check_neighbors, distinct_points, search_knn
@@ -81,7 +81,6 @@ WITHOUT_GRADIENT = {"consensus"}
 
 
 @eager_only
-@sequential_operations()
 def estimate_normals(
     points: Points,
     config: NormalsConfig | AnyConfig | None = None,

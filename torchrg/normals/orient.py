@@ -17,7 +17,7 @@ from torchrg._checks import (
     check_shapes,
     eager_only,
 )
-from torchrg._parallel import nonzero_rows, sequential_operations
+from torchrg._parallel import nonzero_rows
 from torchrg.errors import ConfigError
 from torchrg.neighbors import check_neighbors, distinct_points, distinct_rows, search_knn
 from torchrg.normals.faces import find_faces, find_surfaces
@@ -54,7 +54,6 @@ _AS_NEAR = 1 + 1e-6
 
 
 @eager_only
-@sequential_operations()
 def orient_normals(
     points: Points | Cloud,
     normals: Points,

@@ -17,7 +17,6 @@ from torchrg._parallel import (
     CHUNK_SIZE,
     ROWS_AT_ONCE,
     map_chunks,
-    sequential_operations,
     split_rows,
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
@@ -37,7 +36,6 @@ neighbor lists."""
 
 
 @eager_only
-@sequential_operations()
 def grow_regions(
     points: Points,
     normals: Points,

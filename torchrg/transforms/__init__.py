@@ -13,6 +13,8 @@ next transform, see :class:`torchrg.transforms.sample.NeighborSearch`.
 cameras applies kornia's augmentations to them.
 """
 
+import torch
+
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.transforms.depth import DepthToCloud, SegmentDepth, fuse_depth
 from torchrg.transforms.planes import (
@@ -23,7 +25,7 @@ from torchrg.transforms.planes import (
     OrientNormals,
     SegmentPlanes,
 )
-from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleVoxels
+from torchrg.transforms.sample import CenterCloud, KeepFinite, NeighborSearch, SampleVoxels
 
 __all__ = [
     "AlignAxes",
@@ -42,3 +44,8 @@ __all__ = [
     "sample_voxels",
 ]
 __dir__ = __all__.copy
+
+# Lets torch.load(weights_only=True) read checkpoints of transforms, and their samples.
+torch.serialization.add_safe_globals(
+    [NeighborSearch, *(value for value in globals().values() if isinstance(value, type))]
+)

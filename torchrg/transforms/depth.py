@@ -171,10 +171,6 @@ class SegmentDepth(DepthTransform):
         self.config = settings_of("SegmentDepth", DepthConfig, config, changes)
         self.orient, self.planes = orient, planes
 
-    def extra_repr(self) -> str:
-        """Return the configuration."""
-        return f"{super().extra_repr()}, orient={self.orient!r}"
-
     @eager_only
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""

@@ -100,12 +100,6 @@ class OrientedTransform(CloudTransform):
         viewpoint = self.viewpoint if self.viewpoint is not None else cloud.get("viewpoint")
         return {"orient": self.orient, "viewpoint": viewpoint, "front": cloud.get("front")}
 
-    def extra_repr(self) -> str:
-        """Return the configuration."""
-        options = {"orient": self.orient, "viewpoint": self.viewpoint}
-        shown = [f"{name}={value!r}" for name, value in options.items() if value is not None]
-        return ", ".join([*filter(None, [super().extra_repr()]), *shown])
-
 
 class EstimateNormals(OrientedTransform):
     """Add unit normals and curvature; see :func:`torchrg.estimate_normals`.
@@ -253,10 +247,6 @@ class GrowRegions(CloudTransform):
         )
         plane = distinct.restore(grown, fill=UNLABELED)
         return {"plane": rank_by_count(plane)[plane]}
-
-    def extra_repr(self) -> str:
-        """Return the configuration."""
-        return f"{super().extra_repr()}, k={self.k}"
 
 
 class SegmentPlanes(OrientedTransform):

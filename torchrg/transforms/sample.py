@@ -7,6 +7,7 @@ cloud index of each point (PyG). Transforms treat each cloud separately. PyG is 
 
 import copy
 import importlib
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -70,8 +71,8 @@ class SampleTransform(nn.Module):
 
     def __init__(self, *, keys: Mapping[str, str] | None = None) -> None:
         super().__init__()
-        self.renamed = dict(keys or {})
-        unknown = self.renamed.keys() - set(self.names)
+        self.keys = dict(keys or {})
+        unknown = self.keys.keys() - set(self.names)
         if unknown:
             raise ConfigError(
                 f"{type(self).__name__}: expected keys to rename {', '.join(self.names)}, got "
@@ -79,8 +80,16 @@ class SampleTransform(nn.Module):
             )
 
     def extra_repr(self) -> str:
-        """Return the configuration."""
-        return "" if self.config is None else repr(self.config)
+        """Return the configuration, and each argument that differs from its default.
+
+        PyG compares the text to decide whether processed data are up to date.
+        """
+        shown = [] if self.config is None else [repr(self.config)]
+        for name, parameter in inspect.signature(type(self)).parameters.items():
+            value = getattr(self, name, parameter.default)
+            if name not in ("config", "changes") and value not in (parameter.default, {}):
+                shown.append(f"{name}={value!r}")
+        return ", ".join(shown)
 
     @eager_only
     def forward(self, sample: Sample) -> Sample:
@@ -99,7 +108,7 @@ class SampleTransform(nn.Module):
     def key(self, sample: Sample, name: str) -> str:
         """Return the key of an entry in a sample."""
         default = name if isinstance(sample, Mapping) else PYG_KEYS.get(name, name)
-        return self.renamed.get(name, default)
+        return self.keys.get(name, default)
 
     def read(self, sample: Sample, name: str) -> Tensor:
         """Return an entry of a sample as a tensor, or raise ConfigError."""
@@ -350,10 +359,6 @@ class SampleVoxels(SampleTransform):
             sample, voxel_index
         )
         return self.replace(sample, selected | added)
-
-    def extra_repr(self) -> str:
-        """Return the configuration."""
-        return f"size={self.size}"
 
 
 def can_split(sample: Sample) -> bool:
