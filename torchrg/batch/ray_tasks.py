@@ -1,6 +1,12 @@
-"""Ray engine, based on Ray's retries and node management."""
+"""Ray engine, based on Ray's scheduling and node management."""
 
-from collections.abc import Sequence
+import signal
+import socket
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,12 +16,17 @@ from torchrg._parallel import CHILD_ENVIRONMENT, in_root_directory
 from torchrg.batch.local import POLL_SECONDS
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
+from torchrg.errors import ConfigError
+from torchrg.io.files import first_line
 
 __all__ = ["run_ray"]
 __dir__ = __all__.copy
 
-_RETRIES = 3
-"""Maximum retries of a task whose process or node was lost."""
+_ATTEMPTS = 3
+"""Maximum attempts at a scan whose process or node is lost. Retries by Ray itself have no limit if
+the memory of a node runs out."""
+_CONNECT_SECONDS = 10.0
+"""Timeout of the test of an address. Ray itself tries for minutes."""
 _OBJECT_STORE_BYTES = 100_000_000
 """Object store size: only tasks and reports pass through it, never points."""
 
@@ -43,6 +54,7 @@ def run_ray(
         unfinished scans.
 
     Raises:
+        ConfigError: If the address is not that of a cluster, or Ray cannot start or connect.
         MissingDependencyError: If Ray is not installed.
     """
     ray = require("ray", extra="ray", purpose="convert on a Ray cluster")
@@ -52,30 +64,43 @@ def run_ray(
         "object_store_memory": _OBJECT_STORE_BYTES,
         "include_dashboard": False,
     }
-    with in_root_directory():
-        ray.init(
-            address=address or "local",
-            logging_level="error",
-            log_to_driver=False,
-            runtime_env={"env_vars": CHILD_ENVIRONMENT},
-            **({} if address else started),
-        )
+    if address is not None:
+        _check_address(address)
+    with in_root_directory(), _keep_interrupts():
+        try:
+            ray.init(
+                address="local" if address is None else address,
+                logging_level="error",
+                log_to_driver=False,
+                runtime_env={"env_vars": CHILD_ENVIRONMENT},
+                **(started if address is None else {}),
+            )
+        except (ValueError, RuntimeError, OSError, ray.exceptions.RayError) as error:
+            where = "Ray" if address is None else f"Ray address {address}"
+            raise ConfigError(f"{where}: no connection: {first_line(error)}.") from error
     pending: dict[Any, Job] = {}
+    attempts: Counter[str] = Counter()
     try:
         largest = max(
             int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]
         )
-        run = ray.remote(num_cpus=1, max_retries=_RETRIES)(_run)
+        run = ray.remote(num_cpus=1, max_retries=0)(_run)
         waiting = sorted(jobs, key=lambda job: job.memory)
         while waiting or pending:
             while waiting and (workers is None or len(pending) < workers):
                 job = waiting.pop()
+                attempts[job.name] += 1
                 pending[run.options(memory=min(job.memory, largest)).remote(job)] = job
             ready, _ = ray.wait(list(pending), num_returns=1, timeout=POLL_SECONDS)
             if not ready:
                 yield None
             for reference in ready:
-                yield _collect(ray, reference, pending.pop(reference))
+                job = pending.pop(reference)
+                report = _collect(ray, reference, job, attempts[job.name])
+                if report is None:
+                    waiting.append(job)
+                else:
+                    yield report
     finally:
         for reference in pending:
             ray.cancel(reference, force=True)
@@ -88,12 +113,56 @@ def _run(job: Job) -> TaskReport:
     return convert_scan(job)
 
 
-def _collect(ray: Any, reference: Any, job: Job) -> TaskReport:  # noqa: ANN401
-    """Return the report of a scan, or a failure report if Ray could not finish it."""
+def _check_address(address: str) -> None:
+    """Raise ConfigError unless a process listens at an address of the form ``host:port``.
+
+    Other addresses of Ray, ``auto`` and ``ray://host:port``, are not tested.
+
+    Example:
+        >>> _check_address("nowhere")
+        Traceback (most recent call last):
+        torchrg.errors.ConfigError: Ray address 'nowhere': expected auto or host:port of a cluster.
+    """
+    if address in ("auto", "local") or "://" in address:
+        return
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal():
+        raise ConfigError(f"Ray address {address!r}: expected auto or host:port of a cluster.")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), _CONNECT_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"Ray address {address}: no cluster there: {first_line(error)}; start one with "
+            f"ray start --head --port {port}."
+        ) from error
+
+
+@contextmanager
+def _keep_interrupts() -> Iterator[None]:
+    """Restore the handlers of Ctrl-C and SIGTERM, which Ray replaces when it starts."""
+    signals = (signal.SIGINT, signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in signals}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+
+def _collect(ray: Any, reference: Any, job: Job, attempts: int) -> TaskReport | None:  # noqa: ANN401
+    """Return the report of a scan, or None if it must be tried again."""
     try:
         report: TaskReport = ray.get(reference)
     except ray.exceptions.RayError as error:
         job.clean()
-        text = " ".join(str(error).split())
-        return TaskReport(job.name, "failed", reason=f"{type(error).__name__}: {text}"[:500])
-    return report
+        if not isinstance(error, ray.exceptions.RayTaskError) and attempts < _ATTEMPTS:
+            return None
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]
+        if isinstance(error, ray.exceptions.OutOfMemoryError):
+            reason = (
+                f"the memory of its node ran out in {attempts} attempts; use nodes with more "
+                "memory, or a smaller part of the data"
+            )
+        return TaskReport(job.name, "failed", reason=reason, attempts=attempts)
+    return replace(report, attempts=attempts)

@@ -46,7 +46,7 @@ class TaskReport:
         details: Traceback of an unexpected failure.
         disk_full: Whether the task failed because the disk is full.
         host: Machine and process that ran the task.
-        attempts: Number of attempts; Ray does not report it.
+        attempts: Number of attempts.
     """
 
     name: str

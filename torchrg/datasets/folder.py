@@ -70,7 +70,7 @@ class SceneDataset(Dataset[Sample]):
         >>> class TextScans(SceneDataset):
         ...     kind = "text-scans"
         ...     def __init__(self, root):
-        ...         self.root = local_path(root)
+        ...         self.root = Path(root)
         ...         paths = sorted(self.root.glob("*.txt"))
         ...         self.scenes = [SceneFiles(path.stem, path, (path,), "") for path in paths]
         ...     def read_scene(self, scene):
