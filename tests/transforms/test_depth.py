@@ -242,3 +242,12 @@ def test_negative_focal_lengths_turn_the_image_over():
     camera, mirrored = ([[5.0, 0, 2], [0, fy, 1], [0, 0, 1]] for fy in (5.0, -5.0))
     expected = depth_to_points(depth, torch.tensor([camera])) * torch.tensor([1.0, -1, 1])
     torch.testing.assert_close(depth_to_points(depth, torch.tensor([mirrored])), expected)
+
+
+def test_tables_are_collated_into_a_list(frames):
+    single = SegmentDepth(planes=True)
+    batch = torch.utils.data.default_collate([single(sample_of(frame)) for frame in frames])
+    expected = single(batch_of(frames))["planes"]
+    assert len(batch["planes"]) == len(frames)
+    for table, other in zip(batch["planes"], expected, strict=True):
+        assert torch.equal(table.normal, other.normal)

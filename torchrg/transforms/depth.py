@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from torchrg._checks import as_tensor, check_choices, eager_only
 from torchrg.config import settings_of
@@ -15,7 +16,7 @@ from torchrg.depth.camera import read_intrinsics
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.normals import Orientation
-from torchrg.structures import UNLABELED
+from torchrg.structures import UNLABELED, Planes
 from torchrg.transforms.rows import Entries, SampleDict, check_sample
 from torchrg.transforms.sample import SampleTransform
 
@@ -188,6 +189,10 @@ class SegmentDepth(DepthTransform):
             tables = [seg.planes for seg in segmentations]
             added[self.key(sample, "planes")] = tables if batch else tables[0]
         return added
+
+
+# torch's default_collate gives a list of plane tables, like SegmentDepth for a batch.
+default_collate_fn_map[Planes] = lambda tables, **_: list(tables)
 
 
 class FusedFrames(NamedTuple):
