@@ -184,7 +184,10 @@ def test_a_reader_that_goes_away_is_no_error():
 def test_output_that_cannot_be_written_is_one_line(room_file):
     with Path("/dev/full").open("w") as output:
         done = run_into(output, "info", room_file)
-    assert (done.returncode, done.stderr) == (2, "torchrg: info: No space left on device.\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "torchrg: standard output: No space left on device.\n",
+    )
 
 
 def test_every_command_is_named_by_help_and_to_those_who_misspell_one(run):

@@ -1,7 +1,9 @@
 """``torchrg convert``: a folder of rooms from end to end, what it refuses, and what it tells."""
 
+import errno
 import io
 import json
+import os
 import shutil
 from dataclasses import asdict
 
@@ -105,6 +107,39 @@ def test_a_disk_that_is_too_small_is_told_beforehand(rooms, tmp_path, convert, m
     done = convert("folder", rooms, tmp_path / "out", *flags)
     assert done.code == 2
     assert "MB of free disk for 2 scans, got 0.0 MB; free some space" in done.err
+
+
+class Closed(io.StringIO):
+    """A pipe whose reader has gone."""
+
+    def write(self, text):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+
+def test_output_that_closes_keeps_the_code_and_the_report(rooms, tmp_path, monkeypatch):
+    shutil.copytree(rooms, tmp_path / "in")
+    (tmp_path / "in" / "bad.ply").write_bytes(b"ply\n")
+    monkeypatch.setattr("sys.stdout", Closed())
+    out, flags = tmp_path / "out", ["--preset", "classic", "--workers", "1"]
+    assert main(["convert", "folder", str(tmp_path / "in"), str(out), *flags]) == 3
+    report = json.loads((out / "report.json").read_text())
+    assert report["scans_by_status"] == {
+        "converted": 2, "kept": 0, "failed": 1, "not started": 0
+    }  # fmt: skip
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_pipes_and_devices_are_failed_scans(rooms, tmp_path, convert):
+    root, out = tmp_path / "in", tmp_path / "out"
+    shutil.copytree(rooms, root)
+    os.mkfifo(root / "pipe.ply")
+    (root / "zero.txt").symlink_to("/dev/zero")
+    assert convert("folder", root, out, "--dry-run").code == 0
+    done = convert("folder", root, out, "--workers", 1)
+    assert done.code == 3
+    assert "2 of 4 scans are complete" in done.err
+    for name in ("pipe.ply", "zero.txt"):
+        assert f"{root / name}: expected a regular file, got a pipe or a device" in done.err
 
 
 def test_a_finished_set_has_nothing_to_do(rooms, converted, convert):

@@ -3,6 +3,8 @@
 The reading is that of the programs in our own words; each function names whose it is.
 """
 
+import json
+import os
 import shutil
 
 import numpy as np
@@ -209,3 +211,13 @@ def test_one_scan_after_the_other_is_on_the_list_of_the_test(root, tmp_path, mon
     monkeypatch.chdir("/")
     samples, _ = load_mask3d(tmp_path / "out", "test")
     assert [*samples] == ["scene0011_00_vh_clean_2", "scene0799_00_vh_clean_2"]
+
+
+def test_names_that_are_not_utf8_are_listed_by_their_bytes(tmp_path):
+    name = os.fsdecode(b"bad\xff")
+    folder = tmp_path / "meta_data" / "scannetv2_train"
+    folder.mkdir(parents=True)
+    (folder / f"{name}.json").write_text(json.dumps({"name": name}))
+    for _ in range(2):
+        write_lists("mmdet3d", "ScanNet", tmp_path, MARK)
+    assert (tmp_path / "meta_data" / "scannetv2_train.txt").read_bytes() == b"bad\xff\n"

@@ -17,7 +17,7 @@ from torchrg.batch.task import TaskReport
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import PARSE_ERRORS
+from torchrg.io.files import PARSE_ERRORS, check_regular
 from torchrg.result import RECORD as RECORD
 
 Record = dict[str, Any]
@@ -64,6 +64,7 @@ def describe_versions() -> dict[str, str]:
 
 def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal."""
+    check_regular(path)
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(_BYTES_PER_READ):
@@ -178,7 +179,7 @@ def reason_to_convert(job: Recorded) -> str:
         return "new"
     try:
         description = json.loads(json.dumps(job.describe()))
-    except OSError:
+    except (OSError, FormatError):
         return "input cannot be read"
     changes = {"versions": "version", "config": "settings", "source": "options", "inputs": "input"}
     for key, name in changes.items():

@@ -3,12 +3,9 @@
 import difflib
 import gc
 import importlib
-import os
 import sys
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
-from io import UnsupportedOperation
 
 from torchrg.cli.ending import (
     INTERRUPTED,
@@ -17,6 +14,7 @@ from torchrg.cli.ending import (
     fail,
     raising_interrupts,
     warn,
+    writing_to,
 )
 from torchrg.errors import (
     OUT_OF_MEMORY,
@@ -59,13 +57,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 success; 2 usage error or invalid input; 3 some inputs of a batch failed; 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    with writing_to(sys.stdout) as output, writing_to(sys.stderr):
+        code = _exit_code(arguments)
+    if output.error is None or isinstance(output.error, BrokenPipeError):
+        return code
+    message = f"standard output: {output.error.strerror or output.error}."
+    return fail(message, code=code or USAGE_ERROR)
+
+
+def _exit_code(arguments: list[str]) -> int:
+    """Run a command, print its errors, and return the exit code."""
     name = next(iter(arguments), "")
     try:
-        try:
-            return _run(arguments)
-        finally:
-            # Flush here, so that write errors are reported as errors of the command.
-            print(end="", flush=True)
+        return _run(arguments)
     except TorchrgError as error:
         return fail(str(error))
     except (MemoryError, RuntimeError) as error:
@@ -73,11 +77,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return fail(f"{name}: {OUT_OF_MEMORY}")
     except OSError as error:
-        # Otherwise Python would flush stdout again at exit and print a traceback.
-        with suppress(UnsupportedOperation, AttributeError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError):
-            return 0
         return fail(f"{error.filename or name}: {error.strerror or error}.")
     except KeyboardInterrupt:
         return fail(INTERRUPTED_LINE, code=INTERRUPTED)

@@ -7,7 +7,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 USAGE_ERROR = 2
 """Exit code of a usage error or an invalid input."""
@@ -19,6 +19,57 @@ INTERRUPTED = 130
 INTERRUPTED_LINE = "interrupted; every file written is complete."
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 """Ctrl-C, and the termination signal of batch systems."""
+
+
+class Output:
+    """A standard stream that keeps its first error, so that a command still ends its work.
+
+    Attributes:
+        stream: The stream.
+        error: The first error of writing, such as a closed pipe or a full disk, or None.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+        self.error: OSError | None = None
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        """Write a text unless an earlier one could not be written; return its length."""
+        if self.error is None:
+            with self._keeping_error():
+                self.stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write buffered text."""
+        if self.error is None:
+            with self._keeping_error():
+                self.stream.flush()
+
+    @contextlib.contextmanager
+    def _keeping_error(self) -> Iterator[None]:
+        """Keep an error, and discard what Python would write again at its exit."""
+        try:
+            yield
+        except OSError as error:
+            self.error = error
+            with contextlib.suppress(OSError, AttributeError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
+
+
+@contextlib.contextmanager
+def writing_to(stream: TextIO) -> Iterator[Output]:
+    """Replace ``sys.stdout`` or ``sys.stderr`` in a block by a stream that keeps its errors."""
+    output, name = Output(stream), "stdout" if stream is sys.stdout else "stderr"
+    setattr(sys, name, output)
+    try:
+        yield output
+    finally:
+        output.flush()
+        setattr(sys, name, stream)
 
 
 def printable(text: str) -> str:

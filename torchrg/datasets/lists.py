@@ -92,7 +92,7 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
     for folder, scans in listed_in.items() if any(listed_in.values()) or removed else ():
         path = out / f"{folder}.txt"
         with wrap_errors(f"{path}: expected one name per line, got: ", ValueError):
-            text = path.read_text(encoding="utf-8") if path.is_file() else ""
+            text = path.read_text("utf-8", "surrogateescape") if path.is_file() else ""
         existing = [line.strip() for line in text.splitlines() if line.strip()]
         moved = removed.union(*listed_in.values()) - set(scans)
         listed = [name for name in existing if name not in moved]
@@ -108,7 +108,8 @@ def _write(out: Path, name: str | Path, text: str) -> None:
     """Write a list atomically."""
     create_folder((out / name).parent)
     with atomic_path(out / name, within=out) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # Undecodable bytes of file names stay as they are.
+        temporary.write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
 def _entry_files(out: Path, folders: Sequence[str], files: Collection[Path]) -> list[Path]:

@@ -270,7 +270,7 @@ def estimate_points(path: Path) -> int:
         3
     """
     try:
-        return _get_format(path).count(path, path.stat().st_size)
+        return _get_format(path).count(path, check_file(path))
     except (OSError, FormatError, *ARCHIVE_ERRORS):
         return 0
 

@@ -230,20 +230,31 @@ def local_path(source: FilePath) -> Path:
     return path
 
 
+def check_regular(path: Path) -> os.stat_result:
+    """Return the status of a file or folder; raise FormatError for pipes and devices.
+
+    Call it before opening a file: reading a pipe or a device may never end.
+    """
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+        raise FormatError(f"{path}: expected a regular file, got a pipe or a device; remove it.")
+    return status
+
+
 def check_file(path: Path) -> int:
     """Check that a path is a non-empty regular file, and return its size in bytes."""
     try:
-        status = path.stat()
+        status = check_regular(path)
     except FileNotFoundError as error:
         raise FormatError(f"{path}: file not found; check the path.") from error
+    except FormatError:
+        raise
     except (OSError, ValueError) as error:  # ValueError: not a valid file name.
         raise FormatError(
             f"{path}: cannot be read: {getattr(error, 'strerror', error)}."
         ) from error
     if stat.S_ISDIR(status.st_mode):
         raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
-    if not stat.S_ISREG(status.st_mode):
-        raise FormatError(f"{path}: expected a regular file, got a pipe or a device; remove it.")
     if status.st_size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; copy or write it again.")
     return status.st_size
