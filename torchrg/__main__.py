@@ -4,6 +4,9 @@ import gc
 import os
 import sys
 
+# OpenBLAS starts a thread per core, which torchrg never uses, and interrupts the process if one
+# cannot start.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Garbage collection during the import of torch takes a fifth of the startup time. Commands and
 # workers enable it again.
 gc.disable()

@@ -21,17 +21,35 @@ OUT_OF_MEMORY = "out of memory; use a machine with more memory, or a smaller par
 """Message of any out-of-memory error."""
 
 
-def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error means out of memory; torch raises a RuntimeError.
+OUT_OF_THREADS = (
+    "no further thread can be started; raise the limit of processes, or set OMP_NUM_THREADS=1."
+)
+"""Message of any error at a limit of threads."""
+_LIMITS = {
+    "can't allocate memory": OUT_OF_MEMORY,
+    "not enough memory": OUT_OF_MEMORY,
+    "out of memory": OUT_OF_MEMORY,
+    "failed to map segment": OUT_OF_MEMORY,
+    "can't start new thread": OUT_OF_THREADS,
+}
+"""Messages by words in errors of Python, torch and the loader of libraries."""
+
+
+def system_limit(error: BaseException) -> str:
+    """Return the message of an error at a limit of the system, or "" for other errors.
 
     Example:
-        >>> is_out_of_memory(MemoryError()), is_out_of_memory(RuntimeError("shape mismatch"))
-        (True, False)
+        >>> system_limit(MemoryError()) == OUT_OF_MEMORY
+        True
+        >>> system_limit(RuntimeError("can't start new thread"))[:24]
+        'no further thread can be'
+        >>> system_limit(RuntimeError("shape mismatch"))
+        ''
     """
-    words = ("can't allocate memory", "not enough memory", "out of memory")
-    return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(word in str(error) for word in words)
-    )
+    if isinstance(error, MemoryError):
+        return OUT_OF_MEMORY
+    found = [message for words, message in _LIMITS.items() if words in str(error)]
+    return found[0] if found and isinstance(error, RuntimeError | ImportError | SystemError) else ""
 
 
 def add_note(error: BaseException, note: str) -> None:

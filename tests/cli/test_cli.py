@@ -233,3 +233,24 @@ def test_single_points_far_off_that_cost_precision_are_told(room_file, tmp_path,
     first, second = done.err.splitlines()
     assert "zero.npy: half of the points lie within " in first
     assert "no plane found" in second
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (RuntimeError("can't start new thread"), "no further thread can be started"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out of memory"),
+        (ImportError("libtorch_cpu.so: failed to map segment"), "out of memory"),
+        (MemoryError(), "out of memory"),
+    ],
+)
+def test_a_limit_of_the_system_is_one_line(error, message, run, monkeypatch):
+    from torchrg.cli import info
+
+    def fail(argv):
+        raise error
+
+    monkeypatch.setattr(info, "run", fail)
+    done = run("info", "room.ply")
+    assert done.code == 2
+    assert f"torchrg: info: {message}" in done.error

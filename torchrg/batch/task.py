@@ -12,11 +12,10 @@ from typing import Any, Literal, get_args
 
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.errors import (
-    OUT_OF_MEMORY,
     DepthWarning,
     PrecisionWarning,
     TorchrgError,
-    is_out_of_memory,
+    system_limit,
 )
 from torchrg.io.files import is_disk_full
 
@@ -81,7 +80,7 @@ def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
             warnings.simplefilter("ignore", DepthWarning)
             report = work(clock.begin)
     except Exception as error:  # noqa: BLE001 A failing task must not stop other tasks.
-        is_expected = isinstance(error, TorchrgError | OSError) or is_out_of_memory(error)
+        is_expected = isinstance(error, TorchrgError | OSError) or system_limit(error)
         report = TaskReport(
             name,
             "failed",
@@ -128,8 +127,8 @@ class _StageClock:
 
 def _reason(error: Exception) -> str:
     """Format an error as one line, with the file name if possible."""
-    if is_out_of_memory(error):
-        return OUT_OF_MEMORY
+    if limit := system_limit(error):
+        return limit
     if isinstance(error, OSError):
         return f"{error.filename or 'a file'}: {error.strerror or error}."
     text = " ".join(str(error).split())

@@ -17,11 +17,10 @@ from torchrg.cli.ending import (
     writing_to,
 )
 from torchrg.errors import (
-    OUT_OF_MEMORY,
     ConfigError,
     PrecisionWarning,
     TorchrgError,
-    is_out_of_memory,
+    system_limit,
 )
 
 COMMANDS = {
@@ -72,12 +71,12 @@ def _exit_code(arguments: list[str]) -> int:
         return _run(arguments)
     except TorchrgError as error:
         return fail(str(error))
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        return fail(f"{name}: {OUT_OF_MEMORY}")
     except OSError as error:
         return fail(f"{error.filename or name}: {error.strerror or error}.")
+    except Exception as error:
+        if limit := system_limit(error):
+            return fail(f"{name}: {limit}")
+        raise
     except KeyboardInterrupt:
         return fail(INTERRUPTED_LINE, code=INTERRUPTED)
 

@@ -18,7 +18,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
-from torchrg.errors import OUT_OF_MEMORY, FormatError, is_out_of_memory
+from torchrg.errors import FormatError, system_limit
 from torchrg.structures import FilePath
 
 PARSE_ERRORS = (
@@ -341,8 +341,8 @@ def wrap_errors(message: str, *errors: type[BaseException], repair: str = "") ->
     except FormatError:
         raise
     except errors as error:
-        if is_out_of_memory(error):
-            raise FormatError(f"{message}{OUT_OF_MEMORY}") from error
+        if limit := system_limit(error):
+            raise FormatError(f"{message}{limit}") from error
         raise FormatError(f"{message}{first_line(error)}{repair}.") from error
 
 
