@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
-    {"errors", "version", "_deprecated", "_display", "_parallel"},
+    {"errors", "version", "_parallel"},
     {"precision"},
     {"_checks", "_optional", "scratch", "structures"},
     {"kernels"},
@@ -35,6 +35,8 @@ FILES = {
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 """Every module of the package by its name."""
+SHOWN = ("torchrg.structures", {"torchrg.render.notebook", "torchrg.render.page"})
+"""The only imports upward, in methods: what a notebook shows of a result."""
 LOADS_ANYTHING = {"torchrg._optional"}
 """Modules that import by a name they are given: packages of others."""
 
@@ -85,6 +87,7 @@ def imported_modules(module, source):
                 f"{module}: import_module of a variable hides what is imported"
             )
             found |= named or set()
+    found -= SHOWN[1] if module == SHOWN[0] else set()
     return found - {None, module}
 
 

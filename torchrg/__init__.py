@@ -29,13 +29,10 @@ Example:
     (torch.Size([2000]), torch.Size([2000, 3]), True)
 """
 
-from torchrg import _display
 from torchrg.version import __version__ as __version__
 
 TYPE_CHECKING = False  # Like typing.TYPE_CHECKING, without importing typing.
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from torchrg import datasets, depth, metrics, nn, normals, robust, scenes, transforms
     from torchrg.config import load_config
     from torchrg.errors import TorchrgError
@@ -89,15 +86,6 @@ else:
         """Return the public names, loaded or not."""
         return sorted([*__all__, *_PACKAGES, "__version__"])
 
-
-def _load_display() -> "ModuleType":
-    """Load the module that displays results in notebooks."""
-    from torchrg.render import notebook
-
-    return notebook
-
-
-_display.register(_load_display)
 
 __all__ = [
     "UNLABELED", "Cloud", "Plane", "TorchrgError", "align_axes", "datasets", "depth",

@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg import _display
 from torchrg.errors import PrecisionWarning, ShapeError
 from torchrg.precision import describe_steps
 
@@ -39,6 +38,9 @@ __all__ = [
     "Values",
 ]
 __dir__ = __all__.copy
+
+if TYPE_CHECKING:
+    from torchrg.render.page import Page
 
 UNLABELED = -1
 """Label of points without a region."""
@@ -483,7 +485,9 @@ class Planes:
         Raises:
             MissingDependencyError: If pandas is not installed.
         """
-        return _display.call("as_frame", self)
+        from torchrg.render.notebook import as_frame
+
+        return as_frame(self)
 
 
 def _count_points(labels: Tensor) -> str:
@@ -564,7 +568,7 @@ class Segmentation:
         """Move the segmentation to the CPU."""
         return self.to("cpu")
 
-    def show(self, **settings: Any) -> Any:  # noqa: ANN401
+    def show(self, **settings: Any) -> "Page":  # noqa: ANN401
         """Return an interactive viewer, displayed by notebooks; needs ``torchrg[view]``.
 
         Args:
@@ -577,12 +581,15 @@ class Segmentation:
             ConfigError: If ``points`` is None.
             MissingDependencyError: If the viewer cannot be created.
         """
-        return _display.call("show", self, **settings)
+        from torchrg.render.notebook import show
+
+        return show(self, **settings)
 
     def _repr_html_(self) -> str:
         """Return an image and the plane table, as displayed by notebooks."""
-        text: str = _display.call("as_html", self)
-        return text
+        from torchrg.render.notebook import as_html
+
+        return as_html(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,6 @@ from torchrg.result import Result
 
 INDEX = "index.html"
 """File name of the index."""
-_IMAGE_BYTES, _BYTES_PER_POINT = 200_000_000, 200
-"""Memory for the pixels of an image, and per point, in bytes; a viewer takes no more."""
 
 
 class Entry(NamedTuple):
@@ -45,16 +43,6 @@ def write_planes(path: str | os.PathLike[str], result: Result) -> None:
         labels=fields.get("labels"),
     )
     write_png(path, picture)
-
-
-def memory_of_picture(num_points: int) -> int:
-    """Return the memory for an image or viewer of a result, in bytes.
-
-    Example:
-        >>> memory_of_picture(1_000_000)
-        400000000
-    """
-    return _IMAGE_BYTES + _BYTES_PER_POINT * num_points
 
 
 def check_gallery(folder: Path, names: Sequence[str]) -> None:
