@@ -64,7 +64,7 @@ _FOLDER_FIELDS = {
 _KINDS = {
     "labels": ("iu", ()),
     "superpoint": ("iu", ()),
-    "color": ("u", (3,)),
+    "color": ("ub", (3,)),
     "normals": ("f", (3,)),
     "curvature": ("f", ()),
     "sharp": ("b", ()),

@@ -120,7 +120,6 @@ def assemble_cloud(
             fields[name] = check(path, fields[name])
     if "color" in fields:
         color = fields["color"]
-        _check_triples(path, "color", color)
         if set(integers).issuperset(sources["color"]) and are_integers(color):
             color = color.astype(np.int64)
         fields["color"], more = read_colors(path, color)
