@@ -45,7 +45,10 @@ def find_white(color: Array) -> int:
         above = _count(color > 1 + _HALF_STEP / BYTE)
         if _are_outliers(above, positive) or (2 * above < positive and not _is_integral(color)):
             return 1
-    return BYTE if _are_outliers(_count(color > BYTE + _HALF_STEP), positive) else WORD
+    wide = _count(color > BYTE + _HALF_STEP)
+    if color.dtype == np.uint16:  # A type for wide values: a single one counts.
+        return BYTE if wide <= _MAX_OUTLIER_FRACTION * positive else WORD
+    return BYTE if _are_outliers(wide, positive) else WORD
 
 
 @np.errstate(over="ignore")
