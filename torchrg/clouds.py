@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.errors import FormatError
-from torchrg.io.fields import are_integers
+from torchrg.io.tables import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes

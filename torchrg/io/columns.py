@@ -14,6 +14,8 @@ from torchrg.structures import Cloud
 
 _RECORDS_PER_CHUNK = 1 << 20
 """Number of records converted and written at a time, which bounds the memory."""
+_MAX_NAME = 255
+"""Maximum number of letters of a field name, as of a file name."""
 _LABELS = ("labels", backup_name("labels"))
 
 
@@ -61,8 +63,13 @@ def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str
     return columns
 
 
-def check_length(path: Path, name: str, values: Values, num_points: int) -> None:
-    """Check that a field has one row per point."""
+def check_field(path: Path, name: str, values: Values, num_points: int) -> None:
+    """Check that a field has a name that files can store, and one row per point."""
+    if "\0" in name or len(name) > _MAX_NAME:
+        raise FormatError(
+            f"{path}: expected field names without NUL of at most {_MAX_NAME} letters, got "
+            f"{name[:20]!r} of {len(name):,}; rename the field."
+        )
     if values.shape[:1] != (num_points,):
         raise FormatError(
             f"{path}: expected field {name} of shape ({num_points}, ...), got {values.shape}; "
