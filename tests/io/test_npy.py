@@ -350,8 +350,6 @@ def test_other_archives_are_no_clouds(tmp_path, arrays, message):
 @pytest.mark.parametrize("name", ["color", "normal", "Normals", "rgb"])
 def test_a_file_named_as_a_field_is_no_cloud(tmp_path, name):
     np.save(tmp_path / f"{name}.npy", POINTS)
-    with pytest.raises(
-        FormatError, match=rf"named as the field {name}; pass the folder with coord"
-    ):
+    with pytest.raises(FormatError, match=rf"named as the field {name}; pass the folder"):
         read_cloud(tmp_path / f"{name}.npy")
     assert len(read_cloud(tmp_path / f"{name}.npy", columns="xyz")) == len(POINTS)

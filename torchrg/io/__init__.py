@@ -92,6 +92,8 @@ _CONVERTERS = {
     "a spreadsheet; save it as .csv": ".xls .xlsx .ods",
 }
 """Contents of files that are not read and the way to read them, with their suffixes."""
+TEXT_SUFFIXES = tuple(kind for kind, form in FORMATS.items() if form.read is read_text)
+"""Suffixes of text files."""
 _PLANES_SUFFIX = ".vg"
 """Suffix of vertex groups, which are write-only and store coordinates, colors and planes."""
 

@@ -167,8 +167,8 @@ def narrow_colors(color: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 def _scale_to_bytes(color: NDArray[np.generic], white: int) -> NDArray[np.uint8]:
     """Scale colors in 0..white to uint8."""
-    scaled = np.rint(color.astype(np.float32) / np.float32(white / BYTE))
-    return scaled.clip(0, BYTE).astype(np.uint8)
+    scaled: Array = np.rint(color.astype(np.float32) / np.float32(white / BYTE))
+    return np.clip(scaled, 0, BYTE).astype(np.uint8)
 
 
 def _are_outliers(count: int, total: int) -> bool:

@@ -127,7 +127,9 @@ def read_npz(path: Path, size: int) -> Cloud:
             for member in skipped:
                 with _open_member(path, archive, member) as stream:
                     _drain(stream)
-    notes = (f"{', '.join(mismatched)} skipped: not {num_points:,} rows",) if mismatched else ()
+    notes: tuple[str, ...] = ()
+    if mismatched:
+        notes = (f"{', '.join(mismatched)} skipped: not {num_points:,} rows",)
     if coordinates is not None and coordinates not in _COORDINATES:
         check_table(path, columns[coordinates])
         notes += (f"{coordinates} is read as the points, as no other array has 3 columns",)
