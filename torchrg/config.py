@@ -268,8 +268,8 @@ class PlanesConfig:
     """Plane table."""
 
     up: Up | None = field(default=None, metadata=SHORT_FLAG)
-    """Up axis. If set, planes are classified as floor, ceiling, wall and so on. Commands on clouds
-    use z. None: no classes (z if kinds is set)."""
+    """Up axis, by which planes are classified as floor, ceiling, wall and so on. Commands on clouds
+    use z. None: z, when the classes are read."""
     outline: bool = False
     """Trace the polygon of each plane (needs shapely)."""
 

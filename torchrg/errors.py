@@ -12,6 +12,7 @@ __all__ = [
     "PrecisionWarning",
     "ShapeError",
     "TorchrgError",
+    "UnitWarning",
 ]
 __dir__ = __all__.copy
 
@@ -54,6 +55,10 @@ class MissingDependencyError(TorchrgError, ImportError):
 
 class PrecisionWarning(UserWarning):
     """The rounding step of coordinates is coarse for the spacing of the points."""
+
+
+class UnitWarning(PrecisionWarning):
+    """The axes of a cloud seem to have different units, such as degrees and meters."""
 
 
 class DepthWarning(UserWarning):

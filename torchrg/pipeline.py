@@ -35,12 +35,14 @@ from torchrg.normals.orient import Orientation, choose_side, find_directions, tu
 from torchrg.precision import warn_about_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
 from torchrg.regions.growth import needs_sampling, rank_by_count
+from torchrg.regions.kinds import find_kinds
 from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.superpoints import merge_duplicates
 from torchrg.structures import (
     UNLABELED,
     Cloud,
     Colors,
+    DeferredKind,
     FilePath,
     Labels,
     Neighbors,
@@ -57,6 +59,10 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+_MIN_NEIGHBORHOODS = 2
+"""Minimum number of points of a cloud, in neighborhoods; fewer points have one plane for all."""
+_UP = torch.tensor([0.0, 0.0, 1.0])
+"""Up axis of clouds for which none is set."""
 _STRENGTH_OF_K = 100.0
 """Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
 meshed depth frames get about the same number of superpoints as Segmentator's segments."""
@@ -145,10 +151,12 @@ def segment_planes(
     """
     if isinstance(points, str | os.PathLike):
         points = read_cloud(points)
+    is_cloud = isinstance(points, Cloud)  # It warns on access to its points.
     points, directions = find_directions(
         "segment_planes", points, orient, viewpoint=viewpoint, front=front
     )
-    warn_about_steps("segment_planes", points)
+    if not is_cloud:
+        warn_about_steps("segment_planes", points)
     objects = None if within is None else as_tensor("segment_planes", "within", within)
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
     if objects is not None and (objects.is_floating_point() or objects.is_complex()):
@@ -203,6 +211,7 @@ def _segment(
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
     if len(sites):
         k = min(config.normals.k, len(sites))
+        _warn_about_size(len(sites), config.normals.k)
         neighbors = search_knn(sites, k, canonical=True)
     sampling = None
     if _has_auto(config):
@@ -263,6 +272,10 @@ def _segment(
         of_plane = objects.new_zeros(len(planes))
         of_plane[point_labels[point_labels >= 0]] = objects[point_labels >= 0]
         planes = replace(planes, object=of_plane)
+    if config.planes.up is None:
+        classify = partial(find_kinds, points=points, labels=point_labels, up=_UP)
+        deferred: Any = DeferredKind(classify)
+        planes = replace(planes, kind=deferred)
 
     begin("orientation")
     if isinstance(parts, Tensor):
@@ -288,6 +301,17 @@ def _segment(
         sampling,
         distinct.num_copies,
     )
+
+
+def _warn_about_size(num_points: int, k: int) -> None:
+    """Warn if every neighborhood contains more than half of a cloud."""
+    if num_points < _MIN_NEIGHBORHOODS * k:
+        warnings.warn(
+            f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
+            f"neighborhoods of {k:,}, got {num_points:,}; add points, or reduce normals.k or the "
+            "voxel size.",
+            stacklevel=6,
+        )
 
 
 def _sample_sites(distinct: DistinctPoints, voxel: float) -> tuple[Tensor, Tensor]:

@@ -55,6 +55,10 @@ _MIN_HEIGHT = 0.2
 thinner than 0.2 a w is a plane with noisy normals."""
 
 
+_MAX_RMS = 0.1
+"""Maximum RMS distance of flat regions to their plane, as a fraction of their length: a cube has
+0.29, a slab that is as thick as a third of its length 0.1. Below that, noise may be as thick."""
+
 _SQ_WIDTH = 12.0
 """Squared width of a uniformly covered strip, in units of the variance across it."""
 
@@ -232,6 +236,19 @@ def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> R
     explained = torch.where(reach.isfinite(), torch.maximum(_BENT_FRACTION * reach, floor), floor)
     bent = planes.thickness > explained
     return planes._replace(curved=planes.curved & bent, reach=reach, bent=bent)
+
+
+def find_solid_regions(points: Tensor, normals: Tensor, labels: Tensor) -> Tensor:
+    """Return the mask of regions ``(M,)`` that fill a volume instead of a plane, bool.
+
+    Neighborhoods that contain most of a cloud have one normal, whatever its shape. Curved regions
+    are surfaces.
+    """
+    segments = Segments(labels, max_points=MAX_FITTED)
+    local = segments.gather_centered(points, segments.first(points).double())
+    variances = eigh3_lapack(segments.moments(local, torch.ones_like(local[0]))[1])[0]
+    solid = variances[:, 0] > _MAX_RMS**2 * _SQ_WIDTH * variances[:, 2]
+    return solid & ~fit_planes(segments, points, normals).curved if bool(solid.any()) else solid
 
 
 class RegionFits:
