@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrg.config import PipelineConfig, PlanesConfig, load_config
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels
 from torchrg.pipeline import segment_planes
@@ -213,3 +213,24 @@ def test_consensus_keeps_the_faces_of_a_plate_apart():
         both = ((seg.labels == found).numpy() & (face == side)).sum()
         either = ((seg.labels == found).numpy() | (face == side)).sum()
         assert both > 0.9 * either
+
+
+@pytest.mark.parametrize("exponent", [-60, 0, 38, 44])
+def test_scaling_by_a_power_of_two_keeps_planes(scene, exponent):
+    points = scene.points.double()[::4]
+    seg = segment_planes(points * 2.0**exponent, "classic", orient="none")
+    assert torch.equal(seg.labels, segment_planes(points, "classic", orient="none").labels)
+
+
+def test_a_unit_that_is_too_small_names_the_coordinates(scene):
+    with pytest.raises(ConfigError, match=r"expected coordinates within 1e\+12, got a cloud"):
+        segment_planes(scene.points.double()[::4] * 2.0**60)
+
+
+def test_a_cloud_of_few_neighborhoods_is_told():
+    points = torch.rand(99, 3, generator=torch.Generator().manual_seed(0))
+    message = "expected at least 100 distinct points for neighborhoods of 50, got 99; add points"
+    with pytest.warns(UserWarning, match=message) as caught:
+        segment_planes(points)
+    assert caught[0].filename == __file__
+    segment_planes(points, **{"normals.k": 49})

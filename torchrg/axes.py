@@ -71,13 +71,13 @@ def describe_units(points: NDArray[np.floating], header: Mapping[str, Any] | Non
 
 
 def _noise(points: NDArray[np.floating]) -> float:
-    """Return the lower quartile of the differences of z between nearest points in x and y."""
+    """Return the lowest tenth of the differences of z between nearest points in x and y."""
     from scipy.spatial import cKDTree
 
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     some = finite[:: max(len(finite) // _NUM_PAIRS, 1)]
     _, near = cKDTree(finite[:, :2]).query(some[:, :2], k=2)
-    return float(np.quantile(np.abs(finite[near[:, 1], 2] - some[:, 2]), 0.25))
+    return float(np.quantile(np.abs(finite[near[:, 1], 2] - some[:, 2]), 0.1))
 
 
 def _describe_header(header: Mapping[str, Any]) -> str:

@@ -55,9 +55,10 @@ _MIN_HEIGHT = 0.2
 thinner than 0.2 a w is a plane with noisy normals."""
 
 
-_MAX_RMS = 0.1
+_MAX_RMS, _MAX_RMS_OF_FEW = 0.2, 0.1
 """Maximum RMS distance of flat regions to their plane, as a fraction of their length: a cube has
-0.29, a slab that is as thick as a third of its length 0.1. Below that, noise may be as thick."""
+0.29, clutter in rooms up to 0.19, a slab a third as thick as long 0.1. The second limit is for
+clouds of fewer than two neighborhoods, whose normals are equal, whatever their shape."""
 
 _SQ_WIDTH = 12.0
 """Squared width of a uniformly covered strip, in units of the variance across it."""
@@ -238,17 +239,20 @@ def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> R
     return planes._replace(curved=planes.curved & bent, reach=reach, bent=bent)
 
 
-def find_solid_regions(points: Tensor, normals: Tensor, labels: Tensor) -> Tensor:
+def find_solid_regions(cloud: GrowingInput, labels: Tensor) -> Tensor:
     """Return the mask of regions ``(M,)`` that fill a volume instead of a plane, bool.
 
-    Neighborhoods that contain most of a cloud have one normal, whatever its shape. Curved regions
-    are surfaces.
+    Curved regions are surfaces.
     """
     segments = Segments(labels, max_points=MAX_FITTED)
-    local = segments.gather_centered(points, segments.first(points).double())
+    local = segments.gather_centered(cloud.points, segments.first(cloud.points).double())
     variances = eigh3_lapack(segments.moments(local, torch.ones_like(local[0]))[1])[0]
-    solid = variances[:, 0] > _MAX_RMS**2 * _SQ_WIDTH * variances[:, 2]
-    return solid & ~fit_planes(segments, points, normals).curved if bool(solid.any()) else solid
+    are_few = len(labels) < 2 * cloud.neighbors.indices.shape[1]
+    limit = _MAX_RMS_OF_FEW if are_few else _MAX_RMS
+    solid = variances[:, 0] > limit**2 * _SQ_WIDTH * variances[:, 2]
+    if bool(solid.any()):
+        solid &= ~fit_planes(segments, cloud.points, cloud.normals).curved
+    return solid
 
 
 class RegionFits:

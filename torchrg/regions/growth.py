@@ -167,7 +167,7 @@ def label_regions(
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = rank_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
     if bool((labels >= 0).any()):
-        solid = find_solid_regions(cloud.points, cloud.normals, labels)
+        solid = find_solid_regions(cloud, labels)
         if bool(solid.any()):
             labels = rank_by_size(labels.where(~solid[labels] & (labels >= 0), UNLABELED), 1)
     return labels
