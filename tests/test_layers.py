@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
     {"axes", "errors", "version", "_deprecated", "_display", "_parallel"},
-    {"precision"},
+    {"precision", "tables"},
     {"_checks", "_optional", "scratch", "structures"},
     {"kernels"},
     {"_opaque", "linalg", "mesh", "neighbors", "config", "plane_table"},

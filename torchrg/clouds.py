@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.errors import FormatError, PrecisionWarning
-from torchrg.io.tables import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
+from torchrg.tables import are_integers
 
 __all__ = ["check_finite", "find_objects", "note_on_copies", "segment_cloud"]
 __dir__ = __all__.copy

@@ -23,7 +23,6 @@ from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.fields import add_result_fields
 from torchrg.io.files import PARSE_ERRORS
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
-from torchrg.io.tables import are_integers
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.plane_table import (
@@ -47,6 +46,7 @@ from torchrg.structures import (
     Segmentation,
     Superpoints,
 )
+from torchrg.tables import are_integers
 
 __all__ = ["Result", "read_result", "write_table"]
 __dir__ = __all__.copy

@@ -27,9 +27,9 @@ from torchrg.datasets.camera_files import SUFFIXES, read_camera
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
-from torchrg.io.tables import COLUMNS_RULE
 from torchrg.normals import Orientation
 from torchrg.structures import FARTHEST, Sampling
+from torchrg.tables import COLUMNS_RULE
 
 _MAX_THREADS = 1024
 """Upper bound of --threads: more than any machine has cores, and few enough to start."""

@@ -31,6 +31,7 @@ _FIELD_KEYS = {"normals": "normal"}
 """Sample keys of cloud fields, if they differ."""
 _MAX_PROSE_BYTES = 1 << 16
 """Maximum size of a text file that is read to see whether it contains points."""
+_LINKS = "links to files that were already read, or to a parent folder"
 _THREE_NUMBERS = re.compile(r"^\W*([-+]?[\d.][^\s,;]*[\s,;]+){2}[-+]?[\d.]", re.MULTILINE)
 """Beginning of a line of points."""
 
@@ -354,15 +355,11 @@ def find_files(
             skipped.append(link)
         else:
             visit(link, str(target))
-    warn_skipped(folder, skipped, "links to files that were already read, or to a parent folder")
+    warn_skipped(folder, skipped)
     return sorted(files, key=lambda path: [natural_key(p) for p in path.relative_to(folder).parts])
 
 
-def warn_skipped(
-    folder: Path,
-    skipped: Sequence[Path],
-    why: str = "links to files that were already read, or to a parent folder",
-) -> None:
+def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> None:
     """Warn if entries of a folder were skipped, and say why."""
     if skipped:
         more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""

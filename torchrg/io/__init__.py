@@ -113,7 +113,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
         path: A file with a suffix of :data:`FORMATS`, in any case.
         columns: Column names of a text file or a plain ``.npy`` array, in order: ``x``, ``y``,
             ``z`` and any others, ``_`` to skip a column. Default: the names in the file, else
-            :data:`torchrg.io.tables.COLUMNS_RULE`.
+            :data:`torchrg.tables.COLUMNS_RULE`.
 
     Returns:
         The cloud, with at least one point.

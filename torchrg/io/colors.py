@@ -38,8 +38,8 @@ def find_white(color: Array) -> int:
         >>> find_white(np.array([0.2, 0.9, 1.3])), find_white(np.array([0.0, 1.0, 200.0]))
         (1, 255)
     """
-    if color.dtype in (np.uint8, np.bool_):
-        return BYTE if color.dtype == np.uint8 else 1
+    if color.dtype.itemsize == 1 and color.dtype.kind in "ub":
+        return BYTE if color.dtype.kind == "u" else 1
     positive = _count(color > _HALF_STEP / BYTE)
     if color.dtype.kind == "f":
         above = _count(color > 1 + _HALF_STEP / BYTE)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 from torchrg.io.colors import read_colors
-from torchrg.io.tables import are_integers, check_table, guess_column_names, warn_about_counters
 from torchrg.structures import UNLABELED, Cloud
+from torchrg.tables import are_integers, check_table, guess_column_names, warn_about_counters
 
 Values = NDArray[Any]
 """An array of any type."""

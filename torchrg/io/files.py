@@ -235,8 +235,7 @@ def check_file(path: Path) -> int:
 def find_encoding(path: Path) -> str:
     """Return the encoding of a text file: UTF-16 with a byte order mark, else UTF-8."""
     with path.open("rb") as stream:
-        is_wide = stream.read(2) in _UTF_16_MARKS
-    return "utf-16" if is_wide else "utf-8-sig"
+        return "utf-16" if stream.read(2) in _UTF_16_MARKS else "utf-8-sig"
 
 
 def decode_file(path: Path) -> str:

@@ -30,8 +30,8 @@ from torchrg.io.files import (
     wrap_errors,
 )
 from torchrg.io.headers import MAX_INTEGER, check_grid, distance_outside
-from torchrg.io.tables import are_integers
 from torchrg.structures import Cloud, bounding_box
+from torchrg.tables import are_integers
 
 _FIELD_NAMES = FieldNames(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True

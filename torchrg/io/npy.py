@@ -4,7 +4,7 @@
 ``y`` and ``z``, and any arrays of N rows, which become fields. Arrays of other lengths and the
 plane table of a result are skipped. See :func:`torchrg.io.write_cloud` for the names in a result.
 ``.npy``: an array (N, 3) or wider, with column names from the caller or by
-:data:`torchrg.io.tables.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
+:data:`torchrg.tables.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
 """
 
 import io
@@ -39,9 +39,9 @@ from torchrg.io.files import (
     check_file,
     wrap_errors,
 )
-from torchrg.io.tables import check_table
 from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
+from torchrg.tables import check_table
 
 _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
@@ -131,6 +131,7 @@ def read_npz(path: Path, size: int) -> Cloud:
     if mismatched:
         notes = (f"{', '.join(mismatched)} skipped: not {num_points:,} rows",)
     if coordinates is not None and coordinates not in _COORDINATES:
+        check_coordinates(path, *layouts[coordinates])
         check_table(path, columns[coordinates])
         notes += (f"{coordinates} is read as the points, as no other array has 3 columns",)
     if coordinates is not None and (names := layouts[coordinates][1].names) is not None:
@@ -160,13 +161,10 @@ def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str |
             return name, shape[0]
     if {"x", "y", "z"} <= layouts.keys() and layouts["x"][0]:
         return None, layouts["x"][0][0]
-    tables = [
-        name
-        for name, (shape, dtype) in layouts.items()
-        if shape[1:] == (3,) and dtype.kind in "fiu" and name.lower() not in FIELD_NAMES
-    ]
-    if len(tables) == 1 and tables[0] not in _NOT_PER_POINT and layouts[tables[0]][0][0]:
-        return tables[0], layouts[tables[0]][0][0]
+    others = {n: rows[0] for n, (rows, _) in layouts.items() if rows[1:] == (3,) and rows[0]}
+    others = {name: others[name] for name in others.keys() - _NOT_PER_POINT - FIELD_NAMES.keys()}
+    if len(others) == 1:
+        return next(iter(others.items()))
     names = ", ".join(map(repr, layouts)) or "none"
     raise FormatError(
         f"{path}: expected an array points (or coord), got {names}; rename the coordinates."

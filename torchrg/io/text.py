@@ -2,7 +2,7 @@
 
 The delimiter is a comma, semicolon, tab or blanks; the decimal separator may be a comma if that is
 not the delimiter. A first line of names (``x y z red green blue``, with or without ``#`` or ``//``)
-names the columns unless the caller does; otherwise :data:`torchrg.io.tables.COLUMNS_RULE` applies.
+names the columns unless the caller does; otherwise :data:`torchrg.tables.COLUMNS_RULE` applies.
 A line of one number before the first point is the point count, as in Leica's ``.pts``. Further
 scans begin with their count. pyarrow, if installed, parses plain numbers. The slower
 parser here handles the remaining cases with bit-identical results and reports errors. It also

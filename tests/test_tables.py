@@ -8,7 +8,7 @@ import pytest
 import torchrg
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud
-from torchrg.io.tables import guess_column_names
+from torchrg.tables import guess_column_names
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(40, 3))

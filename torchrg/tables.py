@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.colors import BYTE, WORD
 
 Table = NDArray[Any]
 """Numbers of shape ``(N, C)``."""
 _TRIPLES = _NORMAL, _COLOR = ("nx", "ny", "nz"), ("red", "green", "blue")
 """Names of three columns whose meaning their values show."""
+_BYTE, _WORD = 255, 65535
+"""Maximum of an 8-bit and of a 16-bit channel."""
 _MAX_COLUMNS = 15
 """Maximum number of unnamed columns. Programs write up to a dozen values per point; more columns
 mean features, a transposed table, or cameras such as LLFF's 17 numbers."""
@@ -127,13 +128,15 @@ def _guess_triple(three: Table) -> tuple[str, str, str] | None:
     """Return names for three columns, shape ``(n, 3)``, if they can be a normal or a color."""
     if _are_units(three):
         return _NORMAL
-    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= BYTE and are_integers(three))
+    is_color = three.size == 0 or (
+        three.min() >= 0 and three.max() <= _BYTE and are_integers(three)
+    )
     return _COLOR if is_color else None
 
 
 def _is_wide_color(three: Table) -> bool:
     """Whether three columns can be a 16-bit color with every channel above the 8-bit maximum."""
-    in_range = three.min() >= 0 and three.max() <= WORD and three.max(axis=0).min() > BYTE
+    in_range = three.min() >= 0 and three.max() <= _WORD and three.max(axis=0).min() > _BYTE
     return bool(in_range) and are_integers(three)
 
 
