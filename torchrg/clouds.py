@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.config import PipelineConfig, SuperpointsConfig
-from torchrg.errors import FormatError, PrecisionWarning
+from torchrg.errors import CloudWarning, FormatError, PrecisionWarning
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
@@ -73,8 +73,8 @@ def segment_cloud(
     objects = find_objects(cloud, within)
     is_kept = partition is not None
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
         warnings.simplefilter("ignore", PrecisionWarning)  # The notes above.
+        warnings.simplefilter("always", CloudWarning)
         seg = segment_planes(
             cloud,
             # Superpoints respect the boundaries of all planes.
@@ -87,7 +87,10 @@ def segment_cloud(
             on_stage=begin,
         )
     for warning in caught:
-        warn(" ".join(str(warning.message).split()).rstrip("."))
+        if issubclass(warning.category, CloudWarning):
+            warn(str(warning.message).rstrip("."))
+        else:
+            warnings.warn(warning.message, stacklevel=2)
     if partition is None:
         return seg, None
     begin("superpoints")

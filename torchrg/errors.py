@@ -5,6 +5,7 @@ the fix.
 """
 
 __all__ = [
+    "CloudWarning",
     "ConfigError",
     "DepthWarning",
     "FormatError",
@@ -55,6 +56,10 @@ class MissingDependencyError(TorchrgError, ImportError):
 
 class PrecisionWarning(UserWarning):
     """The rounding step of coordinates is coarse for the spacing of the points."""
+
+
+class CloudWarning(UserWarning):
+    """A cloud has few points, or seems to have another up axis than assumed."""
 
 
 class UnitWarning(PrecisionWarning):

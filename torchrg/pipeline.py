@@ -17,7 +17,7 @@ from torchrg import scratch
 from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
 from torchrg._parallel import return_freed_memory, sequential_operations
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import CloudWarning, ConfigError, ShapeError
 from torchrg.io import read_cloud
 from torchrg.io.colors import read_colors
 from torchrg.neighbors import (
@@ -59,6 +59,8 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+_MIN_FITTED = 3
+"""Number of points that define a plane."""
 _MIN_NEIGHBORHOODS = 2
 """Minimum number of points of a cloud, in neighborhoods; fewer points have one plane for all."""
 _UP = torch.tensor([0.0, 0.0, 1.0])
@@ -136,7 +138,9 @@ def segment_planes(
 
     Warns:
         PrecisionWarning: If the rounding step of float32 exceeds a tenth of the point spacing, as
-            it does far from the origin.
+            it does far from the origin, or the axes seem to have different units.
+        CloudWarning: If the cloud has fewer than ``2 k`` points. If another axis seems to be up,
+            when planes are classified.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
@@ -305,11 +309,12 @@ def _segment(
 
 def _warn_about_size(num_points: int, k: int) -> None:
     """Warn if every neighborhood contains more than half of a cloud."""
-    if num_points < _MIN_NEIGHBORHOODS * k:
+    if _MIN_FITTED <= num_points < _MIN_NEIGHBORHOODS * k:
         warnings.warn(
             f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
             f"neighborhoods of {k:,}, got {num_points:,}; add points, or reduce normals.k or the "
             "voxel size.",
+            CloudWarning,
             stacklevel=6,
         )
 

@@ -373,7 +373,6 @@ def test_columns_of_words_are_left_out_by_name(tmp_path):
         (".ptx", "save it there"),
         (".tif", "torchrg depth"),
         (".h5", "numpy.save"),
-        (".xlsx", "save it as .csv"),
     ],
 )
 def test_what_is_no_cloud_names_the_program_that_makes_one(tmp_path, suffix, tool):

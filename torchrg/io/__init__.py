@@ -89,7 +89,6 @@ _CONVERTERS = {
     "an archive; unpack it, or save its points with numpy.save": (
         ".zip .gz .7z .tar .h5 .hdf5 .mat .pkl .pt .pth .parquet .feather"
     ),
-    "a spreadsheet; save it as .csv": ".xls .xlsx .ods",
 }
 """Contents of files that are not read and the way to read them, with their suffixes."""
 TEXT_SUFFIXES = tuple(kind for kind, form in FORMATS.items() if form.read is read_text)
