@@ -69,7 +69,7 @@ def test_units_are_told_through_every_door(tmp_path):
 
 GEOGRAPHIC = 'GEOGCS["WGS 84",DATUM["WGS_1984"],UNIT["degree",0.0174532925199433]]'
 PROJECTED = f'PROJCS["zone",{GEOGRAPHIC},UNIT["{{}}",{{}}]]'
-HEIGHT = 'COMPD_CS["both",{},VERT_CS["height",UNIT["metre",1.0]]]'
+HEIGHT = 'COMPD_CS["both",{},VERT_CS["height",UNIT["meter",1.0]]]'
 
 
 @pytest.mark.parametrize(
@@ -77,10 +77,10 @@ HEIGHT = 'COMPD_CS["both",{},VERT_CS["height",UNIT["metre",1.0]]]'
     [
         (GEOGRAPHIC, "degrees by its header"),
         (HEIGHT.format(GEOGRAPHIC), "degrees by its header"),
-        (PROJECTED.format("metre", 1), ""),
-        (HEIGHT.format(PROJECTED.format("metre", 1)), ""),
+        (PROJECTED.format("meter", 1), ""),
+        (HEIGHT.format(PROJECTED.format("meter", 1)), ""),
         (HEIGHT.format(PROJECTED.format("foot", 0.3048)), "units of 0.3048 m, z of 1 m"),
-        ('GEODCRS["earth",CS[Cartesian,3],LENGTHUNIT["metre",1]]', ""),
+        ('GEODCRS["earth",CS[Cartesian,3],LENGTHUNIT["meter",1]]', ""),
     ],
 )
 def test_the_reference_system_of_a_file_says_the_units(tmp_path, wkt, note):

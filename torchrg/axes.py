@@ -35,8 +35,8 @@ _MIN_ALONG = 0.966
 _END = 0.15
 """Fraction of the height of a room at its bottom and top that contains floor and ceiling."""
 _MIN_PAIR = 2.0
-"""Minimum ratio of the floor and ceiling of another axis to everything that faces up. The walls of
-corridors and streets reach 1.5."""
+"""Minimum ratio of the floor and ceiling of another axis to everything that faces up, and to what
+faces the third axis. The walls of corridors and streets reach 1.5."""
 
 
 def describe_units(points: NDArray[np.floating], header: Mapping[str, Any] | None = None) -> str:
@@ -106,7 +106,7 @@ def likely_up(
     areas: NDArray[np.floating],
     up: NDArray[np.floating],
 ) -> str:
-    """Return the axis whose floor and ceiling are far larger than all that faces up, or "".
+    """Return the axis whose floor and ceiling exceed all that faces up or another axis, or "".
 
     Args:
         normals: Unit normals of planes or points, shape ``(M, 3)``.
@@ -122,12 +122,13 @@ def likely_up(
     """
     if len(normals) == 0:
         return ""
-    best, limit = "", _MIN_PAIR * areas[np.abs(normals @ up) >= _MIN_ALONG].sum()
     low, high = np.quantile(positions, _QUANTILES, axis=0)
     level = (positions - low) / np.maximum(high - low, np.finfo(np.float64).tiny)
+    faces = np.abs(normals @ np.column_stack([np.eye(3), up])) >= _MIN_ALONG
     for i, axis in enumerate("xyz"):
-        faces = np.abs(normals[:, i]) >= _MIN_ALONG
-        ends = [areas[faces & at].sum() for at in (level[:, i] <= _END, level[:, i] >= 1 - _END)]
-        if 2 * min(ends) > limit:
-            best, limit = axis, 2 * min(ends)
-    return best
+        ends = [faces[:, i] & at for at in (level[:, i] <= _END, level[:, i] >= 1 - _END)]
+        pair = 2 * min(areas[end].sum() for end in ends)
+        others = [areas[faces[:, j]].sum() for j in range(4) if j != i]
+        if pair > _MIN_PAIR * max(others):
+            return axis
+    return ""

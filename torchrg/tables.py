@@ -164,7 +164,7 @@ def warn_about_counters(path: Path, table: Table, names: Sequence[str]) -> None:
 
 
 def _only_rises(column: Table) -> bool:
-    """Whether a column never falls, except to its start; whole numbers rise by at most one."""
+    """Whether a column never falls, except to its start; integers rise by at most one."""
     steps = np.diff(column)
     rises = (steps >= 0) & (steps <= (1 if are_integers(column) else np.inf))
     return bool(steps.any() and (rises | (column[1:] == column.min())).all())

@@ -1,4 +1,4 @@
-"""Classes of planes are the same through every door, and another axis that is up is told."""
+"""Classes of planes are the same through every door, and another up axis is a warning."""
 
 import copy
 import gc

@@ -360,7 +360,7 @@ def find_files(
 
 
 def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> None:
-    """Warn if entries of a folder were skipped, and say why."""
+    """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
         more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
         warnings.warn(

@@ -258,7 +258,7 @@ def decode_file(path: Path) -> str:
 
 
 def open_lines(path: Path, last: bytes) -> BinaryIO:
-    r"""Open a file with a header of lines; those that end in ``\r`` alone end in ``\n`` in a copy.
+    r"""Open a file with a header; lines that end in ``\r`` alone end in ``\n`` in a copy.
 
     ``last`` begins the last line of the header. All lines of ASCII files are changed.
     """

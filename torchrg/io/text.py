@@ -380,7 +380,7 @@ def _parse_names(text: str) -> list[list[str]]:
 
 
 def _warn_about_names(path: Path, comment: str, num_columns: int) -> None:
-    """Warn if a comment before the points names as many columns, but no x, y and z."""
+    """Warn if a comment before the points names all columns, but no x, y and z."""
     readings = [row for row in _split_names(comment) if len(row) == num_columns]
     if any(not any(map(_is_number, row)) for row in readings):
         warnings.warn(
