@@ -12,7 +12,7 @@ from tests.test_opaque import FUNCTIONS
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.normals import ESTIMATORS, orient_normals
-from torchrg.transforms import SegmentDepth
+from torchrg.transforms import SegmentDepth, SegmentPlanes
 
 PATCHES = {
     name: lambda x, function=function: function(x)[-1] for name, function in FUNCTIONS.items()
@@ -159,8 +159,15 @@ def test_clouds_on_meta_are_refused(name):
     "call", [torchrg.estimate_normals, torchrg.segment_planes, torchrg.make_superpoints]
 )
 def test_an_organised_cloud_points_to_depth(call):
-    with pytest.raises(ShapeError, match=r"got \(4, 5, 3\); pass the depth .*SegmentDepth, or"):
+    loop = rf"got \(4, 5, 3\); .*\[{call.__name__}\(p\) for p in points\], or .*SegmentDepth"
+    with pytest.raises(ShapeError, match=loop) as caught:
         call(torch.rand(4, 5, 3))
+    assert "reshape" not in str(caught.value)
+
+
+def test_a_batch_in_a_sample_points_to_offset():
+    with pytest.raises(ShapeError, match=r"coord of shape \(N, 3\).*flatten\(0, 1\).*'offset'"):
+        SegmentPlanes()({"coord": torch.rand(1, 5, 3)})
 
 
 def test_depth_under_other_surroundings():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrg.config import PipelineConfig, PlanesConfig, load_config
-from torchrg.errors import ShapeError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels
 from torchrg.pipeline import segment_planes
@@ -71,10 +71,12 @@ def test_table_says_what_meets_and_what_is_asked_for(scene):
     planes = segment_planes(scene.points, plain).planes
     assert planes.adjacency is not None
     assert [0, 2] in planes.adjacency.pairs.tolist()
-    assert [planes.kind, planes.outline] == [None, None]
+    assert planes.outline is None
+    without = planes.kind
     asked = dataclasses.replace(plain, planes=PlanesConfig(up="z", outline=True))
     planes = segment_planes(scene.points, asked).planes
     assert [PLANE_KINDS[kind] for kind in planes.kind[:6]] == ["ceiling", "floor"] + ["wall"] * 4
+    assert torch.equal(without, planes.kind)
     assert len(planes.outline) == len(planes)
     turned = dataclasses.replace(plain, planes=PlanesConfig(up="-y"))
     points = scene.points[:, [0, 2, 1]] * torch.tensor([1.0, -1, 1])
@@ -211,3 +213,24 @@ def test_consensus_keeps_the_faces_of_a_plate_apart():
         both = ((seg.labels == found).numpy() & (face == side)).sum()
         either = ((seg.labels == found).numpy() | (face == side)).sum()
         assert both > 0.9 * either
+
+
+@pytest.mark.parametrize("exponent", [-60, 0, 38, 44])
+def test_scaling_by_a_power_of_two_keeps_planes(scene, exponent):
+    points = scene.points.double()[::4]
+    seg = segment_planes(points * 2.0**exponent, "classic", orient="none")
+    assert torch.equal(seg.labels, segment_planes(points, "classic", orient="none").labels)
+
+
+def test_a_unit_that_is_too_small_names_the_coordinates(scene):
+    with pytest.raises(ConfigError, match=r"expected coordinates within 1e\+12, got a cloud"):
+        segment_planes(scene.points.double()[::4] * 2.0**60)
+
+
+def test_a_cloud_of_few_neighborhoods_is_told():
+    points = torch.rand(99, 3, generator=torch.Generator().manual_seed(0))
+    message = "expected at least 100 distinct points for neighborhoods of 50, got 99; add points"
+    with pytest.warns(UserWarning, match=message) as caught:
+        segment_planes(points)
+    assert caught[0].filename == __file__
+    segment_planes(points, **{"normals.k": 49})

@@ -88,12 +88,9 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
 
 
 def check_points(caller: str, points: Tensor) -> None:
-    """Check that points are a cloud; suggest a fix for images and extra columns."""
-    if points.ndim == 3 and points.shape[2] == 3:
-        raise ShapeError(
-            f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass the depth "
-            "of an image to torchrg.transforms.SegmentDepth, or points.reshape(-1, 3)."
-        )
+    """Check that points are one cloud; suggest a fix for batches, images and extra columns."""
+    loop = f"[{caller}(p) for p in points]" if caller.isidentifier() else "points[i]"
+    check_batch(caller, "points", points, f"pass one cloud at a time, as {loop}")
     if points.ndim == 2 and points.shape[1] > 3:
         repair = "points.T" if len(points) == 3 else "points[:, :3]"
         raise ShapeError(
@@ -101,6 +98,15 @@ def check_points(caller: str, points: Tensor) -> None:
         )
     check_shapes(caller, points=(points, "N 3"))
     check_floating(caller, points=points)
+
+
+def check_batch(caller: str, name: str, points: Tensor, repair: str) -> None:
+    """Refuse a batch of clouds ``(B, N, 3)``: its neighborhoods would cross between clouds."""
+    if points.ndim == 3 and points.shape[2] == 3:
+        raise ShapeError(
+            f"{caller}: expected {name} of shape (N, 3), got {tuple(points.shape)}; {repair}, or "
+            "the depth of an image to torchrg.transforms.SegmentDepth."
+        )
 
 
 def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:

@@ -3,6 +3,7 @@
 ``torchrg segment`` and ``torchrg convert`` call :func:`segment_cloud` for each cloud.
 """
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.config import PipelineConfig, SuperpointsConfig
-from torchrg.errors import FormatError
-from torchrg.io.fields import are_integers
+from torchrg.errors import CloudWarning, FormatError, PrecisionWarning
+from torchrg.io.tables import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
@@ -53,7 +54,7 @@ def segment_cloud(
         voxel: Voxel size; one point per voxel is segmented. Default: segment all points.
         within: Name of the field with the object of each point; see :func:`find_objects`.
         begin: Callback that receives the name of each stage at its start.
-        warn: Callback that receives each warning of :func:`check_finite`, before segmentation.
+        warn: Callback that receives the notes of :func:`check_finite` and later warnings.
 
     Raises:
         FormatError: If no point is finite, or ``within`` is not a field of integers.
@@ -71,17 +72,25 @@ def segment_cloud(
         warn(note)
     objects = find_objects(cloud, within)
     is_kept = partition is not None
-    seg = segment_planes(
-        cloud,
-        # Superpoints respect the boundaries of all planes.
-        settings.without_selection() if is_kept else settings,
-        orient=orient,
-        viewpoint=viewpoint,
-        voxel=voxel,
-        within=objects,
-        keep_neighbors=is_kept,
-        on_stage=begin,
-    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore", PrecisionWarning)  # The notes above.
+        warnings.simplefilter("always", CloudWarning)
+        seg = segment_planes(
+            cloud,
+            # Superpoints respect the boundaries of all planes.
+            settings.without_selection() if is_kept else settings,
+            orient=orient,
+            viewpoint=viewpoint,
+            voxel=voxel,
+            within=objects,
+            keep_neighbors=is_kept,
+            on_stage=begin,
+        )
+    for warning in caught:
+        if issubclass(warning.category, CloudWarning):
+            warn(str(warning.message).rstrip("."))
+        else:
+            warnings.warn(warning.message, stacklevel=2)
     if partition is None:
         return seg, None
     begin("superpoints")
@@ -93,7 +102,7 @@ def segment_cloud(
 
 
 def check_finite(cloud: Cloud) -> tuple[str, ...]:
-    """Return warnings about missing points, outliers and lost precision.
+    """Return warnings about different units, missing points, outliers and lost precision.
 
     Raises:
         FormatError: If no point is finite.
@@ -108,7 +117,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
             f"{cloud.source}: expected finite points, got none in {num_bad:,} points; coordinates "
             f"beyond {FARTHEST:g} count as missing: use another unit, or check the file."
         )
-    notes = []
+    notes = [cloud.unit_note] if cloud.unit_note else []
     if num_bad:
         notes.append(
             f"{num_bad:,} of {len(cloud):,} points are not finite or beyond {FARTHEST:g}; they "

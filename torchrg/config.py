@@ -225,6 +225,11 @@ class GrowingConfig:
             limit = min(_FACET_HEIGHT_FRACTION * sampling.height, _FACET_RADIUS_FRACTION * reach)
             fraction = max(_shape_fraction(sampling), _WHITE_FRACTION)
             tolerance = float(f"{fraction * limit:.3g}") or None
+            if tolerance is not None and tolerance > FARTHEST:
+                raise ConfigError(
+                    f"expected coordinates within {FARTHEST:g}, got a cloud of height "
+                    f"{sampling.height:.3g}; use a larger unit, as points / 2**40."
+                )
         faceted = self.faceted
         if faceted == "auto" and tolerance is not None:
             faceted = _shape_fraction(sampling) > 0.5
@@ -268,8 +273,8 @@ class PlanesConfig:
     """Plane table."""
 
     up: Up | None = field(default=None, metadata=SHORT_FLAG)
-    """Up axis. If set, planes are classified as floor, ceiling, wall and so on. Commands on clouds
-    use z. None: no classes (z if kinds is set)."""
+    """Up axis, by which planes are classified as floor, ceiling, wall and so on. Commands on clouds
+    use z. None: z, when the classes are read."""
     outline: bool = False
     """Trace the polygon of each plane (needs shapely)."""
 

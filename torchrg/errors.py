@@ -7,6 +7,7 @@ the fix.
 import sys
 
 __all__ = [
+    "CloudWarning",
     "ConfigError",
     "DepthWarning",
     "FormatError",
@@ -14,6 +15,7 @@ __all__ = [
     "PrecisionWarning",
     "ShapeError",
     "TorchrgError",
+    "UnitWarning",
 ]
 __dir__ = __all__.copy
 
@@ -90,6 +92,14 @@ class MissingDependencyError(TorchrgError, ImportError):
 
 class PrecisionWarning(UserWarning):
     """The rounding step of coordinates is coarse for the spacing of the points."""
+
+
+class CloudWarning(UserWarning):
+    """A cloud has few points, or seems to have another up axis than assumed."""
+
+
+class UnitWarning(PrecisionWarning):
+    """The axes of a cloud seem to have different units, such as degrees and meters."""
 
 
 class DepthWarning(UserWarning):

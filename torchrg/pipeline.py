@@ -17,7 +17,7 @@ from torchrg import scratch
 from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
 from torchrg._parallel import return_freed_memory
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import CloudWarning, ConfigError, ShapeError
 from torchrg.io import read_cloud
 from torchrg.io.colors import read_colors
 from torchrg.neighbors import (
@@ -35,12 +35,14 @@ from torchrg.normals.orient import Orientation, choose_side, find_directions, tu
 from torchrg.precision import warn_about_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
 from torchrg.regions.growth import needs_sampling, rank_by_count
+from torchrg.regions.kinds import find_kinds
 from torchrg.regions.selection import choose_planes, keep_planes
 from torchrg.regions.superpoints import merge_duplicates
 from torchrg.structures import (
     UNLABELED,
     Cloud,
     Colors,
+    DeferredKind,
     FilePath,
     Labels,
     Neighbors,
@@ -57,6 +59,12 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+_MIN_FITTED = 3
+"""Number of points that define a plane."""
+_MIN_NEIGHBORHOODS = 2
+"""Minimum number of points of a cloud, in neighborhoods; fewer points have one plane for all."""
+_UP = torch.tensor([0.0, 0.0, 1.0])
+"""Up axis of clouds for which none is set."""
 _STRENGTH_OF_K = 100.0
 """Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
 meshed depth frames get about the same number of superpoints as Segmentator's segments."""
@@ -129,7 +137,9 @@ def segment_planes(
 
     Warns:
         PrecisionWarning: If the rounding step of float32 exceeds a tenth of the point spacing, as
-            it does far from the origin.
+            it does far from the origin, or the axes seem to have different units.
+        CloudWarning: If the cloud has fewer than ``2 k`` points. If another axis seems to be up,
+            when planes are classified.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
@@ -144,10 +154,12 @@ def segment_planes(
     """
     if isinstance(points, str | os.PathLike):
         points = read_cloud(points)
+    is_cloud = isinstance(points, Cloud)  # It warns on access to its points.
     points, directions = find_directions(
         "segment_planes", points, orient, viewpoint=viewpoint, front=front
     )
-    warn_about_steps("segment_planes", points)
+    if not is_cloud:
+        warn_about_steps("segment_planes", points)
     objects = None if within is None else as_tensor("segment_planes", "within", within)
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
     if objects is not None and (objects.is_floating_point() or objects.is_complex()):
@@ -202,6 +214,7 @@ def _segment(
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
     if len(sites):
         k = min(config.normals.k, len(sites))
+        _warn_about_size(len(sites), config.normals.k)
         neighbors = search_knn(sites, k, canonical=True)
     sampling = None
     if _has_auto(config):
@@ -262,6 +275,10 @@ def _segment(
         of_plane = objects.new_zeros(len(planes))
         of_plane[point_labels[point_labels >= 0]] = objects[point_labels >= 0]
         planes = replace(planes, object=of_plane)
+    if config.planes.up is None:
+        classify = partial(find_kinds, points=points, labels=point_labels, up=_UP)
+        deferred: Any = DeferredKind(classify)
+        planes = replace(planes, kind=deferred)
 
     begin("orientation")
     if isinstance(parts, Tensor):
@@ -287,6 +304,18 @@ def _segment(
         sampling,
         distinct.num_copies,
     )
+
+
+def _warn_about_size(num_points: int, k: int) -> None:
+    """Warn if every neighborhood contains more than half of a cloud."""
+    if _MIN_FITTED <= num_points < _MIN_NEIGHBORHOODS * k:
+        warnings.warn(
+            f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
+            f"neighborhoods of {k:,}, got {num_points:,}; add points, or reduce normals.k or the "
+            "voxel size.",
+            CloudWarning,
+            stacklevel=6,
+        )
 
 
 def _sample_sites(distinct: DistinctPoints, voxel: float) -> tuple[Tensor, Tensor]:

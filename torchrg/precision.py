@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.errors import PrecisionWarning
+from torchrg.axes import describe_units
+from torchrg.errors import PrecisionWarning, UnitWarning
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
 """Rounding steps, in spacings of the points, above which there is a note: for float32, and for the
@@ -89,13 +90,14 @@ def describe_steps(
 
 
 def warn_about_steps(caller: str, points: Tensor) -> None:
-    """Warn about :func:`describe_steps`, at the caller of a decorated public function."""
+    """Warn about coarse steps and different units, at the caller of a decorated function."""
     coordinates = points.detach().cpu().numpy()
     note = describe_steps(
         coordinates, fix="pass float64, or subtract an offset before it is float32"
     )
-    if note:
-        warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=_ABOVE_DECORATORS)
+    for kind, text in ((PrecisionWarning, note), (UnitWarning, describe_units(coordinates))):
+        if text:
+            warnings.warn(f"{caller}: {text}.", kind, stacklevel=_ABOVE_DECORATORS)
 
 
 def _spacing(points: NDArray[np.floating], side: float) -> float:

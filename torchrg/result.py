@@ -20,9 +20,10 @@ from torch import Tensor
 from torchrg.errors import ShapeError
 from torchrg.io import atomic_path, read_cloud
 from torchrg.io.colors import narrow_colors, read_colors
-from torchrg.io.fields import add_result_fields, are_integers
+from torchrg.io.fields import add_result_fields
 from torchrg.io.files import PARSE_ERRORS, local_path
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
+from torchrg.io.tables import are_integers
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.plane_table import (
@@ -64,7 +65,7 @@ _FOLDER_FIELDS = {
 _KINDS = {
     "labels": ("iu", ()),
     "superpoint": ("iu", ()),
-    "color": ("u", (3,)),
+    "color": ("ub", (3,)),
     "normals": ("f", (3,)),
     "curvature": ("f", ()),
     "sharp": ("b", ()),

@@ -6,14 +6,15 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, cast, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.errors import PrecisionWarning, ShapeError
+from torchrg.axes import describe_units
+from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning
 from torchrg.precision import describe_steps
 
 __all__ = [
@@ -93,7 +94,8 @@ class Cloud:
         ShapeError: If ``coordinates`` is neither array nor tensor, or ``front`` has another shape.
 
     Warns:
-        PrecisionWarning: On access to :attr:`points` if :attr:`precision_note` is not empty.
+        PrecisionWarning: On access to :attr:`points` if :attr:`precision_note` or
+            :attr:`unit_note` is not empty.
 
     Example:
         >>> cloud = Cloud(np.array([[500000.25, 4000000.5, 1.0], [500001.25, 4000000.5, 1.0]]))
@@ -169,10 +171,10 @@ class Cloud:
 
         Rows that are not :attr:`finite` are not finite here either.
         """
-        if self.precision_note:
-            warnings.warn(
-                f"{self.source or 'Cloud'}: {self.precision_note}.", PrecisionWarning, stacklevel=3
-            )
+        kinds = {UnitWarning: self.unit_note, PrecisionWarning: self.precision_note}
+        for kind, note in kinds.items():
+            if note:
+                warnings.warn(f"{self.source or 'Cloud'}: {note}.", kind, stacklevel=3)
         return self._local
 
     @cached_property
@@ -195,6 +197,15 @@ class Cloud:
             return ""
         fix = "leave out points that are far off, or cut the cloud into parts"
         return describe_steps(self._local.numpy(), fix=fix)
+
+    @cached_property
+    def unit_note(self) -> str:
+        """Note on axes that seem to have different units, or an empty string.
+
+        Judged by the header of the file and by the spans of the axes. Without a period.
+        """
+        coordinates = self.coordinates if self.finite.all() else self.coordinates[self.finite]
+        return describe_units(coordinates, self.header)
 
     def relative_to(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates relative to ``origin`` ``(3,)``, float32, shape ``(N, 3)``."""
@@ -353,6 +364,38 @@ class PlaneAdjacency(NamedTuple):
     dihedral_deg: Tensor
 
 
+class DeferredKind:
+    """Classes of planes that are computed on first access, with z up.
+
+    Args:
+        classify: Function that returns the classes of a plane table. It is called once and then
+            dropped, with the points that it holds. A pickled object contains the classes alone.
+    """
+
+    def __init__(self, classify: Callable[["Planes"], Tensor]) -> None:
+        self._classify: Callable[[Planes], Tensor] | None = classify
+        self._kind: Tensor | None = None
+
+    def get(self, planes: "Planes") -> Tensor | None:
+        """Return the class of each plane."""
+        if self._classify is not None:
+            self._kind, self._classify = self._classify(planes), None
+        return self._kind
+
+
+class _KindColumn:
+    """Descriptor of :attr:`Planes.kind`, which may be a :class:`DeferredKind`."""
+
+    def __get__(self, planes: "Planes | None", owner: type | None = None) -> Tensor | None:
+        if planes is None:  # The default of the field.
+            return None
+        value: Tensor | DeferredKind | None = vars(planes)["kind"]
+        return value.get(planes) if isinstance(value, DeferredKind) else value
+
+    def __set__(self, planes: "Planes", value: Tensor | DeferredKind | None) -> None:
+        vars(planes)["kind"] = value
+
+
 @dataclass(frozen=True, eq=False)
 class Plane:
     """One plane: a row of :class:`Planes`, with the same names, as returned by ``seg.planes[0]``.
@@ -362,7 +405,7 @@ class Plane:
         normal: Shape ``(3,)``; so are ``centroid`` and ``center``. ``extent`` is ``(2,)``, and
             ``axes`` is ``(2, 3)``.
         offset: A Python number, as are ``area``, ``count``, ``rms`` and ``curved``.
-        kind: One of :data:`PLANE_KINDS`; None if the up axis is unknown.
+        kind: One of :data:`PLANE_KINDS`; None in depth images with an unknown up axis.
         outline: Rings of its polygon, of shape ``(V, 3)``; None if not requested.
         object: Object ID; None without objects.
     """
@@ -413,8 +456,9 @@ class Planes:
         center: Center of that rectangle, shape ``(M, 3)``.
         curved: Mask of smooth but nonplanar regions (a column, a bent wall), shape ``(M,)``, bool.
             Their plane is only a best fit.
-        kind: Class of each plane as an index of :data:`PLANE_KINDS`, shape ``(M,)``, int64; None if
-            the up axis is unknown.
+        kind: Class of each plane as an index of :data:`PLANE_KINDS`, shape ``(M,)``, int64. Unless
+            an up axis was set, :func:`torchrg.segment_planes` classifies on first access, with z
+            up. None for depth images with an unknown up axis.
         outline: Polygon of each region as rings of shape ``(V, 3)``: seen against the normal, outer
             rings are counter-clockwise and holes clockwise; None if not requested.
         adjacency: Adjacent planes; None without neighbors.
@@ -440,7 +484,7 @@ class Planes:
     axes: Tensor
     center: Tensor
     curved: Tensor
-    kind: Tensor | None = None
+    kind: Tensor | None = cast("Tensor | None", _KindColumn())  # noqa: RUF009 A descriptor.
     outline: tuple[tuple[Tensor, ...], ...] | None = None
     adjacency: PlaneAdjacency | None = None
     object: Tensor | None = None
@@ -477,7 +521,14 @@ class Planes:
 
     def to(self, device: torch.device | str) -> "Planes":
         """Move the table to a device."""
-        return replace(self, **{name: moved(value, device) for name, value in vars(self).items()})
+        columns = {name: moved(value, device) for name, value in vars(self).items()}
+        if isinstance(columns["kind"], DeferredKind):
+            columns["kind"] = DeferredKind(lambda _: cast(Tensor, moved(self.kind, device)))
+        return replace(self, **columns)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the columns with their classes, instead of the points that define them."""
+        return vars(self) | {"kind": self.kind}
 
     def to_pandas(self) -> Any:  # noqa: ANN401
         """Convert to a ``pandas.DataFrame`` with :data:`torchrg.plane_table.CSV_COLUMNS`.

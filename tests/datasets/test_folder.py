@@ -197,3 +197,27 @@ def test_slices_are_subsets(root):
 def test_a_data_set_is_shown_by_its_folder(root):
     assert repr(FolderOfClouds(root)) == f"FolderOfClouds('{root}', 4 scenes)"
     assert repr(RGBDFrames([])) == "RGBDFrames(0 scenes)"
+
+
+def test_files_without_points_are_skipped_with_one_line(root):
+    (root / "readme.txt").write_text("Scans of a house.\n1. Look at 3 of them.\n")
+    np.save(root / "labels.npy", np.arange(3))
+    with pytest.warns(UserWarning, match=r"skipped labels\.npy and 1 more: files without points"):
+        assert names_of(FolderOfClouds(root))[-1] == "scan_10"
+
+
+@pytest.mark.parametrize("content", [b"0 1\0", b"1 2 3\n", b"", b"\xff\xfe garbage"])
+def test_damaged_files_stay_scans(root, content):
+    (root / "z.txt").write_bytes(content)
+    (root / "y.npy").write_bytes(content)
+    assert names_of(FolderOfClouds(root))[-2:] == ["y", "z"]
+
+
+def test_arrays_of_a_scene_need_its_coordinates(root):
+    (root / "room").mkdir()
+    np.save(root / "room" / "color.npy", COORDINATES)
+    np.save(root / "room" / "segment.npy", np.zeros(3, int))
+    with pytest.raises(FormatError, match=r"room: expected coord\.npy next to color\.npy"):
+        FolderOfClouds(root)
+    np.save(root / "room" / "coord.npy", COORDINATES)
+    assert "room" in names_of(FolderOfClouds(root))

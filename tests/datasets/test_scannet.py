@@ -295,3 +295,21 @@ def test_object_numbers_of_scannetpp_fit_their_arrays(scans, tmp_path):
     path.write_text(path.read_text().replace('"objectId": 1', '"objectId": 40000'))
     with pytest.raises(FormatError, match=r"anno\.json: object 0: .* from 0 to 32,767 as objectId"):
         _ = ScanNet(tmp_path)[0]
+
+
+def test_a_scan_of_two_splits_is_told(tree):
+    write_tables(tree, ["scene0010_00"], ["scene0010_00"])
+    with pytest.warns(UserWarning, match=r"_val\.txt: scans of another split are in val, .*010"):
+        data = ScanNet(tree)
+    assert "val/scene0010_00" in [scene.name for scene in data.scenes]
+
+
+def test_objects_that_share_their_second_id_are_told(tree):
+    write_tables(tree, ["scene0010_00"], [])
+    path = next(tree.rglob(GROUPS))
+    content = json.loads(path.read_text())
+    for group in content["segGroups"]:
+        group["objectId"] = 0
+    path.write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match="objects share an ID with an earlier one"):
+        read_scannet_scan(path.with_name(f"{path.parent.name}_vh_clean_2.ply"), tree)

@@ -6,6 +6,7 @@ import pytest
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.io.colors import read_colors
+from torchrg.result import Result
 from torchrg.structures import Cloud
 
 RNG = np.random.default_rng(0)
@@ -233,3 +234,23 @@ def test_colors_of_16_bits_survive_formats_that_hold_them(tmp_path):
         write_cloud(tmp_path / f"b{suffix}", read_cloud(tmp_path / "b.npz"))
         narrow = np.rint(SIXTEEN / 257)
         np.testing.assert_array_equal(read_cloud(tmp_path / f"b{suffix}").fields["color"], narrow)
+
+
+@pytest.mark.parametrize("kind", [".npz", ".npy", ".ply", ".pcd", ".las", ".xyz"])
+@pytest.mark.parametrize("channel", [np.uint8, np.uint16, np.uint32, bool])
+def test_writing_and_reading_choose_one_range(tmp_path, kind, channel):
+    colors = EIGHT > 127 if channel is bool else EIGHT.astype(channel)
+    path = tmp_path / f"cloud{kind}"
+    write_cloud(path, Cloud(POINTS, {"color": colors}))
+    shown = colors * 255 if channel is bool else EIGHT
+    assert read_cloud(path).fields["color"].tolist() == shown.tolist()
+
+
+def test_sixteen_bits_are_rounded_where_a_file_has_eight(tmp_path):
+    write_cloud(tmp_path / "cloud.ply", Cloud(POINTS, {"color": SIXTEEN.astype(np.uint16)}))
+    assert read(tmp_path / "cloud.ply")[0] == np.rint(SIXTEEN / 257).astype(int).tolist()
+
+
+def test_a_result_shows_small_values_of_16_bits():
+    cloud = Cloud(POINTS, {"color": EIGHT.astype(np.uint16)})
+    assert Result(cloud).fields["color"].tolist() == EIGHT.tolist()

@@ -128,3 +128,29 @@ def test_only_regular_files_are_read(tmp_path):
     for name in ("pipe.ply", "zero.ply"):
         with pytest.raises(FormatError, match="expected a regular file, got a pipe or a device"):
             read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", [".ply", ".pcd"])
+@pytest.mark.parametrize("is_ascii", [False, True])
+def test_headers_may_end_their_lines_as_old_macs_did(tmp_path, kind, is_ascii):
+    points = np.array([[0.0, 1.5, 13], [10, 4, 1e3]])
+    path = tmp_path / f"a{kind}"
+    write_cloud(path, Cloud(points))
+    header, mark, body = path.read_bytes().partition(
+        b"end_header\n" if kind == ".ply" else b"DATA binary\n"
+    )
+    header += mark
+    if is_ascii:
+        header = header.replace(b"binary_little_endian", b"ascii").replace(b"binary", b"ascii")
+        body = b"0 1.5 13\n10 4 1e3\n"
+    if kind == ".ply" and is_ascii:
+        header = header.replace(
+            b"end_header", b"element face 1\nproperty list uchar int vertex_indices\nend_header"
+        )
+        body += b"3 0 1 0\n"
+    path.write_bytes(
+        header.replace(b"\n", b"\r") + (body.replace(b"\n", b"\r") if is_ascii else body)
+    )
+    cloud = read_cloud(path)
+    assert cloud.coordinates.tolist() == points.tolist()
+    assert (cloud.front is not None) == (kind == ".ply" and is_ascii)

@@ -322,3 +322,34 @@ def test_plain_array_is_written_without_fields(tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), POINTS)
     write_cloud(tmp_path / "a.npy", Cloud(POINTS, {"labels": np.arange(4)}))
     assert np.load(tmp_path / "a.npy").dtype.names == ("x", "y", "z", "label")
+
+
+def test_one_array_of_three_columns_is_the_points(tmp_path):
+    np.savez(tmp_path / "a.npz", xyz=POINTS, labels=np.arange(4), normals=POINTS)
+    cloud = read_cloud(tmp_path / "a.npz")
+    np.testing.assert_array_equal(cloud.coordinates, POINTS)
+    assert list(cloud.fields) == ["labels", "normals"]
+    assert cloud.notes == ("xyz is read as the points, as no other array has 3 columns",)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"pos": POINTS, "xyz": POINTS}, "expected an array points"),
+        ({"color": POINTS, "normal": POINTS}, "expected an array points"),
+        ({"arr_0": np.diag([500.0, 500, 1])}, "got a 3 x 3 camera matrix"),
+        ({"arr_0": np.zeros((0, 3))}, "expected an array points"),
+    ],
+)
+def test_other_archives_are_no_clouds(tmp_path, arrays, message):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(FormatError, match=message):
+        read_cloud(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("name", ["color", "normal", "Normals", "rgb"])
+def test_a_file_named_as_a_field_is_no_cloud(tmp_path, name):
+    np.save(tmp_path / f"{name}.npy", POINTS)
+    with pytest.raises(FormatError, match=rf"named as the field {name}; pass the folder"):
+        read_cloud(tmp_path / f"{name}.npy")
+    assert len(read_cloud(tmp_path / f"{name}.npy", columns="xyz")) == len(POINTS)

@@ -324,10 +324,10 @@ def test_suffix_in_capitals_is_the_same(tmp_path, make_cloud, assert_same):
 
 @pytest.mark.parametrize(("call", "kinds"), [(read_cloud, FORMATS), (check_output, WRITTEN)])
 def test_unknown_suffix_lists_the_known_ones(tmp_path, call, kinds):
-    (tmp_path / "a.stl").write_bytes(b"solid")
-    known = re.escape(f"{' '.join(kinds)}, got '.stl'")
-    with pytest.raises(FormatError, match=rf"a\.stl: expected a file that ends in one of {known}"):
-        call(tmp_path / "a.stl")
+    (tmp_path / "a.abc").write_bytes(b"solid")
+    known = re.escape(f"{' '.join(kinds)}, got '.abc'")
+    with pytest.raises(FormatError, match=rf"a\.abc: expected a file that ends in one of {known}"):
+        call(tmp_path / "a.abc")
 
 
 @pytest.mark.parametrize("kind", [*FORMATS, ".stl"])
@@ -393,3 +393,11 @@ def test_points_alone_are_a_cloud(given, tmp_path):
     assert np.array_equal(read_cloud(tmp_path / "points.ply").coordinates, np.eye(3))
     with pytest.raises(ShapeError, match=r"write_cloud: expected cloud of shape \(N, 3\)"):
         write_cloud(tmp_path / "points.ply", given[:, :2])
+
+
+@pytest.mark.parametrize("name", ["a\0b", "n" * 70_000])
+@pytest.mark.parametrize("kind", WRITTEN)
+def test_names_that_no_file_can_hold_are_refused(tmp_path, kind, name):
+    cloud = Cloud(np.zeros((2, 3)), {name: np.zeros(2)})
+    with pytest.raises(FormatError, match=r"expected field names without NUL .*; rename the fie"):
+        write_cloud(tmp_path / f"a{kind}", cloud)

@@ -1,5 +1,6 @@
 """Points as text of other programs, whole and broken, with pyarrow and without."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -365,8 +366,69 @@ def test_columns_of_words_are_left_out_by_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "tool"), [(".obj", "CloudCompare or pcl_mesh_sampling"), (".ptx", "save it there")]
+    ("suffix", "tool"),
+    [
+        (".obj", "CloudCompare or pcl_mesh_sampling"),
+        (".STL", "sample points"),
+        (".ptx", "save it there"),
+        (".tif", "torchrg depth"),
+        (".h5", "numpy.save"),
+    ],
 )
 def test_what_is_no_cloud_names_the_program_that_makes_one(tmp_path, suffix, tool):
     with pytest.raises(FormatError, match=rf"a\{suffix}: expected points, got .*{tool}"):
         read_cloud(save(tmp_path / f"a{suffix}", "v 0 0 0\n"))
+
+
+@pytest.mark.parametrize("place", range(3))
+@pytest.mark.parametrize("word", ["-1.#IND", "1.#QNAN0", "-nan(ind)", "nan(snan)", "1.#INF00"])
+def test_windows_spellings_of_missing_numbers_are_read(tmp_path, word, place):
+    rows = [["0", "1.5", "-2"], ["3", "4", "1e3"]]
+    for row in (0, 1):
+        words = [list(line) for line in rows]
+        words[row][place] = word
+        text = "\n".join(" ".join(line) for line in words)
+        expected = np.array(POINTS)
+        expected[row, place] = np.nan
+        ply = "ply\nformat ascii 1.0\nelement vertex 2\n"
+        ply += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        for name, content in (("a.xyz", text), ("a.ply", ply + text)):
+            cloud = read_cloud(save(tmp_path / name, content + "\n"))
+            np.testing.assert_array_equal(cloud.coordinates, expected)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "utf-8"])
+@pytest.mark.parametrize("names", ["", "x y z höhe\n"])
+def test_marked_encodings_are_read(tmp_path, encoding, names):
+    text = f"{names}0 1.5 -2 7\n3 4 1e3 8\n"
+    (tmp_path / "a.txt").write_bytes(text.encode(encoding))
+    cloud = read_cloud(tmp_path / "a.txt")
+    assert cloud.coordinates.tolist() == POINTS
+    assert list(cloud.fields) == ["höhe" if names else "intensity"]
+
+
+def test_words_alone_separate_scans(tmp_path):
+    text = "BEGIN\n0 1.5 -2\nEND\nBEGIN\n3 4 1e3\nEND\n"
+    assert read_cloud(save(tmp_path / "a.pts", text)).coordinates.tolist() == POINTS
+
+
+@pytest.mark.parametrize(
+    ("comment", "named"),
+    [
+        ("# time row col east", True),
+        ("#time,row,col,east", True),
+        ("# written by some program", True),
+        ("# a comment of more words than columns", False),
+        ("# 2024 01 02 03", False),
+        ("# X [m] Y [m] Z [m] i", False),
+    ],
+)
+def test_names_in_a_comment_are_used_or_told(tmp_path, comment, named):
+    path = save(tmp_path / "a.txt", f"{comment}\n0 1.5 -2 7\n3 4 1e3 8\n")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert read_cloud(path).coordinates.tolist() == POINTS
+    assert [f"{path}: its comment names columns" in str(w.message) for w in caught] == [
+        True
+    ] * named
+    assert not any("comment" in str(w.message) for w in caught if not named)

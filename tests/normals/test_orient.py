@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.made import make_shape
+from torchrg import segment_planes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals, orient_normals
@@ -270,6 +271,21 @@ def test_wrong_arguments_are_refused():
         orient_normals(points, points, orient="viewpoint", viewpoint=torch.zeros(2, 3))
     with pytest.raises(ShapeError, match="expected normals of shape"):
         orient_normals(points, points[:3])
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+def test_viewpoint_and_front_are_finite_where_points_are(wrong):
+    points, normals = np.random.default_rng(0).random((9, 3)), np.eye(3)[[2] * 9]
+    with pytest.raises(ConfigError, match=r"finite viewpoint, got (nan|inf); pass the sc"):
+        orient_normals(points, normals, orient="viewpoint", viewpoint=[0, wrong, 0])
+    front = np.ones((9, 3))
+    front[4, 1] = wrong
+    with pytest.raises(ConfigError, match=r"expected finite front, got (nan|inf); pass zeros"):
+        orient_normals(points, normals, front=front)
+    with pytest.raises(ConfigError, match="expected finite viewpoint"):
+        segment_planes(points, "classic", orient="viewpoint", viewpoint=front)
+    points[4] = np.nan  # A missing point has no front.
+    assert orient_normals(points, normals, front=front).isfinite().all()
 
 
 def test_what_lies_apart_decides_for_itself_however_small_it_is(rng):

@@ -8,6 +8,7 @@ import torch
 
 from tests.regions.test_repair import OFF, flat_cloud, scattered, sheet, with_settings
 from tests.regions.test_splits import CONFIG, bumpy
+from torchrg import segment_planes
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
 
@@ -84,3 +85,16 @@ def test_points_decide_whether_a_faceted_region_is_flat(radius, curved):
     for faceted, expected in ((True, curved), (False, True), ("auto", True)):
         config = dataclasses.replace(CONFIG, faceted=faceted)
         assert fit_regions(cloud, labels, config).curved.tolist() == [expected]
+
+
+@pytest.mark.parametrize("num_points", [10, 20, 30, 40, 60, 90])
+def test_random_points_in_a_cube_are_no_flat_plane(num_points):
+    for seed in range(6):
+        points = torch.rand(num_points, 3, generator=torch.Generator().manual_seed(seed))
+        assert segment_planes(points).planes.curved.all()
+
+
+@pytest.mark.parametrize("size", [(1, 1, 0.0), (1, 1, 0.05), (1, 0.05, 0.01)])
+def test_flat_and_long_points_stay_planes(size):
+    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(size)
+    assert len(segment_planes(points, {"growing.min_size": 10}).planes) == 1

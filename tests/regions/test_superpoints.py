@@ -378,7 +378,7 @@ def test_arguments_are_checked(room):
     with pytest.raises(ShapeError, match="expected colors of shape"):
         make_superpoints(points, colors=points[:5])
     with pytest.raises(ConfigError, match=r"expected color of shape \(N, 3\), got"):
-        make_superpoints(points, colors=points > 0)
+        make_superpoints(points, colors=points.to(torch.complex64))
     seg = segment_planes(points[:100])
     with pytest.raises(ShapeError, match="expected seg of 6,000 points, got 100"):
         make_superpoints(points, seg)

@@ -27,7 +27,7 @@ from torchrg.datasets.camera_files import SUFFIXES, read_camera
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
-from torchrg.io.fields import COLUMNS_RULE
+from torchrg.io.tables import COLUMNS_RULE
 from torchrg.normals import Orientation
 from torchrg.structures import FARTHEST, Sampling
 

@@ -8,13 +8,14 @@ import numpy as np
 import torch
 
 from torchrg import kernels
+from torchrg.axes import likely_up
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, describe_sampling, file_columns
 from torchrg.config import load_config
 from torchrg.io import read_cloud
 from torchrg.neighbors import distinct_points, measure_sampling, prepare_search
-from torchrg.structures import Cloud
+from torchrg.structures import Array, Cloud
 
 _DIGITS = {4: 6, 8: 10}
 """Significant digits printed for a coordinate, by its size in bytes. float32 has at most six; ten
@@ -51,10 +52,21 @@ def run(argv: list[str]) -> int:
     cloud = read_cloud(arguments.file, columns=file_columns(arguments.file, arguments.columns))
     for name, value in describe_cloud(cloud).items():
         print_lines(f"{name:<12}{value}")
-    for note in filter(None, (*cloud.notes, cloud.precision_note)):
+    for note in filter(None, (*cloud.notes, cloud.unit_note, cloud.precision_note)):
         print_lines(f"{'note':<12}{note}")
     print_lines(f"{'kernels':<12}{kernels.name_of_library() or 'none (several times slower)'}")
     return 0
+
+
+def _describe_up(positions: Array, rows: Array, near: Array) -> str:
+    """Return the axis that is likely up, from planes through the neighbors of some points."""
+    local = positions[near].astype(np.float64)
+    offsets = local - local.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets)[1][:, :, 0]
+    # The square of the radius of a neighborhood is proportional to the area of a point.
+    areas = np.square(local[:, -1] - positions[rows]).sum(axis=1)
+    axis = likely_up(normals, positions[rows], areas, np.array([0.0, 0, 1]))
+    return f"{axis}, whose floor and ceiling are largest; pass --up {axis}" if axis else "z"
 
 
 def describe_cloud(cloud: Cloud) -> dict[str, str]:
@@ -83,6 +95,7 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
             sampling = measure_sampling(torch.from_numpy(positions), search)
             chosen = load_config().measured(sampling)["settings"]
+            facts["up axis"] = _describe_up(positions, rows, search(rows))
             facts["height"] = f"{sampling.height:g} (smallest extent along the principal axes)"
             facts["density"] = f"{sampling.density:g} points on a square of side 1"
             facts["surfaces"] = describe_sampling(sampling, chosen)

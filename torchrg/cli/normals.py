@@ -81,8 +81,8 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     cloud = read_cloud(source, columns=flags.file_columns(source, arguments.columns))
     note_input(f"{source}", cloud, target, RESULTS)
     check_finite(cloud)
-    if cloud.precision_note:
-        warn(f"{source}: {cloud.precision_note}.")
+    for note in filter(None, (cloud.unit_note, cloud.precision_note)):
+        warn(f"{source}: {note}.")
     # Fail before the computation.
     find_directions("normals", cloud, arguments.orient, viewpoint=arguments.viewpoint)
     check_output(target, cloud)

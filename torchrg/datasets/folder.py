@@ -4,6 +4,7 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, overload
 
@@ -15,10 +16,10 @@ from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
 from torchrg.errors import ConfigError, FormatError, add_note
-from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
+from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.colors import read_colors
-from torchrg.io.files import local_path
-from torchrg.io.npy import map_folder
+from torchrg.io.files import decode_file, local_path
+from torchrg.io.npy import map_array, map_folder
 from torchrg.structures import Cloud
 from torchrg.transforms.rows import Sample, SampleDict
 
@@ -28,6 +29,11 @@ _ID_ARRAYS = {"instance", "plane", "superpoint"}
 """Arrays whose IDs start at 0 in each scene."""
 _FIELD_KEYS = {"normals": "normal"}
 """Sample keys of cloud fields, if they differ."""
+_MAX_PROSE_BYTES = 1 << 16
+"""Maximum size of a text file that is read to see whether it contains points."""
+_LINKS = "links to files that were already read, or to a parent folder"
+_THREE_NUMBERS = re.compile(r"^\W*([-+]?[\d.][^\s,;]*[\s,;]+){2}[-+]?[\d.]", re.MULTILINE)
+"""Beginning of a line of points."""
 
 
 class SceneFiles(NamedTuple):
@@ -202,6 +208,15 @@ class FolderOfClouds(SceneDataset):
             for path in find_files(self.root, is_item=is_scene)
             if path.is_dir() or path.suffix.lower() in endings
         ]
+        for path in paths:
+            if path.suffix == ".npy" and path.stem in POINT_ARRAYS:
+                raise FormatError(
+                    f"{path.parent}: expected coord.npy next to {path.name}, got none; copy it, or "
+                    "rename the file if it is a cloud."
+                )
+        others = [path for path in paths if columns is None and is_other(path)]
+        warn_skipped(self.root, others, "files without points")
+        paths = [path for path in paths if path not in {*others}] if others else paths
         if not paths:
             raise FormatError(
                 f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
@@ -296,6 +311,17 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     return collate_offset(scenes)
 
 
+def is_other(path: Path) -> bool:
+    """Whether an intact file is no cloud: a list of numbers such as labels, or text to be read."""
+    with suppress(FormatError):
+        if path.suffix.lower() == ".npy":
+            values = map_array(path)
+            return values.ndim == 1 and values.dtype.names is None
+        if path.suffix.lower() in TEXT_SUFFIXES and 0 < path.stat().st_size <= _MAX_PROSE_BYTES:
+            return _THREE_NUMBERS.search(decode_file(path)) is None
+    return False
+
+
 def is_scene(folder: Path) -> bool:
     """Whether a folder is itself a cloud in Pointcept's layout."""
     return (folder / "coord.npy").is_file()
@@ -357,13 +383,12 @@ def find_files(
     return sorted(files, key=lambda path: [natural_key(p) for p in path.relative_to(folder).parts])
 
 
-def warn_skipped(folder: Path, skipped: Sequence[Path]) -> None:
-    """Warn if duplicates or recursive links in a folder were skipped."""
+def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> None:
+    """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
         more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
         warnings.warn(
-            f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: links to files that were "
-            "already read, or to a parent folder.",
+            f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.",
             stacklevel=3,
         )
 

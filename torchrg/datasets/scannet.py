@@ -256,12 +256,14 @@ def _find_file(root: Path, name: str) -> Path | None:
 def _read_lists(root: Path) -> dict[str, tuple[str, Path]]:
     """Return the split and the list of each listed scan."""
     paths = ((split, _find_file(root, name)) for split, names in _SPLITS.items() for name in names)
-    return {
-        name: (split, path)
-        for split, path in paths
-        if path is not None
-        for name in decode_file(path).split()
-    }
+    lists = dict[str, tuple[str, Path]]()
+    for split, path in paths:
+        if path is not None:
+            names = decode_file(path).split()
+            both = [name for name in names if lists.get(name, (split,))[0] != split]
+            lists |= dict.fromkeys(names, (split, path))
+            _warn_entries(path, f"scans of another split are in {split}, too, which counts", both)
+    return lists
 
 
 def _warn_missing_scans(lists: Mapping[str, tuple[str, Path]], scans: set[str]) -> None:
@@ -386,7 +388,7 @@ def _groups(
         )
     vertex_segments = _to_int64(path, "segIndices", segments)
     known, path = np.unique(vertex_segments), files["groups"]
-    seen: set[int] = set()
+    seen: set[tuple[str, object]] = set()
     repeated = []
     for i, group in enumerate(_read_list(path, "segGroups")):
         entries = group if isinstance(group, dict) else {}
@@ -406,8 +408,9 @@ def _groups(
                 f"{path}: object {i}: expected segments of {files['segments'].name}, got "
                 f"{absent[0]}, which is missing there; use the annotation of the same mesh."
             )
-        repeated += [numbers[0]] if numbers[0] in seen else []
-        seen.add(numbers[0])
+        ids = {(key, entries[key]) for key in ("id", "objectId") if key in entries}
+        repeated += [numbers[0]] if seen & ids else []
+        seen |= ids
         yield (
             label,
             numbers,

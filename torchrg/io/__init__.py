@@ -11,7 +11,7 @@ import numpy as np
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import FormatError
-from torchrg.io.columns import check_length
+from torchrg.io.columns import check_field
 from torchrg.io.e57 import count_e57, read_e57
 from torchrg.io.fields import add_result_fields, convert_coordinates
 from torchrg.io.files import ARCHIVE_ERRORS, atomic_path, check_file, check_writable, local_path
@@ -77,11 +77,22 @@ FORMATS: dict[str, Format] = {
 FOLDER_SUFFIXES = tuple(kind for kind in FORMATS if kind != ".csv")
 """Suffixes read as clouds in folders. A ``.csv`` file is usually another table."""
 _CONVERTERS = {
-    ".obj": "a mesh; sample points on it with CloudCompare or pcl_mesh_sampling",
-    ".glb": "a mesh; sample points on it with CloudCompare or Open3D",
-    ".ptx": "a scan that CloudCompare opens; save it there as .e57",
+    "a mesh; sample points on it with CloudCompare or pcl_mesh_sampling": (
+        ".obj .glb .gltf .stl .off .fbx .dae .3ds .x3d .wrl .usdz"
+    ),
+    "a scan of another program; save it there or in CloudCompare as .e57, .laz or .ply": (
+        ".ptx .fls .lsproj .zfs .rcp .rcs .rdb .rxp .bin .pcap .bag .mcap .db3 .pod .potree"
+    ),
+    "an image; pass images of depth to torchrg depth": (
+        ".png .pgm .ppm .exr .tif .tiff .jpg .jpeg .pfm .bmp .webp"
+    ),
+    "an archive; unpack it, or save its points with numpy.save": (
+        ".zip .gz .7z .tar .h5 .hdf5 .mat .pkl .pt .pth .parquet .feather"
+    ),
 }
-"""Unsupported suffixes, with the programs that convert them to point clouds."""
+"""Contents of files that are not read and the way to read them, with their suffixes."""
+TEXT_SUFFIXES = tuple(kind for kind, form in FORMATS.items() if form.read is read_text)
+"""Suffixes of text files."""
 _PLANES_SUFFIX = ".vg"
 """Suffix of vertex groups, which are write-only and store coordinates, colors and planes."""
 
@@ -101,7 +112,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
         path: A file with a suffix of :data:`FORMATS`, in any case.
         columns: Column names of a text file or a plain ``.npy`` array, in order: ``x``, ``y``,
             ``z`` and any others, ``_`` to skip a column. Default: the names in the file, else
-            :data:`torchrg.io.fields.COLUMNS_RULE`.
+            :data:`torchrg.io.tables.COLUMNS_RULE`.
 
     Returns:
         The cloud, with at least one point.
@@ -205,7 +216,7 @@ def write_cloud(
         cloud = Cloud(points.numpy(force=True))
     check_output(target, cloud)
     for name, values in cloud.fields.items():
-        check_length(target, name, values, len(cloud))
+        check_field(target, name, values, len(cloud))
     cloud = replace(cloud, coordinates=convert_coordinates(target, cloud.coordinates))
     for what, result in (("a segmentation", segmentation), ("superpoints", superpoints)):
         if result is not None and len(result.labels) != len(cloud):
@@ -278,8 +289,9 @@ def estimate_points(path: Path) -> int:
 def _get_format(path: Path, *, for_writing: bool = False) -> Format:
     """Return the format of a file to read or write, by its suffix."""
     suffix = path.suffix.lower()
-    if suffix in _CONVERTERS and not for_writing:
-        raise FormatError(f"{path}: expected points, got {_CONVERTERS[suffix]}.")
+    content = next((what for what, kinds in _CONVERTERS.items() if suffix in kinds.split()), "")
+    if content and not for_writing:
+        raise FormatError(f"{path}: expected points, got {content}.")
     if suffix not in FORMATS:
         suffixes = [kind for kind, format_ in FORMATS.items() if format_.write or not for_writing]
         raise FormatError(

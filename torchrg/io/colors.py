@@ -28,7 +28,8 @@ def find_white(color: Array) -> int:
     Convention:
         Floating-point values are in 0..1 if most of them are and some are not integers, or if all
         but a few are 0 or 1. Other values are in 0..255, or in 0..65535 if more than a few exceed
-        255. Values that are black in every range are ignored.
+        255. Values that are black in every range are ignored. Booleans are in 0..1. This function
+        alone chooses the range, for reading and for writing.
 
     Args:
         color: Real numbers of any type and shape, without NaN.
@@ -37,14 +38,17 @@ def find_white(color: Array) -> int:
         >>> find_white(np.array([0.2, 0.9, 1.3])), find_white(np.array([0.0, 1.0, 200.0]))
         (1, 255)
     """
-    if color.dtype == np.uint8:
-        return BYTE
+    if color.dtype.itemsize == 1 and color.dtype.kind in "ub":
+        return BYTE if color.dtype.kind == "u" else 1
     positive = _count(color > _HALF_STEP / BYTE)
     if color.dtype.kind == "f":
         above = _count(color > 1 + _HALF_STEP / BYTE)
         if _are_outliers(above, positive) or (2 * above < positive and not _is_integral(color)):
             return 1
-    return BYTE if _are_outliers(_count(color > BYTE + _HALF_STEP), positive) else WORD
+    wide = _count(color > BYTE + _HALF_STEP)
+    if color.dtype == np.uint16:  # A type for wide values: a single one counts.
+        return BYTE if wide <= _MAX_OUTLIER_FRACTION * positive else WORD
+    return BYTE if _are_outliers(wide, positive) else WORD
 
 
 @np.errstate(over="ignore")
@@ -58,8 +62,8 @@ def read_colors(
 
     Args:
         owner: File or function that the colors belong to, for messages.
-        color: Integers or floating-point numbers, shape ``(*, 3)``. NaN is read as 0; values
-            outside the range are clipped.
+        color: Integers, booleans or floating-point numbers, shape ``(*, 3)``. NaN is read as 0;
+            values outside the range are clipped.
         limits: Minimum and maximum of each channel, shape ``(2, 3)``, if the file states them.
             Default: 0 and :func:`find_white`.
         error: Exception class to raise if more than a few values fit no range.
@@ -72,7 +76,7 @@ def read_colors(
         ('color values beyond 0..1 are clipped: 1 of 6',)
     """
     notes, dtype, white = list[str](), color.dtype, None
-    if dtype.kind not in "fiu" or color.shape[-1:] != (3,):
+    if dtype.kind not in "fiub" or color.shape[-1:] != (3,):
         raise error(
             f"{owner}: expected color of shape (N, 3), got shape {color.shape} of "
             f"{dtype}; convert it, or rename or remove that field."
@@ -88,8 +92,8 @@ def read_colors(
     elif dtype == np.int8:
         color = color.view(np.uint8)
         notes.append("its colors are signed bytes, read as unsigned")
-    if color.dtype == np.uint8 or color.size == 0:
-        return color.astype(np.uint8, copy=False), tuple(notes)
+    if color.dtype in (np.uint8, np.bool_) or color.size == 0:
+        return narrow_colors(color), tuple(notes)
     if white is None:
         white = find_white(color)
         notes += _range_notes(color, white)
@@ -115,7 +119,7 @@ def read_colors(
         # Limits are not written back, and such values would then be read as 0..255.
         is_wide = False
         notes.append(f"its colors are almost black: at most {BYTE} of their limit {WORD}")
-    return values if is_wide else narrow_colors(values), tuple(notes)
+    return values if is_wide else _scale_to_bytes(values, WORD), tuple(notes)
 
 
 def _scale_by_limits(
@@ -148,15 +152,23 @@ def _range_notes(color: Array, white: int) -> list[str]:
 
 
 def narrow_colors(color: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Round colors of 8 or 16 bits to uint8.
+    """Round colors to uint8; :func:`find_white` chooses their range.
 
     Example:
-        >>> narrow_colors(np.array([128, 129, 65535], np.uint16)).tolist()
+        >>> narrow_colors(np.array([128, 385, 65535], np.uint16)).tolist()
         [0, 1, 255]
+        >>> narrow_colors(np.array([128, 129, 255], np.uint16)).tolist()
+        [128, 129, 255]
     """
-    if color.dtype == np.uint8:
+    if color.dtype == np.uint8 or color.size == 0:
         return color.astype(np.uint8, copy=False)
-    return np.rint(color.astype(np.float32) / WIDEN).astype(np.uint8)
+    return _scale_to_bytes(color, find_white(color))
+
+
+def _scale_to_bytes(color: NDArray[np.generic], white: int) -> NDArray[np.uint8]:
+    """Scale colors in 0..white to uint8."""
+    scaled: Array = np.rint(color.astype(np.float32) / np.float32(white / BYTE))
+    return np.clip(scaled, 0, BYTE).astype(np.uint8)
 
 
 def _are_outliers(count: int, total: int) -> bool:

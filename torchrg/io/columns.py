@@ -7,13 +7,15 @@ from typing import NamedTuple
 import numpy as np
 
 from torchrg.errors import FormatError
-from torchrg.io.colors import narrow_colors
+from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.fields import MAX_EXACT_INTEGER, SKIPPED, Columns, Values, backup_name
 from torchrg.io.files import atomic_path
 from torchrg.structures import Cloud
 
 _RECORDS_PER_CHUNK = 1 << 20
 """Number of records converted and written at a time, which bounds the memory."""
+_MAX_NAME = 255
+"""Maximum number of letters of a field name, as of a file name."""
 _LABELS = ("labels", backup_name("labels"))
 
 
@@ -40,7 +42,8 @@ class FieldNames(NamedTuple):
 def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str, Values]:
     """Convert a cloud to named columns: ``x y z`` first, then its fields.
 
-    Labels become int32 if they fit, colors uint8 (or uint16 if the format supports it), booleans
+    Labels become int32 if they fit, colors uint8 (or uint16 if the format supports it;
+    see :func:`torchrg.io.colors.read_colors`), booleans
     uint8, and half precision float32. A multi-column field is split into ``name_0``,
     ``name_1`` and so on, unless the format has ``vectors``.
     """
@@ -60,8 +63,13 @@ def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str
     return columns
 
 
-def check_length(path: Path, name: str, values: Values, num_points: int) -> None:
-    """Check that a field has one row per point."""
+def check_field(path: Path, name: str, values: Values, num_points: int) -> None:
+    """Check that a field has a name that files can store, and one row per point."""
+    if "\0" in name or len(name) > _MAX_NAME:
+        raise FormatError(
+            f"{path}: expected field names without NUL of at most {_MAX_NAME} letters, got "
+            f"{name[:20]!r} of {len(name):,}; rename the field."
+        )
     if values.shape[:1] != (num_points,):
         raise FormatError(
             f"{path}: expected field {name} of shape ({num_points}, ...), got {values.shape}; "
@@ -81,17 +89,16 @@ def _to_storable(path: Path, name: str, values: Values, field_names: FieldNames)
             f"{path}: expected field {name} of shape (N,) or (N, C), got {values.shape}; "
             "remove it or write .npz."
         )
-    if values.dtype.kind == "b":
-        return values.astype(np.uint8)
-    if values.dtype == np.float16:
-        return values.astype(np.float32)
-    if name != "color" or values.dtype == np.uint8:
-        return values
-    if values.dtype != np.uint16:
+    if name == "color" and values.dtype.kind == "f":
         raise FormatError(
             f"{path}: expected field color of uint8 or uint16, got {values.dtype}; convert it."
         )
-    return values if field_names.color_bits == 16 else narrow_colors(values)
+    if name == "color" and values.shape[1:] == (3,):
+        color, _ = read_colors(path, values)
+        return color if field_names.color_bits == 16 else narrow_colors(color)
+    if values.dtype.kind == "b":
+        return values.astype(np.uint8)
+    return values.astype(np.float32) if values.dtype == np.float16 else values
 
 
 def _split_field(name: str, values: Values, field_names: FieldNames) -> dict[str, Values]:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.colors import BYTE, WORD, read_colors
+from torchrg.io.colors import read_colors
+from torchrg.io.tables import are_integers, check_table, guess_column_names, warn_about_counters
 from torchrg.structures import UNLABELED, Cloud
 
 Values = NDArray[Any]
@@ -24,7 +25,7 @@ Values = NDArray[Any]
 Columns = Mapping[str, Values]
 """Per-point values by name, each of shape ``(N, ...)``."""
 
-_ALIASES = {
+FIELD_NAMES = {
     "label": "labels",
     "labels": "labels",
     "normal": "normals",
@@ -47,29 +48,10 @@ _TRIPLES = {
     ("rf", "gf", "bf"): "color",
 }
 """Field names by three lower-case column names."""
-_COLOR = ("red", "green", "blue")
-_GUESSED_WIDTHS = (6, 7)
-"""Numbers of unnamed columns whose meaning is guessed from the values."""
 SKIPPED = "_"
 """Name of a skipped column, as in PCD."""
-_MAX_COLUMNS = 32
-"""Maximum number of unnamed columns of a table with few rows. Programs write up to a dozen unnamed
-values per point; more columns mean a transposed table."""
 _SHOWN_NAMES = 8
 """Maximum number of column names listed in a note."""
-_GUESSED_ROWS = 1000
-"""Rows from which the meaning of unnamed columns is guessed."""
-COLUMNS_RULE = (
-    "Without names, columns are x y z; a fourth column alone is intensity. With six columns, the "
-    "last three are a unit normal, or a color of integers from 0 to 255, if the first 1,000 rows "
-    "fit; else a color of integers from 0 to 65535, if all rows fit. With seven columns, the last "
-    "three and the three before the last are tested in this way; if exactly one of them fits, it "
-    "is used, with intensity before a color. In .pts files, in which colors come last, only the "
-    "last three are tested. All other columns are named column_4, column_5 and so on."
-)
-"""Naming rule for unnamed columns of text files and plain arrays, for help texts."""
-_UNIT_TOLERANCE = 2e-3
-"""Maximum deviation of a unit vector's squared norm from 1; 1e-3 of the norm."""
 MAX_EXACT_INTEGER = 2**53
 """Limit below which float64, and thus text, represents integers exactly. The limit itself may be a
 rounded integer."""
@@ -120,7 +102,6 @@ def assemble_cloud(
             fields[name] = check(path, fields[name])
     if "color" in fields:
         color = fields["color"]
-        _check_triples(path, "color", color)
         if set(integers).issuperset(sources["color"]) and are_integers(color):
             color = color.astype(np.int64)
         fields["color"], more = read_colors(path, color)
@@ -140,9 +121,10 @@ def assemble_table(
     ``integers`` are the indices of columns written without decimal point or exponent.
     """
     if names is None:
-        _check_table(path, table)
+        check_table(path, table)
         is_pts = path.suffix.lower() == ".pts"
         names = guess_column_names(table, color_last=is_pts)
+        warn_about_counters(path, table, names)
         if len(names) > 3:
             is_long = len(names) > _SHOWN_NAMES
             shown = [*names[: _SHOWN_NAMES - 1], "...", names[-1]] if is_long else names
@@ -228,53 +210,6 @@ def describe_renamed_fields(fields: Collection[str], results: Collection[str]) -
     return notes
 
 
-def guess_column_names(table: Values, *, color_last: bool = False) -> list[str]:
-    """Name the columns of a table by :data:`COLUMNS_RULE`, shape ``(N, C)``.
-
-    Seven columns of small integers mean ``intensity red green blue`` or ``red green blue label``.
-    The values cannot distinguish the two, so both stay numbered.
-
-    Example:
-        >>> guess_column_names(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
-        ['x', 'y', 'z', 'intensity', 'red', 'green', 'blue']
-    """
-    num_columns = table.shape[1]
-    names = ["x", "y", "z", *(f"column_{i}" for i in range(4, num_columns + 1))]
-    if num_columns == 4:
-        return [*names[:3], "intensity"]
-    if num_columns not in _GUESSED_WIDTHS:
-        return names
-    starts = range(num_columns - 3 if color_last else 3, num_columns - 2)
-    threes = {i: table[:, i : i + 3] for i in starts}
-    first = {i: _guess_triple(three[:_GUESSED_ROWS]) for i, three in threes.items()}
-    triples = {i: triple for i, triple in first.items() if triple}
-    if not triples:
-        triples = {i: _COLOR for i, three in threes.items() if _is_wide_color(three)}
-    if len(triples) == 1:
-        ((start, triple),) = triples.items()
-        names[start : start + 3] = triple
-        if start > 3 and "red" in triple:
-            names[3] = "intensity"
-    return names
-
-
-def _guess_triple(three: Values) -> tuple[str, str, str] | None:
-    """Return names for three columns, shape ``(n, 3)``, if they can be a normal or a color."""
-    squares = np.square(three.astype(np.float64, copy=False)).sum(axis=1)
-    # Missing normals may be zero or NaN.
-    lengths = squares[np.isfinite(squares) & (squares != 0)]
-    if len(lengths) and (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
-        return ("nx", "ny", "nz")
-    is_color = three.size == 0 or (three.min() >= 0 and three.max() <= BYTE and are_integers(three))
-    return _COLOR if is_color else None
-
-
-def _is_wide_color(three: Values) -> bool:
-    """Whether three columns can be a 16-bit color with every channel above the 8-bit maximum."""
-    in_range = three.min() >= 0 and three.max() <= WORD and three.max(axis=0).min() > BYTE
-    return bool(in_range) and are_integers(three)
-
-
 def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
     """Check column names: one per column, and no duplicates except ``_``."""
     read, shown = [name for name in names if name != SKIPPED], ",".join(names)
@@ -285,27 +220,6 @@ def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
     else:
         return
     raise FormatError(f"{path}: expected {wrong}; use {SKIPPED} to skip a column.")
-
-
-def _check_table(path: Path, table: Values) -> None:
-    """Reject unnamed tables that are no point clouds: a pose matrix, or a transposed table."""
-    num_rows, num_columns = table.shape
-    if table.shape == (4, 4) and table[3].tolist() == [0, 0, 0, 1]:
-        raise FormatError(
-            f"{path}: expected points, got a 4 x 4 pose matrix; pass the point cloud file."
-        )
-    if 3 <= num_rows <= max(_GUESSED_WIDTHS) and num_columns > _MAX_COLUMNS:
-        raise FormatError(
-            f"{path}: expected one row per point, got {num_rows} rows of {num_columns:,} "
-            "numbers; transpose them, or name the columns with --columns."
-        )
-
-
-def are_integers(values: Values) -> bool:
-    """Whether all values are finite integers."""
-    if values.dtype.kind in "iub":
-        return True
-    return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
 def _field_columns(columns: Columns) -> dict[str, list[str]]:
@@ -332,7 +246,7 @@ def _field_columns(columns: Columns) -> dict[str, list[str]]:
 
 def _unique_field_name(name: str, values: Values, existing: Collection[str]) -> str:
     """Return the field name of a column if its shape fits, changed if the name is taken."""
-    target = _ALIASES.get(_normalize_name(name), name.removeprefix("scalar_") or name)
+    target = FIELD_NAMES.get(_normalize_name(name), name.removeprefix("scalar_") or name)
     shapes = {"normals": (3,), "color": (3,), "labels": ()}
     if target in shapes and values.shape[1:] != shapes[target]:
         target = name

@@ -1,5 +1,6 @@
 """File checks, atomic writing and error conversion."""
 
+import codecs
 import errno
 import hashlib
 import os
@@ -8,6 +9,7 @@ import secrets
 import shutil
 import stat
 import struct
+import tempfile
 import tokenize
 import unicodedata
 import zipfile
@@ -16,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from torchrg.errors import FormatError, system_limit
 from torchrg.structures import FilePath
@@ -43,6 +45,8 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _PROBE_BYTES = 1 << 20
 """Bytes written to test whether a disk is full. They exceed the buffer of a library, so they do not
 fit if its last write failed."""
+_UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""First bytes of text as Excel and PowerShell write it."""
 _CHECKED_END = 1 << 16
 """Bytes checked after the last record. Padding to a page is shorter."""
 _URL = re.compile(r"(?:^|/)[A-Za-z][A-Za-z0-9+.-]+:/")
@@ -260,6 +264,12 @@ def check_file(path: Path) -> int:
     return status.st_size
 
 
+def find_encoding(path: Path) -> str:
+    """Return the encoding of a text file: UTF-16 with a byte order mark, else UTF-8."""
+    with path.open("rb") as stream:
+        return "utf-16" if stream.read(2) in _UTF_16_MARKS else "utf-8-sig"
+
+
 def decode_file(path: Path) -> str:
     """Return the UTF-8 text of a file, without a byte order mark."""
     try:
@@ -272,11 +282,31 @@ def decode_file(path: Path) -> str:
     except UnicodeDecodeError as error:
         byte = error.start
     if byte >= 0:
+        found = "UTF-16" if content[:2] in _UTF_16_MARKS else repr(content[byte : byte + 1])
         raise FormatError(
-            f"{path}: byte {byte}: expected text in UTF-8, got {content[byte : byte + 1]!r}; "
-            "save it as UTF-8."
+            f"{path}: byte {byte}: expected text in UTF-8, got {found}; save it as UTF-8."
         )
     return text
+
+
+def open_lines(path: Path, last: bytes) -> BinaryIO:
+    r"""Open a file with a header; lines that end in ``\r`` alone end in ``\n`` in a copy.
+
+    ``last`` begins the last line of the header. All lines of ASCII files are changed.
+    """
+    stream = path.open("rb")
+    first = stream.readline(_CHECKED_END)
+    stream.seek(0)
+    if b"\r" not in first[:-2] or not first.partition(b"\r")[0].isascii():
+        return stream
+    with stream:
+        content = stream.read()
+    end = content.find(b"\r", content.find(last)) + 1
+    end = len(content) if re.search(rb"(format|DATA) ascii", content[:end]) else end
+    copy = cast(BinaryIO, tempfile.TemporaryFile())  # noqa: SIM115 The caller closes it.
+    copy.write(content[:end].replace(b"\r", b"\n") + content[end:])
+    copy.seek(0)
+    return copy
 
 
 def check_available(

@@ -20,7 +20,7 @@ from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN
 from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
-from torchrg.io.fields import Columns, Values, are_integers, assemble_cloud
+from torchrg.io.fields import Columns, Values, assemble_cloud
 from torchrg.io.files import (
     PARSE_ERRORS,
     atomic_path,
@@ -30,6 +30,7 @@ from torchrg.io.files import (
     wrap_errors,
 )
 from torchrg.io.headers import MAX_INTEGER, check_grid, distance_outside
+from torchrg.io.tables import are_integers
 from torchrg.structures import Cloud, bounding_box
 
 _FIELD_NAMES = FieldNames(

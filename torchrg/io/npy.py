@@ -4,7 +4,7 @@
 ``y`` and ``z``, and any arrays of N rows, which become fields. Arrays of other lengths and the
 plane table of a result are skipped. See :func:`torchrg.io.write_cloud` for the names in a result.
 ``.npy``: an array (N, 3) or wider, with column names from the caller or by
-:data:`torchrg.io.fields.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
+:data:`torchrg.io.tables.COLUMNS_RULE`, or a structured array with named fields ``x``, ``y``, ``z``.
 """
 
 import io
@@ -23,6 +23,7 @@ from numpy.lib import format as npy_format
 from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, to_records
 from torchrg.io.fields import (
+    FIELD_NAMES,
     Values,
     assemble_cloud,
     assemble_table,
@@ -38,6 +39,7 @@ from torchrg.io.files import (
     check_file,
     wrap_errors,
 )
+from torchrg.io.tables import check_table
 from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
 
@@ -87,6 +89,11 @@ def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Clo
             f"{path}: expected an array of shape (N, 3) or wider, got {shape}; reshape it."
         )
     check_coordinates(path, (shape[0], 3), dtype)
+    if columns is None and path.stem.lower() in FIELD_NAMES:
+        raise FormatError(
+            f"{path}: expected coordinates, got a file named as the field {path.stem}; pass the "
+            "folder with coord.npy, or rename the file if it is a cloud."
+        )
     if columns is not None:
         check_names(path, columns, shape[1])
     return assemble_table(path, np.load(path, allow_pickle=False), columns)
@@ -120,7 +127,13 @@ def read_npz(path: Path, size: int) -> Cloud:
             for member in skipped:
                 with _open_member(path, archive, member) as stream:
                     _drain(stream)
-    notes = (f"{', '.join(mismatched)} skipped: not {num_points:,} rows",) if mismatched else ()
+    notes: tuple[str, ...] = ()
+    if mismatched:
+        notes = (f"{', '.join(mismatched)} skipped: not {num_points:,} rows",)
+    if coordinates is not None and coordinates not in _COORDINATES:
+        check_coordinates(path, *layouts[coordinates])
+        check_table(path, columns[coordinates])
+        notes += (f"{coordinates} is read as the points, as no other array has 3 columns",)
     if coordinates is not None and (names := layouts[coordinates][1].names) is not None:
         # pyntcloud writes a structured array, whose fields become columns.
         records = columns.pop(coordinates)
@@ -148,6 +161,10 @@ def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str |
             return name, shape[0]
     if {"x", "y", "z"} <= layouts.keys() and layouts["x"][0]:
         return None, layouts["x"][0][0]
+    others = {n: rows[0] for n, (rows, _) in layouts.items() if rows[1:] == (3,) and rows[0]}
+    others = {name: others[name] for name in others.keys() - _NOT_PER_POINT - FIELD_NAMES.keys()}
+    if len(others) == 1:
+        return next(iter(others.items()))
     names = ", ".join(map(repr, layouts)) or "none"
     raise FormatError(
         f"{path}: expected an array points (or coord), got {names}; rename the coordinates."

@@ -16,7 +16,7 @@ import numpy as np
 from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, write_records
 from torchrg.io.fields import Columns, Values, assemble_cloud
-from torchrg.io.files import check_available, check_end, split_words
+from torchrg.io.files import check_available, check_end, open_lines, split_words
 from torchrg.io.text import read_rows
 from torchrg.structures import FARTHEST, Cloud
 
@@ -41,7 +41,7 @@ def read_pcd(path: Path, size: int) -> Cloud:
     Packed colors become ``color``; the fourth channel of ``rgba`` becomes ``alpha``. An organized
     cloud gets a ``grid_shape``. The viewpoint is kept for writing.
     """
-    with path.open("rb") as stream:
+    with open_lines(path, b"DATA") as stream:
         header = _read_header(path, stream)
         read = {"ascii": _read_text, "binary": _read_binary}.get(header.encoding, _read_compressed)
         stored = read(path, stream, header, size)
@@ -61,7 +61,7 @@ def read_pcd(path: Path, size: int) -> Cloud:
 
 def count_pcd(path: Path, size: int) -> int:
     """Return the number of points from the header."""
-    with path.open("rb") as stream:
+    with open_lines(path, b"DATA") as stream:
         return _read_header(path, stream).num_points
 
 

@@ -24,7 +24,7 @@ from torchrg.io.columns import (
     write_records,
 )
 from torchrg.io.fields import MAX_EXACT_INTEGER, Values, assemble_cloud
-from torchrg.io.files import check_available, check_end, split_words
+from torchrg.io.files import check_available, check_end, open_lines, split_words
 from torchrg.io.text import read_rows, skip_lines
 from torchrg.mesh import Fronts, find_fronts
 from torchrg.structures import Cloud
@@ -68,7 +68,7 @@ def read_ply(path: Path, size: int) -> Cloud:
 
     Lists of equal length become multi-column fields. Other lists and elements are skipped.
     """
-    with path.open("rb") as stream:
+    with open_lines(path, b"end_header") as stream:
         header = _read_header(path, stream)
         vertex = header.vertex_index(path)
         columns, uneven = _read_vertices(path, stream, header, vertex, size)
@@ -95,7 +95,7 @@ def read_ply(path: Path, size: int) -> Cloud:
 
 def count_ply(path: Path, size: int) -> int:
     """Return the number of vertices from the header."""
-    with path.open("rb") as stream:
+    with open_lines(path, b"end_header") as stream:
         header = _read_header(path, stream)
     return header.elements[header.vertex_index(path)].num_records
 
@@ -519,7 +519,7 @@ def _vertex_fronts(path: Path, header: _Header, index: int, size: int, cloud: Cl
     faces = header.elements[index]
     lists = next(prop for prop in faces.properties if prop.name in _VERTEX_LISTS)
     try:
-        with path.open("rb") as stream:
+        with open_lines(path, b"end_header") as stream:
             line_number = _seek_element(path, stream, header, index, size)
             blocks = _read_records(path, stream, faces, header.byte_order, size, line_number)
             arrays = (array for records in blocks for array in records.values(path, lists))

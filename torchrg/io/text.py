@@ -2,7 +2,7 @@
 
 The delimiter is a comma, semicolon, tab or blanks; the decimal separator may be a comma if that is
 not the delimiter. A first line of names (``x y z red green blue``, with or without ``#`` or ``//``)
-names the columns unless the caller does; otherwise :data:`torchrg.io.fields.COLUMNS_RULE` applies.
+names the columns unless the caller does; otherwise :data:`torchrg.io.tables.COLUMNS_RULE` applies.
 A line of one number before the first point is the point count, as in Leica's ``.pts``. Further
 scans begin with their count. pyarrow, if installed, parses plain numbers. The slower
 parser here handles the remaining cases with bit-identical results and reports errors. It also
@@ -11,6 +11,7 @@ reads the rows of other ASCII formats.
 
 import csv
 import os
+import re
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from itertools import chain, islice
@@ -23,7 +24,7 @@ from torchrg.errors import FormatError
 from torchrg.io.arrow import parse_numbers
 from torchrg.io.columns import FieldNames, check_exact, flatten_cloud, row_slices
 from torchrg.io.fields import SKIPPED, Values, assemble_table, check_names
-from torchrg.io.files import atomic_path, check_available
+from torchrg.io.files import atomic_path, check_available, find_encoding
 from torchrg.structures import Cloud
 
 LINES_PER_CHUNK = 65_536
@@ -32,7 +33,11 @@ CHARACTERS_PER_READ = 1 << 22
 """Characters read together, which bounds the memory and still occupies all cores."""
 _SAMPLE_BYTES = 1 << 16
 """Bytes read to estimate the line length."""
-_COMMENTS = ("#", "//")
+_COMMENTS = ("#", "//", "BEGIN", "END")
+"""Beginnings of lines without points. Words alone separate the scans of a file."""
+_WINDOWS_NAN = re.compile(r"1[.,]#[A-Z]+[0-9]*|nan\([a-z]*\)", re.IGNORECASE)
+"""Numbers that are not finite, as printed by the C library of Windows: ``-1.#IND``, ``1.#QNAN0``,
+``-nan(ind)``."""
 _COLMAP = "POINT3D_ID, X, Y, Z"
 """Comment above the points in COLMAP's ``points3D.txt``, whose rows list the images that see a
 point."""
@@ -66,8 +71,8 @@ _DELIMITER_NAMES = {None: "blanks", ",": "commas", ";": "semicolons"}
 def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
     """Read a text file in float64; ``columns`` overrides the file's column names."""
     # Decoding errors matter only in column names.
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        preamble = _read_preamble(path, stream, columns)
+    with path.open(encoding=find_encoding(path), errors="replace") as stream:
+        preamble = _read_preamble(path, map(standardize, stream), columns)
         table = np.concatenate(list(_parse_blocks(path, stream, preamble)))
     num_points = sum(preamble.counts)
     if len(table) < num_points:
@@ -123,8 +128,18 @@ def read_rows(
     available = os.fstat(stream.fileno()).st_size - start
     content = f"{num_rows:,} {content}"
     check_available(path, start, min_bytes, content, available=available, at_least=True)
-    lines = (raw.decode("latin-1") for raw in stream)
+    lines = (standardize(raw.decode("latin-1")) for raw in stream)
     return _read_table(path, lines, dtype, line_number, num_rows)
+
+
+def standardize(text: str) -> str:
+    """Return text with Windows' spellings of numbers that are not finite as ``nan``.
+
+    Example:
+        >>> standardize("1.5 -1.#IND00 nan(snan)")
+        '1.5 -nan nan'
+    """
+    return _WINDOWS_NAN.sub("nan", text) if "#" in text or "(" in text else text
 
 
 def skip_lines(stream: BinaryIO, count: int) -> int:
@@ -161,7 +176,7 @@ def _parse_blocks(path: Path, stream: TextIO, preamble: "_Preamble") -> Iterator
     """Yield tables of the first point and of the lines that follow it in a stream."""
     dtype = np.dtype([("row", "f8", (preamble.num_columns,))])
     line, number = preamble.line, preamble.line_number
-    while block := line + stream.read(CHARACTERS_PER_READ) + stream.readline():
+    while block := line + standardize(stream.read(CHARACTERS_PER_READ) + stream.readline()):
         table = parse_numbers(block.encode(), preamble.num_columns, *preamble.dialect)
         if table is None:
             lines = _extract_counts(block.split("\n"), preamble.counts)
@@ -219,7 +234,7 @@ def _parse(
     numbered = [
         (number, line)
         for number, line in enumerate(block, start=line_number)
-        if (text := line.strip()) and (comments is None or not text.startswith(comments))
+        if (text := line.strip()) and (comments is None or not text.startswith(_COMMENTS))
     ]
     if not numbered:
         return np.empty(0, dtype)
@@ -288,7 +303,7 @@ class _Preamble(NamedTuple):
 
 def _read_preamble(path: Path, lines: Iterable[str], columns: Sequence[str] | None) -> _Preamble:
     """Read up to the first line of numbers."""
-    header, counts = "", list[int]()
+    header, comment, counts = "", "", list[int]()
     for number, line in enumerate(lines, start=1):
         text = line.strip()
         is_comment = text.startswith(_COMMENTS)
@@ -303,7 +318,7 @@ def _read_preamble(path: Path, lines: Iterable[str], columns: Sequence[str] | No
                 "--output_type PLY."
             )
         if is_comment:
-            header = bare if _parse_names(bare) else header
+            header, comment = (bare, "") if _parse_names(bare) else (header, bare)
         elif not bare.strip():
             continue
         elif len(words) == 1 and are_numbers[0]:
@@ -338,6 +353,8 @@ def _read_preamble(path: Path, lines: Iterable[str], columns: Sequence[str] | No
                 names: list[str] | None = list(columns)
             else:
                 names = _match_names(path, header, words, number) if header else None
+                if names is None and len(words) > 3:
+                    _warn_about_names(path, comment, len(words))
             return _Preamble(names, dialect, len(words), counts, line, number)
     raise FormatError(f"{path}: expected at least one point, got none; check the file's source.")
 
@@ -351,7 +368,30 @@ def _detect_dialect(text: str) -> _Dialect:
 
 
 def _parse_names(text: str) -> list[list[str]]:
-    """Return all readings of a line as distinct column names, one per delimiter.
+    """Return the readings of a line as column names that include x, y and z.
+
+    If there is none, units in brackets, as in ``X [m]``, are left out of the names.
+    """
+    for line in (text, re.sub(r"\s*[\[(][^\])]*[\])]", "", text)):
+        named = [row for row in _split_names(line) if {"x", "y", "z"} <= {*map(str.lower, row)}]
+        if named:
+            return named
+    return []
+
+
+def _warn_about_names(path: Path, comment: str, num_columns: int) -> None:
+    """Warn if a comment before the points names all columns, but no x, y and z."""
+    readings = [row for row in _split_names(comment) if len(row) == num_columns]
+    if any(not any(map(_is_number, row)) for row in readings):
+        warnings.warn(
+            f"{path}: its comment names columns {comment.strip()[:60]!r}, none of them x, y and z: "
+            "the first three are taken; name the columns with --columns.",
+            stacklevel=5,
+        )
+
+
+def _split_names(text: str) -> list[list[str]]:
+    """Return all readings of a line as distinct words, one per delimiter.
 
     Quoted names may contain the delimiter.
     """
@@ -364,7 +404,7 @@ def _parse_names(text: str) -> list[list[str]]:
         except csv.Error:
             return []
         words = [word.strip().strip("\"'") for word in row if delimiter != " " or word]
-        if {"x", "y", "z"} <= {word.lower() for word in words} and len(set(words)) == len(words):
+        if len(set(words)) == len(words):
             rows.append(words)
     return rows
 

@@ -99,7 +99,8 @@ def orient_normals(
         The normals, some of them reversed. Rows of points that are not finite are unchanged.
 
     Raises:
-        ConfigError: If ``orient`` is unknown, or ``viewpoint`` is missing or unexpected.
+        ConfigError: If ``orient`` is unknown, ``viewpoint`` is missing or unexpected, or
+            ``viewpoint`` or ``front`` is not finite.
         ShapeError: If a shape or dtype is wrong.
 
     Example:
@@ -168,10 +169,12 @@ def find_directions(
             points=(positions, "N 3"),
             viewpoint=(position, "3" if position.ndim == 1 else "N 3"),
         )
+        _check_finite(caller, "viewpoint", position, positions, "pass the scanner position")
         return positions, (position - origin.to(position.device)).to(positions) - positions
     if front is not None:
         directions = as_tensor(caller, "front", front).to(positions)
         check_shapes(caller, points=(positions, "N 3"), front=(directions, "N 3"))
+        _check_finite(caller, "front", directions, positions, "pass zeros where it is unknown")
         return positions, directions
     if orient == "viewpoint":
         raise ConfigError(
@@ -179,6 +182,16 @@ def find_directions(
             "the viewpoint (--viewpoint X Y Z), or use interior."
         )
     return positions, None
+
+
+def _check_finite(caller: str, name: str, values: Tensor, points: Tensor, repair: str) -> None:
+    """Check values ``(3,)``, or those ``(N, 3)`` of all finite points."""
+    wrong = ~values.isfinite()
+    if values.ndim == 2:
+        wrong &= points.isfinite().all(dim=1, keepdim=True).to(wrong.device)
+    if bool(wrong.any()):
+        shown = values[wrong][0].item()
+        raise ConfigError(f"{caller}: expected finite {name}, got {shown}; {repair}.")
 
 
 def choose_side(

@@ -55,6 +55,11 @@ _MIN_HEIGHT = 0.2
 thinner than 0.2 a w is a plane with noisy normals."""
 
 
+_MAX_RMS, _MAX_RMS_OF_FEW = 0.2, 0.1
+"""Maximum RMS distance of flat regions to their plane, as a fraction of their length: a cube has
+0.29, clutter in rooms up to 0.19, a slab a third as thick as long 0.1. The second limit is for
+clouds of fewer than two neighborhoods, whose normals are equal, whatever their shape."""
+
 _SQ_WIDTH = 12.0
 """Squared width of a uniformly covered strip, in units of the variance across it."""
 
@@ -232,6 +237,22 @@ def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> R
     explained = torch.where(reach.isfinite(), torch.maximum(_BENT_FRACTION * reach, floor), floor)
     bent = planes.thickness > explained
     return planes._replace(curved=planes.curved & bent, reach=reach, bent=bent)
+
+
+def find_solid_regions(cloud: GrowingInput, labels: Tensor) -> Tensor:
+    """Return the mask of regions ``(M,)`` that fill a volume instead of a plane, bool.
+
+    Curved regions are surfaces.
+    """
+    segments = Segments(labels, max_points=MAX_FITTED)
+    local = segments.gather_centered(cloud.points, segments.first(cloud.points).double())
+    variances = eigh3_lapack(segments.moments(local, torch.ones_like(local[0]))[1])[0]
+    are_few = len(labels) < 2 * cloud.neighbors.indices.shape[1]
+    limit = _MAX_RMS_OF_FEW if are_few else _MAX_RMS
+    solid = variances[:, 0] > limit**2 * _SQ_WIDTH * variances[:, 2]
+    if bool(solid.any()):
+        solid &= ~fit_planes(segments, cloud.points, cloud.normals).curved
+    return solid
 
 
 class RegionFits:

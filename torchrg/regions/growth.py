@@ -25,7 +25,7 @@ from torchrg.linalg.moments import to_column_major
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
-from torchrg.regions.fit import MIN_FITTED, RegionFits
+from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
 from torchrg.structures import UNLABELED, Colors, Neighbors, Points, Values
@@ -164,6 +164,10 @@ def label_regions(
         labels = labels if split is labels else rank_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = rank_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
+    if bool((labels >= 0).any()):
+        solid = find_solid_regions(cloud, labels)
+        if bool(solid.any()):
+            labels = rank_by_size(labels.where(~solid[labels] & (labels >= 0), UNLABELED), 1)
     return labels
 
 

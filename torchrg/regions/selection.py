@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg.config import SelectionConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.linalg import unit_direction
-from torchrg.regions.classes import classify_planes
+from torchrg.regions.kinds import find_kinds
 from torchrg.structures import (
     PLANE_COLUMNS,
     PLANE_KINDS,
@@ -69,7 +69,7 @@ def select_planes(
                 "select_planes: expected points in the segmentation to classify planes, got None. "
                 "Pass up to segment_depth."
             )
-        kind = classify_planes(seg.planes, seg.points, seg.labels, direction)
+        kind = find_kinds(seg.planes, seg.points, seg.labels, direction)
         seg = replace(seg, planes=replace(seg.planes, kind=kind))
     return keep_planes(seg, choose_planes(seg.planes, settings))
 

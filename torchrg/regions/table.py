@@ -16,9 +16,9 @@ from torchrg.linalg import eigh3_lapack, unit_direction
 from torchrg.linalg.moments import Segments, to_column_major
 from torchrg.neighbors import check_neighbors, distinct_rows, mark_distinct
 from torchrg.regions.adjacency import find_adjacency
-from torchrg.regions.classes import classify_planes
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
+from torchrg.regions.kinds import find_kinds
 from torchrg.regions.polygons import trace_polygon
 from torchrg.structures import Labels, Neighbors, PlaneAdjacency, Planes, Points, Rows
 
@@ -85,7 +85,7 @@ def summarize_planes(
     planes = replace(planes, count=torch.bincount(labels.clamp(min=-1) + 1, minlength=1)[1:])
     if up is not None:
         direction = unit_direction("summarize_planes", up)
-        planes = replace(planes, kind=classify_planes(planes, positions, labels[rows], direction))
+        planes = replace(planes, kind=find_kinds(planes, positions, labels[rows], direction))
     if neighbors is not None:
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved

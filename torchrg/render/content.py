@@ -171,7 +171,7 @@ def displayed_table(result: Result, frame: PageFrame) -> Json:
     planes = result.planes
     if not planes:
         return {"planes": []}
-    if planes.kind is None:
+    if not isinstance(vars(planes)["kind"], Tensor):
         cloud = result.cloud.points, result.labels
         planes = replace(planes, kind=classify_planes(planes, *cloud, frame.rotation[2]))
     described = describe_planes(planes, origin=result.cloud.origin.tolist())

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrg._checks import as_tensor, check_shapes, eager_only
+from torchrg._checks import as_tensor, check_batch, check_shapes, eager_only
 from torchrg.errors import ConfigError
 from torchrg.neighbors import sample_voxels, search_knn
 from torchrg.structures import UNLABELED, Neighbors
@@ -121,6 +121,8 @@ class SampleTransform(nn.Module):
             )
         tensor = as_tensor(caller, key, entries[key])
         if name == "coord":
+            repair = f"pass {key}.flatten(0, 1), and the end row of each cloud as 'offset'"
+            check_batch(caller, key, tensor, repair)
             check_shapes(caller, **{key: (tensor, "N 3")})
         if "index" in key and not isinstance(sample, Mapping):
             tensor = tensor.clamp(min=UNLABELED)
