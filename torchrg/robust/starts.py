@@ -62,7 +62,7 @@ def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
     """Choose the six initial sets of each lane (Hubert, Rousseeuw, Verdonck 2012, section 3)."""
     num_lanes = columns[0].shape[1]
     together = _standardize(torch.cat(columns, dim=1))
-    standard = [part.contiguous() for part in together.split(num_lanes, dim=1)]
+    standard = [part.contiguous() for part in torch.split(together, num_lanes, dim=1)]
     starts_per_chunk = max(_LANES_PER_CHUNK // (len(columns) * num_lanes), 1)
     distances = [
         _sphered_distances(standard, eigenvectors(matrices))
