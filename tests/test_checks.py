@@ -10,11 +10,11 @@ from torchrg.errors import ShapeError
 
 def test_letters_are_shared_between_arguments():
     patches = torch.zeros(5, 8, 3)
-    check_shapes("f", patches=(patches, "* K 3"), mask=(torch.zeros(5, 8), "* K"))
+    check_shapes("f", patches=(patches, "* K 3"), mask=(torch.zeros(5, 8).bool(), "* K"))
     with pytest.raises(
         ShapeError, match=r"f: expected mask of shape \(\*, K\) with \*=\(5,\), K=8"
     ):
-        check_shapes("f", patches=(patches, "* K 3"), mask=(torch.zeros(5, 7), "* K"))
+        check_shapes("f", patches=(patches, "* K 3"), mask=(torch.zeros(5, 7).bool(), "* K"))
 
 
 def test_repeated_letters_must_agree():
@@ -49,3 +49,18 @@ def test_other_things_are_refused(values):
 def test_mixed_precision_is_refused():
     with pytest.raises(ShapeError, match="a and b of one dtype, got float32 and float64"):
         check_floating("f", a=torch.zeros(1), b=torch.zeros(1, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("mask", "kind"),
+    [
+        (torch.ones(8), "float32"),
+        (torch.ones(8, dtype=torch.int64), "int64"),
+        (np.ones(8, dtype=bool), "ndarray"),
+        ([True] * 8, "list"),
+    ],
+)
+def test_masks_of_other_types_are_refused_with_the_repair(mask, kind):
+    repair = f"f: expected mask to be a tensor of bool, got {kind}; pass torch.as_tensor"
+    with pytest.raises(ShapeError, match=repair):
+        check_shapes("f", points=(torch.zeros(8, 3), "N 3"), mask=(mask, "N"))

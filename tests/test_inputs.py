@@ -1,5 +1,6 @@
 """Kinds of tensors: each gives the right result, or one line that says what to do."""
 
+import inspect
 import pickle
 import re
 
@@ -179,3 +180,26 @@ def test_depth_under_other_surroundings():
     depth = torch.full((1, 30, 40), 2.0)
     for run in (under_autocast, under_double, under_inference):
         assert torch.equal(run(segment, depth), segment(depth))
+
+
+MASKED = [
+    (module, name)
+    for module in (torchrg.linalg, torchrg.normals, torchrg.robust)
+    for name in module.__all__
+    if inspect.isfunction(getattr(module, name))
+    and "mask" in inspect.signature(getattr(module, name)).parameters
+]
+
+
+@pytest.mark.parametrize(("module", "name"), MASKED, ids=[name for _, name in MASKED])
+def test_a_mask_of_numbers_is_refused_with_the_repair(module, name):
+    patches, mask = torch.randn(2, 12, 3), torch.ones(2, 12, dtype=torch.uint8)
+    settings = {"noise": torch.ones(2)} if name == "fit_normals_irls" else {}
+    settings |= {"threshold": 1.0} if name == "qn_exceeds" else {}
+    is_scale = "dim" in inspect.signature(getattr(module, name)).parameters
+    with pytest.raises(ShapeError, match="mask to be a tensor of bool, got uint8; pass"):
+        getattr(module, name)(patches[..., 0] if is_scale else patches, mask=mask, **settings)
+
+
+def test_every_function_with_a_mask_was_called():
+    assert len(MASKED) == 16

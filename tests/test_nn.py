@@ -1,5 +1,6 @@
 """Modules give what the functions give."""
 
+import io
 from typing import get_args
 
 import pytest
@@ -7,10 +8,10 @@ import torch
 from torch import nn
 
 from torchrg import nn as modules
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import covariance
 from torchrg.normals import fit_normals_pca
-from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
+from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
 
 
 def test_modules_are_the_functions(rng):
@@ -125,3 +126,93 @@ def test_a_generator_draws_the_starts(rng):
         )
         assert torch.equal(first, again)
         assert not torch.equal(first, other)
+
+
+def test_other_sizes_are_sent_to_the_other_decomposition(rng):
+    fit = modules.DetMCD()(torch.randn(2, 40, 5, generator=rng))
+    with pytest.raises(ShapeError, match=r'Eigh: .*got \(2, 5, 5\); use Eigh\("linalg"\)'):
+        modules.Eigh()(fit)
+    assert modules.Eigh("linalg")(fit).vectors.shape == (2, 5, 5)
+
+
+# Each as a chain from patches, as the modules are used.
+CHAINS = {
+    "Covariance": modules.Covariance(),
+    "Eigh": nn.Sequential(modules.Covariance(), modules.Eigh()),
+    "Eigh linalg": nn.Sequential(modules.Covariance(), modules.Eigh("linalg")),
+    "Normal": nn.Sequential(modules.DetMCD(), modules.Eigh(), modules.Normal()),
+    "Qn": modules.Qn(-2, finite_sample=True),
+    "DetMCD": modules.DetMCD(inliers="reweighted"),
+    "FastMCD": modules.FastMCD(num_starts=20),
+    "MVE": modules.MVE(num_starts=20),
+    "DetS": modules.DetS(),
+    "DetMM": modules.DetMM(),
+} | {
+    f"PatchNormals {method}": modules.PatchNormals(
+        method, **({"noise": 0.02} if method == "irls" else {})
+    )
+    for method in get_args(modules.Method)
+}
+chains = pytest.mark.parametrize("name", CHAINS)
+TRACED_HERE = ("DetMCD", "Normal", "Qn")
+
+
+def unsigned(found):
+    """Return tensors that no sign of a normal changes."""
+    if isinstance(found, modules.Eigen):
+        return found.values, found.vectors[..., :1] * found.vectors[..., :1].mT
+    if isinstance(found, RobustFit):
+        return found.location, found.covariance
+    if found.shape[-2:] != (3, 3):  # normals, or scales, which are positive
+        return (found[..., :, None] * found[..., None, :],)
+    return (found,)
+
+
+def test_every_module_is_among_the_chains():
+    assert {name.split()[0] for name in CHAINS} == set(modules.__all__) - {"Eigen"}
+
+
+def assert_same(found, expected):
+    for part, wanted in zip(found, expected, strict=True):
+        torch.testing.assert_close(part, wanted, rtol=1e-9, atol=1e-12)
+
+
+@chains
+def test_modules_under_vmap_are_loops(name, rng):
+    patches = thin(rng, 4)
+    expected = unsigned(CHAINS[name](patches))
+    assert_same(torch.vmap(lambda patch: unsigned(CHAINS[name](patch)))(patches), expected)
+    singles = [unsigned(CHAINS[name](patch)) for patch in patches]
+    assert_same(map(torch.stack, zip(*singles, strict=True)), expected)
+
+
+# The gradients of DetS and DetMM hold the weights of the points: see test_gradients.py.
+@pytest.mark.parametrize("name", CHAINS.keys() - {"DetS", "DetMM"})
+def test_gradients_of_modules_are_numerical_derivatives(name, rng):
+    patches = thin(rng, 2).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: unsigned(CHAINS[name](x)), patches, fast_mode=True)
+
+
+@pytest.mark.slow
+@chains
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+def test_modules_compile_without_graph_breaks(name, rng):
+    torch.compiler.reset()
+    patches = thin(rng, 3)
+    compiled = torch.compile(CHAINS[name], fullgraph=True, backend="eager")
+    assert_same(unsigned(compiled(patches)), unsigned(CHAINS[name](patches)))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name not in TRACED_HERE)) for name in CHAINS],
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
+def test_traced_modules_are_saved_for_any_number_of_patches(name, rng):
+    file = io.BytesIO()
+    torch.jit.save(torch.jit.trace(CHAINS[name], thin(rng, 3)), file)
+    file.seek(0)
+    patches = thin(rng, 5)
+    expected = CHAINS[name](patches)
+    found = torch.jit.load(file)(patches)
+    torch.testing.assert_close(found, expected if torch.is_tensor(expected) else tuple(expected))

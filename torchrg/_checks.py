@@ -114,7 +114,7 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
 
     Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for a length
     that is equal in all patterns, a number for a fixed length, and a leading ``*`` for any leading
-    axes, equal in all patterns. None is skipped.
+    axes, equal in all patterns. None is skipped. A ``mask`` must be bool, too.
 
     Example:
         >>> check_shapes("f", patches=(torch.zeros(5, 8, 3), "* K 3"))
@@ -127,6 +127,12 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     for name, (tensor, pattern) in arguments.items():
         if tensor is None:
             continue
+        if name == "mask" and not (is_tensor(tensor) and tensor.dtype == torch.bool):
+            kind = str(tensor.dtype) if is_tensor(tensor) else type(tensor).__name__
+            raise ShapeError(
+                f"{caller}: expected mask to be a tensor of bool, got "
+                f"{kind.removeprefix('torch.')}; pass torch.as_tensor(mask).bool()."
+            )
         shape, sizes = tuple(tensor.shape), dict(bound)
         if not _bind(shape, pattern.split(), bound):
             fixed = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in sizes.items())
@@ -153,6 +159,12 @@ def is_tensor(value: object) -> TypeGuard[Tensor]:
     return isinstance(value, Tensor)
 
 
+def is_jit_traced() -> bool:
+    """Return whether :func:`torch.jit.trace` records operations."""
+    traced: bool = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+    return traced
+
+
 def is_concrete(*tensors: Tensor | None) -> bool:
     """Return whether tensors have concrete data: not traced, vmapped or on the meta device.
 
@@ -162,7 +174,7 @@ def is_concrete(*tensors: Tensor | None) -> bool:
         >>> torch.vmap(lambda row: torch.tensor(is_concrete(row)))(torch.zeros(2, 3)).tolist()
         [False, False]
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or is_jit_traced():
         return False
     try:
         strided = [t for t in tensors if t is not None and t.layout is torch.strided]

@@ -15,7 +15,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import Arguments, Returned, is_concrete, is_tensor, raise_forward_mode
+from torchrg._checks import (
+    Arguments,
+    Returned,
+    is_concrete,
+    is_jit_traced,
+    is_tensor,
+    raise_forward_mode,
+)
 from torchrg.errors import ConfigError
 
 
@@ -81,7 +88,8 @@ def _check_literal(name: str, key: str, value: object) -> None:
 
 def _apply(call: str, tensors: list[Tensor]) -> list[Tensor]:
     """Run an opaque function, with gradients if the first tensor may need them."""
-    if torch.compiler.is_compiling() and not tensors[0].requires_grad:
+    is_traced = torch.compiler.is_compiling() or is_jit_traced()
+    if is_traced and not tensors[0].requires_grad:
         outputs: list[Tensor] = _forward(tensors, call)
         return outputs
     return list(_operation().apply(call, *tensors))  # type: ignore[no-untyped-call]

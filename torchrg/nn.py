@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrg._checks import check_choices
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import covariance, eigh3
 from torchrg.normals import (
     fit_normals_irls,
@@ -117,6 +117,11 @@ class Eigh(_Function):
     def forward(self, matrices: Tensor | RobustFit) -> Eigen:
         """Return eigenvalues and eigenvectors of matrices ``(*, P, P)``; P = 3 for ``jacobi``."""
         tensor = matrices.covariance if isinstance(matrices, RobustFit) else matrices
+        if self.method == "jacobi" and tensor.shape[-2:] != (3, 3):
+            raise ShapeError(
+                f"Eigh: expected matrices of shape (*, 3, 3), got {tuple(tensor.shape)}; use "
+                'Eigh("linalg").'
+            )
         return Eigen(*(eigh3(tensor) if self.method == "jacobi" else torch.linalg.eigh(tensor)))
 
 
@@ -139,6 +144,9 @@ class Normal(_Function):
 @dataclass(eq=False, repr=False)
 class Qn(_Function):
     """Robust scale of rows; the fields are settings of :func:`torchrg.robust.qn`.
+
+    The constant is 2.2219, that of the publication. With ``finite_sample`` it is 2.21914 times a
+    factor of the number of values, as in R's ``Qn(x)``.
 
     Example:
         >>> Qn()(torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0]))
@@ -213,6 +221,8 @@ class FastMCD(_Function):
 @dataclass(eq=False, repr=False)
 class MVE(_Function):
     """Minimum volume ellipsoid of patches, with the settings of :func:`torchrg.robust.fit_mve`.
+
+    It is for points of 3 coordinates; use :class:`DetMCD` for more.
 
     Example:
         >>> MVE()(torch.eye(3)[[0, 1, 2, 0, 1, 2]]).exact_fit

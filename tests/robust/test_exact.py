@@ -16,6 +16,9 @@ from tests.robust.oracle_cases import (
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_detmcd, fit_dets
 
+# The cases include patches of fewer than six points.
+pytestmark = pytest.mark.filterwarnings("ignore:.*too few to trust the covariance")
+
 
 def assert_sound(fit):
     """Everything is finite where there is a fit, but for the distances off an exact plane."""

@@ -15,8 +15,11 @@ from tests.robust.oracle_cases import (
     points_of,
 )
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.robust import fit_detmcd
+from torchrg.robust import fit_detmcd, fit_fastmcd
 from torchrg.robust.weights import consistency_factor, small_sample_factor
+
+# The cases include patches of fewer than six points.
+pytestmark = pytest.mark.filterwarnings("ignore:.*too few to trust the covariance")
 
 CUTOFF = 9.348403604496148
 """Quantile 0.975 of the chi-square distribution of 3 degrees."""
@@ -110,6 +113,60 @@ def test_final_flags_and_distances_are_those_of_robustbase(oracles_folder):
         assert points_of(fit.support) == set(np.flatnonzero(expected < CUTOFF)), name
         seen += 1
     assert seen > 110
+
+
+def final_factor(fraction):
+    """c(q) of the guide to estimators, for P = 3."""
+    return fraction / chi2.cdf(chi2.ppf(fraction, 3), 5) if fraction < 1 else 1.0
+
+
+def test_covariances_of_robustbase_are_those_of_the_table_in_the_guide(oracles_folder):
+    patches, cases, robustbase = load_oracles(oracles_folder, "r_robustbase")
+    seen = rescaled = 0
+    settings = {"starts": "robustbase", "small_sample": True}
+    for name, _, fit, answer in regular_fits(patches, cases, robustbase, "detmcd_{}", **settings):
+        n, m = len(fit.support), int(fit.support.sum())
+        if n <= 6:
+            continue  # its factor for few points is negative or above a hundred
+        assert_close(fit.raw_covariance.numpy(), answer["raw_cov"], 1e-5, name)
+        # The answers are those of 0.95-0, whose final factor is that of the kept fraction.
+        factor = final_factor(m / n) / final_factor(0.975) if m < n else 1.0
+        assert_close(fit.covariance.numpy() * factor, answer["cov"], 1e-5, name)
+        seen, rescaled = seen + 1, rescaled + (abs(factor - 1) > 0.02)
+    assert seen > 110
+    assert rescaled > 60
+
+
+@pytest.mark.parametrize(
+    ("name", "trusted"),
+    [
+        ("planar_noisy", 0.5),
+        ("curved_saddle", 0.5),
+        ("edge120_60", 0.5),
+        ("out30_uniform", 0.5),
+        ("sphere", 0.9),
+    ],
+)
+def test_covariances_of_scikit_learn_are_those_of_the_table_in_the_guide(
+    oracles_folder, name, trusted, rng
+):
+    pytest.importorskip("sklearn", minversion="1.9")
+    from sklearn.covariance import MinCovDet
+
+    (patches, _) = load_oracles(oracles_folder)
+    directions = torch.randn(24, 3, generator=rng, dtype=torch.float64)
+    patches["sphere"] = torch.nn.functional.normalize(directions, dim=1).numpy()
+    points = patches[name]
+    fit = fit_fastmcd(torch.from_numpy(points), support_fraction=trusted)
+    n, h, m = len(points), int(fit.raw_support.sum()), int(fit.support.sum())
+    theirs = MinCovDet(random_state=0, support_fraction=(h + 0.5) / n).fit(points)
+    assert np.array_equal(theirs.raw_support_, fit.raw_support.numpy())
+    assert np.array_equal(theirs.support_, fit.support.numpy())
+    assert (m == n) == (name == "sphere")
+    raw = fit.raw_covariance.numpy() * (h - 1) / h / final_factor(h / n)
+    assert_close(theirs.raw_covariance_, raw, 1e-8, name)
+    final = fit.covariance.numpy() * (m - 1) / m * (final_factor(0.975) if m == n else 1)
+    assert_close(theirs.covariance_, final, 1e-8, name)
 
 
 def libra(points, best):

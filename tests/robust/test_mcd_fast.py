@@ -7,6 +7,9 @@ from torchrg.errors import ConfigError
 from torchrg.robust import fit_fastmcd
 from torchrg.robust.mcd import _Concentrated, _distinct_best
 
+# The cases include patches of fewer than six points.
+pytestmark = pytest.mark.filterwarnings("ignore:.*too few to trust the covariance")
+
 
 def gaps(folder, convert, chosen):
     """How far above the best known objective the fits of the chosen cases are."""

@@ -17,6 +17,9 @@ from torchrg.errors import ConfigError
 from torchrg.robust import fit_detmm, fit_dets
 from torchrg.robust.mm import breakdown_constant, efficiency_constant
 
+# The cases include patches of fewer than six points.
+pytestmark = pytest.mark.filterwarnings("ignore:.*too few to trust the covariance")
+
 
 @functools.cache
 def all_fits(folder, fit, convert, without):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchrg.robust import fit_detmcd, qn
+from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
 
 
 def assert_equal_fits(found, expected):
@@ -54,3 +54,39 @@ def test_powers_of_two_scale_bit_for_bit(estimator, patches, power):
     assert torch.equal(scaled.covariance, fit.covariance * unit * unit)
     for name in ("support", "sq_distances", "raw_support"):
         assert torch.equal(getattr(scaled, name), getattr(fit, name)), name
+
+
+@pytest.mark.parametrize("fit", [fit_detmcd, fit_fastmcd, fit_mve, fit_dets, fit_detmm])
+def test_few_points_warn_and_columns_are_named(fit, rng):
+    match = f"{fit.__name__}: expected at least 10 points per patch for 5 coordinates, got 9"
+    with pytest.warns(UserWarning, match=match):
+        fit(torch.randn(2, 9, 5, generator=rng))
+    with pytest.warns(UserWarning, match=r"got 3: .*; pass patches.mT if points are columns"):
+        fit(torch.randn(3, 8, generator=rng))
+    # Enough points, planes alone, and no patches.
+    fit(torch.randn(2, 10, 5, generator=rng))
+    fit(torch.randn(2, 5, 3, generator=rng), min_dimension=2)
+    fit(torch.empty(0, 4, 3))
+
+
+def test_few_points_warn_under_vmap_and_compilers(rng):
+    patches = torch.randn(2, 9, 5, generator=rng)
+    compiled = torch.compile(lambda x: fit_detmcd(x).covariance, fullgraph=True, backend="eager")
+    for transformed in (torch.vmap(lambda x: fit_detmcd(x).covariance), compiled):
+        with pytest.warns(UserWarning, match="too few to trust the covariance"):
+            transformed(patches)
+
+
+def test_a_covariance_beyond_the_largest_number_is_not_valid(estimator, dtype, rng):
+    patches = torch.randn(2, 30, 3, generator=rng, dtype=dtype)
+    patches[1] *= 0.1 * torch.finfo(dtype).max
+    fit = estimator(patches)
+    assert fit.valid.tolist() == [True, False]
+    assert fit.covariance.isfinite().all()
+    assert not fit.support[1].any()
+    assert torch.equal(fit.location[0], estimator(patches[0]).location)
+
+
+def test_a_fit_is_shown_in_one_line(rng):
+    fit = fit_detmcd(torch.randn(2, 4, 30, 3, generator=rng))
+    assert repr(fit) == "RobustFit((2, 4) patches, 30 points, 3 coordinates)"

@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 from tests.robust.oracle_cases import load_oracles, local_float32
 from torchrg.errors import ShapeError
 from torchrg.robust import mad, median, qn, qn_exceeds, tau
-from torchrg.robust.scale import qn_sample_factor, sum_points
+from torchrg.robust.scale import (
+    _difference_by_counts,
+    _difference_by_lags,
+    qn_sample_factor,
+    sum_points,
+)
 
 
 def literal_qn(values):
@@ -75,6 +80,51 @@ def test_qn_is_its_definition(n, dtype, rng):
 def test_qn_is_its_definition_with_ties_and_mixed_magnitudes(values):
     row = torch.tensor(values, dtype=torch.float64)
     assert_close(qn(row), literal_qn(values), 1e-12)
+
+
+def rows_of_all_kinds(n, dtype, rng):
+    """Return rows with ties, several magnitudes, infinities, NaN and negative zeros."""
+    rows = torch.randn(9, n, generator=rng, dtype=dtype)
+    rows[1] = rows[1].mul(3).round()
+    rows[2, : n // 2 + 1] = 3.0
+    rows[3] *= 10.0 ** (torch.arange(n, dtype=dtype) % 12)
+    rows[4, ::3], rows[4, 1::5] = torch.inf, -torch.inf
+    rows[5, ::2] = torch.inf
+    rows[6, n // 2] = torch.nan
+    rows[7] = rows[7].mul(40).round() * torch.finfo(dtype).smallest_normal / 4
+    rows[8] = rows[8].sign() * 0.0
+    return rows
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 8, 9, 31, 32, 33, 100, 401, 402])
+def test_counting_pairs_selects_the_same_difference_as_listing_them(n, dtype, rng):
+    ascending = rows_of_all_kinds(n, dtype, rng).sort(dim=1).values
+    counted, listed = _difference_by_counts(ascending), _difference_by_lags(ascending)
+    torch.testing.assert_close(counted, listed, rtol=0, atol=0, equal_nan=True)
+    assert _difference_by_counts(ascending[:0]).shape == (0,)
+
+
+def test_qn_of_many_values_has_mask_and_gradient(dtype, rng, monkeypatch):
+    rows = rows_of_all_kinds(1200, dtype, rng)[[0, 1, 2, 5]].requires_grad_()
+    mask = torch.rand(rows.shape, generator=rng) < torch.tensor([1.0, 0.95, 0.5, 0.9])[:, None]
+    found = []
+    for longest in (400, 1200):
+        monkeypatch.setattr("torchrg.robust.scale._MAX_LISTED_VALUES", longest)
+        value = qn(rows, mask=mask)
+        found.append((value, *torch.autograd.grad(value.sum(), rows)))
+        batched = torch.vmap(lambda row, used: qn(row, mask=used))(rows.detach(), mask)
+        assert torch.equal(batched, value)
+    assert torch.equal(found[0][0], found[1][0])
+    assert torch.equal(found[0][1], found[1][1])
+
+
+def test_qn_of_a_hundred_thousand_values(dtype):
+    # The integers below n have n - d pairs with the difference d.
+    n = 100_000
+    pairs = np.cumsum(np.arange(n - 1, 0, -1))
+    expected = 1 + np.searchsorted(pairs, math.comb(n // 2 + 1, 2))
+    integers = torch.arange(n, dtype=dtype)[torch.randperm(n)]
+    assert_close(qn(integers), 2.2219 * expected, 1e-7)
 
 
 @given(

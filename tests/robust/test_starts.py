@@ -7,6 +7,9 @@ from tests.robust.oracle_cases import fit_all, load_oracles
 from torchrg.robust import fit_detmcd, fit_fastmcd
 from torchrg.robust.starts import _score_table
 
+# The cases include patches of fewer than six points.
+pytestmark = pytest.mark.filterwarnings("ignore:.*too few to trust the covariance")
+
 
 def test_plane_starts_do_not_depend_on_rotation(rng):
     patches = torch.randn(60, 50, 3, generator=rng, dtype=torch.float64)

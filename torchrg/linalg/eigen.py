@@ -9,7 +9,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._checks import check_floating, check_shapes, is_concrete, raise_forward_mode
+from torchrg._checks import (
+    check_floating,
+    check_shapes,
+    is_concrete,
+    is_jit_traced,
+    raise_forward_mode,
+)
 
 _JACOBI_SWEEPS = 5
 """Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either
@@ -94,7 +100,7 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_shapes("eigh3", matrices=(matrices, "* 3 3"))
     check_floating("eigh3", matrices=matrices)
-    if not matrices.requires_grad and is_concrete(matrices):
+    if not matrices.requires_grad and (is_concrete(matrices) or is_jit_traced()):
         return _jacobi(matrices)
     operation = _Eigh3 if torch.compiler.is_compiling() else _ReverseOnly
     values, vectors = operation.apply(matrices)  # type: ignore[no-untyped-call]

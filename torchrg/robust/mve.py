@@ -46,6 +46,9 @@ def fit_mve(
     Each set of P + 1 points defines an ellipsoid by its mean and covariance; it is scaled until it
     covers h points, and the smallest wins [1].
 
+    It is for P = 3, where most small sets are clean. At P = 10, of 40 samples with a fifth of the
+    points shifted, 13 fits include shifted points, and none of :func:`torchrg.robust.fit_detmcd`.
+
     Random sets nearly always miss the minimum volume by a little; ``exhaustive`` uses all sets:
     230,300 for 50 points, a tenth of a second per patch. Other arguments are as in
     :func:`torchrg.robust.fit_fastmcd`; ``support_fraction`` is the fraction of covered points.

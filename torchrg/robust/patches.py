@@ -1,5 +1,6 @@
 """Application of robust estimators to batches of patches."""
 
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -41,7 +42,8 @@ class RobustFit(NamedTuple):
     within which points are inliers: 0.975 means a squared distance of 9.3484 for P = 3.
     ``chunk_size`` bounds the memory and does not change the result. An invalid shape, dtype or
     device raises :class:`torchrg.errors.ShapeError`, a setting out of range
-    :class:`torchrg.errors.ConfigError`.
+    :class:`torchrg.errors.ConfigError`. Patches of fewer than 2 P points cause a warning, unless
+    ``min_dimension`` is set.
 
     If a majority of the points lies exactly on a flat, such as a plane, a line or a point, the flat
     of lowest dimension is the fit: the limit of fits to points approaching it. Its covariance is
@@ -68,7 +70,8 @@ class RobustFit(NamedTuple):
             NaN if not valid.
         exact_fit: Whether the points in ``support`` lie exactly on one flat, of dimension P - 1 or
             less, and are a majority, shape ``(*)``, bool.
-        valid: Whether there is a fit, shape ``(*)``, bool. Otherwise the other fields are zero.
+        valid: Whether there is a fit, shape ``(*)``, bool. Otherwise the other fields are zero. A
+            covariance beyond the largest number of the dtype is not valid.
     """
 
     location: Tensor
@@ -81,6 +84,11 @@ class RobustFit(NamedTuple):
     log_det: Tensor
     exact_fit: Tensor
     valid: Tensor
+
+    def __repr__(self) -> str:
+        *batch, num_points = self.support.shape
+        size = self.location.shape[-1]
+        return f"RobustFit({tuple(batch)} patches, {num_points} points, {size} coordinates)"
 
 
 class _Frame(NamedTuple):
@@ -147,6 +155,14 @@ def fit_patchwise(
             f"{caller}: expected min_dimension from 0 to {size - 1} for points with {size} "
             f"coordinates, got {min_dimension!r}."
         )
+    # R's robustbase warns below the same number. Normals, which need planes only, have `valid`.
+    if batch.numel() and num_points < 2 * size and min_dimension == 0:
+        repair = "; pass patches.mT if points are columns" * (num_points <= size)
+        warnings.warn(
+            f"{caller}: expected at least {2 * size} points per patch for {size} coordinates, got "
+            f"{num_points}: too few to trust the covariance{repair}.",
+            stacklevel=2,
+        )
     dense = patches.detach().reshape(batch.numel(), num_points, size)
     counted = torch.isfinite(dense).all(dim=-1)
     if mask is not None:
@@ -156,6 +172,9 @@ def fit_patchwise(
         return _fit_chunk(chunk, support_fraction, estimator, min_dimension, majority)
 
     fields = _fit_groups(dense, counted, chunk_size, fit_dense)
+    finite = fields.covariance.isfinite() & fields.raw_covariance.isfinite()
+    rows = torch.nonzero(~finite.flatten(1).all(dim=1)).squeeze(1)
+    _store(fields, rows, _no_fit(dense[rows]))
     fit = RobustFit(*(field.reshape((*batch, *field.shape[1:])) for field in fields))
     if patches.requires_grad and torch.is_grad_enabled():
         weights = torch.where(fit.exact_fit[..., None], fit.support, weigh(fit, patches.detach()))

@@ -41,6 +41,9 @@ _TAU_WEIGHT_CUT = 4.5
 _GPU_FRACTION = 256
 """Factor of the chunk size on a GPU, which has enough memory and a high launch overhead."""
 
+_MAX_LISTED_VALUES = 400
+"""Number of values per row up to which Qn lists the pairs; beyond it, counting them is faster."""
+
 _TAU_SCALE_CUT = 3.0
 """Deviation at which values are truncated, in median deviations."""
 
@@ -87,7 +90,8 @@ def qn(
     :math:`h = \lfloor n/2 \rfloor + 1` [1]. The order statistic is exact, without interpolation.
     With ``finite_sample`` it is multiplied by the revised factor 2.21914 and by
     :func:`qn_sample_factor` instead of 2.2219, as in R's robustbase by default. Otherwise as
-    :func:`median`. It is 0 if at least h values are equal, or for a single value.
+    :func:`median`. It is 0 if at least h values are equal, or for a single value. More than 400
+    values take n log n time and linear memory.
 
     References:
         [1] P. J. Rousseeuw, C. Croux. Alternatives to the median absolute deviation. Journal of
@@ -310,7 +314,56 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
         if len(infinite):
             differences[infinite] = _difference_by_lags(sorted_rows[infinite])
         return differences
+    if sorted_rows.shape[1] > _MAX_LISTED_VALUES:
+        return _difference_by_counts(sorted_rows)
     return _difference_by_lags(sorted_rows)
+
+
+def _difference_by_counts(sorted_rows: Tensor) -> Tensor:
+    """Implement :func:`_majority_difference` by bisection, in n log n time and linear memory.
+
+    The differences of a value to larger ones ascend, so counting those up to a limit is a search
+    for the end of a run. Non-negative numbers ascend like the integers of their bits: bisecting
+    these narrows the limit to one number, and the runs with it.
+    """
+    n = sorted_rows.shape[1]
+    h = half_size(n)
+    integers = torch.int32 if sorted_rows.dtype == torch.float32 else torch.int64
+
+    def select(chunk: slice) -> Tensor:
+        rows = sorted_rows[chunk].contiguous()
+        # The shortest half has C(h, 2) pairs. Two infinite values have the largest difference.
+        lengths = rows[:, h - 1 :] - rows[:, : n - h + 1]
+        shortest = torch.where(lengths.isnan(), torch.inf, lengths).amin(dim=1)
+        low, high = torch.zeros_like(shortest).view(integers), shortest.view(integers)
+        middle = (shortest / 4).view(integers)  # the result is a third of it for normal values
+        starts = torch.arange(1, n + 1, device=rows.device)
+        first, last = (ends.expand(rows.shape) for ends in (starts, (starts + h - 1).clamp(max=n)))
+        while bool((low < high).any()):
+            ends = _ends_of_runs(rows, first, last, middle.view(rows.dtype)[:, None])
+            enough = (ends - starts).sum(dim=1) >= comb(h, 2)
+            low, high = torch.where(enough, low, middle + 1), torch.where(enough, middle, high)
+            first = torch.where(enough[:, None], first, ends)
+            last = torch.where(enough[:, None], ends, last)
+            middle = low + (high - low) // 2
+        return high.view(rows.dtype)
+
+    size = max(CACHE_BYTES // (n * torch.int64.itemsize), 1)
+    parts = map_chunks(select, len(sorted_rows), size, sorted_rows.device, min_rows=1)
+    return torch.where(sorted_rows[:, -1].isnan(), torch.nan, torch.cat(parts))
+
+
+def _ends_of_runs(rows: Tensor, first: Tensor, last: Tensor, limit: Tensor) -> Tensor:
+    """Return where the differences to each value of sorted rows exceed a limit.
+
+    The runs start right of the values; their ends are known to be from ``first`` to ``last``.
+    """
+    ends, largest = first, rows.shape[1] - 1
+    for power in reversed(range(int((last - first).max()).bit_length())):
+        further = ends + 2**power
+        differences = rows.gather(1, (further - 1).clamp_(max=largest)).sub_(rows)
+        ends = torch.where((differences <= limit) & (further <= last), further, ends)
+    return ends
 
 
 def _difference_by_lags(sorted_rows: Tensor) -> Tensor:

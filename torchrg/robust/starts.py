@@ -35,8 +35,9 @@ MCDStarts = Literal[Starts, "more"]
 _MIN_TAU_VALUES = 1000
 """Number of values from which tau replaces Qn, as in robustbase, because Qn needs all pairs."""
 
-_STARTS_PER_CHUNK = 3
-"""Number of starts processed at a time, so that their data fits into the cache."""
+_LANES_PER_CHUNK = 12288
+"""Number of starts times axes times lanes processed at a time, so that their data fits into the
+cache."""
 
 _NUM_PLANES = 64
 """Number of candidate planes."""
@@ -59,10 +60,13 @@ def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> tuple[Tens
 
 def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
     """Choose the six initial sets of each lane (Hubert, Rousseeuw, Verdonck 2012, section 3)."""
-    standard = [_standardize(column) for column in columns]
+    num_lanes = columns[0].shape[1]
+    together = _standardize(torch.cat(columns, dim=1))
+    standard = [part.contiguous() for part in torch.split(together, num_lanes, dim=1)]
+    starts_per_chunk = max(_LANES_PER_CHUNK // (len(columns) * num_lanes), 1)
     distances = [
         _sphered_distances(standard, eigenvectors(matrices))
-        for matrices in torch.split(_scatter_matrices(standard), _STARTS_PER_CHUNK)
+        for matrices in torch.split(_scatter_matrices(standard), starts_per_chunk)
     ]
     sets = [smallest_points(group.flatten(1), size).view_as(group) for group in distances]
     return torch.cat(sets, dim=1)
@@ -133,18 +137,17 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
 def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
     """Squared distances ``(K, S, M)`` of points sphered by the eigenvectors ``(S, M, P, P)``."""
     shape = (len(columns[0]), *loadings.shape[:2])
-    sphered: list[Tensor] = []
-    for directions in loadings.unbind(dim=3):
-        axis = [values.contiguous() for values in directions.unbind(dim=2)]
-        score = dot([column[:, None] for column in columns], axis).flatten(1)
-        rows = sorted_points(score)
-        score /= _positive_scale(rows, median_of_sorted(rows))
-        for i, factor in enumerate(axis):
-            values = score * factor.flatten()
-            if i == len(sphered):
-                sphered.append(values)
-            else:
-                sphered[i] += values
+    wide = [column[:, None] for column in columns]
+    axes = [
+        [factor.contiguous() for factor in axis.unbind(dim=2)] for axis in loadings.unbind(dim=3)
+    ]
+    scores = torch.cat([dot(wide, axis).flatten(1) for axis in axes], dim=1)
+    rows = sorted_points(scores)
+    scores /= _positive_scale(rows, median_of_sorted(rows))
+    parts = scores.chunk(len(axes), dim=1)
+    sphered = [
+        dot(parts, [factors.flatten() for factors in column]) for column in zip(*axes, strict=True)
+    ]
     return sum_squares([values - median_points(values) for values in sphered]).view(shape)
 
 
@@ -164,11 +167,13 @@ def _pairwise_qn(columns: list[Tensor]) -> Tensor:
     size = len(columns)
     matrix = columns[0].new_zeros(columns[0].shape[1], size, size)
     matrix.diagonal(dim1=-2, dim2=-1).fill_(1.0)
-    for i in range(size):
-        for j in range(i + 1, size):
-            total = _scale(sorted_points(columns[i] + columns[j]))
-            difference = _scale(sorted_points(columns[i] - columns[j]))
-            matrix[:, i, j] = matrix[:, j, i] = (total * total - difference * difference) / 4
+    for i, column in enumerate(columns[:-1]):
+        others = columns[i + 1 :]
+        sums = [sorted_points(column + other) for other in others]
+        differences = [sorted_points(column - other) for other in others]
+        total, difference = _scale(torch.cat(sums + differences)).view(2, len(others), -1)
+        matrix[:, i, i + 1 :] = ((total * total - difference * difference) / 4).t()
+        matrix[:, i + 1 :, i] = matrix[:, i, i + 1 :]
     return matrix
 
 
