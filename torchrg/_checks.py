@@ -107,7 +107,7 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
 
     Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for a length
     that is equal in all patterns, a number for a fixed length, and a leading ``*`` for any leading
-    axes, equal in all patterns. None is skipped.
+    axes, equal in all patterns. None is skipped. A ``mask`` must be bool.
 
     Example:
         >>> check_shapes("f", patches=(torch.zeros(5, 8, 3), "* K 3"))
@@ -120,6 +120,9 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     for name, (tensor, pattern) in arguments.items():
         if tensor is None:
             continue
+        if name == "mask" and tensor.dtype != torch.bool:
+            dtype = str(tensor.dtype).removeprefix("torch.")
+            raise ShapeError(f"{caller}: expected mask of bool, got {dtype}; pass mask.bool().")
         shape, sizes = tuple(tensor.shape), dict(bound)
         if not _bind(shape, pattern.split(), bound):
             fixed = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in sizes.items())

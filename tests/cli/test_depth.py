@@ -282,7 +282,7 @@ def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, 
     frame.rename(root / frame.name)
     flags = [*CAMERA[:3], scale]
     reported = (
-        f"frame.png: expected a median depth of 0.05 to 100 m, got {median} with --depth-scale "
+        f"frame.png: expected a median depth of 0.05 to 20 m, got {median} with --depth-scale "
     )
     for command in (
         ("depth", root / frame.name, "--out", tmp_path / "labels.png"),
@@ -311,7 +311,7 @@ def test_a_cloud_is_checked_against_a_camera_that_is_given(tmp_path, depth, run)
         error = run("depth", source, "--intrinsics", camera, *out).err.splitlines()[-1]
         assert "scan.pcd: --intrinsics do not match the points" in error
     done = run("depth", source, "--depth-scale", "1000", *out)
-    assert "--depth-scale is ignored for point clouds" in done.err
+    assert "--depth-scale and --depth-kind are ignored for point clouds" in done.err
 
 
 def test_segment_says_where_depth_images_went(tmp_path, frame, run):

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, is_concrete, is_tensor
-from torchrg.errors import ConfigError, DepthWarning
+from torchrg.depth.values import has_depth
+from torchrg.errors import ConfigError, DepthWarning, ShapeError
+from torchrg.linalg.rigid import describe_fault
 from torchrg.structures import FARTHEST
 
 _MAX_ANGLE_DEG, _WIDE_ANGLE_DEG = 85.0, 75.0
@@ -40,10 +42,10 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Returns:
         Points, shape ``(B, H, W, 3)``, in the unit of ``depth`` and in its dtype, or in that of the
-        poses; NaN where depth is not finite or not positive.
+        poses; NaN for missing depth, see :func:`torchrg.depth.values.has_depth`.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is not as above, or a pose is no rigid motion.
         ConfigError: If a camera matrix is invalid, or impossible for such images.
 
     Warns:
@@ -63,6 +65,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         poses=(poses, "B 4 4"),
     )
     check_floating("depth_to_points", depth=depth)
+    check_pose("depth_to_points", poses)
     if is_concrete(intrinsics):
         check_view("depth_to_points", intrinsics, (depth.shape[2], depth.shape[1]))
     return _unproject(depth, intrinsics, poses)
@@ -135,6 +138,19 @@ def check_camera(caller: str, intrinsics: Tensor) -> None:
         )
 
 
+def check_pose(caller: str, poses: Tensor | None) -> None:
+    """Raise ShapeError if one of the poses ``(*, 4, 4)`` is not a rigid motion.
+
+    Example:
+        >>> check_pose("f", torch.diag(torch.tensor([1.0, 1, -1, 1])))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ShapeError: f: expected a rigid camera-to-world pose, got a mirror; ...
+    """
+    if poses is not None and is_concrete(poses) and (fault := describe_fault(poses)):
+        raise ShapeError(f"{caller}: expected a rigid camera-to-world pose, got {fault}.")
+
+
 def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
     """Check that cameras ``(*, 3, 3)`` are plausible for images of ``size`` (width, height).
 
@@ -183,6 +199,8 @@ def describe_improbable_view(
         doubt = "with an optical axis off the center; pass the camera of images of this size"
     elif error > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
         doubt = "which fit better with cx and cy exchanged; swap them"
+    elif size[0] == 2 * size[1]:
+        doubt = "of a panorama, by its ratio of 2:1; project it to perspective images"
     else:
         return ""
     numbers = ",".join(f"{value:g}" for value in camera[:4])
@@ -210,11 +228,6 @@ def unproject_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = Non
     """
     poses = None if pose is None else pose[None]
     return _unproject(depth[None].double(), intrinsics[None].double(), poses)[0]
-
-
-def has_depth(depth: Tensor) -> Tensor:
-    """Return a mask of pixels with finite and positive depth, in the shape of ``depth``."""
-    return depth.isfinite() & (depth > 0)
 
 
 def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
