@@ -4,6 +4,9 @@ All exceptions derive from :class:`TorchrgError`; messages contain the requireme
 the fix.
 """
 
+import sys
+import warnings
+
 __all__ = [
     "ConfigError",
     "DepthWarning",
@@ -53,8 +56,20 @@ class MissingDependencyError(TorchrgError, ImportError):
 
 
 class PrecisionWarning(UserWarning):
-    """The rounding step of coordinates is coarse for the spacing of the points."""
+    """The rounding step of coordinates is coarse, or many points stand for missing ones."""
 
 
 class DepthWarning(UserWarning):
     """A camera or depth scale is assumed, or does not fit its depth image."""
+
+
+_LIBRARIES = {"torchrg", "torch", "contextlib", "functools"}
+"""Packages between a warning and the code of the user: decorators and ``nn.Module`` calls."""
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the user that called torchrg."""
+    level, frame = 2, sys._getframe(1)  # noqa: SLF001
+    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in _LIBRARIES:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)

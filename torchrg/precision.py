@@ -26,6 +26,9 @@ _SAMPLE = 20_000
 _CELL = 32
 """Side of the cells of the sample, in spacings of a uniform surface. Seven of eight points are away
 from the boundary of their cell, outside of which the nearest point may be."""
+_MIN_PLACEHOLDERS = 10
+"""Number of points at 0 0 0 from which they count as pixels without depth. Fewer may be measured
+there."""
 _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791])
 """Factors of the cell hash: M. Teschner et al. Optimized spatial hashing for collision detection of
 deformable objects. VMV, 2003."""
@@ -88,13 +91,29 @@ def describe_steps(
     return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {fix}"
 
 
-def warn_about_steps(caller: str, points: Tensor) -> None:
-    """Warn about :func:`describe_steps`, at the caller of a decorated public function."""
-    coordinates = points.detach().cpu().numpy()
-    note = describe_steps(
-        coordinates, fix="pass float64, or subtract an offset before it is float32"
+def describe_placeholders(points: NDArray[np.floating]) -> str:
+    """Return a note if many points lie at 0 0 0, where cameras put pixels without depth.
+
+    Example:
+        >>> describe_placeholders(np.arange(120).reshape(40, 3) // 60 * 1.0)
+        '20 of 40 points lie at 0 0 0, as pixels without depth do; remove them, or set them to NaN'
+    """
+    count = len(points) - int(np.count_nonzero(points.any(axis=1)))
+    if not _MIN_PLACEHOLDERS <= count < len(points):
+        return ""
+    return (
+        f"{count:,} of {len(points):,} points lie at 0 0 0, as pixels without depth do; remove "
+        "them, or set them to NaN"
     )
-    if note:
+
+
+def warn_about_steps(caller: str, points: Tensor) -> None:
+    """Warn about coarse steps and placeholders, at the caller of a decorated public function."""
+    coordinates = points.detach().cpu().numpy()
+    fix = "pass float64, or subtract an offset before it is float32"
+    for note in filter(
+        None, (describe_steps(coordinates, fix=fix), describe_placeholders(coordinates))
+    ):
         warnings.warn(f"{caller}: {note}.", PrecisionWarning, stacklevel=_ABOVE_DECORATORS)
 
 

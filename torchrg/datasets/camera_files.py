@@ -4,8 +4,7 @@ import json
 import math
 import os
 import re
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from reprlib import repr as shortened
@@ -18,7 +17,7 @@ from torch import Tensor
 from torchrg.datasets.folder import list_dir
 from torchrg.datasets.rgbd_files import read_array
 from torchrg.depth.camera import Pinhole, check_camera
-from torchrg.errors import DepthWarning, FormatError, TorchrgError
+from torchrg.errors import DepthWarning, FormatError, TorchrgError, warn
 from torchrg.io.files import PARSE_ERRORS, decode_file, wrap_errors
 from torchrg.structures import FARTHEST
 
@@ -27,10 +26,11 @@ SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".npy", ".pincam", ".k
 """Suffixes of files that may be camera files by their name."""
 _SECTIONS = ("intrinsic", "intrinsics", "camera", "cam", "depth", "depth_intrinsics")
 """Sections that contain the camera of depth images: Open3D and NICE-SLAM."""
-_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Names of lens distortion coefficients."""
-_LENS_ARRAYS = ("distortion_coefficients", "distCoeffs", "D", "d", "coeffs")
-"""Names of lists of distortion coefficients: ROS, OpenCV and RealSense."""
+_LENS = (
+    *("k1", "k2", "k3", "k4", "p1", "p2"),
+    *("distortion_coefficients", "distCoeffs", "D", "d", "coeffs"),
+)
+"""Names of lens distortion coefficients, and of lists of them: ROS, OpenCV and RealSense."""
 _PINHOLE_NAMES = {
     ("fl_x", "fl_y", "cx", "cy"): 0.5,
     ("fx", "fy", "cx", "cy"): 0.0,
@@ -218,19 +218,17 @@ def parse_camera(path: Path, record: Record) -> Pinhole:
             "image_undistorter of COLMAP does."
         )
     fx, fy, cx, cy = _read_pinhole(path, record)
-    if distorted := [*_distortions(record)]:
-        warnings.warn(
+    if distorted := _distortions(record):
+        warn(
             f"{path}: lens distortion ({', '.join(distorted)}) is not corrected; undistort images "
             "whose planes bend at the edges.",
             DepthWarning,
-            stacklevel=2,
         )
     if min(fx, fy) < 0:
-        warnings.warn(
+        warn(
             f"{path}: a negative focal length, {min(fx, fy):g}, flips the image; remove the minus "
             "sign unless that is intended.",
             DepthWarning,
-            stacklevel=2,
         )
     scales = (parse_number(path, record, name) for name in _SCALES if name in record)
     scale = next(scales, None)
@@ -260,15 +258,12 @@ def _read_pinhole(path: Path, record: Record) -> tuple[float, float, float, floa
     )
 
 
-def _distortions(record: Record) -> Iterator[str]:
-    """Yield the names of nonzero distortion coefficients, unless the images are rectified."""
-    if not any(name in record for name in _RECTIFIED):
-        yield from (name for name in _LENS if record.get(name))
-        for name in _LENS_ARRAYS:
-            values = record.get(name)
-            values = values.get("data") if isinstance(values, dict) else values
-            if isinstance(values, list) and any(values):
-                yield name
+def _distortions(record: Record) -> list[str]:
+    """Return the names of nonzero distortion coefficients; none if the images are rectified."""
+    names = [] if record.keys() & {*_RECTIFIED} else [name for name in _LENS if name in record]
+    values = {name: record[name] for name in names}
+    values = {n: v.get("data") if isinstance(v, dict) else v for n, v in values.items()}
+    return [n for n, value in values.items() if (any(value) if isinstance(value, list) else value)]
 
 
 def parse_matrix(path: Path, record: Record, key: str, columns: int = 3) -> Tensor:
@@ -330,19 +325,17 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
         if cameras:
             (path, camera), *remaining = cameras.items()
             if is_outside:
-                warnings.warn(
+                warn(
                     f"{root}: using the camera of {path}, outside this folder; pass --intrinsics "
                     "to choose another.",
                     DepthWarning,
-                    stacklevel=3,
                 )
             for other, found in remaining:
                 if found[:4] != camera[:4] and ("depth" in other.name) == ("depth" in path.name):
-                    warnings.warn(
+                    warn(
                         f"{path}: used as the camera, although {other.name} differs; pass "
                         "--intrinsics to choose.",
                         DepthWarning,
-                        stacklevel=2,
                     )
             return camera, path
     return None

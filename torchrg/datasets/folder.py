@@ -2,7 +2,6 @@
 
 import os
 import re
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -14,7 +13,7 @@ from torch.utils.data import Dataset
 from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import FOLDER_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.colors import read_colors
 from torchrg.io.npy import map_folder
@@ -336,10 +335,9 @@ def warn_skipped(folder: Path, skipped: Sequence[Path]) -> None:
     """Warn if duplicates or recursive links in a folder were skipped."""
     if skipped:
         more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
-        warnings.warn(
+        warn(
             f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: links to files that were "
             "already read, or to a parent folder.",
-            stacklevel=3,
         )
 
 

@@ -2,7 +2,6 @@
 
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,15 +22,15 @@ from torchrg.datasets.rgbd_files import (
 )
 from torchrg.datasets.rgbd_layouts import (
     FRAME_LAYOUTS,
-    FrameLayout,
     ListedFrame,
     find_layout,
     find_recordings,
 )
-from torchrg.depth.camera import Pinhole, check_camera, check_pose, describe_improbable_view
+from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view
 from torchrg.depth.values import DepthKind, check_conversion
-from torchrg.errors import ConfigError, DepthWarning, FormatError
-from torchrg.linalg.rigid import describe_fault
+from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError, warn
+from torchrg.io.files import wrap_errors
+from torchrg.linalg.rigid import check_rigid
 from torchrg.structures import FARTHEST
 from torchrg.transforms.rows import SampleDict
 
@@ -48,8 +47,7 @@ class RGBDFrame:
             slashes: ``scene0000_00/12``.
         color: Color image registered to the depth, PNG or JPEG, or None.
         pose: Camera-to-world matrix, shape ``(4, 4)``, or None.
-        depth_kind: ``"z"`` for depth along the optical axis, ``"ray"`` for distances from the
-            camera center.
+        depth_kind: ``"z"`` for depth, ``"ray"`` for distances from the camera center.
         sources: Further files that intrinsics and pose were read from.
         origin: Description of where the intrinsics come from.
 
@@ -71,7 +69,7 @@ class RGBDFrame:
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
         check_camera("RGBDFrame", self.intrinsics)
-        check_pose("RGBDFrame", self.pose)
+        check_rigid("RGBDFrame", "pose", self.pose)
         check_conversion("RGBDFrame", self.depth_scale, self.depth_kind)
 
     @property
@@ -82,8 +80,7 @@ class RGBDFrame:
 
     def read_depth(self) -> Tensor:
         """Return the depth in meters along the optical axis, shape ``(H, W)``, float32."""
-        options = (self.depth_scale, self.depth_kind, self.intrinsics)
-        return read_depth(self.depth, *options)
+        return read_depth(self.depth, self.depth_scale, self.depth_kind, self.intrinsics)
 
 
 class RGBDFrames(SceneDataset):
@@ -168,8 +165,7 @@ class RGBDFrames(SceneDataset):
                 ``tum``, ``icl-nuim`` and ``7-scenes``.
             depth_scale: Depth units per meter. Default: from the camera file, else the layout's;
                 ``images`` and ``.npy`` have no default.
-            depth_kind: ``"z"`` for depth along the optical axis, ``"ray"`` for distances from the
-                camera center. Default: ``"z"``.
+            depth_kind: ``"ray"`` for distances from the camera center. Default: ``"z"``, depth.
             transform: Applied to each sample.
 
         Returns:
@@ -192,7 +188,13 @@ class RGBDFrames(SceneDataset):
         if name not in FRAME_LAYOUTS:
             names = ", ".join(sorted(FRAME_LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = [*_find_frames(folder, name, intrinsics, depth_scale, depth_kind)]
+        camera = intrinsics
+        if camera is not None and not isinstance(camera, Pinhole):
+            matrix = as_tensor("RGBDFrames", "intrinsics", camera)
+            check_shapes("RGBDFrames", intrinsics=(matrix, "3 3"))
+            check_camera("RGBDFrames", matrix)
+            camera = Pinhole(*matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+        frames = _find_frames(folder, name, camera, depth_scale, depth_kind)
         if not frames:
             suffixes = " ".join(DEPTH_SUFFIXES)
             raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
@@ -218,118 +220,81 @@ class RGBDFrames(SceneDataset):
 
 
 def _find_frames(
-    root: Path,
-    name: str,
-    intrinsics: Tensor | Pinhole | None,
-    depth_scale: float | None,
-    depth_kind: DepthKind,
+    root: Path, name: str, camera: Pinhole | None, depth_scale: float | None, kind: DepthKind
 ) -> list[RGBDFrame]:
-    """Return the frames of a folder of one or several recordings.
+    """Return the frames of a folder of one or several recordings; ``camera`` is the user's.
 
     Warns:
         DepthWarning: See :meth:`RGBDFrames.from_folder`; once per kind, of cameras per recording.
     """
-    layout, frames, has_poses = FRAME_LAYOUTS[name], list[RGBDFrame](), False
+    layout, listed, frames = FRAME_LAYOUTS[name], list[ListedFrame](), list[RGBDFrame]()
+    signs = [sign for sign in layout.signs if sign]
     notes: dict[object, str] = {}
     for prefix, folder in find_recordings(root, layout):
         shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}
         for frame in layout.frames(folder):
-            camera, files = intrinsics, tuple[Path, ...]()
-            if intrinsics is None:
-                camera, files = _find_camera(frame, folder, root, layout, shared)
-            origin = files[0].name if files else "given"
-            is_built_in = intrinsics is None and not files
-            if is_built_in and isinstance(camera, Pinhole):
-                origin = f"built in, {name}"
-                numbers = ",".join(f"{number:g}" for number in camera[:4])
-                notes["camera"] = (
-                    f"{root}: using the built-in camera of {name}, {numbers}, for frames without a "
-                    "camera file; pass --intrinsics if they have another."
-                )
-            cameras = [each for each in (camera, frame.camera) if isinstance(each, Pinhole)]
-            scales = (depth_scale, *(each.depth_scale for each in cameras))
+            place, own, files = frame.depth.parent, camera, tuple[Path, ...]()
+            if camera is None and frame.camera is not None:
+                own, files = frame.camera, frame.sources[:1]
+            elif camera is None:
+                if place not in shared:
+                    found = find_camera(place, root)
+                    built_in = layout.camera(folder) if layout.camera and not found else None
+                    shared[place] = (found[0], found[1:]) if found else (built_in, ())
+                own, files = shared[place]
+            origin = files[0].name if files else "given" if camera else f"built in, {name}"
+            scales = (depth_scale, *(c.depth_scale for c in (own, frame.camera) if c))
             scale = next((value for value in scales if value is not None), None)
             # A layout has no unit of floating point.
-            if scale is None and frame.depth.suffix.lower() != ".npy":
-                scale = layout.depth_scale
-                is_own = any(sign and file.match(sign) for file in files for sign in layout.signs)
-                is_own |= is_built_in or camera is frame.camera
-                if scale is not None and not is_own:
-                    notes["unit"] = (
-                        f"{root}: using the depth unit of {name}, {scale:g} units per meter, with "
-                        f"a camera of other origin ({origin}); pass --depth-scale (depth_scale), "
-                        "1000 for millimeters."
-                    )
-            if camera is None or scale is None:
-                missing, values = "depth_scale", "1000 for millimeters, 1 for meters"
-                if camera is None:
-                    missing, values = "intrinsics", "fx,fy,cx,cy or a camera file"
+            is_assumed = scale is None and frame.depth.suffix.lower() != ".npy"
+            scale = layout.depth_scale if is_assumed else scale
+            is_known = own is frame.camera or any(f.match(sign) for f in files for sign in signs)
+            if own is None or scale is None:
+                missing, example = "depth_scale", "1000 for millimeters"
+                if own is None:
+                    missing, example = "intrinsics", "fx,fy,cx,cy or a camera file"
                 raise ConfigError(
-                    f"{frame.depth}: expected {missing}, which depth images do not store; pass it: "
-                    f"{values}."
+                    f"{frame.depth}: expected {missing}, which depth images do not store; pass it, "
+                    f"{example}."
                 )
-            matrix, doubt = fit_camera(frame.depth, camera, *files[:1])
+            if not camera and not files:
+                notes["camera"] = (
+                    f"{root}: using the built-in camera of {name}, "
+                    f"{','.join(f'{number:g}' for number in own[:4])}, for frames without a camera "
+                    "file; pass --intrinsics if they have another."
+                )
+            elif is_assumed and not is_known:
+                notes["unit"] = (
+                    f"{root}: using the depth unit of {name}, {scale:g} units per meter, with a "
+                    f"camera of other origin ({origin}); pass --depth-scale (depth_scale), 1000 "
+                    "for millimeters."
+                )
+            matrix, doubt = fit_camera(frame.depth, own, *files[:1])
             notes[folder] = notes.get(folder) or doubt
-            files = tuple(dict.fromkeys((*files, *frame.sources)))
-            named = (prefix + frame.name, frame.color, _checked_pose(frame), depth_kind)
-            has_poses |= frame.pose is not None
-            frames.append(RGBDFrame(frame.depth, matrix, scale, *named, files, origin))
+            pose, files = frame.pose, tuple(dict.fromkeys((*files, *frame.sources)))
+            if pose is not None and not bool((pose.abs() <= FARTHEST).all()):
+                pose = None  # Tracking was lost.
+            options = (prefix + frame.name, frame.color, pose, kind, files, origin)
+            with wrap_errors(f"{[*files, root][-1]}: {frame.name}: ", ShapeError):
+                frames.append(RGBDFrame(frame.depth, matrix, scale, *options))
+            listed.append(frame)
     num_lost = sum(frame.pose is None for frame in frames)
-    if has_poses and num_lost:
+    if num_lost and any(frame.pose is not None for frame in listed):
         notes["pose"] = (
             f"{root}: {num_lost:,} of {len(frames):,} frames have no pose; their results are in "
             "camera coordinates."
         )
     for note in filter(None, notes.values()):
-        warnings.warn(note, DepthWarning, stacklevel=3)
+        warn(note, DepthWarning)
     return frames
 
 
-def _find_camera(
-    frame: ListedFrame,
-    folder: Path,
-    root: Path,
-    layout: FrameLayout,
-    shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]],
-) -> tuple[Pinhole | None, tuple[Path, ...]]:
-    """Return the camera of a frame, or None, and its file; ``shared`` are those of folders.
-
-    A camera file takes precedence over the built-in camera.
-    """
-    if frame.camera is not None:
-        return frame.camera, frame.sources[:1]
-    place = frame.depth.parent
-    if place not in shared:
-        found = find_camera(place, root)
-        built_in = layout.camera(folder) if layout.camera and not found else None
-        shared[place] = (found[0], found[1:]) if found else (built_in, ())
-    return shared[place]
-
-
-def _checked_pose(frame: ListedFrame) -> Tensor | None:
-    """Return the pose of a frame, or None if tracking was lost: non-finite, or too far away.
-
-    Raises:
-        FormatError: If the pose is not a rigid motion.
-    """
-    if frame.pose is None or not bool((frame.pose.abs() <= FARTHEST).all()):
-        return None
-    if fault := describe_fault(frame.pose):
-        raise FormatError(
-            f"{frame.sources[-1]}: expected a rigid camera-to-world pose of {frame.name}, got "
-            f"{fault}."
-        )
-    return frame.pose
-
-
-def fit_camera(
-    image: Path, camera: Tensor | Pinhole, file: Path | None = None
-) -> tuple[Tensor, str]:
+def fit_camera(image: Path, camera: Pinhole, file: Path | None = None) -> tuple[Tensor, str]:
     """Return the camera matrix for a depth image, and a warning if it is implausible.
 
     Args:
         image: The depth image. Its size is ignored if it is too large to be read.
-        camera: The camera, or its matrix.
+        camera: The camera.
         file: File of the camera, for messages.
 
     Raises:
@@ -338,12 +303,7 @@ def fit_camera(
     caller = f"{image}" if file is None else f"{image}: {file.name}"
     size = image_size(image)
     size = None if size and math.prod(size) > MAX_PIXELS else size
-    if isinstance(camera, Pinhole):
-        camera = camera.matrix(size, caller)
-    matrix = as_tensor(caller, "intrinsics", camera)
-    check_shapes(caller, intrinsics=(matrix, "3 3"))
-    check_camera(caller, matrix)
-    values = matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return matrix, describe_improbable_view(
-        caller, Pinhole(*values), size, name="--intrinsics"
-    ) if size else ""
+    matrix = camera.matrix(size, caller)
+    fitted = Pinhole(*matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+    doubt = describe_improbable_view(caller, fitted, size, name="--intrinsics") if size else ""
+    return matrix, doubt

@@ -7,7 +7,7 @@ import struct
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -69,8 +69,7 @@ def read_depth(
     refuse_form(source)
     readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16}
     stored = as_tensor(f"{source}", "depth", readers[source.suffix.lower()](source))
-    options: dict[str, Any] = {"depth_scale": depth_scale, "depth_kind": depth_kind}
-    return convert_depth(f"{source}", stored, intrinsics, **options).float()
+    return convert_depth(f"{source}", stored, intrinsics, depth_scale, depth_kind).float()
 
 
 def refuse_form(path: Path, *others: str) -> None:
@@ -311,7 +310,5 @@ def _words(path: Path) -> list[list[str]]:
 
 def _numbers(path: Path, rows: list[list[str]]) -> list[list[float]]:
     """Convert words to numbers."""
-    try:
+    with wrap_errors(f"{path}: expected numbers: ", ValueError):
         return [[float(word) for word in row] for row in rows]
-    except ValueError as error:
-        raise FormatError(f"{path}: expected numbers: {error}.") from error

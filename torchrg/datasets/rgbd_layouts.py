@@ -5,7 +5,6 @@ a choice of ``torchrg convert rgbd``, and a test.
 """
 
 import re
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -32,7 +31,7 @@ from torchrg.datasets.rgbd_files import (
     read_trajectory,
 )
 from torchrg.depth.camera import Pinhole
-from torchrg.errors import DepthWarning, FormatError
+from torchrg.errors import DepthWarning, FormatError, warn
 from torchrg.io.files import wrap_errors
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -197,11 +196,10 @@ def _all_images(folder: Path) -> Iterator[ListedFrame]:
     if any("depth" in words[path] for path in chosen):
         chosen = [path for path in chosen if "depth" in words[path]]
     if skipped := [path for path in images if path not in {*chosen}]:
-        warnings.warn(
+        warn(
             f"{folder}: skipped {len(skipped):,} of {len(images):,} images that are not depth "
             f"by their names, {skipped[0].relative_to(folder)} first; rename them if they are.",
             DepthWarning,
-            stacklevel=2,
         )
     for path in chosen:
         yield ListedFrame(path.relative_to(folder).with_suffix("").as_posix(), path)

@@ -1,7 +1,6 @@
 """Pinhole cameras: unprojection of depth images, and estimation from organized clouds."""
 
 import math
-import warnings
 from typing import Any, NamedTuple
 
 import torch
@@ -9,8 +8,8 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, is_concrete, is_tensor
 from torchrg.depth.values import has_depth
-from torchrg.errors import ConfigError, DepthWarning, ShapeError
-from torchrg.linalg.rigid import describe_fault
+from torchrg.errors import ConfigError, DepthWarning, warn
+from torchrg.linalg.rigid import check_rigid
 from torchrg.structures import FARTHEST
 
 _MAX_ANGLE_DEG, _WIDE_ANGLE_DEG = 85.0, 75.0
@@ -65,7 +64,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         poses=(poses, "B 4 4"),
     )
     check_floating("depth_to_points", depth=depth)
-    check_pose("depth_to_points", poses)
+    check_rigid("depth_to_points", "poses", poses)
     if is_concrete(intrinsics):
         check_view("depth_to_points", intrinsics, (depth.shape[2], depth.shape[1]))
     return _unproject(depth, intrinsics, poses)
@@ -109,11 +108,10 @@ def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa:
     if all(is_tensor(side) and is_concrete(side) for side in sides):
         height, width = (int(side.flatten()[0]) for side in sides if side is not None)
         if (height, width) != tuple(depth.shape[-2:]):
-            warnings.warn(
+            warn(
                 f"{caller}: expected intrinsics of images of {depth.shape[-1]} x "
                 f"{depth.shape[-2]} pixels, got a PinholeCamera of {width} x {height}; scale it.",
                 DepthWarning,
-                stacklevel=3,
             )
     return tensor
 
@@ -138,19 +136,6 @@ def check_camera(caller: str, intrinsics: Tensor) -> None:
         )
 
 
-def check_pose(caller: str, poses: Tensor | None) -> None:
-    """Raise ShapeError if one of the poses ``(*, 4, 4)`` is not a rigid motion.
-
-    Example:
-        >>> check_pose("f", torch.diag(torch.tensor([1.0, 1, -1, 1])))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected a rigid camera-to-world pose, got a mirror; ...
-    """
-    if poses is not None and is_concrete(poses) and (fault := describe_fault(poses)):
-        raise ShapeError(f"{caller}: expected a rigid camera-to-world pose, got {fault}.")
-
-
 def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
     """Check that cameras ``(*, 3, 3)`` are plausible for images of ``size`` (width, height).
 
@@ -169,7 +154,7 @@ def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
     rows = intrinsics.detach().reshape(-1, 9)[:, [0, 4, 2, 5]].double().cpu().tolist()
     for row in dict.fromkeys(map(tuple, rows)):
         if doubt := describe_improbable_view(caller, Pinhole(*row), size):
-            warnings.warn(doubt, DepthWarning, stacklevel=3)
+            warn(doubt, DepthWarning)
 
 
 def describe_improbable_view(

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_choices, check_shapes, eager_only
 from torchrg._parallel import nonzero_rows, sequential_operations
 from torchrg.config import DepthConfig, settings_of
-from torchrg.depth.camera import check_pose, check_view, read_intrinsics
+from torchrg.depth.camera import check_view, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import fit_pixels
 from torchrg.depth.pixels import Pixels, describe_pixels
@@ -18,6 +18,7 @@ from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.depth.windows import Image
 from torchrg.linalg import unit_direction
 from torchrg.linalg.moments import Segments, kth_smallest
+from torchrg.linalg.rigid import check_rigid
 from torchrg.normals import Orientation, orient_normals
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.fit import fit_planes
@@ -60,8 +61,7 @@ def segment_depth(
         orient: Normal orientation: towards the camera for "auto", "viewpoint" and "none", otherwise
             as in :func:`torchrg.normals.orient_normals`. Default: "auto".
         depth_scale: Depth units per meter, 1000 for millimeters. Default: 1, meters.
-        depth_kind: "z" for depth along the optical axis, "ray" for distances from the camera
-            center. Default: "z".
+        depth_kind: "ray" for distances from the camera center. Default: "z".
         **changes: Individual parameters, as in ``max_depth=4.0``.
 
     Returns:
@@ -94,13 +94,11 @@ def segment_depth(
         intrinsics=(intrinsics, "3 3"),
         pose=(pose, "4 4"),
     )
-    check_pose("segment_depth", pose)
+    check_rigid("segment_depth", "pose", pose)
     check_view("segment_depth", intrinsics, (depth.shape[1], depth.shape[0]))
     check_choices("segment_depth", orient=(orient, Orientation))
     settings = settings_of("segment_depth", DepthConfig, config, changes)
-    depth = convert_depth(
-        "segment_depth", depth, intrinsics, depth_scale=depth_scale, depth_kind=depth_kind
-    )
+    depth = convert_depth("segment_depth", depth, intrinsics, depth_scale, depth_kind)
     seg = _segment(depth, intrinsics, settings, pose, orient)
     return keep_planes(seg, choose_planes(seg.planes, settings))
 

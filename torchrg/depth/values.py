@@ -3,19 +3,18 @@
 Depth images of every layout, command and transform pass through :func:`convert_depth`.
 """
 
-import warnings
 from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices, check_floating
-from torchrg.errors import ConfigError, DepthWarning, ShapeError
+from torchrg.errors import ConfigError, DepthWarning, warn
 from torchrg.structures import Array
 
 Image = TypeVar("Image", Tensor, Array)
 DepthKind = Literal["z", "ray"]
-"""What depth images store: distances along the optical axis, or along the ray of each pixel."""
+"""Meaning of depth: distance along the optical axis, or from the camera center along the ray."""
 _MAX_16_BIT = 65535.0
 """Largest value of 16 bits: "no depth" of many recorders, also after conversion to wider types."""
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 20.0
@@ -29,15 +28,11 @@ def has_depth(depth: Tensor) -> Tensor:
 
     Depth is finite and positive. The largest value of an integer type, and that of 16 bits in any
     type, stands for missing depth.
-
-    Example:
-        >>> has_depth(torch.tensor([1.5, 0.0, -1.0, torch.nan, 65535.0])).tolist()
-        [True, False, False, False, False]
     """
-    is_integer = not depth.is_floating_point()
-    values = depth.double() if is_integer else depth
-    seen = values.isfinite() & (values > 0) & (values != _MAX_16_BIT)
-    return seen & (values != float(torch.iinfo(depth.dtype).max)) if is_integer else seen
+    largest, values = _MAX_16_BIT, depth
+    if not depth.is_floating_point():
+        largest, values = float(torch.iinfo(depth.dtype).max), depth.double()
+    return values.isfinite() & (values > 0) & (values != _MAX_16_BIT) & (values != largest)
 
 
 def drop_channel(image: Image) -> Image:
@@ -60,63 +55,39 @@ def convert_depth(
     caller: str,
     stored: Tensor,
     intrinsics: Tensor | None,
-    *,
     depth_scale: float = 1.0,
     depth_kind: DepthKind = "z",
 ) -> Tensor:
     """Convert stored depth to meters along the optical axis, with 0 for missing depth.
 
-    Args:
-        caller: Function or file for messages.
-        stored: Depth images, shape ``(*, H, W)``, of any type of numbers and any memory layout.
-        intrinsics: Camera matrices, shape ``(*, 3, 3)``; needed only for ``"ray"``.
-        depth_scale: Depth units per meter: 1000 for millimeters, 1 for meters.
-        depth_kind: ``"z"`` for depth along the optical axis, ``"ray"`` for distances from the
-            camera center.
-
-    Returns:
-        Contiguous depth in the shape of ``stored``; float64 stays, integers become float32.
+    ``stored`` ``(*, H, W)`` has any memory layout; float64 stays, integers become float32.
+    ``intrinsics`` ``(*, 3, 3)`` are needed only for distances along the ray. ``caller`` is the
+    function or file for messages.
 
     Warns:
         DepthWarning: If the median depth is below 5 cm or above 20 m.
 
     Example:
         >>> stored = torch.tensor([[1500, 0, 65535]])
-        >>> convert_depth("f", stored, None, depth_scale=1000)
+        >>> convert_depth("f", stored, None, 1000)
         tensor([[1.5000, 0.0000, 0.0000]])
     """
     check_conversion(caller, depth_scale, depth_kind)
-    if stored.is_floating_point():
+    if stored.dtype == torch.bool or stored.is_floating_point() or stored.is_complex():
         check_floating(caller, depth=stored)
-    elif stored.dtype == torch.bool or stored.is_complex():
-        raise ShapeError(f"{caller}: expected depth of real numbers, got {stored.dtype}.")
     meters = torch.where(has_depth(stored), stored.double(), 0.0) / depth_scale
     if depth_kind == "ray" and intrinsics is not None:
-        meters = meters * _ray_cosines(intrinsics.to(stored.device), *stored.shape[-2:])
-    _check_median(caller, meters, depth_scale)
-    dtype = stored.dtype if stored.is_floating_point() else torch.float32
-    return meters.to(dtype).contiguous()
+        from kornia.geometry.depth import depth_to_3d_v2
 
-
-def _ray_cosines(intrinsics: Tensor, height: int, width: int) -> Tensor:
-    """Return the cosine between the optical axis and the ray of each pixel, ``(*, H, W)``."""
-    matrix = intrinsics.double()
-    columns = torch.arange(width, device=matrix.device)
-    rows = torch.arange(height, device=matrix.device)[:, None]
-    x = (columns - matrix[..., :1, 2:]) / matrix[..., :1, :1]
-    y = (rows - matrix[..., 1:2, 2:]) / matrix[..., 1:2, 1:2]
-    return (1 + x.square() + y.square()).rsqrt()
-
-
-def _check_median(caller: str, meters: Tensor, depth_scale: float) -> None:
-    """Warn if the median depth is implausible; a sample of the pixels suffices."""
+        meters = depth_to_3d_v2(meters, intrinsics.to(meters), normalize_points=True)[..., 2]
     valid = meters[meters > 0]
     median = float(valid[:: len(valid) // _SAMPLED + 1].median()) if len(valid) else 1.0
     if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:
-        warnings.warn(
+        warn(
             f"{caller}: expected a median depth of {_MIN_MEDIAN_DEPTH} to {_MAX_MEDIAN_DEPTH:g} m, "
             f"got {median:,.4g} m with --depth-scale (depth_scale) {depth_scale:g}; pass 1000 for "
             "millimeters, 1 for meters.",
             DepthWarning,
-            stacklevel=4,
         )
+    dtype = stored.dtype if stored.is_floating_point() else torch.float32
+    return meters.to(dtype).contiguous()

@@ -3,30 +3,35 @@
 import torch
 from torch import Tensor
 
+from torchrg._checks import is_concrete
+from torchrg.errors import ShapeError
+
 _MAX_ERROR = 1e-3
 """Maximum error of an entry of ``R @ R.T``. Poses in text files have at least four digits."""
 _MAX_ROW_ERROR = 1e-6
 """Maximum error of the last row, which programs write exactly."""
 
 
-def describe_fault(motions: Tensor) -> str:
-    """Return what is wrong with matrices ``(*, 4, 4)`` as rigid motions, otherwise "".
+def check_rigid(caller: str, name: str, motions: Tensor | None) -> None:
+    """Raise ShapeError if a matrix of ``(*, 4, 4)`` is not a rigid motion; None is skipped.
 
     A rigid motion turns and shifts: ``R @ R.T`` is the identity, the determinant of ``R`` is
     positive, and the last row is 0 0 0 1.
 
     Example:
-        >>> describe_fault(torch.eye(4)), describe_fault(torch.diag(torch.tensor([5.0, 5, 5, 1])))
-        ('', 'a rotation scaled by 5; divide it by 5')
+        >>> check_rigid("f", "pose", torch.diag(torch.tensor([5.0, 5, 5, 1])))
+        Traceback (most recent call last):
+            ...
+        torchrg.errors.ShapeError: f: expected pose to be rigid, got a rotation scaled by 5; ...
     """
-    for matrix in motions.detach().reshape(-1, 4, 4).double().cpu():
-        if fault := _describe_fault(matrix):
-            return fault
-    return ""
+    if motions is not None and is_concrete(motions):
+        for matrix in motions.detach().reshape(-1, 4, 4).double().cpu():
+            if fault := _describe_fault(matrix):
+                raise ShapeError(f"{caller}: expected {name} to be rigid, got {fault}.")
 
 
 def _describe_fault(matrix: Tensor) -> str:
-    """Implement :func:`describe_fault` for one matrix ``(4, 4)``."""
+    """Return what is wrong with a matrix ``(4, 4)`` as a rigid motion, otherwise ""."""
     turn, row = matrix[:3, :3], matrix[3]
     if not bool(matrix.isfinite().all()):
         return "values that are not finite"

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrg._checks import default_device_cpu
 from torchrg.errors import ConfigError
 from torchrg.linalg import eigh3_lapack, unit_direction
+from torchrg.linalg.rigid import check_rigid
 from torchrg.regions.fit import canonicalize_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
@@ -102,6 +103,7 @@ def transform_planes(planes: Planes, motion: Tensor) -> Planes:
         >>> transform_planes(table, motion).offset.tolist()
         [5.0]
     """
+    check_rigid("transform_planes", "motion", motion)
     dtype = planes.normal.dtype
     rotation, shift = motion[:3, :3].to(planes.normal.device), motion[:3, 3]
     shift = shift.to(planes.normal.device)
@@ -145,6 +147,7 @@ def transform_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
         >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
         ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
     """
+    check_rigid("transform_cloud", "motion", motion)
     rotation, coordinates, finite = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
     # Rotate about the cloud origin: large offsets would lose digits in the rotation.
     shift = motion[:3, 3].numpy() + rotation @ cloud.origin

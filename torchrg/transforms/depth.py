@@ -116,8 +116,8 @@ class DepthToCloud(DepthTransform):
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with the cloud."""
         depth, intrinsics, poses = self.read_images(sample)
-        scale, kind = self.depth_scale, self.depth_kind
-        depth = convert_depth("DepthToCloud", depth, intrinsics, depth_scale=scale, depth_kind=kind)
+        options = (self.depth_scale, self.depth_kind)
+        depth = convert_depth("DepthToCloud", depth, intrinsics, *options)
         images = depth_to_points(depth, intrinsics, poses)
         seen = images[..., 2].isfinite()
         pixel = torch.arange(depth[0].numel(), device=depth.device).view(depth.shape[1:])
