@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+import torchrg
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
+from torchrg.linalg import covariance
+from torchrg.robust.scale import median
 
 
 def test_letters_are_shared_between_arguments():
@@ -49,3 +52,21 @@ def test_other_things_are_refused(values):
 def test_mixed_precision_is_refused():
     with pytest.raises(ShapeError, match="a and b of one dtype, got float32 and float64"):
         check_floating("f", a=torch.zeros(1), b=torch.zeros(1, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.int64, torch.uint8])
+def test_masks_of_numbers_are_refused_with_the_repair(kind):
+    x = torch.randn(4, 9, 3, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(4, 9, dtype=kind)
+    calls = (
+        lambda mask: torchrg.nn.DetMCD()(x, mask),
+        lambda mask: torchrg.nn.FastMCD()(x, mask),
+        lambda mask: torchrg.nn.PatchNormals("pca")(x, mask),
+        lambda mask: torchrg.nn.Qn()(x[..., 0], mask),
+        lambda mask: median(x[..., 0], mask=mask),
+        lambda mask: covariance(x, mask),
+    )
+    for call in calls:
+        with pytest.raises(ShapeError, match=r"expected mask of bool, got .*; pass mask\.bool\(\)"):
+            call(mask)
+        call(mask.bool())

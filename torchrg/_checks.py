@@ -107,7 +107,7 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
 
     Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for a length
     that is equal in all patterns, a number for a fixed length, and a leading ``*`` for any leading
-    axes, equal in all patterns. None is skipped. A ``mask`` must be bool.
+    axes, equal in all patterns. None is skipped.
 
     Example:
         >>> check_shapes("f", patches=(torch.zeros(5, 8, 3), "* K 3"))
@@ -120,14 +120,18 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     for name, (tensor, pattern) in arguments.items():
         if tensor is None:
             continue
-        if name == "mask" and tensor.dtype != torch.bool:
-            dtype = str(tensor.dtype).removeprefix("torch.")
-            raise ShapeError(f"{caller}: expected mask of bool, got {dtype}; pass mask.bool().")
         shape, sizes = tuple(tensor.shape), dict(bound)
         if not _bind(shape, pattern.split(), bound):
             fixed = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in sizes.items())
             expected = f"({', '.join(pattern.split())})" + (f" with {fixed}" if fixed else "")
             raise ShapeError(f"{caller}: expected {name} of shape {expected}, got {shape}.")
+
+
+def check_mask(caller: str, mask: Tensor | None) -> None:
+    """Check that a mask is bool; None is skipped."""
+    if mask is not None and mask.dtype != torch.bool:
+        dtype = str(mask.dtype).removeprefix("torch.")
+        raise ShapeError(f"{caller}: expected mask of bool, got {dtype}; pass mask.bool().")
 
 
 def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, ...]]) -> bool:

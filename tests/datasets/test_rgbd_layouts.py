@@ -244,3 +244,15 @@ def test_layouts_are_found_by_what_is_there(tmp_path):
     (tmp_path / "capture").mkdir()
     with pytest.raises(FormatError, match=r"expected depth images \(.png .npy .pgm\), got none"):
         RGBDFrames.from_folder(tmp_path / "capture")
+
+
+def test_paths_of_windows_and_units_per_frame_are_read(tmp_path):
+    root = write_nerfstudio(tmp_path / "capture", scale=4000.0, depth_unit_scale_factor=0.00025)
+    shared = json.loads((root / "transforms.json").read_text())
+    for frame in shared["frames"]:
+        frame["depth_file_path"] = frame["depth_file_path"].replace("/", "\\")
+    write_text(root / "transforms.json", shared)
+    data = RGBDFrames.from_folder(root)
+    assert [scene.name for scene in data.scenes] == NAMES["nerfstudio"]
+    for sample, frame in zip(data, FRAMES, strict=True):
+        np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)

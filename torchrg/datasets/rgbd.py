@@ -124,13 +124,13 @@ class RGBDFrames(SceneDataset):
         *,
         transform: Transform | None = None,
     ) -> None:
-        if not all(isinstance(frame, RGBDFrame) for frame in frames):
+        is_path = isinstance(frames, os.PathLike)
+        if is_path or not all(isinstance(frame, RGBDFrame) for frame in frames):
             raise ConfigError(
                 f"RGBDFrames: expected a list of RGBDFrame, got {frames!r:.60}; use "
                 "RGBDFrames.from_folder for a folder."
             )
-        self.frames = tuple(frames)
-        self.transform = transform
+        self.frames, self.transform = tuple(frames), transform
         self.scenes = [SceneFiles(frame.name, frame.depth, frame.files) for frame in self.frames]
         first: dict[str, Path] = {}
         for number, (name, path, *_) in enumerate(self.scenes):
@@ -275,8 +275,9 @@ def _find_frames(
             if pose is not None and not bool((pose.abs() <= FARTHEST).all()):
                 pose = None  # Tracking was lost.
             options = (prefix + frame.name, frame.color, pose, kind, files, origin)
-            with wrap_errors(f"{[*files, root][-1]}: {frame.name}: ", ShapeError):
-                frames.append(RGBDFrame(frame.depth, matrix, scale, *options))
+            with wrap_errors(f"{[root, *files][-1]}: ", ShapeError):
+                check_rigid(frame.name, "pose", pose)
+            frames.append(RGBDFrame(frame.depth, matrix, scale, *options))
             listed.append(frame)
     num_lost = sum(frame.pose is None for frame in frames)
     if num_lost and any(frame.pose is not None for frame in listed):

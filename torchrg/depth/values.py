@@ -79,7 +79,10 @@ def convert_depth(
     if depth_kind == "ray" and intrinsics is not None:
         from kornia.geometry.depth import depth_to_3d_v2
 
-        meters = depth_to_3d_v2(meters, intrinsics.to(meters), normalize_points=True)[..., 2]
+        images = meters.reshape(-1, *meters.shape[-2:])
+        cameras = intrinsics.to(meters).reshape(-1, 3, 3)
+        points = depth_to_3d_v2(images, cameras, normalize_points=True)
+        meters = points[..., 2].reshape(meters.shape)
     valid = meters[meters > 0]
     median = float(valid[:: len(valid) // _SAMPLED + 1].median()) if len(valid) else 1.0
     if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._checks import check_floating, check_shapes
+from torchrg._checks import check_floating, check_mask, check_shapes
 from torchrg._parallel import allowed_threads
 from torchrg.linalg.eigen import smallest_eigenvector3
 
@@ -50,6 +50,7 @@ def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Ten
         (tensor([1., 2., 1.]), tensor([1., 4., 0.]))
     """
     check_shapes("covariance", patches=(patches, "* K P"), mask=(mask, "* K"))
+    check_mask("covariance", mask)
     check_floating("covariance", patches=patches)
     return covariance_of_columns(patches.unbind(dim=-1), mask)
 

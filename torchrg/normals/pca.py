@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._checks import check_floating, check_shapes, is_concrete
+from torchrg._checks import check_floating, check_mask, check_shapes, is_concrete
 from torchrg._parallel import CHUNK_SIZE, map_chunks, nonzero_rows
 from torchrg.config import NormalsConfig
 from torchrg.linalg import (
@@ -154,6 +154,7 @@ def check_patches(
 ) -> None:
     """Validate the arguments of a patch estimator; raise ShapeError if one is wrong."""
     check_shapes(caller, patches=(patches, "* K 3"), mask=(mask, "* K"))
+    check_mask(caller, mask)
     check_shapes(caller, patches=(patches[..., 0, 0], "*"), resolution=(resolution, "*"))
     check_floating(caller, patches=patches, resolution=resolution)
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._checks import Arguments, as_tensor, check_floating, check_shapes
+from torchrg._checks import Arguments, as_tensor, check_floating, check_mask, check_shapes
 from torchrg._opaque import opaque
 from torchrg._parallel import map_chunks
 from torchrg.errors import ConfigError
@@ -133,6 +133,7 @@ def fit_patchwise(
     patches = as_tensor(caller, "patches", patches)
     check_floating(caller, patches=patches)
     check_shapes(caller, patches=(patches, "* K P"), mask=(mask, "* K"))
+    check_mask(caller, mask)
     if not 0.5 <= support_fraction <= 1:
         raise ConfigError(
             f"{caller}: expected support_fraction from 0.5 to 1, got {support_fraction!r}."

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_floating, check_mask, check_shapes
 from torchrg._opaque import opaque
 from torchrg._parallel import CACHE_BYTES, map_chunks, map_rows
 from torchrg.errors import ShapeError
@@ -149,6 +149,7 @@ def _rows_along(
     x = as_tensor(caller, "x", x)
     check_floating(caller, x=x)
     check_shapes(caller, x=(x, "*"), mask=(mask, "*"))
+    check_mask(caller, mask)
     if not -x.dim() <= dim < x.dim():
         raise ShapeError(f"{caller}: expected x with an axis {dim}, got shape {tuple(x.shape)}.")
     return x.movedim(dim, -1), None if mask is None else mask.movedim(dim, -1)
