@@ -233,35 +233,35 @@ def _find_frames(
     for prefix, folder in find_recordings(root, layout):
         shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}
         for frame in layout.frames(folder):
-            place, own, files = frame.depth.parent, camera, tuple[Path, ...]()
+            images, chosen, files = frame.depth.parent, camera, tuple[Path, ...]()
             if camera is None and frame.camera is not None:
-                own, files = frame.camera, frame.sources[:1]
+                chosen, files = frame.camera, frame.sources[:1]
             elif camera is None:
-                if place not in shared:
-                    found = find_camera(place, root)
+                if images not in shared:
+                    found = find_camera(images, root)
                     built_in = layout.camera(folder) if layout.camera and not found else None
-                    shared[place] = (found[0], found[1:]) if found else (built_in, ())
-                own, files = shared[place]
+                    shared[images] = (found[0], found[1:]) if found else (built_in, ())
+                chosen, files = shared[images]
             origin = files[0].name if files else "given" if camera else f"built in, {name}"
-            scales = (depth_scale, *(c.depth_scale for c in (own, frame.camera) if c))
+            scales = (depth_scale, *(c.depth_scale for c in (chosen, frame.camera) if c))
             scale = next((value for value in scales if value is not None), None)
             # A layout has no unit of floating point.
             is_assumed = scale is None and frame.depth.suffix.lower() != ".npy"
             scale = layout.depth_scale if is_assumed else scale
-            is_known = own is frame.camera or any(f.match(sign) for f in files for sign in signs)
-            if own is None or scale is None:
+            is_known = chosen is frame.camera or any(f.match(sign) for f in files for sign in signs)
+            if chosen is None or scale is None:
                 missing, example = "depth_scale", "1000 for millimeters"
-                if own is None:
+                if chosen is None:
                     missing, example = "intrinsics", "fx,fy,cx,cy or a camera file"
                 raise ConfigError(
                     f"{frame.depth}: expected {missing}, which depth images do not store; pass it, "
                     f"{example}."
                 )
             if not camera and not files:
+                numbers = ",".join(f"{number:g}" for number in chosen[:4])
                 notes["camera"] = (
-                    f"{root}: using the built-in camera of {name}, "
-                    f"{','.join(f'{number:g}' for number in own[:4])}, for frames without a camera "
-                    "file; pass --intrinsics if they have another."
+                    f"{root}: using the built-in camera of {name}, {numbers}, for frames without a "
+                    "camera file; pass --intrinsics if they have another."
                 )
             elif is_assumed and not is_known:
                 notes["unit"] = (
@@ -269,7 +269,7 @@ def _find_frames(
                     f"camera of other origin ({origin}); pass --depth-scale (depth_scale), 1000 "
                     "for millimeters."
                 )
-            matrix, doubt = fit_camera(frame.depth, own, *files[:1])
+            matrix, doubt = fit_camera(frame.depth, chosen, *files[:1])
             notes[folder] = notes.get(folder) or doubt
             pose, files = frame.pose, tuple(dict.fromkeys((*files, *frame.sources)))
             if pose is not None and not bool((pose.abs() <= FARTHEST).all()):

@@ -305,14 +305,7 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
         yield ListedFrame(name, image, color, pose, (path,), camera)
 
 
-def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of 3RScan, ``frame-000000.depth.pgm``, and of others with ``_info.txt``."""
-    path = folder / "_info.txt"
-    camera = read_camera(path)
-    for frame in _named_frames("*.depth", "*.color", "*.pose.txt")(folder):
-        yield frame._replace(sources=(path, *frame.sources), camera=camera)
-
-
+_DOTTED_FRAMES = _named_frames("*.depth", "*.color", "*.pose.txt")
 FRAME_LAYOUTS = {
     "scannetpp": FrameLayout(
         _scannetpp_frames,
@@ -326,7 +319,9 @@ FRAME_LAYOUTS = {
         depth_scale=1000.0,
         locations=("", "*/", "*/*/", "*/*/*/"),
     ),
-    "3rscan": FrameLayout(_3rscan_frames, "_info.txt", locations=("", "*/", "*/sequence/")),
+    "3rscan": FrameLayout(
+        _DOTTED_FRAMES, "_info.txt", depth_scale=1000.0, locations=("", "*/", "*/sequence/")
+    ),
     "replica": FrameLayout(_replica_frames, "traj.txt"),
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
     "icl-nuim": FrameLayout(
@@ -340,7 +335,7 @@ FRAME_LAYOUTS = {
         signs=("intrinsic*_depth.txt", "intrinsic*/intrinsic*_depth.txt"),
     ),
     "7-scenes": FrameLayout(
-        _named_frames("*.depth", "*.color", "*.pose.txt"),
+        _DOTTED_FRAMES,
         "frame-*.depth.png",
         _fixed_camera(*_SEVEN_SCENES_INTRINSICS),
         1000.0,

@@ -66,11 +66,6 @@ def convert_depth(
 
     Warns:
         DepthWarning: If the median depth is below 5 cm or above 20 m.
-
-    Example:
-        >>> stored = torch.tensor([[1500, 0, 65535]])
-        >>> convert_depth("f", stored, None, 1000)
-        tensor([[1.5000, 0.0000, 0.0000]])
     """
     check_conversion(caller, depth_scale, depth_kind)
     if stored.dtype == torch.bool or stored.is_floating_point() or stored.is_complex():

@@ -31,7 +31,7 @@ def check_rigid(caller: str, name: str, motions: Tensor | None) -> None:
 
 
 def _describe_fault(matrix: Tensor) -> str:
-    """Return what is wrong with a matrix ``(4, 4)`` as a rigid motion, otherwise ""."""
+    """Return the reason why a matrix ``(4, 4)`` is not a rigid motion, otherwise ""."""
     turn, row = matrix[:3, :3], matrix[3]
     if not bool(matrix.isfinite().all()):
         return "values that are not finite"
