@@ -29,6 +29,7 @@ def messages_of(path: Path) -> Iterator[Message]:
             error, arguments = ast.unparse(node.exc.func), node.exc.args
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in (
             "warnings.warn",
+            "warn",
             "wrap_errors",
         ):
             error, arguments = ast.unparse(node.func), node.args[:1]

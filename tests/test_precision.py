@@ -10,9 +10,10 @@ from scipy.spatial import KDTree
 from torchrg import Cloud, estimate_normals, load_config, read_cloud, segment_planes, write_cloud
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.sources import CloudSource
+from torchrg.clouds import check_finite
 from torchrg.datasets import FolderOfClouds
 from torchrg.errors import PrecisionWarning
-from torchrg.precision import describe_steps
+from torchrg.precision import describe_placeholders, describe_steps
 from torchrg.transforms import SegmentPlanes
 
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -179,3 +180,20 @@ def test_reports_of_convert_and_info_say_it_too(places, tmp_path, run):
     report = convert_scan(Job(source, source.list_scans(tmp_path / "out")[0], tmp_path / "out"))
     assert [LINE in warning for warning in report.warnings] == [True]
     assert run("info", tmp_path / "scans" / "hall.npy").out.count(LINE) == 1
+
+
+@pytest.mark.parametrize(("count", "is_said"), [(0, False), (9, False), (10, True), (100, False)])
+def test_points_that_stand_for_missing_pixels_are_said(count, is_said):
+    points = np.random.default_rng(0).normal(size=(100, 3)) + 5
+    points[:count] = 0
+    points[-1, 0] = np.nan if count < 100 else 0
+    note = describe_placeholders(points)
+    assert note.startswith(f"{count} of 100 points lie at 0 0 0, as pixels") == is_said
+    assert bool(note) == is_said
+    notes = check_finite(Cloud(points))
+    assert sum("0 0 0" in text for text in notes) == is_said
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        segment_planes(torch.from_numpy(points))
+    said = [str(warning.message) for warning in caught if "0 0 0" in str(warning.message)]
+    assert len(said) == is_said

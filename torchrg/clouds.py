@@ -16,6 +16,7 @@ from torchrg.errors import CloudWarning, FormatError, PrecisionWarning
 from torchrg.io.tables import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.precision import describe_placeholders
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
 
@@ -135,6 +136,8 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
         )
     elif cloud.precision_note:
         notes.append(cloud.precision_note)
+    if placeholders := describe_placeholders(finite):
+        notes.append(placeholders)
     return tuple(notes)
 
 

@@ -5,6 +5,7 @@ the fix.
 """
 
 import sys
+import warnings
 
 __all__ = [
     "CloudWarning",
@@ -91,7 +92,7 @@ class MissingDependencyError(TorchrgError, ImportError):
 
 
 class PrecisionWarning(UserWarning):
-    """The rounding step of coordinates is coarse for the spacing of the points."""
+    """The rounding step of coordinates is coarse, or many points stand for missing ones."""
 
 
 class CloudWarning(UserWarning):
@@ -104,3 +105,15 @@ class UnitWarning(PrecisionWarning):
 
 class DepthWarning(UserWarning):
     """A camera or depth scale is assumed, or does not fit its depth image."""
+
+
+_LIBRARIES = {"torchrg", "torch", "contextlib", "functools"}
+"""Packages between a warning and the code of the user: decorators and ``nn.Module`` calls."""
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the user that called torchrg."""
+    level, frame = 2, sys._getframe(1)  # noqa: SLF001
+    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in _LIBRARIES:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,7 +16,7 @@ from torchrg import scratch
 from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
 from torchrg._parallel import return_freed_memory
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
-from torchrg.errors import CloudWarning, ConfigError, ShapeError
+from torchrg.errors import CloudWarning, ConfigError, ShapeError, warn
 from torchrg.io import read_cloud
 from torchrg.io.colors import read_colors
 from torchrg.neighbors import (
@@ -32,7 +31,7 @@ from torchrg.neighbors import (
 from torchrg.neighbors.knn import restrict_to_groups
 from torchrg.normals import ESTIMATORS
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
-from torchrg.precision import warn_about_steps
+from torchrg.precision import warn_about_coordinates
 from torchrg.regions import grow_regions, partition_points, summarize_planes
 from torchrg.regions.growth import needs_sampling, rank_by_count
 from torchrg.regions.kinds import find_kinds
@@ -159,7 +158,7 @@ def segment_planes(
         "segment_planes", points, orient, viewpoint=viewpoint, front=front
     )
     if not is_cloud:
-        warn_about_steps("segment_planes", points)
+        warn_about_coordinates("segment_planes", points)
     objects = None if within is None else as_tensor("segment_planes", "within", within)
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
     if objects is not None and (objects.is_floating_point() or objects.is_complex()):
@@ -309,12 +308,11 @@ def _segment(
 def _warn_about_size(num_points: int, k: int) -> None:
     """Warn if every neighborhood contains more than half of a cloud."""
     if _MIN_FITTED <= num_points < _MIN_NEIGHBORHOODS * k:
-        warnings.warn(
+        warn(
             f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
             f"neighborhoods of {k:,}, got {num_points:,}; add points, or reduce normals.k or the "
             "voxel size.",
             CloudWarning,
-            stacklevel=6,
         )
 
 
@@ -406,7 +404,7 @@ def make_superpoints(
     """
     tensor = as_tensor("make_superpoints", "points", points).detach()
     check_points("make_superpoints", tensor)
-    shades = _unit_colors("make_superpoints", tensor, colors, num_decorators=2)
+    shades = _unit_colors("make_superpoints", tensor, colors)
     seg = segment_planes(tensor, voxel=voxel, keep_neighbors=True) if seg is None else seg
     if len(seg.labels) != len(tensor):
         raise ShapeError(
@@ -438,14 +436,11 @@ def _unit_colors(
     caller: str,
     points: Tensor,
     colors: Colors | None,
-    *,
-    num_decorators: int,
 ) -> Tensor | None:
     """Return the colors of points in [0, 1], float64.
 
     Warns:
-        UserWarning: If the range was judged from the values, or some are clipped. The warning is
-            issued to the caller of a function with ``num_decorators`` decorators.
+        UserWarning: If the range was judged from the values, or some are clipped.
     """
     if colors is None:
         return None
@@ -454,7 +449,7 @@ def _unit_colors(
     shades = shades.float() if shades.dtype == torch.bfloat16 else shades
     found, notes = read_colors(caller, shades.cpu().numpy(), error=ConfigError)
     for note in notes:
-        warnings.warn(f"{caller}: {note}.", stacklevel=3 + num_decorators)
+        warn(f"{caller}: {note}.")
     unit = torch.from_numpy(found.astype(np.float64)) / np.iinfo(found.dtype).max
     return unit.to(points.device)
 
@@ -511,7 +506,7 @@ def segment_mesh(
                 f"segment_mesh: expected vertex indices in [0, {len(tensor):,}), got {low:,} to "
                 f"{high:,}; number the vertices from 0."
             )
-    shades = _unit_colors("segment_mesh", tensor, colors, num_decorators=1)
+    shades = _unit_colors("segment_mesh", tensor, colors)
     seg = segment_planes(tensor, config)
     parts = SuperpointsConfig(strengths=(_STRENGTH_OF_K * k_thresh,), min_size=seg_min_verts)
     return partition_points(tensor, seg.normals, seg.labels, parts, shades, corners).labels

@@ -5,14 +5,13 @@ be recovered.
 """
 
 import math
-import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.axes import describe_units
-from torchrg.errors import PrecisionWarning, UnitWarning
+from torchrg.errors import PrecisionWarning, UnitWarning, warn
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
 """Rounding steps, in spacings of the points, above which there is a note: for float32, and for the
@@ -27,14 +26,14 @@ _SAMPLE = 20_000
 _CELL = 32
 """Side of the cells of the sample, in spacings of a uniform surface. Seven of eight points are away
 from the boundary of their cell, outside of which the nearest point may be."""
+_MIN_PLACEHOLDERS = 10
+"""Number of points at 0 0 0 from which they count as pixels without depth. Fewer may be measured
+there."""
 _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791])
 """Factors of the cell hash: M. Teschner et al. Optimized spatial hashing for collision detection of
 deformable objects. VMV, 2003."""
 _MIXING = 0x9E3779B97F4A7C15
 """Odd factor next to 2^64 over the golden ratio, which spreads the hash over all 64 bits."""
-
-_ABOVE_DECORATORS = 5
-"""Number of stack frames from here to the caller of a function with two decorators."""
 
 
 def describe_steps(
@@ -89,15 +88,31 @@ def describe_steps(
     return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {fix}"
 
 
-def warn_about_steps(caller: str, points: Tensor) -> None:
-    """Warn about coarse steps and different units, at the caller of a decorated function."""
-    coordinates = points.detach().cpu().numpy()
-    note = describe_steps(
-        coordinates, fix="pass float64, or subtract an offset before it is float32"
+def describe_placeholders(points: NDArray[np.floating]) -> str:
+    """Return a note if many points lie at 0 0 0, where cameras put pixels without depth.
+
+    Example:
+        >>> describe_placeholders(np.arange(120).reshape(40, 3) // 60 * 1.0)
+        '20 of 40 points lie at 0 0 0, as pixels without depth do; remove them, or set them to NaN'
+    """
+    count = len(points) - int(np.count_nonzero(points.any(axis=1)))
+    if not _MIN_PLACEHOLDERS <= count < len(points):
+        return ""
+    return (
+        f"{count:,} of {len(points):,} points lie at 0 0 0, as pixels without depth do; remove "
+        "them, or set them to NaN"
     )
-    for kind, text in ((PrecisionWarning, note), (UnitWarning, describe_units(coordinates))):
-        if text:
-            warnings.warn(f"{caller}: {text}.", kind, stacklevel=_ABOVE_DECORATORS)
+
+
+def warn_about_coordinates(caller: str, points: Tensor) -> None:
+    """Warn about coarse steps, placeholders of missing points, and axes of different units."""
+    coordinates = points.detach().cpu().numpy()
+    fix = "pass float64, or subtract an offset before it is float32"
+    steps, missing = describe_steps(coordinates, fix=fix), describe_placeholders(coordinates)
+    for note in filter(None, (steps, missing)):
+        warn(f"{caller}: {note}.", PrecisionWarning)
+    if note := describe_units(coordinates):
+        warn(f"{caller}: {note}.", UnitWarning)
 
 
 def _spacing(points: NDArray[np.floating], side: float) -> float:

@@ -2,7 +2,6 @@
 
 import operator
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.axes import describe_units
-from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning
+from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning, warn
 from torchrg.precision import describe_steps
 
 __all__ = [
@@ -174,7 +173,7 @@ class Cloud:
         kinds = {UnitWarning: self.unit_note, PrecisionWarning: self.precision_note}
         for kind, note in kinds.items():
             if note:
-                warnings.warn(f"{self.source or 'Cloud'}: {note}.", kind, stacklevel=3)
+                warn(f"{self.source or 'Cloud'}: {note}.", kind)
         return self._local
 
     @cached_property

@@ -40,6 +40,8 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
     }
     turned = RGBDSource(tmp_path, settings, "images", camera, 9.0, orient="up")
     assert turned.describe()["orient"] == "up"
+    rays = RGBDSource(tmp_path, settings, "images", camera, 9.0, "ray")
+    assert rays.describe()["depth_kind"] == "ray"
     options = {"kind": "s3dis", "class_order": "spt", "superpoint": True, "orient": "auto"}
     write_room(tmp_path / "Area_5" / "a", {"floor_1": grid()})
     np.save(tmp_path / "a.npy", grid())

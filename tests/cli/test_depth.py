@@ -282,7 +282,7 @@ def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, 
     frame.rename(root / frame.name)
     flags = [*CAMERA[:3], scale]
     reported = (
-        f"frame.png: expected a median depth of 0.05 to 100 m, got {median} with --depth-scale "
+        f"frame.png: expected a median depth of 0.05 to 20 m, got {median} with --depth-scale "
     )
     for command in (
         ("depth", root / frame.name, "--out", tmp_path / "labels.png"),
@@ -311,7 +311,7 @@ def test_a_cloud_is_checked_against_a_camera_that_is_given(tmp_path, depth, run)
         error = run("depth", source, "--intrinsics", camera, *out).err.splitlines()[-1]
         assert "scan.pcd: --intrinsics do not match the points" in error
     done = run("depth", source, "--depth-scale", "1000", *out)
-    assert "--depth-scale is ignored for point clouds" in done.err
+    assert "--depth-scale and --depth-kind are ignored for point clouds" in done.err
 
 
 def test_segment_says_where_depth_images_went(tmp_path, frame, run):
@@ -333,3 +333,41 @@ def test_segment_says_where_depth_images_went(tmp_path, frame, run):
     for picture in (["--picture", "a.png"], ["--picture=a.png"]):
         error = run("segment", tmp_path / "no.pcd", "--out", tmp_path, *picture).error
         assert "no.pcd: file not found" in error
+
+
+@pytest.mark.parametrize("kind", ["z", "ray"])
+def test_missing_pixels_and_rays_are_converted_at_every_door(tmp_path, depth, run, kind):
+    stored = (depth.double() * 1000).round()
+    rays = points_of(torch.ones_like(depth).double()).norm(dim=-1).view(60, 80)
+    stored = stored * rays if kind == "ray" else stored
+    stored[depth == 0] = 65535
+    root, flags = tmp_path / "in", [*CAMERA[:4], "--depth-kind", kind]
+    root.mkdir()
+    np.save(root / "0.npy", stored.numpy())
+    assert run("depth", root / "0.npy", *flags, "--out", tmp_path / "a.npz").err == ""
+    assert run("depth", root, *flags, "--out", tmp_path / "b.npz").err == ""
+    assert run("convert", "rgbd", root, tmp_path / "c", *flags, "--workers", "1").err == ""
+    expected = segment_depth(depth, INTRINSICS).labels
+    for name in ("a.npz", "b.npz"):
+        with np.load(tmp_path / name) as found:
+            np.testing.assert_array_equal(found["labels"], expected.flatten())
+            np.testing.assert_allclose(found["plane_offset"], [2.0, 2.5], rtol=1e-6)
+            assert json.loads(str(found["provenance"]))["pose"] == "camera"
+    np.testing.assert_array_equal(np.load(tmp_path / "c/0/plane.npy"), expected)
+    record = json.loads((tmp_path / "c/0/provenance.json").read_text())
+    assert record["measured"]["pose"] == "camera"
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".jpg", ".pfm", ".raw", ""])
+def test_other_forms_of_images_are_answered_with_those_that_are_read(tmp_path, run, suffix):
+    (tmp_path / f"image{suffix}").write_bytes(b"no depth")
+    error = run("depth", tmp_path / f"image{suffix}", *CAMERA, "--out", tmp_path / "a.png").error
+    assert f"expected a depth image that ends in one of .png .npy .pgm, got '{suffix}'" in error
+    assert "convert it to a 16-bit .png, or save its values with numpy.save" in error
+
+
+def test_a_panorama_is_doubted(tmp_path, run):
+    np.save(tmp_path / "a.npy", np.full((40, 80), 2.0))
+    flags = ["--intrinsics", "40,40,39.5,19.5", "--depth-scale", "1", "--out", tmp_path / "a.png"]
+    error = run("depth", tmp_path / "a.npy", *flags).err
+    assert "of a panorama, by its ratio of 2:1; project it to perspective images" in error

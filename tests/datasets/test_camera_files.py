@@ -8,7 +8,7 @@ import torch
 
 from torchrg.datasets.camera_files import read_camera
 from torchrg.depth.camera import Pinhole, depth_to_points
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, DepthWarning, FormatError
 
 CAMERA = Pinhole(525.0, 526.0, 319.5, 239.5, (640, 480))
 SIZE = {"width": 640, "height": 480}
@@ -136,3 +136,96 @@ def test_sizes_may_differ_by_a_rounded_pixel():
     with pytest.raises(ConfigError, match="got 224 x 172; pass the camera of the depth images"):
         camera.matrix((224, 172))
     assert torch.equal(camera._replace(size=None).matrix((999, 500)), camera.matrix())
+
+
+NAMED = {"fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5}
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [
+        ("640 480 525 526 319.5 239.5", (640, 480)),
+        ("525 526 319.5 239.5 640 480", (640, 480)),
+        ("525 526 319.5 239.5", None),
+    ],
+)
+def test_the_order_of_unnamed_numbers_is_that_of_a_centered_axis(tmp_path, text, size):
+    path = tmp_path / "camera.txt"
+    path.write_text(text)
+    assert read_camera(path) == CAMERA._replace(size=size)
+
+
+@pytest.mark.parametrize("lens", ["0.1 -0.2 0 0", "0.1 -0.2 0 0 0", "0.1 -0.2 0 0 0.3"])
+def test_unnamed_numbers_of_a_lens_are_told(tmp_path, lens):
+    path = tmp_path / "calibration.txt"
+    path.write_text(f"525 526 319.5 239.5 {lens}\n")
+    with pytest.warns(DepthWarning, match=r"lens distortion \(k1, k2(, k3)?\) is not corrected"):
+        assert read_camera(path) == CAMERA._replace(size=None)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "scale"),
+    [
+        ("depth_scale", 1000.0, 1000),
+        ("depth_scale", 0.001, 1000),
+        ("depth_scale", 1, 1),
+        ("depth_unit_scale_factor", 0.0002, 5000),
+        ("DepthMapFactor", 5000.0, 5000),
+        ("png_depth_scale", 6553.5, 6553.5),
+    ],
+)
+def test_depth_units_are_units_per_meter_or_meters_per_unit(tmp_path, name, value, scale):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({**NAMED, name: value}))
+    assert read_camera(path).depth_scale == pytest.approx(scale, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"is_fisheye": True},
+        {"camera_model": "OPENCV_FISHEYE"},
+        {"distortion_model": "equidistant"},
+        {"Camera.type": "KannalaBrandt8"},
+    ],
+)
+def test_cameras_that_are_no_pinhole_are_refused(tmp_path, more):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({**NAMED, **more}))
+    with pytest.raises(
+        FormatError, match=r"expected images of a pinhole camera, got .*; undistort"
+    ):
+        read_camera(path)
+    (name,) = more
+    path.write_text(json.dumps({**NAMED, name: False}))
+    assert read_camera(path)[:4] == CAMERA[:4]
+
+
+@pytest.mark.parametrize("name", ["fx", "cy", "width", "depth_scale", "K"])
+def test_a_boolean_is_no_number(tmp_path, name):
+    path = tmp_path / "camera.json"
+    record = {"K": [525, 0, 320, 0, 525, True, 0, 0, 1]}
+    if name != "K":
+        record = {**NAMED, **SIZE, name: True}
+    path.write_text(json.dumps(record))
+    with pytest.raises(FormatError, match=f"expected (a number for )?{name}.*, got .*True"):
+        read_camera(path)
+
+
+def test_a_damaged_line_is_named_with_the_way_out(tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text("%YAML:1.0\nfx: 525\nfy: 526\ncx: 'open\ncy: 239.5\n")
+    with pytest.raises(FormatError) as raised:
+        read_camera(path)
+    (line,) = str(raised.value).splitlines()
+    assert line.startswith(f"{path}: expected JSON or YAML, got: ")
+    assert "line 4" in line
+    assert "cx: 'open" in line
+    assert line.endswith("; correct it, or pass --intrinsics fx,fy,cx,cy.")
+
+
+def test_names_without_a_blank_are_read_as_opencv_reads_them(tmp_path):
+    path = tmp_path / "camera.yaml"
+    lines = [f"Camera1.{name}:{value}" for name, value in NAMED.items()]
+    path.write_text("\n".join(["%YAML:1.0", *lines, "Viewer.PointSize:2", "Window:-.5"]))
+    assert read_camera(path)[:4] == CAMERA[:4]

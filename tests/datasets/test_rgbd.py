@@ -1,6 +1,9 @@
 """Depth frames from the folders of public data sets."""
 
+import json
 import math
+import warnings
+from pathlib import Path
 
 import kornia_rs
 import numpy as np
@@ -12,12 +15,16 @@ from torchrg.batch.sources import RGBDSource
 from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import read_color, read_depth
-from torchrg.depth.camera import make_intrinsics
-from torchrg.errors import ConfigError, FormatError, ShapeError
+from torchrg.depth.camera import Pinhole, make_intrinsics
+from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError
 from torchrg.render import write_png
 from torchrg.transforms import DepthToCloud
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*using the built-in camera")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*using the built-in camera"),
+    pytest.mark.filterwarnings("ignore:.*using the depth unit"),
+    pytest.mark.filterwarnings("ignore:.*frames have no pose"),
+]
 HALF = math.sqrt(0.5)
 # A quarter turn about z, as x y z w, and as a matrix.
 CAMERA = make_intrinsics(5.0, 5.0, 2.5, 1.5)
@@ -87,9 +94,7 @@ def test_tum_frames_are_matched_in_time(tum):
 
 def test_the_camera_of_tum_is_not_guessed(tum):
     other = tum.rename(tum.parent / "desk")
-    with pytest.raises(
-        ConfigError, match="desk: expected intrinsics, because the folder name contains none of"
-    ):
+    with pytest.raises(ConfigError, match=r"1.0.png: expected intrinsics, which depth images do"):
         RGBDFrames.from_folder(other, "tum")
     data = RGBDFrames.from_folder(other, "tum", intrinsics=CAMERA.float(), depth_scale=1000)
     assert data[0]["depth"].max() == 5
@@ -205,7 +210,7 @@ def test_wrong_files_are_refused(tmp_path, tum):
         with pytest.raises(FormatError, match=f"{name}: {message}"):
             read_depth(tmp_path / name, depth_scale=1000)
     with pytest.raises(ConfigError, match="expected depth_scale > 0"):
-        read_depth(tmp_path / "color.png", depth_scale=0)
+        read_depth(tum / "depth" / "1.0.png", depth_scale=0)
     with pytest.raises(FormatError, match=r"text.png: expected a PNG or JPEG image"):
         read_color(tmp_path / "text.png")
     for name, text, message in (
@@ -232,7 +237,7 @@ def test_wrong_folders_are_refused(tmp_path):
     with pytest.raises(FormatError, match="expected depth images"):
         RGBDFrames.from_folder(tmp_path, "images", intrinsics=camera, depth_scale=1)
     write_depth(tmp_path / "depth" / "0.png", 1500)
-    with pytest.raises(FormatError, match=r"expected intrinsic/intrinsic_depth.txt or intrinsics_"):
+    with pytest.raises(ConfigError, match=r"expected intrinsics, which depth images do not store"):
         RGBDFrames.from_folder(tmp_path, "scannet")
     write_text(tmp_path / "intrinsic" / "intrinsic_depth.txt", "1 2 3\n")
     with pytest.raises(FormatError, match=r"_depth.txt: expected a matrix of .*, got 3 numbers"):
@@ -298,3 +303,126 @@ def test_a_frame_that_is_missing_fails_alone(tum, tmp_path):
     assert reports[0].reason.startswith(f"{tum / 'depth' / '1.0.png'}: ")
     assert reports[2].reason.startswith(f"{tum / long}.png: ")
     assert [report.details for report in reports] == [""] * 3
+
+
+@pytest.mark.parametrize("given", ["folder", Path("folder"), ["a.png"]])
+def test_a_folder_in_place_of_frames_is_refused_with_the_right_call(given):
+    message = "RGBDFrames: expected a list of RGBDFrame, got .*; use RGBDFrames.from_folder"
+    with pytest.raises(ConfigError, match=message):
+        RGBDFrames(given)
+    assert len(RGBDFrames([])) == 0
+
+
+def test_numpy_cameras_are_cameras(tum):
+    given = RGBDFrames.from_folder(tum, intrinsics=CAMERA.numpy())[0]["intrinsics"]
+    assert torch.equal(given, CAMERA)
+
+
+@pytest.mark.parametrize("layout", ["images", "scannet", "tum", "7-scenes"])
+def test_the_largest_value_is_no_depth_in_every_layout(tmp_path, layout):
+    root = tmp_path / "scene"
+    name = {"7-scenes": "frame-000000.depth.png"}.get(layout, "depth/0.png")
+    write_depth(root / name, 2000)
+    image = torch.full((4, 6), 2000)
+    image[2:] = 65535
+    write_png(root / name, image)
+    write_text(root / "depth.txt", "0 depth/0.png\n")
+    data = RGBDFrames.from_folder(root, layout, intrinsics=CAMERA, depth_scale=1000.0)
+    assert data[0]["depth"].flatten().unique().tolist() == [0, 2]
+    assert not data[0]["depth"][0, 2:].any()
+
+
+def test_names_listed_on_windows_are_found(tum):
+    for name in ("depth.txt", "rgb.txt"):
+        text = (tum / name).read_text()
+        write_text(tum / name, text.replace("/", "\\"))
+    data = RGBDFrames.from_folder(tum, "tum", intrinsics=CAMERA)
+    assert [frame.name.split("/")[-1] for frame in data.frames] == ["1.0", "2.0"]
+    assert data[0]["color"].shape == (3, 4, 6)
+
+
+def test_distances_along_the_ray_are_read_as_depth(tmp_path):
+    rows, columns = np.mgrid[:4, :6]
+    lengths = np.sqrt(((columns - 2.5) / 5) ** 2 + ((rows - 1.5) / 5) ** 2 + 1)
+    np.save(tmp_path / "a.npy", 2 * lengths)
+    options = {"intrinsics": CAMERA, "depth_scale": 1.0}
+    data = RGBDFrames.from_folder(tmp_path, "images", **options, depth_kind="ray")
+    torch.testing.assert_close(data[0]["depth"], torch.full((1, 4, 6), 2.0))
+    with pytest.raises(ConfigError, match="RGBDFrame: expected depth_kind to be one of z, ray"):
+        RGBDFrames.from_folder(tmp_path, "images", **options, depth_kind="euclid")
+
+
+def messages_of(caught):
+    return [str(warning.message) for warning in caught]
+
+
+@pytest.mark.parametrize("camera", ["flag", "file", "built in", "file with a unit", "flags"])
+def test_a_unit_of_the_layout_with_another_camera_is_said_once(tum, camera):
+    text = {"file": "", "file with a unit": "DepthMapFactor: 1000\n"}.get(camera)
+    if text is not None:
+        write_text(tum / "camera.yaml", f"fx: 5\nfy: 5\ncx: 2.5\ncy: 1.5\n{text}")
+    options = {"intrinsics": CAMERA} if camera.startswith("flag") else {}
+    options |= {"depth_scale": 1000.0} if camera == "flags" else {}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        RGBDFrames.from_folder(tum, **options)
+    said = [text for text in messages_of(caught) if "depth unit" in text]
+    assert len(said) == (camera in ("flag", "file"))
+    for text in said:
+        origin = "given" if camera == "flag" else "camera.yaml"
+        assert text.startswith(f"{tum}: using the depth unit of tum, 5000 units per meter, with a ")
+        assert f"({origin}); pass --depth-scale (depth_scale), 1000 for millimeters" in text
+
+
+def test_the_unit_of_scannet_goes_with_its_own_camera_file(tmp_path):
+    root = tmp_path / "scene0000_00"
+    write_depth(root / "depth" / "0.png", 1500, (480, 640))
+    np.savetxt(root / "intrinsics_depth.txt", np.diag([577.0, 577, 1]) + np.eye(3, k=2) * 320)
+    for given, count in (({}, 0), ({"intrinsics": make_intrinsics(577, 577, 320, 240)}, 1)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            RGBDFrames.from_folder(root, "scannet", **given)
+        assert sum("depth unit of scannet" in text for text in messages_of(caught)) == count
+
+
+@pytest.mark.parametrize("pose", ["-inf", "nan", "missing"])
+def test_frames_without_the_poses_of_others_are_counted(tmp_path, pose):
+    root = tmp_path / "seq-01"
+    for number in range(3):
+        write_depth(root / f"frame-{number:06d}.depth.png", 2500)
+        write_text(root / f"frame-{number:06d}.pose.txt", POSE_ROWS)
+    path = root / "frame-000001.pose.txt"
+    path.unlink() if pose == "missing" else path.write_text(f"{pose} {pose} 1 1\n" * 4)
+    with pytest.warns(DepthWarning, match=f"{tmp_path}: 1 of 3 frames have no pose; their results"):
+        frames = RGBDFrames.from_folder(tmp_path, "7-scenes").frames
+    assert [frame.pose is None for frame in frames] == [False, True, False]
+    for path in root.glob("*.pose.txt"):
+        path.unlink()
+    with warnings.catch_warnings(record=True) as caught:
+        RGBDFrames.from_folder(tmp_path, "7-scenes")
+    assert not any("no pose" in text for text in messages_of(caught))
+
+
+def test_a_pose_that_is_no_motion_is_refused_with_its_file(tmp_path):
+    root = tmp_path / "seq-01"
+    write_depth(root / "frame-000000.depth.png", 2500)
+    write_text(root / "frame-000000.pose.txt", "5 0 0 1\n0 5 0 1\n0 0 5 1\n0 0 0 1\n")
+    message = (
+        r"000000\.pose\.txt: frame-000000: expected pose to be rigid, got a rotation scaled by 5"
+    )
+    with pytest.raises(FormatError, match=message):
+        RGBDFrames.from_folder(tmp_path, "7-scenes")
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_the_record_says_in_which_frame_results_are(tmp_path, posed):
+    root = tmp_path / "seq-01"
+    write_depth(root / "frame-000000.depth.png", 2500, (24, 36))
+    if posed:
+        write_text(root / "frame-000000.pose.txt", POSE_ROWS)
+    source = RGBDSource(tmp_path, DepthConfig(), "7-scenes", intrinsics=Pinhole(30, 30, 17.5, 11.5))
+    (scan,) = source.list_scans(tmp_path / "out")
+    report = convert_scan(Job(source, scan, tmp_path / "out"))
+    record = json.loads((tmp_path / "out" / scan.name / "provenance.json").read_text())
+    expected = "world" if posed else "camera"
+    assert record["measured"]["pose"] == report.measured["pose"] == expected

@@ -16,11 +16,13 @@ from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.depth.camera import make_intrinsics
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*using the depth unit of")
 WIDTH, HEIGHT = 32, 24
 FX, FY, CX, CY = 30.0, 31.0, 16.25, 11.5
 K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
 K4 = np.eye(4)
 K4[:3, :3] = K
+POSE = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, 1, 2], [0, 0, 0, 1]])
 FLAT = " ".join(map(str, K4.ravel()))
 
 
@@ -59,7 +61,10 @@ Camera.cy: {CY}
 Camera.k1: 0.0
 Camera.width: {WIDTH}
 Camera.height: {HEIGHT}
-DepthMapFactor: 2000.0
+Camera.type: "PinHole"
+DepthMapFactor:\t2000.0
+Viewer.PointSize:2
+Viewer.ViewpointY:-0.7
 """
 OPENCV = f"""%YAML:1.0
 ---
@@ -85,11 +90,7 @@ NICE_SLAM = f"""cam: # of all scenes
   cy: {CY}
   png_depth_scale: 2000.0
 """
-KALIBR = f"""cam0:
-  camera_model: pinhole
-  intrinsics: [{FX}, {FY}, {CX}, {CY}]
-  resolution: [{WIDTH}, {HEIGHT}]
-"""
+OPEN3D = {"intrinsic_matrix": K.T.ravel().tolist(), "depth_scale": 2000.0}
 COLMAP = f"# Camera list\n1 PINHOLE {WIDTH} {HEIGHT} {FX} {FY} {CX + 0.5} {CY + 0.5}\n"
 LARGER = [2 * FX, 0, 0, 0, 2 * FY, 0, 2 * CX + 0.5, 2 * CY + 0.5, 1]
 SIZES = {"w": 2 * WIDTH, "h": 2 * HEIGHT}
@@ -116,10 +117,16 @@ FILES = {
     "camera.yaml": ORB_SLAM,
     "calibration.yml": OPENCV,
     "cam.yaml": NICE_SLAM,
-    "camera.yml": KALIBR,
+    "cam.json": OPEN3D,
+    "cam_info.json": {**REALSENSE, "depth_scale": 0.0005, "model": "Azure NFOV"},
+    "cam-params.json": {**NERFSTUDIO, "depth_unit_scale_factor": 0.0005, "is_fisheye": False},
+    "camera-params.txt": f"{FX} {FY} {CX} {CY} {WIDTH} {HEIGHT}",
+    "calib.txt": f"{FX} {FY} {CX} {CY} 0 0 0 0 0",
 }
 """Camera files of other programs, all of one camera, by names that they have."""
-SCALES = {"info.txt": 2000, "camera.yaml": 2000, "cam.yaml": 2000}
+SCALES = dict.fromkeys(
+    ["info.txt", "camera.yaml", "cam.yaml", "cam.json", "cam_info.json", "cam-params.json"], 2000
+)
 """Stored values of one meter that files name; it is 1000 in others."""
 
 
@@ -202,7 +209,7 @@ def test_the_record_names_the_camera_and_a_new_file_changes_the_input(scene, tmp
     record = json.loads((job.folder / "provenance.json").read_text())
     # The camera is that of 640 x 480 pixels; the centers of pixels are scaled.
     camera = {"intrinsics": "29.25,29.25,15.525,11.525", "camera": "built in, 7-scenes"}
-    assert record["measured"] == {**camera, "depth_scale": 1000.0}
+    assert record["measured"] == {**camera, "depth_scale": 1000.0, "pose": "camera"}
     np.savetxt(scene / "camera-intrinsics.txt", K)
     jobs = list_jobs(source, tmp_path / "out")
     assert [*make_plan(jobs).reasons.values()] == ["input changed"]
@@ -257,7 +264,7 @@ def tasks(tmp_path):
     np.savetxt(scan / "intrinsics_depth.txt", K4)
     np.savetxt(scan / "intrinsics_color.txt", 2 * K4)
     (scan / "pose").mkdir()
-    np.savetxt(scan / "pose" / "000000.txt", K4)
+    np.savetxt(scan / "pose" / "000000.txt", POSE)
     return scan
 
 
@@ -267,7 +274,7 @@ def test_labels_and_objects_of_scannets_frames_are_not_depth(tasks, layout, up):
     frame = only_frame((tasks, *tasks.parents)[up], layout)
     assert frame.depth == tasks / "depth" / "000000.png"
     assert frame.intrinsics[0].tolist() == [FX, 0, CX]
-    assert frame.pose.tolist() == K4.tolist()
+    assert frame.pose.tolist() == POSE.tolist()
     assert frame.depth_scale == 1000
 
 

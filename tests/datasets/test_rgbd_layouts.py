@@ -22,7 +22,7 @@ from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrames
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.depth.camera import unproject_image
-from torchrg.errors import FormatError
+from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.pipeline import segment_planes
 
 NAMES = {
@@ -184,7 +184,8 @@ def test_an_image_of_replica_beyond_its_poses_has_none(tmp_path):
     root = WRITERS["replica"](tmp_path / "capture")
     images = root / "room0" / "results"
     shutil.copy(images / "depth000001.png", images / "depth000002.png")
-    data = RGBDFrames.from_folder(root)
+    with pytest.warns(DepthWarning, match=f"{root}: 1 of 3 frames have no pose; their results"):
+        data = RGBDFrames.from_folder(root)
     assert [sample["name"] for sample in data] == [f"room0/{i:06d}" for i in range(3)]
     assert ["pose" in sample for sample in data] == [True, True, False]
     assert torch.equal(data[2]["depth"], data[1]["depth"])
@@ -210,7 +211,7 @@ def test_other_captures_say_what_they_lack(tmp_path):
     write_text(iphone / "pose_intrinsic_imu.json", {"frame_000000": records["frame_000000"]})
     (roots["replica"] / "cam_params.json").unlink()
     info = roots["3rscan"] / "0988ea72" / "sequence" / "_info.txt"
-    info.write_text(info.read_text().replace("m_depthShift", "m_shift"))
+    info.write_text(info.read_text().replace("m_calibrationDepth", "m_calibration"))
     for name, message in (
         ("arkitscenes", "lowres_wide.traj: expected time rx ry rz tx ty tz in each row"),
         (
@@ -218,12 +219,12 @@ def test_other_captures_say_what_they_lack(tmp_path):
             "pose_intrinsic_imu.json: expected an entry for frame_000010, which has depth",
         ),
         ("replica", "cam_params.json: cannot be read: No such file"),
-        ("3rscan", "_info.txt: expected a number for m_depthShift, got None; add it"),
+        ("3rscan", "000000.depth.pgm: expected intrinsics, which depth images do not store; pass"),
     ):
-        with pytest.raises(FormatError, match=message):
+        with pytest.raises((FormatError, ConfigError), match=message):
             RGBDFrames.from_folder(roots[name])
     (scan / "lowres_wide.traj").unlink()
-    with pytest.raises(FormatError, match=r"pincam: expected width height fx fy cx cy in each row"):
+    with pytest.raises(FormatError, match=r"pincam: expected a matrix of .* got 3 numbers; pass"):
         RGBDFrames.from_folder(roots["arkitscenes"])
     (iphone / "depth").rename(iphone / "depth.bin")
     with pytest.raises(
@@ -243,3 +244,15 @@ def test_layouts_are_found_by_what_is_there(tmp_path):
     (tmp_path / "capture").mkdir()
     with pytest.raises(FormatError, match=r"expected depth images \(.png .npy .pgm\), got none"):
         RGBDFrames.from_folder(tmp_path / "capture")
+
+
+def test_paths_of_windows_and_units_per_frame_are_read(tmp_path):
+    root = write_nerfstudio(tmp_path / "capture", scale=4000.0, depth_unit_scale_factor=0.00025)
+    shared = json.loads((root / "transforms.json").read_text())
+    for frame in shared["frames"]:
+        frame["depth_file_path"] = frame["depth_file_path"].replace("/", "\\")
+    write_text(root / "transforms.json", shared)
+    data = RGBDFrames.from_folder(root)
+    assert [scene.name for scene in data.scenes] == NAMES["nerfstudio"]
+    for sample, frame in zip(data, FRAMES, strict=True):
+        np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)

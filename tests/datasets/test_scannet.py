@@ -219,6 +219,11 @@ def groups(**changes):
         ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}nan", "expected 16 finite numbers"),
         ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}1e400", "expected 16 finite numbers"),
         ("scene0010_00.txt", f"axisAlignment = {'0 ' * 15}", "expected 16 finite numbers"),
+        (
+            "scene0010_00.txt",
+            f"axisAlignment = {'0 ' * 15}1",
+            ".* to be rigid, got a rotation of z",
+        ),
     ],
 )
 def test_annotations_that_are_none_are_refused_by_file_and_place(tree, name, content, message):

@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchrg import align_axes, segment_planes
-from torchrg.errors import ConfigError
+from torchrg import Cloud, align_axes, segment_planes
+from torchrg.errors import ConfigError, ShapeError
 from torchrg.regions import summarize_planes
-from torchrg.regions.axes import transform_planes
+from torchrg.regions.axes import transform_cloud, transform_planes
 from torchrg.structures import PLANE_COLUMNS, Planes
 
 
@@ -149,3 +149,13 @@ def test_tables_are_moved_as_if_made_of_moved_points(room):
     owners = [i for i, rings in enumerate(moved.outline) for _ in rings]
     for owner, ring in zip(owners, rings, strict=True):
         assert torch.allclose(ring @ moved.normal[owner], moved.offset[owner], atol=1e-6)
+
+
+def test_only_rigid_motions_move_planes_and_clouds():
+    floor = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
+    planes = segment_planes(floor, "classic").planes
+    scaled = torch.diag(torch.tensor([2.0, 2, 2, 1])).double()
+    with pytest.raises(ShapeError, match="transform_planes: expected motion to be rigid, got a ro"):
+        transform_planes(planes, scaled)
+    with pytest.raises(ShapeError, match="transform_cloud: expected motion to be rigid, got a rot"):
+        transform_cloud(Cloud(floor.numpy()), scaled)

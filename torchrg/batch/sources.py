@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -23,9 +23,10 @@ from torchrg.datasets.layouts import check_layout, check_stems, note_on_origin, 
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.pointcept import SOURCE_ARRAYS, write_results
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
-from torchrg.datasets.rgbd_files import num_pixels, read_depth
+from torchrg.datasets.rgbd_files import num_pixels
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole, format_intrinsics, unproject_image
+from torchrg.depth.values import DepthKind
 from torchrg.errors import FormatError
 from torchrg.normals.orient import Orientation
 from torchrg.structures import Segmentation
@@ -186,6 +187,7 @@ class RGBDSource(Source):
         layout: Layout of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
         intrinsics: The camera. Default: from a camera file, or the layout's.
         depth_scale: Depth units per meter. Default: from a camera file, or the layout's.
+        depth_kind: Meaning of the stored values; see :func:`torchrg.depth.values.convert_depth`.
         orient: Orientation of normals; see :func:`torchrg.depth.segment_depth`.
     """
 
@@ -194,6 +196,7 @@ class RGBDSource(Source):
     layout: str
     intrinsics: Pinhole | None = None
     depth_scale: float | None = None
+    depth_kind: DepthKind = "z"
     orient: Orientation = "auto"
     table: str | None = None
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
@@ -206,14 +209,15 @@ class RGBDSource(Source):
             "intrinsics": self.intrinsics,
             "depth_scale": self.depth_scale,
             "orient": self.orient,
+            **({} if self.depth_kind == "z" else {"depth_kind": self.depth_kind}),
         }
 
     def list_scans(self, out: Path) -> list[SceneFiles]:
         """Return the frames in natural order."""
         check_outside(self.root, out)
-        data = RGBDFrames.from_folder(
-            self.root, self.layout, intrinsics=self.intrinsics, depth_scale=self.depth_scale
-        )
+        names = ("layout", "intrinsics", "depth_scale", "depth_kind")
+        options: dict[str, Any] = {name: getattr(self, name) for name in names}
+        data = RGBDFrames.from_folder(self.root, **options)
         # A wrong scale affects all frames, so warn before the work.
         with suppress(FormatError, OSError):
             data.read_sample(0)
@@ -233,7 +237,7 @@ class RGBDSource(Source):
         begin("read")
         frame = _from_plain(scan.item)
         with collecting_notes() as notes:
-            depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
+            depth = frame.read_depth()
         if not bool((depth > 0).any()):
             raise FormatError(
                 f"{frame.depth}: expected pixels with depth, got none; remove this frame."
@@ -258,6 +262,7 @@ class RGBDSource(Source):
                 "intrinsics": format_intrinsics(frame.intrinsics),
                 "camera": frame.origin,
                 "depth_scale": frame.depth_scale,
+                "pose": "camera" if frame.pose is None else "world",
             },
         )
 

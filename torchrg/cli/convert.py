@@ -227,6 +227,7 @@ class RGBDArguments(Arguments):
     from Polycam and COLMAP. images: all depth images below ROOT, from one camera."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
+    depth_kind: flags.DepthKindFlag = "z"
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """Planes of depth images."""
     orient: flags.ImageOrientFlag = "auto"
@@ -238,7 +239,7 @@ class RGBDArguments(Arguments):
         """Open the frames."""
         camera = flags.parse_intrinsics(self.intrinsics)
         layout = find_layout(root) if self.layout == "auto" else self.layout
-        options = (layout, camera, self.depth_scale, self.orient)
+        options = (layout, camera, self.depth_scale, self.depth_kind, self.orient)
         return RGBDSource(root, self.depth, *options, table=self.table)
 
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -24,8 +24,7 @@ from torchrg.datasets.rgbd import fit_camera
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
     num_pixels,
-    read_depth,
-    refuse_recording,
+    refuse_form,
 )
 from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
 from torchrg.depth.camera import Pinhole, format_intrinsics, reprojection_error, unproject_image
@@ -74,6 +73,7 @@ class Arguments:
     planes.json."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
+    depth_kind: flags.DepthKindFlag = "z"
     picture: Path | None = None
     """Colored image of the planes (.png); with several inputs, a directory. Default: next to .png
     labels, with _planes appended to the name."""
@@ -125,21 +125,23 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
 
     Raises before reading if the camera or the depth scale is missing.
     """
-    refuse_recording(path)
     if path.is_dir():
+        options: dict[str, Any] = {
+            "depth_scale": arguments.depth_scale,
+            "depth_kind": arguments.depth_kind,
+        }
         with print_warnings():
-            frame, *others = RGBDFrames.from_folder(
-                path, intrinsics=camera, depth_scale=arguments.depth_scale
-            ).frames
+            frame, *others = RGBDFrames.from_folder(path, intrinsics=camera, **options).frames
         if others:
             raise ConfigError(
                 f"{path}: expected a folder with one depth image, got {1 + len(others):,}; use "
                 f"torchrg convert rgbd {path} OUT."
             )
         return frame
+    refuse_form(path, *FORMATS)
     if path.suffix.lower() not in DEPTH_SUFFIXES:
-        if arguments.depth_scale is not None:
-            warn(f"{path}: --depth-scale is ignored for point clouds.")
+        if arguments.depth_scale is not None or arguments.depth_kind != "z":
+            warn(f"{path}: --depth-scale and --depth-kind are ignored for point clouds.")
         return None
     camera_scale = None if camera is None else camera.depth_scale
     scale = camera_scale if arguments.depth_scale is None else arguments.depth_scale
@@ -151,7 +153,7 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
     matrix, doubt = fit_camera(path, camera)
     if doubt:
         warn(doubt)
-    return RGBDFrame(path, matrix, scale)
+    return RGBDFrame(path, matrix, scale, depth_kind=arguments.depth_kind)
 
 
 def _label(
@@ -203,6 +205,7 @@ def _label(
             "config": {"depth": asdict(arguments.depth)},
             "intrinsics": known and format_intrinsics(camera),
             "depth_scale": scale,
+            "pose": "camera",
             "orient": arguments.orient,
         }
         images = {name: values for name, values in vars(seg).items() if name not in _NOT_IMAGES}
@@ -236,7 +239,7 @@ def _is_png(path: Path) -> bool:
 
 def _read_image(frame: RGBDFrame) -> tuple[Cloud, Tensor, Tensor]:
     """Return the cloud of an image in camera coordinates, its depth ``(H, W)``, and its camera."""
-    depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
+    depth = frame.read_depth()
     points = unproject_image(depth, frame.intrinsics).view(-1, 3).float()
     height, width = depth.shape
     cloud = Cloud(points.numpy(), grid_shape=(height, width), source=str(frame.depth))

@@ -25,6 +25,7 @@ from torchrg.config import (
 )
 from torchrg.datasets.camera_files import SUFFIXES, read_camera
 from torchrg.depth.camera import Pinhole
+from torchrg.depth.values import DepthKind
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
 from torchrg.io.tables import COLUMNS_RULE
@@ -93,6 +94,13 @@ DepthScaleFlag = Annotated[
     float | None,
     Argument(
         text="Depth units per meter, such as 1000 for millimeters. Default: that of the folder."
+    ),
+]
+DepthKindFlag = Annotated[
+    DepthKind,
+    Argument(
+        text="Meaning of the stored values. z: depth along the optical axis, as depth cameras "
+        "store. ray: distance from the camera center, as ray casters store (Hypersim, SceneNet)."
     ),
 ]
 ImageOrientFlag = Annotated[

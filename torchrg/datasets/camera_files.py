@@ -1,10 +1,10 @@
 """Readers and search of camera files."""
 
 import json
+import math
 import os
 import re
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from reprlib import repr as shortened
@@ -15,30 +15,30 @@ import torch
 from torch import Tensor
 
 from torchrg.datasets.folder import list_dir
+from torchrg.datasets.rgbd_files import read_array
 from torchrg.depth.camera import Pinhole, check_camera
-from torchrg.errors import DepthWarning, FormatError, TorchrgError
-from torchrg.io.files import PARSE_ERRORS, check_file, decode_file, wrap_errors
+from torchrg.errors import DepthWarning, FormatError, TorchrgError, warn
+from torchrg.io.files import PARSE_ERRORS, decode_file, wrap_errors
 from torchrg.structures import FARTHEST
 
 Record = Mapping[str, Any]
 SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".npy", ".pincam", ".k")
 """Suffixes of files that may be camera files by their name."""
-_SECTIONS = ("intrinsic", "intrinsics", "camera", "cam", "cam0", "depth", "depth_intrinsics")
-"""Sections that contain the camera of depth images: Open3D, NICE-SLAM and Kalibr."""
-_LENS = ("k1", "k2", "k3", "k4", "p1", "p2", "Camera.k1", "Camera.k2", "Camera1.k1", "Camera1.k2")
-"""Names of lens distortion coefficients."""
-_LENS_ARRAYS = ("distortion_coefficients", "distortion_coeffs", "distCoeffs", "D", "d", "coeffs")
-"""Names of lists of distortion coefficients: ROS, OpenCV, Kalibr and RealSense."""
+_SECTIONS = ("intrinsic", "intrinsics", "camera", "cam", "depth", "depth_intrinsics")
+"""Sections that contain the camera of depth images: Open3D and NICE-SLAM."""
+_LENS = (
+    *("k1", "k2", "k3", "k4", "p1", "p2"),
+    *("distortion_coefficients", "distCoeffs", "D", "d", "coeffs"),
+)
+"""Names of lens distortion coefficients, and of lists of them: ROS, OpenCV and RealSense."""
 _PINHOLE_NAMES = {
     ("fl_x", "fl_y", "cx", "cy"): 0.5,
     ("fx", "fy", "cx", "cy"): 0.0,
     ("fx", "fy", "ppx", "ppy"): 0.0,
     ("fx_depth", "fy_depth", "mx_depth", "my_depth"): 0.0,
-    ("Camera.fx", "Camera.fy", "Camera.cx", "Camera.cy"): 0.0,
-    ("Camera1.fx", "Camera1.fy", "Camera1.cx", "Camera1.cy"): 0.0,
 }
 """Names of focal lengths and principal point, with the coordinate of the center of pixel (0, 0):
-nerfstudio and COLMAP; most programs; RealSense, ScanNet and ORB-SLAM."""
+nerfstudio and COLMAP; most programs; RealSense and ScanNet."""
 _RECTIFIED = ("projection_matrix", "P", "p")
 """ROS names of the camera matrices of rectified (undistorted) images."""
 _MATRICES = (
@@ -46,30 +46,32 @@ _MATRICES = (
     *("intrinsic_matrix", "intrinsic", "intrinsics", "m_calibrationDepthIntrinsic"),
 )
 """Names of camera matrices. ROS's rectified matrix comes first: depth images are rectified."""
-_SIDES = {
-    "w": "h",
-    "W": "H",
-    "width": "height",
-    "image_width": "image_height",
-    "m_depthWidth": "m_depthHeight",
-    "depthWidth": "depthHeight",
-    "Camera.width": "Camera.height",
-}
+_SIDES = (
+    *(("w", "h"), ("W", "H"), ("width", "height"), ("image_width", "image_height")),
+    *(("m_depthWidth", "m_depthHeight"), ("depthWidth", "depthHeight")),
+)
 """Names of image width and height."""
-_SCALES = ("m_depthShift", "png_depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor")
-"""Names of the depth scale (depth units per meter): BundleFusion, NICE-SLAM and ORB-SLAM. The
-meaning of ``depth_scale`` differs between programs, so it is ignored."""
+_SCALES = (
+    *("m_depthShift", "png_depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor"),
+    *("depth_scale", "depth_unit_scale_factor"),
+)
+"""Names of the depth unit: BundleFusion, NICE-SLAM, ORB-SLAM, Open3D or librealsense, nerfstudio.
+Values below 1 are meters per unit, others units per meter: no unit exceeds a meter."""
 _SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 """Shapes of cameras, projections and poses by their number of elements."""
-_FOUR = ("fx", "fy", "cx", "cy")
-_UNNAMED = {4: _FOUR, 6: ("width", "height", *_FOUR)}
-"""Names of unnamed numbers, by their count: files of ETH3D and ARKitScenes."""
+_UNNAMED = (
+    *("fx fy cx cy", "width height fx fy cx cy", "fx fy cx cy width height"),
+    *("fx fy cx cy k1 k2 p1 p2", "fx fy cx cy k1 k2 p1 p2 k3"),
+)
+"""Names of unnamed numbers: ETH3D, ARKitScenes, PlaneRCNN, BAD SLAM."""
 _COLMAP = re.compile(r"\d+ [A-Z][A-Z_]+ \d+ \d+ ")
 """Beginning of a camera in COLMAP's text format: ID, model, width, height; parameters follow."""
 _COLMAP_NAMES = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 """COLMAP models with one focal length; the others have two."""
-_NO_PINHOLE = ("FISHEYE", "EQUIRECT", "FOV", "THIN_PRISM", "OMNI", "EUCM")
+_MODELS = ("camera_model", "distortion_model", "type", "is_fisheye")
+"""Names of the camera model: COLMAP, ROS, ORB-SLAM; instant-ngp's is a boolean."""
+_NO_PINHOLE = re.compile("FISHEYE|EQUI|FOV|THIN_PRISM|OMNI|EUCM|KANNALA|PANORAM", re.IGNORECASE)
 """Parts of the names of camera models that are not pinhole."""
 _NAMES = re.compile(
     r"(depth_)?(cameras?|cam|(camera_|cam_)?(intrinsics?|k|info|calib(ration)?)"
@@ -85,9 +87,9 @@ _AMBIGUOUS = ("info", "metadata", "transforms")
 def read_camera(path: Path) -> Pinhole:
     """Read a camera file; its content determines the format.
 
-    Supported formats: unnamed numbers (``fx fy cx cy``, ``width height fx fy cx cy``, or a matrix
-    of 3 x 3, 3 x 4 or 4 x 4, also as ``.npy``); JSON (Open3D, nerfstudio, Replica, RealSense,
-    Record3D); YAML (ROS, OpenCV, ORB-SLAM, Kalibr); ``name = numbers`` (BundleFusion, ScanNet);
+    Supported formats: unnamed numbers (``fx fy cx cy``, before or after ``width height``, or a
+    matrix of 3 x 3, 3 x 4 or 4 x 4, also as ``.npy``); JSON (Open3D, nerfstudio, Replica,
+    RealSense, Record3D); YAML (ROS, OpenCV, ORB-SLAM); ``name = numbers`` (BundleFusion, ScanNet);
     COLMAP's ``cameras.txt``.
 
     Raises:
@@ -105,7 +107,7 @@ def read_camera(path: Path) -> Pinhole:
         >>> read_camera(path)[:5]
         (9.0, 9.0, 3.5, 2.5, (8, 6))
     """
-    record = _read_any(path)
+    record = read_record(path)
     if isinstance(record.get("frames"), list) and "fl_x" not in record:
         raise FormatError(
             f"{path}: expected one camera, got one per frame, or none; pass the folder of the file "
@@ -114,10 +116,10 @@ def read_camera(path: Path) -> Pinhole:
     return parse_camera(path, record)
 
 
-def _read_any(path: Path) -> Record:
+def read_record(path: Path) -> Record:
     """Return the names and values of a camera file in any format."""
     if path.suffix.lower() == ".npy":
-        return _name_numbers(path, _read_array(path))
+        return _name_numbers(path, read_array(path).astype(np.float64).ravel().tolist())
     text = decode_file(path)
     lines = (re.split(r"[\s,;\[\]()]+", line.partition("#")[0]) for line in text.splitlines())
     rows = [row for row in (" ".join(filter(None, line)) for line in lines) if row]
@@ -130,27 +132,23 @@ def _read_any(path: Path) -> Record:
         return read_info(path)
     if rows and all(_COLMAP.match(row) for row in rows):
         return _colmap_camera(path, rows)
-    record: Record = read_mapping(path)
+    content = read_mapping(path, repair="; correct it, or pass --intrinsics fx,fy,cx,cy")
+    # ORB-SLAM's names have a prefix.
+    record: Record = {re.sub(r"^Camera1?\.", "", f"{name}"): content[name] for name in content}
     for section in _SECTIONS:
         record = {**record, **record[section]} if isinstance(record.get(section), dict) else record
     return record
 
 
-def _read_array(path: Path) -> list[float]:
-    """Return the numbers of a ``.npy`` file."""
-    check_file(path)
-    with wrap_errors(f"{path}: expected the numbers of a camera, got: ", OSError, *PARSE_ERRORS):
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-        if array.dtype.kind not in "fiu" or array.size > max(_SHAPES):
-            raise TypeError(f"shape {array.shape} and {array.dtype}")
-        numbers: list[float] = array.astype(np.float64).ravel().tolist()
-    return numbers
-
-
 def _name_numbers(path: Path, numbers: list[float]) -> Record:
-    """Return unnamed numbers as a record; their count determines the names."""
-    if len(numbers) in _UNNAMED:
-        return dict(zip(_UNNAMED[len(numbers)], numbers, strict=True))
+    """Return unnamed numbers as a record; their count determines the names.
+
+    If several names fit, the optical axis nearest to the center of the image decides.
+    """
+    names = (text.split() for text in _UNNAMED)
+    records = [dict(zip(n, numbers, strict=True)) for n in names if len(n) == len(numbers)]
+    if records and not (len(numbers) in _SHAPES and (numbers[1] == 0 or numbers[-1] == 1)):
+        return min(records, key=lambda row: abs(row["cx"] / (row.get("width") or math.inf) - 0.5))
     if len(numbers) not in _SHAPES:
         raise FormatError(
             f"{path}: expected a matrix of 3 x 3, 3 x 4 or 4 x 4, fx fy cx cy, or width height fx "
@@ -173,27 +171,30 @@ def _colmap_camera(path: Path, rows: list[str]) -> Record:
     return {"camera_model": model, "w": width, "h": height, **named}
 
 
-def read_mapping(path: Path, *parts: str) -> dict[str, Any]:
-    """Read JSON or the first YAML document as a dict, or a section named in ``parts``."""
+def read_mapping(path: Path, repair: str = "; correct it") -> dict[str, Any]:
+    """Read JSON or the first YAML document as a dict."""
     import yaml
 
     text = decode_file(path)
     is_json = path.suffix.lower() == ".json" or text.lstrip()[:1] == "{"
-    with wrap_errors(f"{path}: expected JSON or YAML, got: ", yaml.YAMLError, *PARSE_ERRORS):
+    with wrap_errors(f"{path}: expected JSON or YAML, got: ", *PARSE_ERRORS, repair=repair):
         if is_json:
-            content = json.loads(text)
+            content: Any = json.loads(text)
         else:
-            # OpenCV uses a header and a tag that are not valid YAML.
+            # OpenCV's YAML has a header, a tag, tabs, and names without a blank after the colon.
             text = re.sub(r"^%YAML:.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
-            if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-                raise ValueError("aliases, which can expand without bounds")
-            content = next(iter(yaml.safe_load_all(text)), None)
+            text = re.sub(r"^([\w.]+):(?=[\w.+-])", r"\1: ", text.expandtabs(), flags=re.MULTILINE)
+            try:
+                if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+                    raise ValueError("aliases, which can expand without bounds")
+                content = next(iter(yaml.safe_load_all(text)), None)
+            except yaml.YAMLError as error:
+                words = re.sub(r'"<unicode string>", |\^', "", f"{error}").split()
+                raise ValueError(" ".join(words)) from error
     if not isinstance(content, dict):
         got = repr(content[:40]) if isinstance(content, str) else type(content).__name__
         raise FormatError(f"{path}: expected names with values, got {got}.")
-    inside = (content[section] for section in parts if isinstance(content.get(section), dict))
-    record: dict[str, Any] = next(inside, content)
-    return record
+    return content
 
 
 def read_info(path: Path) -> dict[str, Any]:
@@ -209,36 +210,33 @@ def read_info(path: Path) -> dict[str, Any]:
 def parse_camera(path: Path, record: Record) -> Pinhole:
     """Return the camera in a record with any of the known names."""
     size = _image_size(path, record)
-    model = str(record.get("camera_model", ""))
-    if any(word in model.upper() for word in _NO_PINHOLE):
+    values = ((name, record.get(name)) for name in _MODELS)
+    models = (name if value in (True, 1) else str(value) for name, value in values)
+    if model := next(filter(_NO_PINHOLE.search, models), ""):
         raise FormatError(
             f"{path}: expected images of a pinhole camera, got {model}; undistort them, as the "
             "image_undistorter of COLMAP does."
         )
     fx, fy, cx, cy = _read_pinhole(path, record)
-    if distorted := [*_distortions(record)]:
-        warnings.warn(
+    if distorted := _distortions(record):
+        warn(
             f"{path}: lens distortion ({', '.join(distorted)}) is not corrected; undistort images "
             "whose planes bend at the edges.",
             DepthWarning,
-            stacklevel=2,
         )
     if min(fx, fy) < 0:
-        warnings.warn(
+        warn(
             f"{path}: a negative focal length, {min(fx, fy):g}, flips the image; remove the minus "
             "sign unless that is intended.",
             DepthWarning,
-            stacklevel=2,
         )
     scales = (parse_number(path, record, name) for name in _SCALES if name in record)
-    return Pinhole(fx, fy, cx, cy, size, next(scales, None))
+    scale = next(scales, None)
+    return Pinhole(fx, fy, cx, cy, size, 1 / scale if scale and 0 < scale < 1 else scale)
 
 
 def _read_pinhole(path: Path, record: Record) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy of a record, with pixel (0, 0) centered at 0."""
-    values = record.get("intrinsics", record.get("intrinsic"))
-    if isinstance(values, list) and len(values) == len(_FOUR) and not isinstance(values[0], list):
-        record = dict(zip(_FOUR, values, strict=True))
     matches = [names for names in _PINHOLE_NAMES if names[0] in record]
     if matches:
         names = max(matches, key=lambda names: len(record.keys() & {*names}))
@@ -260,15 +258,12 @@ def _read_pinhole(path: Path, record: Record) -> tuple[float, float, float, floa
     )
 
 
-def _distortions(record: Record) -> Iterator[str]:
-    """Yield the names of nonzero distortion coefficients, unless the images are rectified."""
-    if not any(name in record for name in _RECTIFIED):
-        yield from (name for name in _LENS if record.get(name))
-        for name in _LENS_ARRAYS:
-            values = record.get(name)
-            values = values.get("data") if isinstance(values, dict) else values
-            if isinstance(values, list) and any(values):
-                yield name
+def _distortions(record: Record) -> list[str]:
+    """Return the names of nonzero distortion coefficients; none if the images are rectified."""
+    names = [] if record.keys() & {*_RECTIFIED} else [name for name in _LENS if name in record]
+    values = {name: record[name] for name in names}
+    values = {n: v.get("data") if isinstance(v, dict) else v for n, v in values.items()}
+    return [n for n, value in values.items() if (any(value) if isinstance(value, list) else value)]
 
 
 def parse_matrix(path: Path, record: Record, key: str, columns: int = 3) -> Tensor:
@@ -277,7 +272,8 @@ def parse_matrix(path: Path, record: Record, key: str, columns: int = 3) -> Tens
     with suppress(TypeError, ValueError, OverflowError):
         data = value.get("data") if isinstance(value, dict) else value
         values = torch.from_numpy(np.asarray(data, dtype=np.float64).ravel())
-        if len(values) in _SHAPES and _SHAPES[len(values)][1] >= columns:
+        has_bool = bool in map(type, np.asarray(data, dtype=object).flat)
+        if len(values) in _SHAPES and _SHAPES[len(values)][1] >= columns and not has_bool:
             return values.view(_SHAPES[len(values)])
     raise FormatError(f"{path}: expected {key} to be a matrix, got {shortened(value)}; correct it.")
 
@@ -285,17 +281,15 @@ def parse_matrix(path: Path, record: Record, key: str, columns: int = 3) -> Tens
 def parse_number(path: Path, record: Record, key: str) -> float:
     """Return a finite number of a record, within FARTHEST."""
     value = record.get(key)
-    if not isinstance(value, (int, float)) or not abs(value) <= FARTHEST:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if value is None or not (is_number and abs(value) <= FARTHEST):
         raise FormatError(f"{path}: expected a number for {key}, got {shortened(value)}; add it.")
     return float(value)
 
 
 def _image_size(path: Path, record: Record) -> tuple[int, int] | None:
     """Return image width and height of a record, or None."""
-    sides = record.get("resolution")
-    if isinstance(sides, list) and len(sides) == 2:
-        record = dict(zip(("width", "height"), sides, strict=True))
-    for names in _SIDES.items():
+    for names in _SIDES:
         if names[0] in record:
             width, height = (int(parse_number(path, record, name)) for name in names)
             if min(width, height) < 1:
@@ -331,19 +325,17 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
         if cameras:
             (path, camera), *remaining = cameras.items()
             if is_outside:
-                warnings.warn(
+                warn(
                     f"{root}: using the camera of {path}, outside this folder; pass --intrinsics "
                     "to choose another.",
                     DepthWarning,
-                    stacklevel=3,
                 )
             for other, found in remaining:
                 if found[:4] != camera[:4] and ("depth" in other.name) == ("depth" in path.name):
-                    warnings.warn(
+                    warn(
                         f"{path}: used as the camera, although {other.name} differs; pass "
                         "--intrinsics to choose.",
                         DepthWarning,
-                        stacklevel=2,
                     )
             return camera, path
     return None

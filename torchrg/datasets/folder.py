@@ -2,7 +2,6 @@
 
 import os
 import re
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch.utils.data import Dataset, Subset
 from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
-from torchrg.errors import ConfigError, FormatError, add_note
+from torchrg.errors import ConfigError, FormatError, add_note, warn
 from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.colors import read_colors
 from torchrg.io.files import decode_file, local_path
@@ -387,9 +386,8 @@ def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> No
     """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
         more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
-        warnings.warn(
+        warn(
             f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.",
-            stacklevel=3,
         )
 
 

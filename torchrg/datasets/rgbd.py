@@ -2,15 +2,14 @@
 
 import math
 import os
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from torchrg._checks import check_shapes
+from torchrg._checks import as_tensor, check_shapes
 from torchrg.datasets.camera_files import find_camera
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform
 from torchrg.datasets.rgbd_files import (
@@ -19,12 +18,20 @@ from torchrg.datasets.rgbd_files import (
     image_size,
     read_color,
     read_depth,
-    refuse_recording,
+    refuse_form,
 )
-from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, find_layout, find_recordings
+from torchrg.datasets.rgbd_layouts import (
+    FRAME_LAYOUTS,
+    ListedFrame,
+    find_layout,
+    find_recordings,
+)
 from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view
-from torchrg.errors import ConfigError, DepthWarning, FormatError
-from torchrg.io.files import local_path
+from torchrg.depth.values import DepthKind, check_conversion
+from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError, warn
+from torchrg.io.files import local_path, wrap_errors
+from torchrg.linalg.rigid import check_rigid
+from torchrg.structures import FARTHEST
 from torchrg.transforms.rows import SampleDict
 
 
@@ -40,12 +47,12 @@ class RGBDFrame:
             slashes: ``scene0000_00/12``.
         color: Color image registered to the depth, PNG or JPEG, or None.
         pose: Camera-to-world matrix, shape ``(4, 4)``, or None.
-        no_depth: Stored value that means "no depth" in addition to 0, or None.
+        depth_kind: ``"z"`` for depth, ``"ray"`` for distances from the camera center.
         sources: Further files that intrinsics and pose were read from.
         origin: Description of where the intrinsics come from.
 
     Raises:
-        ShapeError: If a matrix has a wrong shape.
+        ShapeError: If a matrix has a wrong shape, or the pose is no rigid motion.
         ConfigError: If ``depth_scale`` is not positive.
     """
 
@@ -55,24 +62,25 @@ class RGBDFrame:
     name: str = ""
     color: Path | None = None
     pose: Tensor | None = None
-    no_depth: int | None = None
+    depth_kind: DepthKind = "z"
     sources: tuple[Path, ...] = ()
     origin: str = ""
 
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
         check_camera("RGBDFrame", self.intrinsics)
-        if not 0 < self.depth_scale < float("inf"):
-            raise ConfigError(
-                "RGBDFrame: expected depth_scale > 0, the depth units per meter, got "
-                f"{self.depth_scale}."
-            )
+        check_rigid("RGBDFrame", "pose", self.pose)
+        check_conversion("RGBDFrame", self.depth_scale, self.depth_kind)
 
     @property
     def files(self) -> tuple[Path, ...]:
         """All input files: depth, color if present, and the files of intrinsics and pose."""
         color = () if self.color is None else (self.color,)
         return (self.depth, *color, *self.sources)
+
+    def read_depth(self) -> Tensor:
+        """Return the depth in meters along the optical axis, shape ``(H, W)``, float32."""
+        return read_depth(self.depth, self.depth_scale, self.depth_kind, self.intrinsics)
 
 
 class RGBDFrames(SceneDataset):
@@ -97,7 +105,7 @@ class RGBDFrames(SceneDataset):
         scenes: Name, depth image and all input files of each frame.
 
     Raises:
-        ConfigError: If two frames have the same name.
+        ConfigError: If two frames have the same name, or ``frames`` is a folder.
 
     Example:
         >>> import numpy as np, tempfile
@@ -116,8 +124,13 @@ class RGBDFrames(SceneDataset):
         *,
         transform: Transform | None = None,
     ) -> None:
-        self.frames = tuple(frames)
-        self.transform = transform
+        is_path = isinstance(frames, os.PathLike)
+        if is_path or not all(isinstance(frame, RGBDFrame) for frame in frames):
+            raise ConfigError(
+                f"RGBDFrames: expected a list of RGBDFrame, got {frames!r:.60}; use "
+                "RGBDFrames.from_folder for a folder."
+            )
+        self.frames, self.transform = tuple(frames), transform
         self.scenes = [SceneFiles(frame.name, frame.depth, frame.files) for frame in self.frames]
         first: dict[str, Path] = {}
         for number, (name, path, *_) in enumerate(self.scenes):
@@ -136,6 +149,7 @@ class RGBDFrames(SceneDataset):
         *,
         intrinsics: Tensor | Pinhole | None = None,
         depth_scale: float | None = None,
+        depth_kind: DepthKind = "z",
         transform: Transform | None = None,
     ) -> "RGBDFrames":
         """Find the frames of a folder.
@@ -150,7 +164,8 @@ class RGBDFrames(SceneDataset):
                 Default: from the frames or a camera file next to them, else the built-in camera of
                 ``tum``, ``icl-nuim`` and ``7-scenes``.
             depth_scale: Depth units per meter. Default: from the camera file, else the layout's;
-                ``images`` has no default.
+                ``images`` and ``.npy`` have no default.
+            depth_kind: ``"ray"`` for distances from the camera center. Default: ``"z"``, depth.
             transform: Applied to each sample.
 
         Returns:
@@ -162,17 +177,24 @@ class RGBDFrames(SceneDataset):
             FormatError: If the folder contains no such frames, or a file is corrupt.
 
         Warns:
-            DepthWarning: If a camera is built in, or implausible for an image.
+            DepthWarning: If a camera is built in, or implausible for an image, if the depth unit
+                is the layout's and the camera is not, or frames lack poses that others have.
         """
         folder = local_path(root)
-        refuse_recording(folder)
         if folder.is_file():
+            refuse_form(folder, folder.suffix.lower())
             raise FormatError(f"{root}: expected a folder of frames, got a file; pass its folder.")
         name = find_layout(folder) if layout == "auto" else layout
         if name not in FRAME_LAYOUTS:
             names = ", ".join(sorted(FRAME_LAYOUTS))
             raise ConfigError(f"RGBDFrames: expected layout to be one of {names}, got {layout!r}.")
-        frames = [*_find_frames(folder, name, intrinsics, depth_scale)]
+        camera = intrinsics
+        if camera is not None and not isinstance(camera, Pinhole):
+            matrix = as_tensor("RGBDFrames", "intrinsics", camera)
+            check_shapes("RGBDFrames", intrinsics=(matrix, "3 3"))
+            check_camera("RGBDFrames", matrix)
+            camera = Pinhole(*matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+        frames = _find_frames(folder, name, camera, depth_scale, depth_kind)
         if not frames:
             suffixes = " ".join(DEPTH_SUFFIXES)
             raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
@@ -185,9 +207,8 @@ class RGBDFrames(SceneDataset):
             FormatError: If a file is missing, corrupt, or not a depth image.
         """
         frame = self.frames[index]
-        depth = read_depth(frame.depth, depth_scale=frame.depth_scale, no_depth=frame.no_depth)
         sample: SampleDict = {
-            "depth": depth[None],
+            "depth": frame.read_depth()[None],
             "intrinsics": frame.intrinsics.to(torch.float64),
             "name": frame.name,
         }
@@ -199,89 +220,82 @@ class RGBDFrames(SceneDataset):
 
 
 def _find_frames(
-    root: Path, name: str, intrinsics: Tensor | Pinhole | None, depth_scale: float | None
-) -> Iterator[RGBDFrame]:
-    """Yield the frames of a folder of one or several recordings.
+    root: Path, name: str, camera: Pinhole | None, depth_scale: float | None, kind: DepthKind
+) -> list[RGBDFrame]:
+    """Return the frames of a folder of one or several recordings; ``camera`` is the user's.
 
     Warns:
-        DepthWarning: If a camera is implausible for an image; once per recording.
+        DepthWarning: See :meth:`RGBDFrames.from_folder`; once per kind, of cameras per recording.
     """
-    layout = FRAME_LAYOUTS[name]
+    layout, listed, frames = FRAME_LAYOUTS[name], list[ListedFrame](), list[RGBDFrame]()
+    signs = [sign for sign in layout.signs if sign]
+    notes: dict[object, str] = {}
     for prefix, folder in find_recordings(root, layout):
         shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}
-        has_warned = False
         for frame in layout.frames(folder):
-            camera: Tensor | Pinhole | None = intrinsics
-            files, origin = tuple[Path, ...](), "given"
+            images, chosen, files = frame.depth.parent, camera, tuple[Path, ...]()
             if camera is None and frame.camera is not None:
-                camera, files = frame.camera, frame.sources[:1]
+                chosen, files = frame.camera, frame.sources[:1]
             elif camera is None:
-                image_folder = frame.depth.parent
-                if image_folder not in shared:
-                    shared[image_folder] = _shared_camera(image_folder, folder, root, name)
-                camera, files = shared[image_folder]
-            if intrinsics is None:
-                origin = files[0].name if files else f"built in, {name}"
-            camera_scale = camera.depth_scale if isinstance(camera, Pinhole) else None
-            scales = (depth_scale, camera_scale, frame.depth_scale, layout.depth_scale)
+                if images not in shared:
+                    found = find_camera(images, root)
+                    built_in = layout.camera(folder) if layout.camera and not found else None
+                    shared[images] = (found[0], found[1:]) if found else (built_in, ())
+                chosen, files = shared[images]
+            origin = files[0].name if files else "given" if camera else f"built in, {name}"
+            scales = (depth_scale, *(c.depth_scale for c in (chosen, frame.camera) if c))
             scale = next((value for value in scales if value is not None), None)
-            if camera is None or scale is None:
-                missing = "intrinsics" if camera is None else "depth_scale"
+            # A layout has no unit of floating point.
+            is_assumed = scale is None and frame.depth.suffix.lower() != ".npy"
+            scale = layout.depth_scale if is_assumed else scale
+            is_known = chosen is frame.camera or any(f.match(sign) for f in files for sign in signs)
+            if chosen is None or scale is None:
+                missing, example = "depth_scale", "1000 for millimeters"
+                if chosen is None:
+                    missing, example = "intrinsics", "fx,fy,cx,cy or a camera file"
                 raise ConfigError(
-                    f"{frame.depth}: expected {missing}, which depth images do not store; pass it"
-                    f"{': 1 for meters, 1000 for millimeters' if camera is not None else ''}."
+                    f"{frame.depth}: expected {missing}, which depth images do not store; pass it, "
+                    f"{example}."
                 )
-            matrix, warning = fit_camera(frame.depth, camera, *files[:1])
-            if warning and not has_warned:
-                warnings.warn(warning, DepthWarning, stacklevel=3)
-            has_warned |= bool(warning)
-            yield RGBDFrame(
-                frame.depth,
-                matrix,
-                scale,
-                prefix + frame.name,
-                frame.color,
-                frame.pose,
-                layout.no_depth,
-                tuple(dict.fromkeys((*files, *frame.sources))),
-                origin,
-            )
+            if not camera and not files:
+                numbers = ",".join(f"{number:g}" for number in chosen[:4])
+                notes["camera"] = (
+                    f"{root}: using the built-in camera of {name}, {numbers}, for frames without a "
+                    "camera file; pass --intrinsics if they have another."
+                )
+            elif is_assumed and not is_known:
+                notes["unit"] = (
+                    f"{root}: using the depth unit of {name}, {scale:g} units per meter, with a "
+                    f"camera of other origin ({origin}); pass --depth-scale (depth_scale), 1000 "
+                    "for millimeters."
+                )
+            matrix, doubt = fit_camera(frame.depth, chosen, *files[:1])
+            notes[folder] = notes.get(folder) or doubt
+            pose, files = frame.pose, tuple(dict.fromkeys((*files, *frame.sources)))
+            if pose is not None and not bool((pose.abs() <= FARTHEST).all()):
+                pose = None  # Tracking was lost.
+            options = (prefix + frame.name, frame.color, pose, kind, files, origin)
+            with wrap_errors(f"{[root, *files][-1]}: ", ShapeError):
+                check_rigid(frame.name, "pose", pose)
+            frames.append(RGBDFrame(frame.depth, matrix, scale, *options))
+            listed.append(frame)
+    num_lost = sum(frame.pose is None for frame in frames)
+    if num_lost and any(frame.pose is not None for frame in listed):
+        notes["pose"] = (
+            f"{root}: {num_lost:,} of {len(frames):,} frames have no pose; their results are in "
+            "camera coordinates."
+        )
+    for note in filter(None, notes.values()):
+        warn(note, DepthWarning)
+    return frames
 
 
-def _shared_camera(
-    image_folder: Path, folder: Path, root: Path, name: str
-) -> tuple[Pinhole | None, tuple[Path, ...]]:
-    """Return the camera of the images in a folder of a recording, and its file.
-
-    A camera file takes precedence over the built-in camera. The camera is None without either.
-
-    Warns:
-        DepthWarning: If the camera is built in.
-    """
-    if found := find_camera(image_folder, root):
-        return found[0], found[1:]
-    layout = FRAME_LAYOUTS[name]
-    if layout.camera is None:
-        return None, ()
-    camera = layout.camera(folder)
-    numbers = ",".join(f"{number:g}" for number in camera[:4])
-    warnings.warn(
-        f"{root}: using the built-in camera of {name}, {numbers}, for frames without a camera "
-        "file; pass --intrinsics if they have another.",
-        DepthWarning,
-        stacklevel=4,
-    )
-    return camera, ()
-
-
-def fit_camera(
-    image: Path, camera: Tensor | Pinhole, file: Path | None = None
-) -> tuple[Tensor, str]:
+def fit_camera(image: Path, camera: Pinhole, file: Path | None = None) -> tuple[Tensor, str]:
     """Return the camera matrix for a depth image, and a warning if it is implausible.
 
     Args:
         image: The depth image. Its size is ignored if it is too large to be read.
-        camera: The camera, or its matrix.
+        camera: The camera.
         file: File of the camera, for messages.
 
     Raises:
@@ -290,10 +304,7 @@ def fit_camera(
     caller = f"{image}" if file is None else f"{image}: {file.name}"
     size = image_size(image)
     size = None if size and math.prod(size) > MAX_PIXELS else size
-    matrix = camera.matrix(size, caller) if isinstance(camera, Pinhole) else camera
-    check_shapes(caller, intrinsics=(matrix, "3 3"))
-    check_camera(caller, matrix)
-    values = matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return matrix, describe_improbable_view(
-        caller, Pinhole(*values), size, name="--intrinsics"
-    ) if size else ""
+    matrix = camera.matrix(size, caller)
+    fitted = Pinhole(*matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+    doubt = describe_improbable_view(caller, fitted, size, name="--intrinsics") if size else ""
+    return matrix, doubt

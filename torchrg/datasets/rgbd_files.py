@@ -4,7 +4,6 @@ import math
 import os
 import re
 import struct
-import warnings
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,7 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.errors import ConfigError, DepthWarning, FormatError
+from torchrg._checks import as_tensor
+from torchrg.depth.values import DepthKind, convert_depth, drop_channel
+from torchrg.errors import FormatError
 from torchrg.io.colors import narrow_colors
 from torchrg.io.files import (
     PARSE_ERRORS,
@@ -25,7 +26,7 @@ from torchrg.io.files import (
     local_path,
     wrap_errors,
 )
-from torchrg.structures import FARTHEST, Array
+from torchrg.structures import Array
 
 Value = TypeVar("Value")
 DEPTH_SUFFIXES = (".png", ".npy", ".pgm")
@@ -47,25 +48,22 @@ _MAX_8_BIT, _MAX_16_BIT = 255, 65535
 MAX_PIXELS = 1 << 26
 """Maximum pixels of an image, 8192 x 8192. No depth camera has more, and converting them to
 meters takes 1.5 GB. Running out of memory in a library would end the process."""
-_MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 100.0
-"""Plausible range of the median depth, in meters. Depth cameras measure 0.1 to 20."""
-_SAMPLED = 20_000
-"""Pixels sampled for the median."""
 _MAX_SECONDS = 0.02
 """Maximum time difference, in seconds, between an image and its pose."""
 
 
 def read_depth(
-    path: str | os.PathLike[str], *, depth_scale: float, no_depth: int | None = None
+    path: str | os.PathLike[str],
+    depth_scale: float,
+    depth_kind: DepthKind = "z",
+    intrinsics: Tensor | None = None,
 ) -> Tensor:
     """Read depth in meters, ``(H, W)``, float32, from 16-bit gray PNG or PGM, or ``.npy``.
 
-    Pixels without depth (0, negative, non-finite, or ``no_depth``, like 65535 in 7-Scenes) are 0.
-    ``depth_scale`` is the number of depth units per meter: 1000 for millimeters, 5000 for TUM, 1
-    for meters. It is not stored in the files and never guessed.
-
-    Warns:
-        DepthWarning: If the median depth is below 5 cm or above 100 m.
+    Pixels without depth are 0. ``depth_scale`` is the number of depth units per meter: 1000 for
+    millimeters, 5000 for TUM, 1 for meters. It is not stored in the files and never guessed.
+    Distances along the ray, ``"ray"``, need the camera; see
+    :func:`torchrg.depth.values.convert_depth`.
 
     Example:
         >>> import tempfile
@@ -74,45 +72,25 @@ def read_depth(
         >>> read_depth(path, depth_scale=1000)
         tensor([[1.5000, 0.0000]])
     """
-    if not 0 < depth_scale < float("inf"):
-        raise ConfigError(f"read_depth: expected depth_scale > 0, got {depth_scale}.")
     source = local_path(path)
-    refuse_recording(source)
+    refuse_form(source)
     readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16}
-    reader = readers.get(source.suffix.lower())
-    if reader is None:
-        suffixes = " ".join(DEPTH_SUFFIXES)
-        raise FormatError(
-            f"{source}: expected a depth image that ends in one of {suffixes}, got "
-            f"{source.suffix!r}."
-        )
-    stored = reader(source)
-    depth = stored.astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        missing = ~(np.isfinite(depth) & (depth > 0))
-    if no_depth is not None:
-        missing |= stored == no_depth
-    valid = depth[~missing]
-    # A sample suffices to check the scale.
-    valid = valid[:: len(valid) // _SAMPLED + 1] / depth_scale
-    median = float(np.median(valid)) if len(valid) else _MIN_MEDIAN_DEPTH
-    if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:
-        warnings.warn(
-            f"{source}: expected a median depth of {_MIN_MEDIAN_DEPTH} to {_MAX_MEDIAN_DEPTH:g} m, "
-            f"got {median:,.4g} m with --depth-scale {depth_scale:g}; pass 1000 for millimeters, 1 "
-            "for meters.",
-            DepthWarning,
-            stacklevel=2,
-        )
-    return torch.from_numpy((np.where(missing, 0, depth) / depth_scale).astype(np.float32))
+    stored = as_tensor(f"{source}", "depth", readers[source.suffix.lower()](source))
+    return convert_depth(f"{source}", stored, intrinsics, depth_scale, depth_kind).float()
 
 
-def refuse_recording(path: Path) -> None:
-    """Raise FormatError with instructions if a file is an unsupported recording."""
-    if (tool := _CONVERTERS.get(path.suffix.lower())) and not path.is_dir():
+def refuse_form(path: Path, *others: str) -> None:
+    """Raise FormatError if a file has no suffix of depth images, nor one of ``others``."""
+    suffix = path.suffix.lower()
+    if suffix in _CONVERTERS:
         raise FormatError(
-            f"{path}: expected depth images, got {path.suffix}; {tool}, and pass the folder to "
-            "torchrg convert rgbd."
+            f"{path}: expected depth images, got {path.suffix}; {_CONVERTERS[suffix]}, and pass "
+            "the folder to torchrg convert rgbd."
+        )
+    if suffix not in (*DEPTH_SUFFIXES, *others):
+        raise FormatError(
+            f"{path}: expected a depth image that ends in one of {' '.join(DEPTH_SUFFIXES)}, got "
+            f"{path.suffix!r}; convert it to a 16-bit .png, or save its values with numpy.save."
         )
 
 
@@ -186,7 +164,8 @@ def image_size(path: Path) -> tuple[int, int] | None:
     """Return width and height from a depth image header; None if corrupt or missing."""
     try:
         if path.suffix.lower() == ".npy":
-            height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+            height, width = drop_channel(array).shape
             return width, height
         with path.open("rb") as stream:
             head = stream.read(_MAX_HEADER_BYTES)
@@ -204,15 +183,23 @@ def num_pixels(path: Path) -> int:
     return math.prod(image_size(path) or (0,))
 
 
-def _read_npy(source: Path) -> NDArray[np.number]:
-    """Return the array of a ``.npy`` file, shape ``(H, W)``."""
-    check_file(source)
-    with wrap_errors(f"{source}: expected an array of numbers, got: ", OSError, *PARSE_ERRORS):
-        values: NDArray[np.number] = np.load(source, allow_pickle=False)
-    if values.ndim != 2 or values.dtype.kind not in "fiu" or values.size == 0:
+def _read_npy(source: Path) -> Array:
+    """Return the array of a ``.npy`` file, shape ``(H, W)``; floating point as float64."""
+    values = drop_channel(read_array(source))
+    if values.ndim != 2 or values.size == 0:
         raise FormatError(
             f"{source}: expected depth of shape (H, W), got {values.shape} and {values.dtype}."
         )
+    return values.astype(np.float64) if values.dtype.kind == "f" else values
+
+
+def read_array(source: Path) -> Array:
+    """Return the numbers of a ``.npy`` file."""
+    check_file(source)
+    with wrap_errors(f"{source}: expected an array of numbers, got: ", OSError, *PARSE_ERRORS):
+        values: Array = np.load(source, allow_pickle=False)
+        if values.dtype.kind not in "fiu":
+            raise TypeError(f"{values.dtype}")
     return values
 
 
@@ -229,29 +216,23 @@ def read_numbers(path: Path, count: int, what: str) -> list[list[float]]:
     return _numbers(path, _rows(path, count, what))
 
 
-def valid_pose(matrix: Tensor) -> Tensor | None:
-    """Return a pose, or None if tracking was lost: non-finite, or too far away."""
-    return matrix if bool((matrix.abs() <= FARTHEST).all()) else None
-
-
 def read_timed(path: Path) -> tuple[list[float], list[str]]:
     """Read rows of a time and a file name; return times (ascending) and names."""
     rows = _rows_by_time(path, 2, "a time and a file name")
     return [float(time) for time, _ in rows], [name for _, name in rows]
 
 
-def read_trajectory(path: Path) -> tuple[list[float], list[Tensor | None]]:
+def read_trajectory(path: Path) -> tuple[list[float], list[Tensor]]:
     """Read rows of ``time tx ty tz qx qy qz qw``; return times (ascending) and poses.
 
-    Poses are camera-to-world matrices, shape ``(4, 4)``, float64, or None; see
-    :func:`valid_pose`.
+    Poses are camera-to-world matrices, shape ``(4, 4)``, float64, NaN where tracking was lost.
     """
     rows = _rows_by_time(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
     return _poses_by_time(values, _rotations(values[:, 4:]), values[:, 1:4])
 
 
-def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor | None]]:
+def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor]]:
     """Like :func:`read_trajectory`, for ``time rx ry rz tx ty tz`` from world to camera."""
     from scipy.spatial.transform import Rotation
 
@@ -263,11 +244,11 @@ def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor | None]]:
 
 def _poses_by_time(
     values: Tensor, rotations: Tensor, translations: Tensor
-) -> tuple[list[float], list[Tensor | None]]:
+) -> tuple[list[float], list[Tensor]]:
     """Return the times of rows, and poses from rotations and translations ``(n, 3)``."""
     poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
     poses[:, :3, :3], poses[:, :3, 3] = rotations, translations
-    return values[:, 0].tolist(), [valid_pose(pose) for pose in poses]
+    return values[:, 0].tolist(), [*poses]
 
 
 def read_nearest(
@@ -336,7 +317,5 @@ def _words(path: Path) -> list[list[str]]:
 
 def _numbers(path: Path, rows: list[list[str]]) -> list[list[float]]:
     """Convert words to numbers."""
-    try:
+    with wrap_errors(f"{path}: expected numbers: ", ValueError):
         return [[float(word) for word in row] for row in rows]
-    except ValueError as error:
-        raise FormatError(f"{path}: expected numbers: {error}.") from error

@@ -5,7 +5,6 @@ a choice of ``torchrg convert rgbd``, and a test.
 """
 
 import re
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,8 +16,9 @@ from torchrg.datasets.camera_files import (
     parse_camera,
     parse_matrix,
     parse_number,
-    read_info,
+    read_camera,
     read_mapping,
+    read_record,
 )
 from torchrg.datasets.folder import check_folder, find_files, list_dir, natural_key, warn_skipped
 from torchrg.datasets.rgbd_files import (
@@ -29,10 +29,9 @@ from torchrg.datasets.rgbd_files import (
     read_numbers,
     read_timed,
     read_trajectory,
-    valid_pose,
 )
 from torchrg.depth.camera import Pinhole
-from torchrg.errors import ConfigError, DepthWarning, FormatError
+from torchrg.errors import DepthWarning, FormatError, warn
 from torchrg.io.files import wrap_errors
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -59,14 +58,15 @@ _NON_DEPTH_WORDS = frozenset(
 _IPHONES = ("", "iphone/", "*/iphone/", "data/*/iphone/")
 _SCANNETPP_COLOR = {"width": 1920, "height": 1440}
 """Size of the color images, to which ScanNet++ intrinsics refer."""
-_NERFSTUDIO_UNIT = 0.001
-"""nerfstudio's default depth unit, in meters."""
 _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 """Conversion between torchrg's camera axes and OpenGL's: x right, y up, z backwards."""
 
 
 class ListedFrame(NamedTuple):
-    """Frame listed in a folder, with a camera and scale if these differ per frame."""
+    """Frame listed in a folder, with its camera if that is per frame; the pose is as stored.
+
+    The last of ``sources`` is the file of the pose.
+    """
 
     name: str
     depth: Path
@@ -74,11 +74,10 @@ class ListedFrame(NamedTuple):
     pose: Tensor | None = None
     sources: tuple[Path, ...] = ()
     camera: Pinhole | None = None
-    depth_scale: float | None = None
 
 
-Camera = Callable[[Path], Pinhole]
-"""Function that returns the camera of a recording without a camera file."""
+Camera = Callable[[Path], Pinhole | None]
+"""Function that returns the camera of a recording without a camera file, if it is known."""
 
 
 class FrameLayout(NamedTuple):
@@ -88,8 +87,7 @@ class FrameLayout(NamedTuple):
         frames: Function that yields the frames of a recording in natural order.
         mark: Name pattern of an entry in every recording; empty if any folder is a recording.
         camera: Camera of a recording without a camera file; None if unknown or per frame.
-        depth_scale: Depth units per meter; None if unknown or per frame.
-        no_depth: See :class:`torchrg.datasets.RGBDFrame`.
+        depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
         locations: Path patterns of recordings below the root folder.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
             ``("",)`` if the mark is enough, empty if the layout cannot be detected.
@@ -99,7 +97,6 @@ class FrameLayout(NamedTuple):
     mark: str = ""
     camera: Camera | None = None
     depth_scale: float | None = None
-    no_depth: int | None = None
     locations: tuple[str, ...] = ("", "*/")
     signs: tuple[str, ...] = ("",)
 
@@ -116,20 +113,21 @@ def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
     poses = read_nearest(times, lists[2], read_trajectory)
     sources = tuple(path for path in lists if path.is_file())
     for image, color, pose in zip(images, colors, poses, strict=True):
-        color_path = None if color is None else folder / color
-        yield ListedFrame(Path(image).stem, folder / image, color_path, pose, sources)
+        color_path = None if color is None else _listed_path(folder, color)
+        path = _listed_path(folder, image)
+        yield ListedFrame(path.stem, path, color_path, pose, sources)
 
 
-def _tum_camera(folder: Path) -> Pinhole:
-    """Return the camera of a recording from its name."""
+def _listed_path(folder: Path, name: object) -> Path:
+    """Return the path of a file listed by a program, which may run on Windows."""
+    return folder / str(name).replace("\\", "/")
+
+
+def _tum_camera(folder: Path) -> Pinhole | None:
+    """Return the camera of a recording from its name, or None."""
     name = folder.resolve().name.lower()
-    for camera, values in _TUM_INTRINSICS.items():
-        if camera in name:
-            return Pinhole(*values, _KINECT_SIZE)
-    raise ConfigError(
-        f"{folder}: expected intrinsics, because the folder name contains none of "
-        f"{', '.join(_TUM_INTRINSICS)}; pass them."
-    )
+    cameras = (values for camera, values in _TUM_INTRINSICS.items() if camera in name)
+    return next((Pinhole(*values, _KINECT_SIZE) for values in cameras), None)
 
 
 def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -152,7 +150,7 @@ def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterato
             if name.endswith(".rendered"):
                 continue
             path = folder / pose.replace("*", name)
-            posed = (valid_pose(read_matrix(path)), (path,)) if path.is_file() else (None, ())
+            posed = (read_matrix(path), (path,)) if path.is_file() else (None, ())
             yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *posed)
 
     return frames
@@ -180,14 +178,6 @@ def _fixed_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
     return lambda folder: Pinhole(fx, fy, cx, cy, _KINECT_SIZE)
 
 
-def _scannet_camera(folder: Path) -> Pinhole:
-    """Raise FormatError for a scan without a camera file."""
-    raise FormatError(
-        f"{folder}: expected intrinsic/intrinsic_depth.txt or intrinsics_depth.txt, got none; add "
-        "it, or pass --intrinsics."
-    )
-
-
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
     """Yield all depth images below a folder, with one camera, without colors and poses.
 
@@ -206,11 +196,10 @@ def _all_images(folder: Path) -> Iterator[ListedFrame]:
     if any("depth" in words[path] for path in chosen):
         chosen = [path for path in chosen if "depth" in words[path]]
     if skipped := [path for path in images if path not in {*chosen}]:
-        warnings.warn(
+        warn(
             f"{folder}: skipped {len(skipped):,} of {len(images):,} images that are not depth "
             f"by their names, {skipped[0].relative_to(folder)} first; rename them if they are.",
             DepthWarning,
-            stacklevel=2,
         )
     for path in chosen:
         yield ListedFrame(path.relative_to(folder).with_suffix("").as_posix(), path)
@@ -232,23 +221,20 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
         )
     for frame in sorted(frames, key=lambda frame: natural_key(str(frame["depth_file_path"]))):
         record = {**shared, **frame}
-        image = Path(str(record["depth_file_path"]))
+        image = _listed_path(Path(), record["depth_file_path"])
         name = Path(image.as_posix().removesuffix(image.suffix))
         parts = [step for step in name.parts if step not in ("..", name.anchor)]
-        color = folder / str(record.get("file_path"))
-        unit = None if image.suffix.lower() == ".npy" else _NERFSTUDIO_UNIT
-        if "depth_unit_scale_factor" in record:
-            unit = parse_number(path, record, "depth_unit_scale_factor")
+        color = _listed_path(folder, record.get("file_path"))
         pose = torch.eye(4, dtype=torch.float64)
-        pose[:3] = parse_matrix(path, record, "transform_matrix", columns=4)[:3]
+        rows = parse_matrix(path, record, "transform_matrix", columns=4)
+        pose[: len(rows)] = rows
         yield ListedFrame(
             "/".join(parts),
             folder / image,
             color if color.suffix.lower() in _COLOR_SUFFIXES and color.is_file() else None,
-            valid_pose(pose @ _OPENGL_AXES),
+            pose @ _OPENGL_AXES,
             (path,),
             parse_camera(path, record),
-            unit and 1 / unit,
         )
 
 
@@ -271,9 +257,7 @@ def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
         video = name.rpartition("_")[0]
         near = [exact.with_name(f"{video}_{time + off:.3f}.pincam") for off in (-0.001, 0.001)]
         path = next((path for path in (exact, *near) if path.is_file()), exact)
-        names = ("width", "height", "fx", "fy", "cx", "cy")
-        record = dict(zip(names, read_numbers(path, 6, " ".join(names))[0], strict=True))
-        camera = parse_camera(path, record)
+        camera = read_camera(path)
         color = _color_image(folder / "lowres_wide" / name)
         yield ListedFrame(name, image, color, pose, (path, *tracks), camera)
 
@@ -285,17 +269,17 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     """
     locations = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
     calibration = next((path for path in locations if path.is_file()), locations[0])
-    record = read_mapping(calibration, "camera")
-    camera = parse_camera(calibration, record)
+    record = read_record(calibration)
     scale = parse_number(calibration, record, "scale")
+    camera = parse_camera(calibration, {**record, "depth_scale": scale})
     track = folder / "traj.txt"
     rows = read_numbers(track, 16, "16 numbers, those of a matrix,")
     poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
     for name, image in _depth_images(folder, "results/depth*"):
         color = _color_image(folder / "results" / f"frame{name}")
         has_row = name.isdecimal() and int(name) < len(poses)
-        pose = valid_pose(poses[int(name)]) if has_row else None
-        yield ListedFrame(name, image, color, pose, (calibration, track), camera, scale)
+        pose = poses[int(name)] if has_row else None
+        yield ListedFrame(name, image, color, pose, (calibration, track), camera)
 
 
 def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -316,21 +300,12 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
             raise FormatError(f"{path}: expected an entry for {name}, which has depth, got none.")
         camera = parse_camera(path, _SCANNETPP_COLOR | record)
         has_pose = record.get("aligned_pose") is not None
-        pose = valid_pose(parse_matrix(path, record, "aligned_pose", 4)) if has_pose else None
+        pose = parse_matrix(path, record, "aligned_pose", 4) if has_pose else None
         color = _color_image(folder / "rgb" / name)
         yield ListedFrame(name, image, color, pose, (path,), camera)
 
 
-def _3rscan_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of 3RScan, ``frame-000000.depth.pgm``, and of others with ``_info.txt``."""
-    path = folder / "_info.txt"
-    record = read_info(path)
-    camera = parse_camera(path, record)
-    scale = parse_number(path, record, "m_depthShift")
-    for frame in _named_frames("*.depth", "*.color", "*.pose.txt")(folder):
-        yield frame._replace(sources=(path, *frame.sources), camera=camera, depth_scale=scale)
-
-
+_DOTTED_FRAMES = _named_frames("*.depth", "*.color", "*.pose.txt")
 FRAME_LAYOUTS = {
     "scannetpp": FrameLayout(
         _scannetpp_frames,
@@ -344,7 +319,9 @@ FRAME_LAYOUTS = {
         depth_scale=1000.0,
         locations=("", "*/", "*/*/", "*/*/*/"),
     ),
-    "3rscan": FrameLayout(_3rscan_frames, "_info.txt", locations=("", "*/", "*/sequence/")),
+    "3rscan": FrameLayout(
+        _DOTTED_FRAMES, "_info.txt", depth_scale=1000.0, locations=("", "*/", "*/sequence/")
+    ),
     "replica": FrameLayout(_replica_frames, "traj.txt"),
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
     "icl-nuim": FrameLayout(
@@ -353,20 +330,18 @@ FRAME_LAYOUTS = {
     "scannet": FrameLayout(
         _named_frames("depth/*", "color/*", "pose/*.txt"),
         "depth",
-        _scannet_camera,
-        1000.0,
+        depth_scale=1000.0,
         locations=("", "*/", "*/*/"),
         signs=("intrinsic*_depth.txt", "intrinsic*/intrinsic*_depth.txt"),
     ),
     "7-scenes": FrameLayout(
-        _named_frames("*.depth", "*.color", "*.pose.txt"),
+        _DOTTED_FRAMES,
         "frame-*.depth.png",
         _fixed_camera(*_SEVEN_SCENES_INTRINSICS),
         1000.0,
-        no_depth=65535,
         locations=("", "*/", "*/*/"),
     ),
-    "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json"),
+    "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json", depth_scale=1000.0),
     "images": FrameLayout(_all_images),
 }
 """Layouts by name, in the order that :func:`find_layout` tries them: ScanNet++ (ICCV, 2023);

@@ -11,7 +11,6 @@ import hashlib
 import itertools
 import os
 import re
-import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
 from torchrg.io.colors import find_white, narrow_colors, read_colors
@@ -144,10 +143,9 @@ def _list_area(root: Path, area: int) -> list[SceneFiles]:
     if len(rooms) != ROOMS_PER_AREA[area]:
         bare = [path.name for path in entries if path not in rooms]
         missing = f" ({', '.join(bare)}: no {ANNOTATIONS})" if bare else ""
-        warnings.warn(
+        warn(
             f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{missing}; "
             "download the missing rooms unless this is intended.",
-            stacklevel=3,
         )
     return [
         SceneFiles(f"{folder.name}/{room.name}", room, object_files(room), "S3DIS")

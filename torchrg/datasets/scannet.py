@@ -7,7 +7,6 @@ list groups of segments, which are sets of vertices.
 import csv
 import json
 import os
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from io import StringIO
@@ -16,12 +15,14 @@ from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import read_cloud
 from torchrg.io.files import PARSE_ERRORS, decode_file, local_path, wrap_errors
+from torchrg.linalg.rigid import check_rigid
 from torchrg.plane_table import Arrays
 from torchrg.structures import Cloud
 from torchrg.transforms.rows import SampleDict
@@ -271,10 +272,9 @@ def _warn_missing_scans(lists: Mapping[str, tuple[str, Path]], scans: set[str]) 
     missing = [name for name in lists if name not in scans]
     if missing:
         first = missing[0]
-        warnings.warn(
+        warn(
             f"{lists[first][1]}: {len(missing):,} of {len(lists):,} listed scans are missing "
             f"(first: {shortened(first)}); download them, or correct the names.",
-            stacklevel=3,
         )
 
 
@@ -295,6 +295,7 @@ def _alignment(path: Path) -> Arrays:
                 matrix = np.array(numbers.split(), dtype=np.float64).reshape(4, 4)
                 if not np.isfinite(matrix).all():
                     raise ValueError(shortened(numbers.strip()))
+                check_rigid(path.name, name.strip(), torch.from_numpy(matrix))
             return {"axis_align_matrix": matrix}
     return {}
 
@@ -424,7 +425,7 @@ def _warn_entries(path: Path, what: str, entries: Sequence[object]) -> None:
     """Warn of inconsistent entries of a file, if any, and name the first."""
     if entries:
         more = f" and {len(entries) - 1:,} more" if len(entries) > 1 else ""
-        warnings.warn(f"{path}: {what}: {shortened(entries[0])}{more}.", stacklevel=2)
+        warn(f"{path}: {what}: {shortened(entries[0])}{more}.")
 
 
 def _read_list(path: Path, key: str) -> list[Any]:

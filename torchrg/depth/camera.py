@@ -1,14 +1,15 @@
 """Pinhole cameras: unprojection of depth images, and estimation from organized clouds."""
 
 import math
-import warnings
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, is_concrete, is_tensor
-from torchrg.errors import ConfigError, DepthWarning
+from torchrg.depth.values import has_depth
+from torchrg.errors import ConfigError, DepthWarning, warn
+from torchrg.linalg.rigid import check_rigid
 from torchrg.structures import FARTHEST
 
 _MAX_ANGLE_DEG, _WIDE_ANGLE_DEG = 85.0, 75.0
@@ -40,10 +41,10 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Returns:
         Points, shape ``(B, H, W, 3)``, in the unit of ``depth`` and in its dtype, or in that of the
-        poses; NaN where depth is not finite or not positive.
+        poses; NaN for missing depth, see :func:`torchrg.depth.values.has_depth`.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is not as above, or a pose is no rigid motion.
         ConfigError: If a camera matrix is invalid, or impossible for such images.
 
     Warns:
@@ -63,6 +64,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
         poses=(poses, "B 4 4"),
     )
     check_floating("depth_to_points", depth=depth)
+    check_rigid("depth_to_points", "poses", poses)
     if is_concrete(intrinsics):
         check_view("depth_to_points", intrinsics, (depth.shape[2], depth.shape[1]))
     return _unproject(depth, intrinsics, poses)
@@ -106,11 +108,10 @@ def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa:
     if all(is_tensor(side) and is_concrete(side) for side in sides):
         height, width = (int(side.flatten()[0]) for side in sides if side is not None)
         if (height, width) != tuple(depth.shape[-2:]):
-            warnings.warn(
+            warn(
                 f"{caller}: expected intrinsics of images of {depth.shape[-1]} x "
                 f"{depth.shape[-2]} pixels, got a PinholeCamera of {width} x {height}; scale it.",
                 DepthWarning,
-                stacklevel=3,
             )
     return tensor
 
@@ -153,7 +154,7 @@ def check_view(caller: str, intrinsics: Tensor, size: tuple[int, int]) -> None:
     rows = intrinsics.detach().reshape(-1, 9)[:, [0, 4, 2, 5]].double().cpu().tolist()
     for row in dict.fromkeys(map(tuple, rows)):
         if doubt := describe_improbable_view(caller, Pinhole(*row), size):
-            warnings.warn(doubt, DepthWarning, stacklevel=3)
+            warn(doubt, DepthWarning)
 
 
 def describe_improbable_view(
@@ -183,6 +184,8 @@ def describe_improbable_view(
         doubt = "with an optical axis off the center; pass the camera of images of this size"
     elif error > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
         doubt = "which fit better with cx and cy exchanged; swap them"
+    elif size[0] == 2 * size[1]:
+        doubt = "of a panorama, by its ratio of 2:1; project it to perspective images"
     else:
         return ""
     numbers = ",".join(f"{value:g}" for value in camera[:4])
@@ -210,11 +213,6 @@ def unproject_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = Non
     """
     poses = None if pose is None else pose[None]
     return _unproject(depth[None].double(), intrinsics[None].double(), poses)[0]
-
-
-def has_depth(depth: Tensor) -> Tensor:
-    """Return a mask of pixels with finite and positive depth, in the shape of ``depth``."""
-    return depth.isfinite() & (depth > 0)
 
 
 def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:

@@ -7,16 +7,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes, eager_only
+from torchrg._checks import as_tensor, check_choices, check_shapes, eager_only
 from torchrg._parallel import nonzero_rows
 from torchrg.config import DepthConfig, settings_of
-from torchrg.depth.camera import check_view, has_depth, read_intrinsics
+from torchrg.depth.camera import check_view, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import fit_pixels
 from torchrg.depth.pixels import Pixels, describe_pixels
+from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.depth.windows import Image
 from torchrg.linalg import unit_direction
 from torchrg.linalg.moments import Segments, kth_smallest
+from torchrg.linalg.rigid import check_rigid
 from torchrg.normals import Orientation, orient_normals
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.fit import fit_planes
@@ -34,6 +36,8 @@ def segment_depth(
     *,
     pose: Tensor | None = None,
     orient: Orientation = "auto",
+    depth_scale: float = 1.0,
+    depth_kind: DepthKind = "z",
     **changes: Any,  # noqa: ANN401
 ) -> Segmentation:
     """Segment a depth image into planes.
@@ -43,11 +47,11 @@ def segment_depth(
     :func:`torchrg.depth.growth.grow_pixels`.
 
     Convention:
-        Pixels without depth (0, negative, not finite, above ``max_depth``) are unlabeled, and no
-        neighborhood crosses a depth step. The unit of the depth is arbitrary.
+        Pixels without depth (0, negative, not finite, above ``max_depth``, the largest value of 16
+        bits or of an integer type) are unlabeled, and no neighborhood crosses a depth step.
 
     Args:
-        depth: Depth along the optical axis, shape ``(H, W)``, float32 or float64.
+        depth: Depth image, shape ``(H, W)`` or ``(1, H, W)``, float32, float64 or integers.
         intrinsics: Camera matrix, shape ``(3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; see
             :func:`torchrg.depth.camera.depth_to_points`.
         config: A depth configuration, or a dictionary. Default: :class:`DepthConfig`.
@@ -55,6 +59,8 @@ def segment_depth(
             Default: camera coordinates.
         orient: Normal orientation: towards the camera for "auto", "viewpoint" and "none", otherwise
             as in :func:`torchrg.normals.orient_normals`. Default: "auto".
+        depth_scale: Depth units per meter, 1000 for millimeters. Default: 1, meters.
+        depth_kind: "ray" for distances from the camera center. Default: "z".
         **changes: Individual parameters, as in ``max_depth=4.0``.
 
     Returns:
@@ -62,11 +68,12 @@ def segment_depth(
         without a flat window centered on them, are sharp.
 
     Raises:
-        ShapeError: If a shape or dtype is not as above.
+        ShapeError: If a shape or dtype is not as above, or ``pose`` is no rigid motion.
         ConfigError: If ``intrinsics`` are impossible for such images, or a parameter is invalid.
 
     Warns:
-        DepthWarning: If ``intrinsics`` are improbable; see :func:`torchrg.depth.camera.check_view`.
+        DepthWarning: If ``intrinsics`` are improbable, see :func:`torchrg.depth.camera.check_view`,
+            or the depth is, see :func:`torchrg.depth.values.convert_depth`.
 
     Example:
         >>> intrinsics = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -76,7 +83,8 @@ def segment_depth(
         >>> seg.labels[0, ::13].tolist(), seg.planes.offset.tolist()
         ([0, 0, 1, 1], [2.0, 3.0])
     """
-    depth = as_tensor("segment_depth", "depth", depth)
+    depth = drop_channel(as_tensor("segment_depth", "depth", depth))
+    pose = None if pose is None else as_tensor("segment_depth", "pose", pose)
     intrinsics = read_intrinsics("segment_depth", intrinsics, depth)
     intrinsics = intrinsics[0] if intrinsics.shape[:-2] == (1,) else intrinsics
     check_shapes(
@@ -85,10 +93,11 @@ def segment_depth(
         intrinsics=(intrinsics, "3 3"),
         pose=(pose, "4 4"),
     )
-    check_floating("segment_depth", depth=depth)
+    check_rigid("segment_depth", "pose", pose)
     check_view("segment_depth", intrinsics, (depth.shape[1], depth.shape[0]))
     check_choices("segment_depth", orient=(orient, Orientation))
     settings = settings_of("segment_depth", DepthConfig, config, changes)
+    depth = convert_depth("segment_depth", depth, intrinsics, depth_scale, depth_kind)
     seg = _segment(depth, intrinsics, settings, pose, orient)
     return keep_planes(seg, choose_planes(seg.planes, settings))
 
@@ -111,7 +120,7 @@ def _segment(
         return replace(pixel, **images)
     if config.max_depth is not None:
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
-    seen = has_depth(depth)
+    seen = depth > 0
     inverse = torch.where(seen, 1 / depth.double(), 0.0)
     fx, fy, cx, cy = (float(intrinsics[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     focal = (fx, fy)

@@ -1,6 +1,5 @@
 """Tables of numbers without column names: what the columns mean, and which tables are no cloud."""
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.errors import FormatError
+from torchrg.errors import FormatError, warn
 
 Table = NDArray[Any]
 """Numbers of shape ``(N, C)``."""
@@ -156,10 +155,9 @@ def warn_about_counters(path: Path, table: Table, names: Sequence[str]) -> None:
         others = [i for i in others if not are_integers(table[:, i])]
     wrong = [str(i + 1) for i in whole or counting if i < 3]
     if 0 < len(wrong) < 3 <= len(others):
-        warnings.warn(
+        warn(
             f"{path}: values only count up in column {' and '.join(wrong)}, as those of an index "
             f"or of time; if these are no coordinates, {_NAME_THEM}.",
-            stacklevel=5,
         )
 
 

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, NamedTuple, TextIO
 
 import numpy as np
 
-from torchrg.errors import FormatError
+from torchrg.errors import FormatError, warn
 from torchrg.io.arrow import parse_numbers
 from torchrg.io.columns import FieldNames, check_exact, flatten_cloud, row_slices
 from torchrg.io.fields import SKIPPED, Values, assemble_table, check_names
@@ -383,10 +383,9 @@ def _warn_about_names(path: Path, comment: str, num_columns: int) -> None:
     """Warn if a comment before the points names all columns, but no x, y and z."""
     readings = [row for row in _split_names(comment) if len(row) == num_columns]
     if any(not any(map(_is_number, row)) for row in readings):
-        warnings.warn(
+        warn(
             f"{path}: its comment names columns {comment.strip()[:60]!r}, none of them x, y and z: "
             "the first three are taken; name the columns with --columns.",
-            stacklevel=5,
         )
 
 

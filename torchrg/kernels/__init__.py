@@ -11,7 +11,6 @@ for AVX2. Both are bit-identical.
 import ctypes
 import math
 import os
-import warnings
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import is_concrete
+from torchrg.errors import warn
 
 MAX_NEIGHBORS = 512
 """Maximum number of values per row, ``MAX_WIDTH`` in ``plain.h``. Longer rows use the torch
@@ -218,30 +218,27 @@ def _library() -> ctypes.CDLL | None:
         return None
     path = Path(__file__).parent / f"libkernels-{_kind()}.library"
     if _is_stale(path):
-        warnings.warn(
+        warn(
             "torchrg runs without its kernels, which are older than their sources; run "
             "pip install -e . again.",
-            stacklevel=2,
         )
         return None
     if path.exists():
         try:
             library = ctypes.CDLL(str(path))
         except OSError as error:
-            warnings.warn(f"torchrg cannot load its kernels: {error}", stacklevel=2)
+            warn(f"torchrg cannot load its kernels: {error}")
             return None
         if all(hasattr(library, name) for name in SIGNATURES):
             for name in SIGNATURES:
                 getattr(library, name).restype = ctypes.c_int64
             return library
-        warnings.warn(
+        warn(
             "torchrg runs without its kernels, which are of another version; install it again.",
-            stacklevel=2,
         )
         return None
-    warnings.warn(
+    warn(
         "torchrg runs without its kernels, several times slower; install a C++ compiler and "
         "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install).",
-        stacklevel=2,
     )
     return None

@@ -37,7 +37,7 @@ from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import Orientation, orient_normals
 from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
 from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
-from torchrg.precision import warn_about_steps
+from torchrg.precision import warn_about_coordinates
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
 from torchrg.structures import Neighbors, NormalFit, Points
 
@@ -130,7 +130,7 @@ def estimate_normals(
     """
     tensor = as_tensor("estimate_normals", "points", points)
     check_points("estimate_normals", tensor)
-    warn_about_steps("estimate_normals", tensor)
+    warn_about_coordinates("estimate_normals", tensor)
     settings = settings_of("estimate_normals", NormalsConfig, config, changes)
     estimate = ESTIMATORS[settings.method]
     if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,8 +10,9 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import default_device_cpu
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, warn
 from torchrg.linalg import eigh3_lapack, unit_direction
+from torchrg.linalg.rigid import check_rigid
 from torchrg.regions.fit import canonicalize_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
@@ -74,10 +74,9 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
     axis = _find_up(normals, areas, upwards)
     heading = _find_heading(normals, areas, axis)
     if heading is None:
-        warnings.warn(
+        warn(
             "align_axes: expected upright planes (walls) to define x and y, got none large "
             "enough. Only the up axis is aligned.",
-            stacklevel=3,
         )
         heading = _horizontal(torch.eye(3, dtype=torch.float64)[upwards.abs().argmin()], axis)
     rotation = torch.stack([heading, torch.linalg.cross(axis, heading), axis])
@@ -102,6 +101,7 @@ def transform_planes(planes: Planes, motion: Tensor) -> Planes:
         >>> transform_planes(table, motion).offset.tolist()
         [5.0]
     """
+    check_rigid("transform_planes", "motion", motion)
     dtype = planes.normal.dtype
     rotation, shift = motion[:3, :3].to(planes.normal.device), motion[:3, 3]
     shift = shift.to(planes.normal.device)
@@ -145,6 +145,7 @@ def transform_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
         >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
         ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
     """
+    check_rigid("transform_cloud", "motion", motion)
     rotation, coordinates, finite = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
     # Rotate about the cloud origin: large offsets would lose digits in the rotation.
     shift = motion[:3, 3].numpy() + rotation @ cloud.origin

@@ -1,11 +1,9 @@
 """Classes of the planes of a cloud, with a check of the axis that is up."""
 
-import warnings
-
 from torch import Tensor
 
 from torchrg.axes import likely_up
-from torchrg.errors import CloudWarning
+from torchrg.errors import CloudWarning, warn
 from torchrg.regions.classes import classify_planes
 from torchrg.structures import Planes
 
@@ -19,10 +17,9 @@ def find_kinds(planes: Planes, points: Tensor, labels: Tensor, up: Tensor) -> Te
     columns = (planes.normal, planes.centroid, planes.area, up)
     axis = likely_up(*(values.numpy(force=True).astype("f8") for values in columns))
     if axis:
-        warnings.warn(
+        warn(
             f"the largest floor and ceiling face {axis}, so planes may have wrong classes: pass "
             f"--up {axis} (in Python planes.up={axis!r}) if {axis} is up.",
             CloudWarning,
-            stacklevel=2,
         )
     return classify_planes(planes, points, labels, up)

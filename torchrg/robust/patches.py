@@ -1,6 +1,5 @@
 """Application of robust estimators to batches of patches."""
 
-import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from torchrg._checks import Arguments, as_tensor, check_floating, check_shapes
 from torchrg._opaque import opaque
 from torchrg._parallel import map_chunks
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, warn
 from torchrg.linalg import flatness_tolerance, second_moments, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
@@ -158,10 +157,9 @@ def fit_patchwise(
     # R's robustbase warns below the same number. Normals, which need planes only, have `valid`.
     if batch.numel() and num_points < 2 * size and min_dimension == 0:
         repair = "; pass patches.mT if points are columns" * (num_points <= size)
-        warnings.warn(
+        warn(
             f"{caller}: expected at least {2 * size} points per patch for {size} coordinates, got "
             f"{num_points}: too few to trust the covariance{repair}.",
-            stacklevel=2,
         )
     dense = patches.detach().reshape(batch.numel(), num_points, size)
     counted = torch.isfinite(dense).all(dim=-1)

@@ -13,6 +13,7 @@ from torchrg._checks import as_tensor, check_choices, eager_only
 from torchrg.config import settings_of
 from torchrg.depth import DepthConfig, depth_to_points, segment_depth
 from torchrg.depth.camera import read_intrinsics
+from torchrg.depth.values import DepthKind, check_conversion, convert_depth
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.normals import Orientation
@@ -25,12 +26,29 @@ class DepthTransform(SampleTransform):
     """Base class of depth image transforms.
 
     Results are in world coordinates if a sample has a pose, else in camera coordinates.
+
+    Args:
+        depth_scale: Depth units per meter, 1000 for millimeters. Default: 1, meters.
+        depth_kind: "z" for depth along the optical axis, "ray" for distances from the camera
+            center. Default: "z".
+        keys: Other names for some entries.
     """
 
     names = (
         *("depth", "intrinsics", "pose", "color", "coord", "pixel", "offset"),
         *("plane", "normal", "curvature", "planes"),
     )
+
+    def __init__(
+        self,
+        *,
+        depth_scale: float = 1.0,
+        depth_kind: DepthKind = "z",
+        keys: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(keys=keys)
+        check_conversion(type(self).__name__, depth_scale, depth_kind)
+        self.depth_scale, self.depth_kind = depth_scale, depth_kind
 
     def read_images(self, sample: Entries) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
@@ -99,6 +117,8 @@ class DepthToCloud(DepthTransform):
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with the cloud."""
         depth, intrinsics, poses = self.read_images(sample)
+        options = (self.depth_scale, self.depth_kind)
+        depth = convert_depth("DepthToCloud", depth, intrinsics, *options)
         images = depth_to_points(depth, intrinsics, poses)
         seen = images[..., 2].isfinite()
         pixel = torch.arange(depth[0].numel(), device=depth.device).view(depth.shape[1:])
@@ -148,6 +168,9 @@ class SegmentDepth(DepthTransform):
         config: Configuration, as an object or a dictionary.
         orient: Orientation of normals. Default: towards the camera.
         planes: Whether to add the plane table.
+        depth_scale: Depth units per meter, as in :func:`segment_depth`.
+        depth_kind: Meaning of the depth, as in :func:`segment_depth`.
+        keys: Other names for some entries.
         **changes: Single parameters, as in ``max_depth=4.0``.
 
     Example:
@@ -164,10 +187,12 @@ class SegmentDepth(DepthTransform):
         *,
         orient: Orientation = "auto",
         planes: bool = False,
+        depth_scale: float = 1.0,
+        depth_kind: DepthKind = "z",
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(keys=keys)
+        super().__init__(depth_scale=depth_scale, depth_kind=depth_kind, keys=keys)
         check_choices("SegmentDepth", orient=(orient, Orientation))
         self.config = settings_of("SegmentDepth", DepthConfig, config, changes)
         self.orient, self.planes = orient, planes
@@ -176,7 +201,13 @@ class SegmentDepth(DepthTransform):
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""
         depth, intrinsics, poses = self.read_images(sample)
-        segment = partial(segment_depth, config=self.config, orient=self.orient)
+        segment = partial(
+            segment_depth,
+            config=self.config,
+            orient=self.orient,
+            depth_scale=self.depth_scale,
+            depth_kind=self.depth_kind,
+        )
         segmentations = [
             segment(image, camera, pose=None if poses is None else poses[i])
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
