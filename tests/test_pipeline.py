@@ -234,3 +234,11 @@ def test_a_cloud_of_few_neighborhoods_is_told():
         segment_planes(points)
     assert caught[0].filename == __file__
     segment_planes(points, **{"normals.k": 49})
+
+
+def test_a_voxel_of_another_unit_is_told(scene):
+    points = scene.points[::4]
+    with pytest.warns(UserWarning, match="a voxel size of 1e-05 merges no points; it is a length"):
+        segment_planes(points, "classic", voxel=1e-5)
+    with pytest.warns(UserWarning, match="got 1; add points, or reduce normals.k or the voxel"):
+        segment_planes(points, "classic", voxel=100)

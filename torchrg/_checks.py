@@ -35,6 +35,8 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
     repair = ""
     if isinstance(values, list | tuple):
         repair = "; use torch.tensor, or with_format('torch') for a data set"
+    elif type(values).__name__ == "Cloud":
+        repair = "; pass its points"
     elif name == "points" and not isinstance(values, np.ndarray):
         repair = "; use read_cloud(path).points, or numpy.asarray(cloud.points) for Open3D"
     raise ShapeError(

@@ -32,6 +32,10 @@ _GEO_MODEL, _GEO_HORIZONTAL, _GEO_VERTICAL = 1024, 3076, 4099
 """GeoTIFF keys of the model (2: degrees), and of the units of x and y, and of z."""
 _MIN_ALONG = 0.966
 """Minimum cosine of the angle between a plane and the axis that it faces: 15 degrees."""
+_MAX_ACROSS = 0.259
+"""Maximum cosine of the angle between a wall and the axis that is up."""
+_MIN_WALLS = 0.1
+"""Minimum ratio of walls to floor and ceiling: the faces of a single wall have none around them."""
 _END = 0.15
 """Fraction of the height of a room at its bottom and top that contains floor and ceiling."""
 _MIN_PAIR = 2.0
@@ -129,6 +133,7 @@ def likely_up(
         ends = [faces[:, i] & at for at in (level[:, i] <= _END, level[:, i] >= 1 - _END)]
         pair = 2 * min(areas[end].sum() for end in ends)
         others = [areas[faces[:, j]].sum() for j in range(4) if j != i]
-        if pair > _MIN_PAIR * max(others):
+        walls = areas[np.abs(normals[:, i]) <= _MAX_ACROSS].sum()
+        if pair > _MIN_PAIR * max(others) and walls > _MIN_WALLS * pair:
             return axis
     return ""

@@ -58,8 +58,6 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-_MIN_FITTED = 3
-"""Number of points that define a plane."""
 _MIN_NEIGHBORHOODS = 2
 """Minimum number of points of a cloud, in neighborhoods; fewer points have one plane for all."""
 _UP = torch.tensor([0.0, 0.0, 1.0])
@@ -210,10 +208,18 @@ def _segment(
     sites, inverse = distinct.points, distinct.inverse
     if voxel is not None:
         sites, inverse = _sample_sites(distinct, voxel)
+        if 1 < len(sites) == len(distinct.points):
+            warnings.warn(
+                f"segment_planes: a voxel size of {voxel:g} merges no points; it is a length in "
+                "the unit of the cloud.",
+                CloudWarning,
+                stacklevel=5,
+            )
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
     if len(sites):
         k = min(config.normals.k, len(sites))
-        _warn_about_size(len(sites), config.normals.k)
+        if voxel is not None or k > 2:
+            _warn_about_size(len(sites), config.normals.k)
         neighbors = search_knn(sites, k, canonical=True)
     sampling = None
     if _has_auto(config):
@@ -307,7 +313,7 @@ def _segment(
 
 def _warn_about_size(num_points: int, k: int) -> None:
     """Warn if every neighborhood contains more than half of a cloud."""
-    if _MIN_FITTED <= num_points < _MIN_NEIGHBORHOODS * k:
+    if num_points < _MIN_NEIGHBORHOODS * k:
         warn(
             f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
             f"neighborhoods of {k:,}, got {num_points:,}; add points, or reduce normals.k or the "

@@ -17,6 +17,7 @@ from torchrg.structures import PLANE_KINDS
 
 POINTS = make_room(8000, noise=0.003, seed=0).points
 TURNED = torch.stack([POINTS[:, 0], POINTS[:, 2], -POINTS[:, 1]], dim=1)
+YAWED = TURNED @ torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
 ANSWER = segment_planes(POINTS, "classic", **{"planes.up": "z"}).planes.kind
 
 
@@ -72,6 +73,8 @@ def test_points_are_held_no_longer_than_needed():
 def test_another_axis_that_is_up_is_told():
     with pytest.warns(UserWarning, match=r"largest floor and ceiling face y.*--up y .*up='y'"):
         assert segment_planes(TURNED, "classic").planes.kind is not None
+    with pytest.warns(UserWarning, match="face y"):
+        assert segment_planes(YAWED, "classic").planes.kind is not None
     with pytest.warns(UserWarning, match="face z"):
         segment_planes(POINTS, "classic", **{"planes.up": "y"})
 

@@ -115,7 +115,8 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
         raise FormatError(
-            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; rename it."
+            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; write one of these "
+            "and convert it."
         )
     check_writable(path)
     if is_viewer(path):

@@ -258,7 +258,10 @@ def check_file(path: Path) -> int:
             f"{path}: cannot be read: {getattr(error, 'strerror', error)}."
         ) from error
     if stat.S_ISDIR(status.st_mode):
-        raise FormatError(f"{path}: expected a file, got a directory; name a file inside it.")
+        raise FormatError(
+            f"{path}: expected a file, got a directory; name a file inside it, or run torchrg "
+            "convert folder."
+        )
     if status.st_size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; copy or write it again.")
     return status.st_size

@@ -72,7 +72,7 @@ def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cl
     """Read a text file in float64; ``columns`` overrides the file's column names."""
     # Decoding errors matter only in column names.
     with path.open(encoding=find_encoding(path), errors="replace") as stream:
-        preamble = _read_preamble(path, map(standardize, stream), columns)
+        preamble = _read_preamble(path, map(_standardize, stream), columns)
         table = np.concatenate(list(_parse_blocks(path, stream, preamble)))
     num_points = sum(preamble.counts)
     if len(table) < num_points:
@@ -128,17 +128,12 @@ def read_rows(
     available = os.fstat(stream.fileno()).st_size - start
     content = f"{num_rows:,} {content}"
     check_available(path, start, min_bytes, content, available=available, at_least=True)
-    lines = (standardize(raw.decode("latin-1")) for raw in stream)
+    lines = (_standardize(raw.decode("latin-1")) for raw in stream)
     return _read_table(path, lines, dtype, line_number, num_rows)
 
 
-def standardize(text: str) -> str:
-    """Return text with Windows' spellings of numbers that are not finite as ``nan``.
-
-    Example:
-        >>> standardize("1.5 -1.#IND00 nan(snan)")
-        '1.5 -nan nan'
-    """
+def _standardize(text: str) -> str:
+    """Return text with Windows' spellings of numbers that are not finite as ``nan``."""
     return _WINDOWS_NAN.sub("nan", text) if "#" in text or "(" in text else text
 
 
@@ -176,7 +171,7 @@ def _parse_blocks(path: Path, stream: TextIO, preamble: "_Preamble") -> Iterator
     """Yield tables of the first point and of the lines that follow it in a stream."""
     dtype = np.dtype([("row", "f8", (preamble.num_columns,))])
     line, number = preamble.line, preamble.line_number
-    while block := line + standardize(stream.read(CHARACTERS_PER_READ) + stream.readline()):
+    while block := line + _standardize(stream.read(CHARACTERS_PER_READ) + stream.readline()):
         table = parse_numbers(block.encode(), preamble.num_columns, *preamble.dialect)
         if table is None:
             lines = _extract_counts(block.split("\n"), preamble.counts)
