@@ -209,11 +209,10 @@ def _segment(
     if voxel is not None:
         sites, inverse = _sample_sites(distinct, voxel)
         if 1 < len(sites) == len(distinct.points):
-            warnings.warn(
+            warn(
                 f"segment_planes: a voxel size of {voxel:g} merges no points; it is a length in "
                 "the unit of the cloud.",
                 CloudWarning,
-                stacklevel=5,
             )
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
     if len(sites):
