@@ -14,9 +14,8 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from torchrg.errors import OUT_OF_MEMORY, FormatError, is_out_of_memory
 
@@ -44,12 +43,16 @@ _PROBE_BYTES = 1 << 20
 fit if its last write failed."""
 _CHECKED_END = 1 << 16
 """Bytes checked after the last record. Padding to a page is shorter."""
-_mark: ContextVar[str | None] = ContextVar("_mark", default=None)
-"""Mark in the temporary file names of :func:`atomic_path` in this context."""
+_BYTES_PER_READ = 1 << 20
+"""Bytes of a file read together, which bounds the memory."""
+OUTPUT_MARK = "7472675f6f757470"
+"""Mark of the temporary files of the one command that holds the lock of an output directory."""
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> Iterator[Path]:
+def atomic_path(
+    path: str | os.PathLike[str], *, within: Path | None = None, mark: str = ""
+) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` atomically if the block succeeds.
 
     The file is written next to its destination, flushed to disk, and renamed in one step; then the
@@ -59,6 +62,7 @@ def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> 
     Args:
         path: Destination. A symbolic link is followed.
         within: Folder on the same file system for the temporary file. Default: that of ``path``.
+        mark: 16 hexadecimal digits in its name; see :func:`remove_leftovers`. Default: random.
 
     Yields:
         The temporary path to write to.
@@ -78,7 +82,7 @@ def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> 
         complete
     """
     target = Path(os.path.realpath(path))
-    name = f".{target.stem}.{_mark.get() or make_mark()}{secrets.token_hex(4)}{target.suffix}"
+    name = f".{target.stem}.{mark or make_mark()}{secrets.token_hex(4)}{target.suffix}"
     temporary = (target.parent if within is None else within) / name
     check_writable(path)
     try:
@@ -101,23 +105,11 @@ def make_mark() -> str:
     return secrets.token_hex(8)
 
 
-@contextmanager
-def marked_parts(mark: str) -> Iterator[None]:
-    """Make :func:`atomic_path` put a mark into temporary names in this block and thread.
+def remove_leftovers(folder: Path, mark: str = "") -> None:
+    """Remove the temporary files with a mark that a killed process left in a folder.
 
-    The mark identifies the files that a killed process leaves, so that they can be removed.
-    """
-    token = _mark.set(mark)
-    try:
-        yield
-    finally:
-        _mark.reset(token)
-
-
-def remove_leftovers(folder: Path, mark: str) -> None:
-    """Remove the marked temporary files that a killed process left in a folder.
-
-    No process may be writing there under the same mark.
+    No process may be writing there under the same mark. Default: any mark, for a folder in which
+    only this process writes.
 
     Example:
         >>> import tempfile
@@ -129,17 +121,21 @@ def remove_leftovers(folder: Path, mark: str) -> None:
         ['.a.other.txt', 'a.txt']
     """
     for path in find_leftovers(folder, mark):
-        path.unlink(missing_ok=True)
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
-def find_leftovers(folder: Path, mark: str) -> list[Path]:
-    """Return the files that :func:`remove_leftovers` would remove."""
-    name = re.compile(rf"\..*\.{mark}[0-9a-f]{{8}}(\.[^.]*)?")
+def find_leftovers(folder: Path, mark: str = "") -> list[Path]:
+    """Return what :func:`remove_leftovers` would remove; folders only with a mark."""
+    name = re.compile(rf"\..*\.{mark or '[0-9a-f]{16}'}[0-9a-f]{{8}}(\.[^.]*)?")
     with os.scandir(folder) as entries:
         return [
             Path(entry.path)
             for entry in entries
-            if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)
+            if name.fullmatch(entry.name)
+            and (entry.is_file(follow_symlinks=False) or (mark and not entry.is_symlink()))
         ]
 
 
@@ -151,6 +147,26 @@ def sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def is_unchanged(path: Path, stored: dict[str, Any] | None) -> bool:
+    """Return whether a path is a regular file with the stored fingerprint, or any for None."""
+    is_regular = path.is_file() and not path.is_symlink()
+    return is_regular and (stored is None or fingerprint(path) == stored)
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """Return the size and the SHA-256 of a file."""
+    return {"bytes": path.stat().st_size, "sha256": hash_file(path)}
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(_BYTES_PER_READ):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -317,19 +333,6 @@ def wrap_errors(message: str, *errors: type[BaseException], repair: str = "") ->
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message without a full stop, or its class name."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-
-
-def run_mark(name: str) -> str:
-    """Return the mark of the temporary files of a scan in an output directory.
-
-    It is the same in every run, so that a run removes what a killed one left; see
-    :func:`torchrg.io.files.marked_parts`.
-
-    Example:
-        >>> run_mark("Area_1/office_1")
-        '65d1ec9889e61d51'
-    """
-    return hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
 
 
 def normalize_file_name(name: str) -> str:
