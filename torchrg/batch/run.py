@@ -20,7 +20,7 @@ from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.provenance import Record, read_record
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import OUTPUT_MARK, check_space, normalize_file_name
+from torchrg.io.files import OUTPUT_MARK, PARSE_ERRORS, check_space, normalize_file_name
 
 __all__ = [
     "BatchReport",
@@ -215,6 +215,7 @@ class BatchReport:
         engine: Name of the engine.
         workers: Maximum number of concurrent scans; None if the engine decides.
         interrupted: Whether it was stopped by Ctrl-C or SIGTERM.
+        root: The directory of the data set.
     """
 
     scans: tuple[TaskReport, ...]
@@ -223,6 +224,7 @@ class BatchReport:
     engine: str
     workers: int | None
     interrupted: bool = False
+    root: str = ""
 
     @property
     def disk_full(self) -> bool:
@@ -256,6 +258,7 @@ class BatchReport:
         """Return the report as JSON values."""
         points, stages = self.num_points, self.stage_seconds
         return {
+            "root": self.root,
             "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started)),
             "seconds": self.seconds,
             "engine": self.engine,
@@ -318,10 +321,19 @@ def run_plan(
     names = [job.name for job in plan.jobs]
     scans = [by_name.get(name, TaskReport(name, "not started", attempts=0)) for name in names]
     seconds = time.perf_counter() - begin
-    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
+    root = str(plan.jobs[0].source.root)
+    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted, root)
 
 
 def write_report(out: Path, report: BatchReport) -> None:
     """Write ``report.json`` into the output directory; raise FormatError on failure."""
     with atomic_path(out / REPORT, mark=OUTPUT_MARK) as temporary:
         temporary.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")
+
+
+def read_root(out: Path) -> Path | None:
+    """Return the directory of the data set in the last report, None if it is unknown."""
+    try:
+        return Path(json.loads((out / REPORT).read_bytes())["root"])
+    except (OSError, *PARSE_ERRORS):
+        return None

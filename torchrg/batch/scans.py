@@ -104,11 +104,6 @@ class Job:
         """Folder of the results of the scan and their record."""
         return self.out / self.scan.name
 
-    @property
-    def root(self) -> str:
-        """Path of the data set relative to the output directory."""
-        return os.path.relpath(os.path.realpath(self.source.root), os.path.realpath(self.out))
-
     def input_name(self, path: Path) -> str:
         """Return the path of an input file relative to the data set, as in records."""
         root = self.source.root
@@ -127,13 +122,14 @@ class Job:
             "inputs": [{"name": name} | fingerprint(path) for name, path in inputs],
             "device": "cpu",
             "name": self.name,
-            "root": self.root,
         }
 
     def clean(self) -> None:
-        """Remove temporary files of a killed process."""
+        """Remove temporary files of a killed process, and a claim on no file."""
         if self.folder.is_dir():
             remove_leftovers(self.folder)
+            if (read_record(self.folder) or {}).get("claims") == {}:
+                (self.folder / RECORD).unlink()
 
 
 def convert_scan(job: Job) -> TaskReport:
@@ -146,8 +142,7 @@ def convert_scan(job: Job) -> TaskReport:
     report = report_on(job.name, partial(_convert, job))
     if report.status == "failed":
         with contextlib.suppress(OSError):
-            if (read_record(job.folder) or {}).get("claims") == {}:
-                (job.folder / RECORD).unlink()
+            job.clean()
             if is_ours:
                 job.folder.rmdir()  # Fails unless the folder is empty.
     return report

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torchrg.batch.records import RECORD
-from torchrg.batch.run import LOCK
+from torchrg.batch.run import LOCK, read_root
 from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
 from torchrg.datasets.provenance import (
@@ -84,27 +84,19 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
             record.
     """
     out, source = jobs[0].out, jobs[0].source
-    names = {job.name for job in jobs}
-    found = find_records(out)
+    names, found, described = {job.name for job in jobs}, find_records(out), source.describe()
     for name, record in found.items():
-        check_source(out / name, record, source.describe())
+        check_source(out / name, record, described)
     records = {name: found[name] for name in found if "kind" in found[name]["source"]}
     inputs = {name: _first_input(record) for name, record in records.items()}
     paths = {n: Path(os.path.realpath(source.root / first)) for n, (first, _) in inputs.items()}
     files = {job.name: job.scan.files[0] for job in jobs if job.scan.files}
     by_path = {Path(os.path.realpath(path)): name for name, path in files.items()}
     scans = {name: by_path.get(path) for name, path in paths.items() if name not in names}
-    missing = [
-        name
-        for name, scan in scans.items()
-        if scan is None and not (inputs[name][0] and paths[name].exists())
-    ]
+    missing = [n for n in scans if scans[n] is None and not (inputs[n][0] and paths[n].exists())]
     scans |= (renamed := _find_renamed(files, inputs, missing))
-    is_same = renamed or any(
-        record.get("root") == jobs[0].root or is_unchanged(paths[name], inputs[name][1])
-        for name, record in records.items()
-    )
-    if records and not is_same:
+    is_same = not records or renamed or source.root in (out, read_root(out))
+    if not is_same and not any(is_unchanged(paths[name], inputs[name][1]) for name in records):
         raise FormatError(
             f"{out}: expected results of {source.root}, got another data set "
             f"({_join(missing or [*records])}); choose another directory, or remove them."

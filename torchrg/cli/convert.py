@@ -1,6 +1,8 @@
 """``torchrg convert``: segment a whole data set, on one machine or a Ray cluster."""
 
+import contextlib
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -401,6 +403,9 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
         shown = Progress(bar, sizes, unit=arguments.unit)
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
+    for job in jobs:
+        with contextlib.suppress(OSError):
+            os.removedirs(job.folder)  # Of a scan that failed: it fails unless they are empty.
     code = _finish(report, out, unit=arguments.unit)
     if not report.disk_full:
         plan.jobs[0].source.write_lists(out)

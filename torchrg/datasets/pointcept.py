@@ -158,22 +158,12 @@ def write_files(
     planes: Mapping[str, object],
     description: Record | None = None,
 ) -> list[str]:
-    """Write files and the plane table of a scene, without changing files of other origin.
+    """Write files and the plane table of a scene, and return their names.
 
-    Files of an earlier call, as listed in ``provenance.json``, are replaced, or removed if this
-    call does not write them. A claim on the files precedes them, when all of them are complete.
-
-    Args:
-        target: Folder of the scene; created if missing.
-        contents: Bytes, or arrays to write as ``.npy``, by path relative to ``target``.
-        planes: The plane table.
-        description: Further entries of ``provenance.json``, if it has none.
-
-    Returns:
-        Names of the files written.
-
-    Raises:
-        FormatError: If a file of other origin would be overwritten, or a folder is not writable.
+    ``contents`` has bytes, or arrays to write as ``.npy``, by path relative to the folder of the
+    scene. Files of an earlier call, as listed in ``provenance.json``, are replaced, or removed if
+    this call does not write them; files of other origin raise FormatError. A claim on the files
+    precedes them, when all of them are complete. ``description`` are entries of a new claim.
     """
     contents = {**contents, PLANES_FILE: json.dumps(planes, indent=1).encode()}
     earlier = read_record(target, strict=True)

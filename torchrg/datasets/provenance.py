@@ -37,7 +37,8 @@ def read_record(folder: Path, *, strict: bool = False) -> Record | None:
         ) from error
     content = content if isinstance(content, dict) else {}
     keys = ("claims",) if "claims" in content else ("outputs", "versions")
-    return content if all(isinstance(content.get(key), dict) for key in keys) else None
+    is_record = isinstance(content.get("pages", []), list)
+    return content if is_record and all(isinstance(content.get(k), dict) for k in keys) else None
 
 
 def write_record(folder: Path, record: Record) -> None:

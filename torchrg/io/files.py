@@ -149,10 +149,13 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def is_unchanged(path: Path, stored: dict[str, Any] | None) -> bool:
+def is_unchanged(path: Path, stored: object) -> bool:
     """Return whether a path is a regular file with the stored fingerprint, or any for None."""
     is_regular = path.is_file() and not path.is_symlink()
-    return is_regular and (stored is None or fingerprint(path) == stored)
+    if stored is None or not is_regular:
+        return is_regular
+    has_size = isinstance(stored, dict) and stored.get("bytes") == path.stat().st_size
+    return has_size and fingerprint(path) == stored
 
 
 def fingerprint(path: Path) -> dict[str, Any]:
