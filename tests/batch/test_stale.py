@@ -367,7 +367,7 @@ def test_another_layout_goes_to_another_directory(root, out, run, convert):
     assert f"{out}/train/{FIRST}: {message}" in run(*command, "npy").error
     assert files_of(out) == before
     assert run(*command, "mask3d").code == 0
-    # A single result beside a data set is none of its scans.
+    # A single result in the directory of a data set is none of its scans.
     assert convert("scannet", root, out, "--layout", "mask3d").code == 0
     assert (out / "a" / RECORD).is_file()
 

@@ -188,6 +188,6 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
 
 def claim_pages(job: Job, folder: Path) -> None:
     """Add a folder of pages to the record of a complete scan, before they are written."""
-    record, place = read_record(job.folder), os.path.relpath(os.path.realpath(folder), job.out)
-    if record is not None and place not in (known := record.get("pages", [])):
-        write_record(job.folder, record | {"pages": sorted([*known, place])})
+    record, pages = read_record(job.folder), os.path.relpath(os.path.realpath(folder), job.out)
+    if record is not None and pages not in (known := record.get("pages", [])):
+        write_record(job.folder, record | {"pages": sorted([*known, pages])})

@@ -73,8 +73,8 @@ class Arguments:
     root: Annotated[Path, Argument("ROOT", is_positional=True)]
     """Directory of the data set, read only."""
     out: Annotated[Path, Argument("OUT", is_positional=True)]
-    """Output directory, with one folder per scan; created if missing. Finished scans are
-    skipped."""
+    """Output directory of one data set in one layout, with one folder per scan; created if missing.
+    Finished scans are skipped."""
     workers: int | None = None
     """Number of scans processed at a time. Default: one per core; on a cluster, as the memory
     allows."""
@@ -95,8 +95,8 @@ class Arguments:
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False
-    """Remove unmodified results of scans missing from ROOT. Without it, such results are listed and
-    the command stops."""
+    """Remove unmodified results of scans missing from ROOT, and their pages. Without it, such
+    results are listed and the command stops."""
     dry_run: bool = False
     """Print the plan, write nothing."""
     unit: ClassVar[str] = "scan"

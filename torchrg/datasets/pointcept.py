@@ -3,8 +3,8 @@
 ``coord`` float32, ``color`` uint8 and ``normal`` float32 of shape ``(N, 3)``; ``segment`` and
 ``instance`` int16 of shape ``(N, 1)``, ``(N, 3)`` for ScanNet++; ``segment20``, ``segment200`` and
 ``instance`` int64 of shape ``(N,)`` for ScanNet. torchrg adds ``plane`` int32 of shape ``(N,)``,
-``curvature`` float32 of shape ``(N, 1)`` (like Pointcept's features), ``planes.json``, and
-optionally ``superpoint`` int32. Pointcept ignores unknown files;
+``curvature`` float32 of shape ``(N, 1)`` (like Pointcept's features), ``planes.json``,
+``provenance.json``, and optionally ``superpoint`` int32. Pointcept ignores unknown files;
 ``import torchrg.transforms.pointcept`` makes it load these.
 """
 
