@@ -2,21 +2,13 @@
 
 import dataclasses
 import json
-from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
-
-from torchrg import kernels, version
+from torchrg.batch.scans import Job
 from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
-from torchrg.datasets.provenance import Record, read_record
+from torchrg.datasets.provenance import Record, describe_versions, read_record
 from torchrg.io.files import fingerprint, hash_file
 from torchrg.result import RECORD as RECORD
-
-if TYPE_CHECKING:
-    from torchrg.batch.scans import Job
 
 _RESULTS = {"points": int, "regions": int, "repairs": list, "warnings": list}
 """Types of the record entries that reports repeat."""
@@ -32,18 +24,7 @@ def describe_run(source: Path, settings: PipelineConfig | NormalsConfig | DepthC
     }
 
 
-def describe_versions() -> dict[str, str]:
-    """Return the versions of the software that determines results."""
-    return {
-        "torchrg": version.__version__,
-        "torch": str(torch.__version__),
-        "numpy": np.__version__,
-        "scipy": metadata.version("scipy"),
-        "kernels": "none" if kernels.name_of_library() is None else "C++",
-    }
-
-
-def reason_to_convert(job: "Job") -> str:
+def reason_to_convert(job: Job) -> str:
     """Return why a scan must be converted, or "" if it is up to date.
 
     ``"new"`` without a complete record; else the first of version, settings, options, input or

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import filelock
 
-from torchrg.batch.records import describe_versions, reason_to_convert
+from torchrg.batch.records import reason_to_convert
 from torchrg.batch.scans import Job, Source
 from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import SceneFiles
-from torchrg.datasets.provenance import Record, read_record
+from torchrg.datasets.provenance import Record, describe_versions, read_record
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import OUTPUT_MARK, PARSE_ERRORS, check_space, normalize_file_name

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import ClassVar
 
 from torchrg.batch.memory import scan_memory
-from torchrg.batch.records import RECORD, describe_versions
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
 from torchrg.datasets.folder import SceneFiles
@@ -19,13 +18,14 @@ from torchrg.datasets.provenance import (
     check_owned,
     check_source,
     claim_files,
+    describe_versions,
     owned_files,
     read_record,
     remove_unwritten,
     write_record,
 )
 from torchrg.io.files import check_writable, fingerprint, remove_leftovers, sync_folder
-from torchrg.result import PLANES_FILE, write_table
+from torchrg.result import PLANES_FILE, RECORD, write_table
 
 __all__ = ["Job", "Source", "convert_scan"]
 __dir__ = __all__.copy

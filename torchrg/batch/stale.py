@@ -35,7 +35,7 @@ from torchrg.io.files import (
 )
 from torchrg.result import PAGE_SUFFIXES
 
-__all__ = ["StaleResult", "check_stale", "find_records", "find_stale", "remove_stale"]
+__all__ = ["StaleResult", "check_stale", "find_stale", "remove_stale"]
 __dir__ = __all__.copy
 
 _MAX_NAMED = 3

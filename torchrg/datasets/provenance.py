@@ -8,9 +8,14 @@ The records in an output directory are its index.
 import json
 import os
 from collections.abc import Iterable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
+from torchrg import kernels, version
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.files import PARSE_ERRORS, first_line, is_unchanged
@@ -18,6 +23,17 @@ from torchrg.result import RECORD
 
 Record = dict[str, Any]
 """A record, or a part of one, as JSON values."""
+
+
+def describe_versions() -> dict[str, str]:
+    """Return the versions of the software that determines results."""
+    return {
+        "torchrg": version.__version__,
+        "torch": str(torch.__version__),
+        "numpy": np.__version__,
+        "scipy": metadata.version("scipy"),
+        "kernels": "none" if kernels.name_of_library() is None else "C++",
+    }
 
 
 def read_record(folder: Path, *, strict: bool = False) -> Record | None:
