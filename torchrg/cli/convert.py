@@ -437,8 +437,10 @@ def _index_pages(folder: Path, scans: list[Job]) -> Path:
     """Write the index of the viewers of complete scans in a folder, and return its path."""
     entries = []
     for name, record in ((job.name, read_record(job.folder) or {}) for job in scans):
-        if "outputs" in record and (folder / f"{name}.html").is_file():
-            words = f"{record.get('points'):,} points, {record.get('regions'):,} planes"
+        points, regions = record.get("points"), record.get("regions")
+        is_complete = isinstance(points, int) and isinstance(regions, int)
+        if is_complete and (folder / f"{name}.html").is_file():
+            words = f"{points:,} points, {regions:,} planes"
             entries.append(Entry(name, f"{name}.png", f"{name}.html", words))
     return write_index(folder, scans[0].source.root.name, entries)
 

@@ -163,15 +163,14 @@ def run(argv: list[str]) -> int:
 @contextlib.contextmanager
 def _layout_lock(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
     """Lock the output directory and update the lists of a layout that shares folders."""
-    if arguments.layout is not None:
-        source = {"layout": arguments.layout, "version": VERSION}
-        for name, record in find_records(arguments.out).items():
-            check_source(arguments.out / name, record, source)
     if arguments.layout in (None, "pointcept"):
         yield
         return
     check_stems(arguments.layout, {path.name: path.name for path in outputs})
     with lock_folder(arguments.out):
+        source = {"layout": arguments.layout, "version": VERSION}
+        for name, record in find_records(arguments.out).items():
+            check_source(arguments.out / name, record, source)
         check_lists(arguments.layout, _DATASET, arguments.out)
         yield
         write_lists(arguments.layout, _DATASET, arguments.out)
