@@ -52,8 +52,10 @@ __all__ = ["Result", "read_result", "write_table"]
 __dir__ = __all__.copy
 
 PLANES_FILE, RECORD = "planes.json", "provenance.json"
-"""Files of the plane table and the provenance in a folder of arrays. The provenance is written
-last, so that a scan without it is incomplete."""
+"""Files of the plane table and the provenance in a folder of arrays; see
+``torchrg/datasets/provenance.py``."""
+PAGE_SUFFIXES = (".png", ".html")
+"""Suffixes of the image and the viewer of a result."""
 _FOLDER_FIELDS = {
     "plane": "labels",
     "superpoint": "superpoint",

@@ -1,18 +1,20 @@
 """The whole command is stopped at any moment: no partial file, and the next run finishes."""
 
 import contextlib
+import json
 import os
 import random
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.datasets.s3dis_tree import write_clean_room
-from torchrg.batch.run import list_jobs
+from torchrg.batch.run import LOCK, list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
@@ -93,9 +95,9 @@ def wait_for_files(out, process, count):
 
 
 def check_whole(out, undisturbed):
-    """Check that every file there is the one of an undisturbed run."""
+    """Check that every file there is the one of an undisturbed run, or a claim on files."""
     for name, content in results_of(out).items():
-        assert content == undisturbed[name], name
+        assert content == undisturbed[name] or "claims" in json.loads(content), name
 
 
 def finish(process):
@@ -122,8 +124,25 @@ def test_a_killed_command_goes_on_where_it_was(rooms, undisturbed, tmp_path):
     check_finishes(rooms, tmp_path, undisturbed)
 
 
-KILLS = 50
-"""Kills of the command for each kind of data set."""
+KILLS = 60
+"""Kills of the command or one of its workers, for each kind of data set."""
+
+
+def workers_of(process):
+    """Return the running processes that a command has started, which are its workers."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+            if int(parent) == process.pid and state != "Z":
+                found.append(int(path.parent.name))
+    return found
+
+
+def check_nothing_is_left(out):
+    """Check that no temporary file and no empty folder is there."""
+    assert [path.name for path in out.rglob(".*")] == [LOCK]
+    assert not [path for path in out.rglob("*") if path.is_dir() and not any(path.iterdir())]
 
 
 @pytest.fixture
@@ -145,6 +164,7 @@ def test_kills_at_random_moments_change_no_byte(rooms, rooms_of_s3dis, tmp_path,
     finish(start(root, tmp_path / "undisturbed", workers=2, kind=kind))
     seconds = time.monotonic() - begin
     undisturbed, kills, round_number = results_of(tmp_path / "undisturbed"), 0, 0
+    num_workers_killed = 0
     while kills < KILLS:
         out = tmp_path / f"round_{round_number}"
         round_number += 1
@@ -158,14 +178,24 @@ def test_kills_at_random_moments_change_no_byte(rooms, rooms_of_s3dis, tmp_path,
                 count = sum(path.is_file() for path in out.rglob("*"))
                 wait_for_files(out, process, count + chance.randint(1, 8))
                 time.sleep(chance.choice([0, 0.002, 0.02, 0.1]))
-            is_done = process.poll() is not None
-            # Sometimes its workers are left to themselves, as when the kernel picks the process.
+            # A worker alone, the command alone, or both, as the kernel picks them.
+            victim = chance.choice(["worker", "command", "all"])
+            workers, is_done = workers_of(process), process.poll() is not None
             with contextlib.suppress(ProcessLookupError):
-                (os.killpg if chance.random() < 0.5 else os.kill)(process.pid, signal.SIGKILL)
-            process.communicate()
+                if victim == "worker" and workers:
+                    os.kill(chance.choice(workers), signal.SIGKILL)
+                    num_workers_killed += not is_done
+                else:
+                    (os.kill if victim == "command" else os.killpg)(process.pid, signal.SIGKILL)
+            # Without a worker, the command goes on to its end.
+            _, message = process.communicate()
+            assert process.returncode in (-signal.SIGKILL, 0, 3), message
             kills += not is_done
+            is_done |= process.returncode == 0
             check_whole(out, undisturbed)
         check_finishes(root, out, undisturbed, kind=kind)
+        check_nothing_is_left(out)
+    assert 0 < num_workers_killed < KILLS
 
 
 @pytest.mark.parametrize(

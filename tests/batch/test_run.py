@@ -5,10 +5,10 @@ import os
 
 import pytest
 
-from torchrg.batch.run import REPORT, make_plan, run_plan, write_report
+from torchrg.batch.run import make_plan, run_plan, write_report
 from torchrg.batch.scans import convert_scan
 from torchrg.cli.report import format_costs, format_report
-from torchrg.io.files import remove_leftovers, run_mark
+from torchrg.io.files import OUTPUT_MARK, remove_leftovers
 
 
 def run(jobs, on_report=lambda report: None):
@@ -74,7 +74,7 @@ def test_a_report_that_was_not_completed_is_removed_the_next_time(faults, tmp_pa
         with pytest.raises(ZeroDivisionError):
             write_report(tmp_path, report)
     (left,) = tmp_path.glob(".report.*.json")
-    remove_leftovers(tmp_path, run_mark(REPORT))
+    remove_leftovers(tmp_path, OUTPUT_MARK)
     assert not left.exists()
 
 

@@ -46,7 +46,7 @@ def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
     earlier = ("superpoint.npy", "edited.npy", "../../other.npy")
     record["outputs"] |= dict.fromkeys(earlier, nothing)
     (job.folder / RECORD).write_text(json.dumps(record))
-    unfinished = f".result.{job.mark}01234567.txt"
+    unfinished = ".result.0123456789abcdef01234567.txt"
     for name in (*earlier, unfinished, "theirs.npy", ".result.0123abcd.txt"):
         (job.folder / name).touch()
     (job.folder / "edited.npy").write_text("by the user since")
@@ -54,6 +54,13 @@ def test_remains_of_a_killed_run_and_of_other_options_go(faults, tmp_path):
     names = {path.name for path in job.folder.iterdir()}
     assert names == {"result.txt", RECORD, "theirs.npy", "edited.npy", ".result.0123abcd.txt"}
     assert (tmp_path / "other.npy").exists()
+
+
+def make_claim(path):
+    """Turn a record into what a conversion leaves that is killed."""
+    record = json.loads(path.read_text())
+    claims = dict.fromkeys(record.pop("outputs"))
+    path.write_text(json.dumps({**record, "claims": claims}))
 
 
 @pytest.fixture
@@ -105,8 +112,8 @@ def test_results_are_replaced_by_those_of_other_settings_and_no_others(job_of_a_
         "planes.json",
         "provenance.json",
     ]
-    # Killed after the old record went and before the new one came.
-    (job.folder / "provenance.json").unlink()
+    # Killed after the claim and before the record.
+    make_claim(job.folder / "provenance.json")
     assert convert_scan(job).status == "converted"
     assert (job.folder / "superpoint.npy").exists()
 

@@ -13,13 +13,14 @@ from tests.batch.test_interruptions import results_of
 from tests.datasets.s3dis_tree import write_clean_room
 from tests.datasets.scannet_tree import write_scan, write_tables
 from torchrg.batch.records import RECORD
-from torchrg.batch.run import DATA_SETS, LOCK, REPORT, list_jobs
+from torchrg.batch.run import LOCK, REPORT, list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.batch.stale import check_stale, find_stale, remove_stale
 from torchrg.config import load_config
 from torchrg.datasets import ScanNet
 from torchrg.datasets.layouts import LAYOUTS
+from torchrg.io.files import OUTPUT_MARK, remove_leftovers
 from torchrg.scenes import make_room
 
 FIRST, MOVED, LAST = SCANS = ("scene0001_00", "scene0002_00", "scene0003_00")
@@ -75,9 +76,16 @@ def files_of(out):
     return {name: path.read_bytes() for name, path in files.items() if name not in (LOCK, REPORT)}
 
 
-def save_rooms(folder, *names):
+def make_claim(path):
+    """Turn a record into what a conversion leaves that is killed."""
+    record = json.loads(path.read_text())
+    claims = dict.fromkeys(record.pop("outputs"))
+    path.write_text(json.dumps({**record, "claims": claims}))
+
+
+def save_rooms(folder, *names, first=0):
     """Write small rooms, each of its own points."""
-    for seed, name in enumerate(names):
+    for seed, name in enumerate(names, first):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         np.save(folder / name, make_room(num_points=300, seed=seed).points)
 
@@ -127,9 +135,8 @@ def test_a_scan_that_left_the_data_set_is_named(root, out, convert, layout, flag
     assert convert(*command, "--prune", *flags).code == 0
     assert (files_of(out) == before) == bool(flags)
     if not flags:
-        texts = (content for name, content in files_of(out).items() if name != DATA_SETS)
         assert not [name for name in files_of(out) if MOVED.removeprefix("scene") in name]
-        assert not [text for text in texts if MOVED.encode() in text]
+        assert not [text for text in files_of(out).values() if MOVED.encode() in text]
 
 
 def test_lists_lose_the_scans_of_other_splits_and_keep_other_names(root, out, convert):
@@ -193,12 +200,13 @@ def test_a_removal_that_is_killed_at_any_moment_goes_on(
     assert convert("scannet", root, out, "--layout", "mask3d").code == 0
     record = out / "train" / MOVED / RECORD
     if not has_record:
-        record.unlink()
+        make_claim(record)
     start = shutil.copytree(out, out.with_name("start"))
     move(root)
     jobs = list_jobs(CloudSource(ScanNet(root), load_config("classic"), layout="mask3d"), out)
 
     def remove():
+        remove_leftovers(out, OUTPUT_MARK)
         for result in find_stale(jobs):
             check_stale([result], root, prune=False)
             remove_stale(result)
@@ -206,16 +214,16 @@ def test_a_removal_that_is_killed_at_any_moment_goes_on(
 
     expected = remove()
     assert not [name for name in expected[0] if "2_00" in name and not name.startswith("val")]
-    calls = {name: getattr(os, name) for name in ("unlink", "rmdir")}
+    calls = {name: getattr(os, name) for name in ("unlink", "rmdir", "rename")}
     for moment in range(20):
         shutil.rmtree(out)
         shutil.copytree(start, out)
         left = iter(range(moment))
 
-        def call(path, *given, name, left=left):
+        def call(path, *given, name, left=left, **options):
             if next(left, None) is None:
                 raise KeyboardInterrupt
-            return calls[name](path, *given)
+            return calls[name](path, *given, **options)
 
         with monkeypatch.context() as patch:
             for name in calls:
@@ -226,8 +234,8 @@ def test_a_removal_that_is_killed_at_any_moment_goes_on(
             except KeyboardInterrupt:
                 pass
         # The record stays until all files that it names are gone.
-        left_over = [name for name in files_of(out) if name not in expected[0]]
-        assert record.exists() or not has_record or not left_over
+        left_over = [n for n in files_of(out) if n not in expected[0] and OUTPUT_MARK not in n]
+        assert record.exists() or not left_over
         assert remove() == expected
     assert moment > 6
 
@@ -235,10 +243,14 @@ def test_a_removal_that_is_killed_at_any_moment_goes_on(
 def test_what_a_killed_command_left_of_a_scan_that_moved_goes_too(root, out, convert):
     assert convert("scannet", root, out).code == 0
     folder = out / "train" / MOVED
-    (folder / RECORD).unlink()
+    make_claim(folder / RECORD)
     (folder / "coord.npy").unlink()
-    shutil.rmtree(out / "train" / FIRST)
-    (out / "train" / FIRST).mkdir()
+    record = out / "train" / FIRST / RECORD
+    described = json.loads(record.read_text())
+    shutil.rmtree(record.parent)
+    record.parent.mkdir()
+    del described["outputs"]
+    record.write_text(json.dumps(described | {"claims": {}}))
     move(root, train=[], val=SCANS)
     done = convert("scannet", root, out)
     assert (done.code, done.err) == (0, "")
@@ -264,43 +276,138 @@ def test_scans_that_were_not_asked_for_are_not_missing(tmp_path, out, convert):
     assert yaml.safe_load((out / "Area_2_database.yaml").read_text()) == []
 
 
-def test_data_sets_share_a_directory(tmp_path, out, convert):
-    roots = {name: tmp_path / name for name in ("one", "two")}
+def test_a_directory_holds_one_data_set(tmp_path, out, convert):
+    roots = {name: tmp_path / name for name in ("one", "two", "three", "four")}
     save_rooms(roots["one"], "a.npy", "b.npy", "c.npy")
-    save_rooms(roots["two"], "d.npy", "sub/e.npy")
-    for name in ("one", "two", "one", "two"):
-        done = convert("folder", roots[name], out)
-        assert (done.code, done.err) == (0, "")
-    names = {"a", "b", "c", "d", "sub/e"}
-    assert {name for name in names if (out / name / RECORD).exists()} == names
+    save_rooms(roots["two"], "d.npy", "sub/e.npy", first=5)
+    save_rooms(roots["three"], "f.npy", "a.npy", first=7)
+    save_rooms(roots["four"], "a.npy", "b.npy", "c.npy", "d.npy", first=9)
+    assert convert("folder", roots["one"], out).code == 0
+    before = files_of(out)
+    for name, results in (("two", "a, b, c"), ("three", "b, c"), ("four", "a, b, c")):
+        for flags in ([], ["--prune"], ["--only", "*"], ["--force"], ["--dry-run"]):
+            done = convert("folder", roots[name], out, *flags)
+            assert done.code == 2
+            assert done.error == (
+                f"torchrg: {out}: expected results of {roots[name]}, got another data set "
+                f"({results}); choose another directory, or remove them.\n"
+            )
+    assert files_of(out) == before
     (roots["one"] / "b.npy").unlink()
-    assert convert("folder", roots["two"], out).code == 0
     # Copies of a data set are the same data set.
     copy = shutil.copytree(roots["one"], tmp_path / "copy")
     for root in (roots["one"], copy):
         assert f"{out}/b: no scan in {root} belongs" in convert("folder", root, out).error
-    # Without the list of scans, those of which none was converted here are another data set.
-    (out / DATA_SETS).unlink()
-    save_rooms(tmp_path / "three", "f.npy")
-    assert convert("folder", tmp_path / "three", out).code == 0
-    (out / DATA_SETS).unlink()
-    error = convert("folder", roots["one"], out).error
-    assert f"{out}/b, {out}/d, {out}/f and 1 more: no scan in" in error
 
 
-def test_results_in_other_output_directories_and_of_other_kinds_are_left_alone(
-    tmp_path, root, out, convert
-):
+def test_a_data_set_is_known_by_its_place_when_all_its_scans_changed(tmp_path, out, convert):
+    root = tmp_path / "in"
+    save_rooms(root, "a.npy", "b.npy", "c.npy")
+    assert convert("folder", root, out).code == 0
+    (root / "c.npy").unlink()
+    save_rooms(root, "a.npy", "b.npy", first=5)
+    assert f"{out}/c: no scan in {root} belongs" in convert("folder", root, out).error
+    assert convert("folder", root, out, "--prune").code == 0
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        {"a": "new"},
+        {"a": "A"},
+        {"a": "b/a"},
+        {"a": "x", "b": "y", "c": "z"},
+        {"c": "d", "b": "c", "a": "b"},
+        {"a": None, "b": "a", "c": "b"},
+    ],
+)
+def test_scans_of_other_names_are_known_by_their_content(tmp_path, out, convert, names):
+    root, kept = tmp_path / "in", {old: new for old, new in names.items() if new is not None}
+    save_rooms(root, *(f"{name}.npy" for name in names))
+    assert convert("folder", root, out).code == 0
+    for name in names.keys() - kept.keys():
+        (root / f"{name}.npy").unlink()
+    for old, new in kept.items():
+        (root / new).parent.mkdir(exist_ok=True)
+        (root / f"{old}.npy").rename(root / f"{new}.npy")
+    done = convert("folder", root, out)
+    assert (done.code, done.err) == (0, "")
+    for name in names.keys() - kept.values():
+        assert f"{out}/{name}: removed: its scan is {names[name]} now\n" in done.out
+    found = files_of(out)
+    shutil.rmtree(out)
+    assert convert("folder", root, out).code == 0
+    assert files_of(out) == found
+
+
+def test_copies_are_no_new_names(tmp_path, out, convert):
+    root = tmp_path / "in"
+    save_rooms(root, "a.npy")
+    shutil.copy(root / "a.npy", root / "b.npy")
+    assert convert("folder", root, out).code == 0
+    # A copy of a result is of the user, as is a record of another place.
+    shutil.copytree(out / "a", out / "a_backup")
+    (root / "a.npy").unlink()
+    assert f"{out}/a: no scan in {root} belongs" in convert("folder", root, out).error
+    assert convert("folder", root, out, "--prune").code == 0
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["a_backup", "b"]
+    assert len([*(out / "a_backup").iterdir()]) == 6
+
+
+def test_another_layout_goes_to_another_directory(root, out, run, convert):
+    assert convert("scannet", root, out, "--layout", "mask3d").code == 0
+    before, message = files_of(out), "expected results in layout npy, got mask3d; choose another "
+    for flags in ([], ["--force"], ["--prune"], ["--dry-run"]):
+        done = convert("scannet", root, out, "--layout", "npy", *flags)
+        assert (done.code, done.error.count("\n")) == (2, 1)
+        assert f"{out}/train/{FIRST}: {message}" in done.error
+    save_rooms(out.parent / "in", "a.npy")
+    command = ("segment", out.parent / "in" / "a.npy", "--out", out, "--layout")
+    assert f"{out}/train/{FIRST}: {message}" in run(*command, "npy").error
+    assert files_of(out) == before
+    assert run(*command, "mask3d").code == 0
+    # A single result in the directory of a data set is none of its scans.
+    assert convert("scannet", root, out, "--layout", "mask3d").code == 0
+    assert (out / "a" / RECORD).is_file()
+
+
+def test_pages_leave_with_their_scan(tmp_path, out, convert):
+    pytest.importorskip("jinja2")
+    root, pages = tmp_path / "in", tmp_path / "pages"
+    save_rooms(root, "a.npy", "b.npy", "sub/c.npy", "s.npy")
+    assert convert("folder", root, out, "--pages", pages).code == 0
+    (root / "b.npy").unlink()
+    (root / "sub" / "c.npy").rename(root / "d.npy")
+    (pages / "b.txt").write_text("mine")
+    assert convert("folder", root, out, "--prune").code == 0
+
+    def find_pages():
+        return {path.relative_to(pages).as_posix() for path in pages.rglob("*")}
+
+    left = {"index.html", "b.txt", "a.html", "a.png", "s.html", "s.png"}
+    assert find_pages() == left
+    index = (pages / "index.html").read_text()
+    assert [name for name in "abcds" if f"{name}.html" in index] == ["a", "s"]
+    # The index lists the pages of all scans, whichever command drew them.
+    done = convert("folder", root, out, "--only", "d", "--pages", pages)
+    assert done.code == 0
+    assert find_pages() == left | {"d.html", "d.png"}
+    index = (pages / "index.html").read_text()
+    assert [name for name in "abcds" if f"{name}.html" in index] == ["a", "d", "s"]
+
+
+def test_other_directories_are_left_alone_and_other_kinds_are_refused(tmp_path, root, out, convert):
     save_rooms(tmp_path / "in", "a.npy", "b.npy")
     assert convert("folder", tmp_path / "in", out).code == 0
     save_rooms(tmp_path / "more", "x.npy")
     assert convert("folder", tmp_path / "more", out / "more").code == 0
-    assert convert("scannet", root, out).code == 0
-    (out / DATA_SETS).unlink()
+    error = convert("scannet", root, out).error
+    assert f"{out}/a: expected results of convert scannet, got folder; choose another" in error
     (tmp_path / "in" / "b.npy").unlink()
     assert convert("folder", tmp_path / "in", out, "--prune").code == 0
     assert not (out / "b").exists()
-    for name in ("a", "more/x", f"train/{FIRST}", f"val/{LAST}"):
+    for name in ("a", "more/x"):
         assert (out / name / RECORD).is_file()
 
 
@@ -323,27 +430,6 @@ def test_a_folder_of_results_may_be_a_link(root, out, tmp_path, convert):
     assert (tmp_path / "last" / RECORD).exists()
 
 
-def test_files_of_other_layouts_go_with_their_scan(root, out, convert):
-    pytest.importorskip("h5py")
-    for layout in ("nag", "mask3d", "npy"):
-        assert convert("scannet", root, out, "--layout", layout).code == 0
-    move(root)
-    assert convert("scannet", root, out, "--layout", "npy").code == 0
-    found = files_of(out)
-    assert not [name for name in found if name.startswith("train") and "0002_00" in name]
-    assert MOVED.encode() not in found["train_database.yaml"]
-    assert "superpoints/scene0002_00.npy" in found
-    assert "train/scene0001_00.h5" in found
-    # Without its fingerprint no one knows whether a file was changed.
-    path = out / "val" / MOVED / RECORD
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
-    assert convert("scannet", root, out, "--layout", "nag").code == 0
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_layouts": {}}))
-    move(root, train=SCANS, val=[])
-    error = convert("scannet", root, out, "--layout", "nag").error
-    assert f"{out}/planes/{MOVED}.npy: was changed or not written by torchrg" in error
-
-
 def test_a_scan_without_a_split_in_its_name_leaves_the_old_one_too(tmp_path, out, convert):
     scene = tmp_path / "in" / "hall"
     scene.mkdir(parents=True)
@@ -359,19 +445,6 @@ def test_a_scan_without_a_split_in_its_name_leaves_the_old_one_too(tmp_path, out
         assert convert(*command, layout).code == 0
         assert ((out / "test" / file).exists(), (out / "train" / file).exists()) == (False, True)
         shutil.rmtree(out)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[3]", '[{"../../x": "a"}]', '[["a"]]', "\x00"])
-def test_a_damaged_list_of_scans_is_written_again(tmp_path, out, convert, text):
-    save_rooms(tmp_path / "in", "a.npy", "b.npy")
-    assert convert("folder", tmp_path / "in", out).code == 0
-    whole = (out / DATA_SETS).read_bytes()
-    (out / DATA_SETS).write_text(text)
-    assert convert("folder", tmp_path / "in", out).code == 0
-    if "x" not in text:
-        assert (out / DATA_SETS).read_bytes() == whole
-    (tmp_path / "in" / "b.npy").unlink()
-    assert f"{out}/b: no scan in" in convert("folder", tmp_path / "in", out).error
 
 
 @pytest.mark.parametrize(
@@ -392,9 +465,13 @@ def test_records_of_other_versions_end_in_no_loss(root, out, convert, change):
     before = results_of(out)
     move(root)
     done = convert("scannet", root, out)
-    if "versions" in change or change.keys() & {"inputs", "source"}:
+    if "source" in change:  # The record of a single result.
+        assert (done.code, path.exists()) == (0, True)
+    elif "versions" in change:
         assert (done.code, done.err) == (0, "")
         assert not path.exists()
+    elif "inputs" in change:
+        assert f"{path.parent}: no scan in {root} belongs" in done.error
     else:
         assert "npy: was changed or not written by torchrg" in done.error
         assert results_of(out) == before
@@ -405,20 +482,5 @@ def test_a_damaged_record_says_nothing_of_changes(root, out, convert):
     (out / "train" / MOVED / RECORD).write_text("{")
     before = files_of(out)
     move(root)
-    assert (
-        f"{MOVED}/{RECORD}: was changed or not written by torchrg"
-        in convert("scannet", root, out).error
-    )
+    assert f"{MOVED}/{RECORD}: expected JSON, got: " in convert("scannet", root, out).error
     assert files_of(out) == before
-
-
-def test_the_scans_of_a_directory_are_listed_before_the_first(tmp_path, out, convert, monkeypatch):
-    save_rooms(tmp_path / "in", "a.npy", "b.npy")
-
-    def killed(jobs, *, workers, memory_limit):
-        assert json.loads((out / DATA_SETS).read_text()) == [{"a": "a.npy", "b": "b.npy"}]
-        raise KeyboardInterrupt
-        yield
-
-    monkeypatch.setattr("torchrg.cli.convert.run_local", killed)
-    assert convert("folder", tmp_path / "in", out, "--only", "a").code == 130

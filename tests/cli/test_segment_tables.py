@@ -92,7 +92,6 @@ def test_json_is_the_planes_json_of_convert(scans, tmp_path, run):
     assert run(*command, "--table", table).code == 0
     assert run("convert", "folder", scans[0], out, *CLASSIC, "--table", "planes.csv").code == 0
     written = json.loads((out / "room" / "planes.json").read_text())
-    assert written.pop("written")
     assert json.loads(table.read_text()) == written
     rows = rows_of(out / "room" / "planes.csv")
     assert [float(row["offset"]) for row in rows] == [row["offset"] for row in written["planes"]]
@@ -222,7 +221,7 @@ def test_what_are_no_objects_is_refused_in_one_line(scans, tmp_path, run, comman
     reported = run("convert", "folder", scans[0], tmp_path / "out", "--within", field)
     assert reported.code == 3
     assert message in reported.err
-    assert set(files(tmp_path)) == {".torchrg.lock", ".torchrg.scans.json", "report.json"}
+    assert set(files(tmp_path)) == {".torchrg.lock", "report.json"}
 
 
 def test_lengths_that_differ_in_a_folder_are_refused(scans, tmp_path, run):
@@ -233,7 +232,7 @@ def test_lengths_that_differ_in_a_folder_are_refused(scans, tmp_path, run):
     reported = run("convert", "folder", tmp_path / "root", tmp_path / "out", "--within", "instance")
     assert reported.code == 3
     assert "instance.npy: expected 500 rows" in reported.err or "499" in reported.err
-    assert set(files(tmp_path / "out")) == {".torchrg.lock", ".torchrg.scans.json", "report.json"}
+    assert set(files(tmp_path / "out")) == {".torchrg.lock", "report.json"}
 
 
 def test_frames_have_tables_too(tmp_path, run):

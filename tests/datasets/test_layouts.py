@@ -270,12 +270,14 @@ def test_pickles_name_no_module_that_old_numpy_lacks(converted):
         assert modules <= {"numpy", "numpy.core.multiarray", "_codecs"}
 
 
-def test_what_is_done_is_kept_and_layouts_share_a_directory(root, room, tmp_path):
+def test_what_is_done_is_kept_and_layouts_share_no_directory(root, room, tmp_path):
     path = tmp_path / "superpoints" / f"{SCAN}.npy"
-    for layout in ("npy", "mmdet3d", "npy"):
-        (report,) = convert(root, tmp_path, layout, only=f"*{SCAN}")
-        assert report.status == "converted", report
+    (report,) = convert(root, tmp_path, "npy", only=f"*{SCAN}")
+    assert report.status == "converted", report
     before = path.read_bytes()
+    for layout in ("mmdet3d", "pointcept"):
+        (report,) = convert(root, tmp_path, layout, only=f"*{SCAN}")
+        assert f"{SCAN}: expected results in layout {layout}, got npy; choose" in report.reason
     assert convert(root, tmp_path, "npy", only=f"*{SCAN}") == []
     path.write_bytes(b"")
     assert len(convert(root, tmp_path, "npy", only=f"*{SCAN}")) == 1
@@ -292,9 +294,10 @@ def test_what_is_done_is_kept_and_layouts_share_a_directory(root, room, tmp_path
 
 def test_results_may_go_beside_the_scans_where_programs_look_for_them(root, room, tmp_path):
     place = tmp_path / "data"
-    shutil.copytree(root, place)
-    before = digest(place / "scans")
-    for layout in ("spformer", "pointcept"):
+    for layout in ("pointcept", "spformer"):
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(root, place)
+        before = digest(place / "scans")
         for status in (["converted"], []):
             reports = convert(place, place, layout, only=f"*{SCAN}")
             assert [report.status for report in reports] == status

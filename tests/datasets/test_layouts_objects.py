@@ -251,11 +251,11 @@ def test_superpoints_of_scannet_plusplus_are_where_sai3d_reads_them(tmp_path):
     settings, out = load_config("classic"), tmp_path / "out"
     for layout in ("scannet", "npy"):
         source = CloudSource(ScanNet(tmp_path / "in"), settings, layout=layout)
-        (job,) = list_jobs(source, out)
+        (job,) = list_jobs(source, out / layout)
         assert convert_scan(job).status == "converted"
-    path = out / "scans/0a5c013435/scans/mesh_aligned_0.05.0.010000.segs.json"
+    path = out / "scannet/scans/0a5c013435/scans/mesh_aligned_0.05.0.010000.segs.json"
     segments = json.loads(path.read_text())["segIndices"]
-    assert segments == np.load(out / "superpoints" / "0a5c013435.npy").tolist()
+    assert segments == np.load(out / "npy" / "superpoints" / "0a5c013435.npy").tolist()
     assert not [*out.rglob("*aggregation*")]
     for layout in ("mmdet3d", "spformer", "isbnet", "mask3d"):
         source = CloudSource(ScanNet(tmp_path / "in"), settings, layout=layout)

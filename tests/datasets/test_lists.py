@@ -31,7 +31,6 @@ SPLITS = {
 }
 NYU = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 24, 28, 33, 34, 36, 39)
 """``classes_SemVoxLabel-nyu40id.txt`` of ScanNet."""
-MARK = "0123456789abcdef"
 MODES = {"train": "train", "validation": "val", "test": "test"}
 
 
@@ -71,7 +70,7 @@ def lists_in(out):
 def converted(root, tmp_path_factory):
     folders = {layout: tmp_path_factory.mktemp(layout) for layout in ("mask3d", "mmdet3d")}
     for layout, out in folders.items():
-        convert(root, out, layout).write_lists(out, MARK)
+        convert(root, out, layout).write_lists(out)
     return folders
 
 
@@ -127,13 +126,13 @@ def test_mmdet3d_has_the_names_of_each_split(converted):
 def test_lists_are_the_same_whichever_runs_made_them(root, converted, tmp_path, layout):
     out = tmp_path / "out"
     shutil.copytree(converted[layout], out)
-    write_lists(layout, "ScanNet", out, MARK)
+    write_lists(layout, "ScanNet", out)
     expected = lists_in(out)
     assert len(expected) == (6 if layout == "mask3d" else 3)
     shutil.rmtree(out)
     for only in ("val/*", "*10_00", "*"):
         convert(root, out, layout, only)
-        write_lists(layout, "ScanNet", out, MARK)
+        write_lists(layout, "ScanNet", out)
         if only == "val/*":
             assert "scene0011_00" in "".join(map(bytes.decode, lists_in(out).values()))
     assert lists_in(out) == expected
@@ -175,7 +174,7 @@ def test_lists_that_a_program_brings_stay_and_get_what_they_lack(converted, tmp_
     whole = "scene0700_00\r\nscene0010_00\r\nscene0009_00\r\n"
     (out / "meta_data" / "scannetv2_train.txt").write_bytes(whole.encode())
     (out / "meta_data" / "scannetv2_val.txt").write_text("scene0700_00")
-    write_lists("mmdet3d", "ScanNet", out, MARK)
+    write_lists("mmdet3d", "ScanNet", out)
     assert (out / "meta_data" / "scannetv2_train.txt").read_bytes() == whole.encode()
     found = (out / "meta_data" / "scannetv2_val.txt").read_text()
     assert found == "scene0700_00\nscene0011_00\n"
@@ -190,7 +189,7 @@ def test_scans_without_labels_are_on_no_list_of_training(root, tmp_path):
     write_tables(bare, SPLITS["train"], [])
     for layout in ("mask3d", "mmdet3d"):
         out = tmp_path / layout
-        convert(bare, out, layout).write_lists(out, MARK)
+        convert(bare, out, layout).write_lists(out)
         assert not lists_in(out)
 
 
@@ -199,7 +198,7 @@ def test_a_damaged_entry_is_named(converted, tmp_path):
     shutil.copytree(converted["mask3d"] / "train_database", out / "train_database")
     (out / "train_database" / "0010_00.json").write_text("{")
     with pytest.raises(FormatError, match=r"0010_00\.json: expected an entry of a list, got: "):
-        write_lists("mask3d", "ScanNet", out, MARK)
+        write_lists("mask3d", "ScanNet", out)
 
 
 def test_one_scan_after_the_other_is_on_the_list_of_the_test(root, tmp_path, monkeypatch):
@@ -219,5 +218,5 @@ def test_names_that_are_not_utf8_are_listed_by_their_bytes(tmp_path):
     folder.mkdir(parents=True)
     (folder / f"{name}.json").write_text(json.dumps({"name": name}))
     for _ in range(2):
-        write_lists("mmdet3d", "ScanNet", tmp_path, MARK)
+        write_lists("mmdet3d", "ScanNet", tmp_path)
     assert (tmp_path / "meta_data" / "scannetv2_train.txt").read_bytes() == b"bad\xff\n"

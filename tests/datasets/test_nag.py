@@ -174,7 +174,7 @@ def test_a_command_without_h5py_or_place_is_one_line(tmp_path, run, folder_of_cl
     assert reported.code == 3
     assert "a: " in reported.err
     assert "nag: cannot be created: File exists." in reported.err
-    own = {".torchrg.lock", ".torchrg.scans.json", "report.json"}
+    own = {".torchrg.lock", "report.json"}
     assert {path.name for path in out.rglob("*")} == {"nag", *own}
     (out / "nag").unlink()
     assert run(*command, "--partition.counts", "200", "40", "--level", "1").code == 0

@@ -65,7 +65,7 @@ def test_types_and_shapes_are_pointcepts(sample, seg, tmp_path):
     found = {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in expected}
     assert {name: (a.dtype.str, a.shape) for name, a in found.items()} == expected
     assert sorted(written) == sorted([*(f"{name}.npy" for name in expected), "planes.json"])
-    assert sorted(path.name for path in folder.iterdir()) == sorted(written)
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*written, "provenance.json"])
     assert np.array_equal(found["coord"], sample["coord"])
     assert np.array_equal(found["plane"], seg.labels)
     assert np.array_equal(found["superpoint"], seg.labels)
@@ -157,7 +157,8 @@ def test_what_torchrg_wrote_is_replaced(sample, seg, tmp_path):
 def test_a_table_cannot_name_files_elsewhere(sample, seg, tmp_path):
     (tmp_path / "other.npy").touch()
     (tmp_path / "room").mkdir()
-    (tmp_path / "room" / "planes.json").write_text('{"written": ["../other", "plane"]}')
+    claims = dict.fromkeys(["../other.npy", "plane.npy"])
+    (tmp_path / "room" / "provenance.json").write_text(json.dumps({"claims": claims}))
     write_pointcept_scene(tmp_path / "room", sample, seg)
     assert (tmp_path / "other.npy").exists()
 
@@ -207,7 +208,7 @@ def test_labels_from_elsewhere_are_not_touched(foreign, sample, seg, name):
 @pytest.mark.parametrize("content", ["{}", "[", '{"written": 5}', '{"written": [[1]]}'])
 def test_a_table_from_elsewhere_is_not_touched(foreign, sample, seg, content):
     (foreign / "planes.json").write_text(content)
-    with pytest.raises(FormatError, match="expected a plane table written by torchrg"):
+    with pytest.raises(FormatError, match=r"planes\.json: was not written by torchrg"):
         write_pointcept_scene(foreign, sample, seg)
     assert (foreign / "planes.json").read_text() == content
 

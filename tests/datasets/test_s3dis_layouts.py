@@ -18,7 +18,6 @@ from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
 from torchrg.datasets import S3DIS
-from torchrg.io.files import make_mark
 
 CLASSIC = load_config("classic")
 NAMES = (
@@ -70,7 +69,7 @@ def converted(root, rooms, tmp_path_factory):
             source = CloudSource(S3DIS(root, (1, 5)), CLASSIC, layout=layout)
             reports = [convert_scan(job) for job in list_jobs(source, out)]
         assert [report.status for report in reports] == ["converted"] * 2, reports
-        source.write_lists(out, make_mark())
+        source.write_lists(out)
     return folders
 
 

@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 import filelock
 
-from torchrg.batch.records import Record, describe_versions, read_record, reason_to_convert
+from torchrg.batch.records import reason_to_convert
 from torchrg.batch.scans import Job, Source
 from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import SceneFiles
+from torchrg.datasets.provenance import Record, describe_versions, read_record
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import check_space, marked_parts, normalize_file_name, run_mark
+from torchrg.io.files import OUTPUT_MARK, PARSE_ERRORS, check_space, normalize_file_name
 
 __all__ = [
     "BatchReport",
@@ -38,9 +39,6 @@ REPORT = "report.json"
 """Name of the report in the output directory."""
 LOCK = ".torchrg.lock"
 """Name of the lock file in the output directory; it remains there, empty."""
-DATA_SETS = ".torchrg.scans.json"
-"""Name of the file in the output directory that lists the scans of its data sets; see
-:mod:`torchrg.batch.stale`."""
 _BYTES_PER_SCAN = 32_768
 """Disk space of a scan's files beyond their content: its tables, and half a 4 KiB block for each of
 six to eight files."""
@@ -154,7 +152,7 @@ def _is_inside_scans(source: Source, scans: Sequence[SceneFiles], out: Path) -> 
 
 def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
     """Raise FormatError if results would share a folder, or replace files of the batch."""
-    batch_files = {normalize_file_name(name): name for name in (REPORT, LOCK, DATA_SETS)}
+    batch_files = {normalize_file_name(name): name for name in (REPORT, LOCK)}
     owners: dict[str, str] = {}
     for name in (scan.name for scan in scans):
         key = normalize_file_name(name)
@@ -217,6 +215,7 @@ class BatchReport:
         engine: Name of the engine.
         workers: Maximum number of concurrent scans; None if the engine decides.
         interrupted: Whether it was stopped by Ctrl-C or SIGTERM.
+        root: The directory of the data set.
     """
 
     scans: tuple[TaskReport, ...]
@@ -225,6 +224,7 @@ class BatchReport:
     engine: str
     workers: int | None
     interrupted: bool = False
+    root: str = ""
 
     @property
     def disk_full(self) -> bool:
@@ -258,6 +258,7 @@ class BatchReport:
         """Return the report as JSON values."""
         points, stages = self.num_points, self.stage_seconds
         return {
+            "root": self.root,
             "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started)),
             "seconds": self.seconds,
             "engine": self.engine,
@@ -320,10 +321,19 @@ def run_plan(
     names = [job.name for job in plan.jobs]
     scans = [by_name.get(name, TaskReport(name, "not started", attempts=0)) for name in names]
     seconds = time.perf_counter() - begin
-    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted)
+    root = str(plan.jobs[0].source.root)
+    return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted, root)
 
 
 def write_report(out: Path, report: BatchReport) -> None:
     """Write ``report.json`` into the output directory; raise FormatError on failure."""
-    with marked_parts(run_mark(REPORT)), atomic_path(out / REPORT) as temporary:
+    with atomic_path(out / REPORT, mark=OUTPUT_MARK) as temporary:
         temporary.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")
+
+
+def read_root(out: Path) -> Path | None:
+    """Return the directory of the data set in the last report, None if it is unknown."""
+    try:
+        return Path(json.loads((out / REPORT).read_bytes())["root"])
+    except (OSError, *PARSE_ERRORS):
+        return None

@@ -10,25 +10,22 @@ from pathlib import Path
 from typing import ClassVar
 
 from torchrg.batch.memory import scan_memory
-from torchrg.batch.records import (
-    RECORD,
-    Record,
-    describe_versions,
-    fingerprint,
-    get_layout,
-    is_unchanged,
-    read_record,
-    remove_replaced,
-    split_by_layout,
-    write_record,
-)
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
 from torchrg.datasets.folder import SceneFiles
-from torchrg.datasets.pointcept import protecting_files
-from torchrg.errors import FormatError
-from torchrg.io.files import check_writable, marked_parts, remove_leftovers, run_mark, sync_folder
-from torchrg.result import PLANES_FILE, write_table
+from torchrg.datasets.provenance import (
+    Record,
+    check_owned,
+    check_source,
+    claim_files,
+    describe_versions,
+    owned_files,
+    read_record,
+    remove_unwritten,
+    write_record,
+)
+from torchrg.io.files import check_writable, fingerprint, remove_leftovers, sync_folder
+from torchrg.result import PLANES_FILE, RECORD, write_table
 
 __all__ = ["Job", "Source", "convert_scan"]
 __dir__ = __all__.copy
@@ -71,7 +68,7 @@ class Source:
     def check_results(self, scans: Sequence[SceneFiles], out: Path) -> None:
         """Raise FormatError if result files would replace files of other origin."""
 
-    def write_lists(self, out: Path, mark: str, *, without: Collection[Path] = ()) -> None:
+    def write_lists(self, out: Path, *, without: Collection[Path] = ()) -> None:
         """Write data-set-wide files from all scans in ``out``.
 
         ``without`` contains files of scans that are about to be removed.
@@ -107,11 +104,6 @@ class Job:
         """Folder of the results of the scan and their record."""
         return self.out / self.scan.name
 
-    @property
-    def mark(self) -> str:
-        """Mark of the scan's temporary files."""
-        return run_mark(self.scan.name)
-
     def input_name(self, path: Path) -> str:
         """Return the path of an input file relative to the data set, as in records."""
         root = self.source.root
@@ -129,59 +121,73 @@ class Job:
             "source": self.source.describe() | ({"table": table} if table else {}),
             "inputs": [{"name": name} | fingerprint(path) for name, path in inputs],
             "device": "cpu",
+            "name": self.name,
         }
 
     def clean(self) -> None:
-        """Remove temporary files of a killed process."""
+        """Remove temporary files of a killed process, and a claim on no file."""
         if self.folder.is_dir():
-            remove_leftovers(self.folder, self.mark)
+            remove_leftovers(self.folder)
+            if (read_record(self.folder) or {}).get("claims") == {}:
+                (self.folder / RECORD).unlink()
 
 
 def convert_scan(job: Job) -> TaskReport:
     """Convert one scan; errors are put into the report and never raised.
 
-    The record of an earlier run is removed first, and the new one is written last, so that a record
-    implies complete files.
+    The record of an earlier run becomes a claim first, and the new one is written last, so that a
+    record of outputs implies complete files.
     """
-    is_new = not os.path.lexists(job.folder)
+    is_ours = not os.path.lexists(job.folder) or read_record(job.folder) is not None
     report = report_on(job.name, partial(_convert, job))
-    if report.status == "failed" and is_new:
+    if report.status == "failed":
         with contextlib.suppress(OSError):
-            job.folder.rmdir()  # Fails unless the folder is empty.
+            job.clean()
+            if is_ours:
+                job.folder.rmdir()  # Fails unless the folder is empty.
     return report
 
 
 def _convert(job: Job, begin: Begin) -> TaskReport:
-    """Convert one scan, after removing the earlier record, and write the new one."""
+    """Convert one scan: claim its files, write them, and record them."""
     begin("hash")
-    description, folder = job.describe(), job.folder
+    description, folder, table = job.describe(), job.folder, job.source.table
     folder.mkdir(parents=True, exist_ok=True)
     for path in (folder, *folder.parents):
         sync_folder(path.parent)
         if path == job.out:
             break
     check_writable(folder / RECORD)
-    earlier = read_record(folder, strict=True) or {"outputs": {}, "other_layouts": {}}
-    table = job.source.table
-    if table is not None and table not in earlier["outputs"] and (folder / table).exists():
-        raise FormatError(
-            f"{folder / table}: was not written by torchrg; move it, or choose another --table."
-        )
+    earlier = read_record(folder, strict=True)
+    check_owned(folder, [RECORD, *([] if table is None else [table])], earlier)
+    if earlier is not None:
+        check_source(folder, earlier, description["source"])
+        description |= {key: earlier[key] for key in earlier.keys() & {"pages"}}
     job.clean()
-    (folder / RECORD).unlink(missing_ok=True)
-    replaced, other_layouts = split_by_layout(earlier, get_layout(description))
-    edited = [n for n, stored in replaced.items() if not is_unchanged(folder / n, stored)]
-    with marked_parts(job.mark), protecting_files(edited):
-        report = job.source.convert(job.scan, folder, begin)
-        if table is not None:
-            table_data = json.loads((folder / PLANES_FILE).read_text("utf-8"))
-            write_table(folder / table, {k: v for k, v in table_data.items() if k != "written"})
-            report = replace(report, files=(*report.files, table))
-        begin("record")
-        for name in report.files:
-            replaced.pop(name, None)
-        changed = remove_replaced(job.out, folder, replaced)
-        notes = [f"{name} is kept, as it was changed since torchrg wrote it" for name in changed]
-        report = replace(report, warnings=(*report.warnings, *notes))
-        write_record(folder, description, report, other_layouts)
+    write_record(folder, description | {"claims": owned_files(earlier)})
+    report = job.source.convert(job.scan, folder, begin)
+    if table is not None:
+        write_record(folder, claim_files(read_record(folder) or description, [table]))
+        write_table(folder / table, json.loads((folder / PLANES_FILE).read_text("utf-8")))
+        report = replace(report, files=(*report.files, table))
+    begin("record")
+    changed = remove_unwritten(job.out, folder, earlier, report.files)
+    notes = [f"{name} is kept, as it was changed since torchrg wrote it" for name in changed]
+    report = replace(report, warnings=(*report.warnings, *notes))
+    results = {
+        "points": report.num_points,
+        "regions": report.num_regions,
+        "repairs": list(report.repairs),
+        "warnings": list(report.warnings),
+        "measured": report.measured,
+        "outputs": {name: fingerprint(folder / name) for name in report.files},
+    }
+    write_record(folder, description | results)
     return report
+
+
+def claim_pages(job: Job, folder: Path) -> None:
+    """Add a folder of pages to the record of a complete scan, before they are written."""
+    record, pages = read_record(job.folder), os.path.relpath(os.path.realpath(folder), job.out)
+    if record is not None and pages not in (known := record.get("pages", [])):
+        write_record(job.folder, record | {"pages": sorted([*known, pages])})

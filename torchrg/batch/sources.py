@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchrg.batch.records import Record
 from torchrg.batch.scans import Source
 from torchrg.batch.task import Begin, TaskReport, collecting_notes
 from torchrg.clouds import note_on_copies, segment_cloud
@@ -22,6 +21,7 @@ from torchrg.datasets.folder import SceneDataset, SceneFiles, check_outside
 from torchrg.datasets.layouts import check_layout, check_stems, note_on_origin, write_scan
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.pointcept import SOURCE_ARRAYS, write_results
+from torchrg.datasets.provenance import Record
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd_files import num_pixels
 from torchrg.depth import DepthConfig, segment_depth
@@ -157,11 +157,9 @@ class CloudSource(Source):
         check_stems(self.layout, {scan.name: scan.release_path or scan.name for scan in scans})
         check_lists(self.layout, self._list_dataset, out)
 
-    def write_lists(self, out: Path, mark: str, *, without: Collection[Path] = ()) -> None:
+    def write_lists(self, out: Path, *, without: Collection[Path] = ()) -> None:
         """Write the layout's data-set-wide files from all scans in ``out``."""
-        # A removed scan must disappear from the lists of all layouts.
-        for layout in layouts.LAYOUTS if without else (self.layout,):
-            write_lists(layout, self._list_dataset, out, mark, without=without)
+        write_lists(self.layout, self._list_dataset, out, without=without)
 
     @property
     def _list_dataset(self) -> str:

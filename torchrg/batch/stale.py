@@ -1,43 +1,43 @@
 """Stale results: results of renamed or removed scans.
 
 Otherwise a ScanNet scan that moves from ``train`` to ``val`` would stay in ``train`` as well. An
-output directory may contain results of several data sets, so it lists the scan names of each.
+output directory contains one data set in one layout, and its records are the index: a result is of
+the scan of its name, else of the scan with its first input file, by path or by content.
 """
 
-import json
 import os
-from collections.abc import Iterator, Sequence
+import secrets
+import shutil
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from torchrg.batch.records import (
-    RECORD,
-    Record,
-    is_unchanged,
-    read_record,
-    resolve_output,
-)
-from torchrg.batch.run import DATA_SETS, LOCK, REPORT
+from torchrg.batch.records import RECORD
+from torchrg.batch.run import LOCK, read_root
 from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
-from torchrg.datasets.pointcept import written_files
+from torchrg.datasets.provenance import (
+    Record,
+    check_source,
+    output_paths,
+    read_record,
+)
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
 from torchrg.io.files import (
-    PARSE_ERRORS,
+    OUTPUT_MARK,
     find_leftovers,
-    marked_parts,
+    hash_file,
+    is_unchanged,
     remove_leftovers,
-    run_mark,
     sync_folder,
 )
-from torchrg.result import PLANES_FILE
+from torchrg.result import PAGE_SUFFIXES
 
 __all__ = ["StaleResult", "check_stale", "find_stale", "remove_stale"]
 __dir__ = __all__.copy
 
-DataSet = dict[str, str]
-"""First input file of each scan of a data set, by scan name."""
 _MAX_NAMED = 3
 """Maximum number of results named in an error, so that it stays one line."""
 
@@ -49,25 +49,20 @@ class StaleResult(NamedTuple):
         out: The output directory.
         name: Name of the result, its folder below the output directory.
         scan: Current name of the scan, None if it was removed from the data set.
-        files: Fingerprints of its files by path relative to the folder; None for the files of a
-            killed conversion, which has no record.
+        paths: Fingerprints of its files and pages; None for any content.
+        page_folders: Folders that contain its pages, and an index of pages.
     """
 
     out: Path
     name: str
     scan: str | None
-    files: dict[str, Record | None]
+    paths: dict[Path, Record | None]
+    page_folders: set[Path]
 
     @property
     def folder(self) -> Path:
         """Folder of the result."""
         return self.out / self.name
-
-    @property
-    def paths(self) -> dict[Path, Record | None]:
-        """Files by absolute path, without files outside the output directory."""
-        found = {resolve_output(self.out, self.folder, n): data for n, data in self.files.items()}
-        return {path: data for path, data in found.items() if path is not None}
 
     @property
     def reason(self) -> str:
@@ -79,39 +74,57 @@ class StaleResult(NamedTuple):
 def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
     """Return the stale results of a data set in an output directory, in natural order.
 
-    Results of unselected scans are not stale, nor results of other data sets, which have no scan
-    in common with this one.
+    Results of unselected scans, whose input is still there, are not stale.
 
     Args:
         jobs: All scans of the data set.
+
+    Raises:
+        FormatError: If the directory contains another data set, kind or layout, or a corrupt
+            record.
     """
     out, source = jobs[0].out, jobs[0].source
-    names, data_sets = {job.name for job in jobs}, _read_data_sets(out)
-    inputs = {name: first for scans in data_sets for name, first in scans.items()}
-    folders = {str(path.parent) for job in jobs for path in job.scan.files}
-    found = {*_find_records(out, folders)}
-    candidates = [name for name in inputs.keys() | found if name not in names]
-    if not candidates:
-        return []
-    kind = source.describe().get("kind")
-    scans = {os.path.realpath(job.scan.files[0]): job.name for job in jobs if job.scan.files}
-    renamed: dict[str, str] = {}
-    missing = []
-    for name in candidates:
-        folder = resolve_output(out, out, name)
-        if folder in (None, out) or not folder.is_dir():
-            continue
-        if first := inputs.get(name) or _first_input(folder, kind):
-            path = os.path.realpath(source.root / first)
-            if path in scans:
-                renamed[name] = scans[path]
-            elif not Path(path).exists():
-                missing.append(name)
-    current = names | renamed.keys()
-    groups = [*map(set, data_sets), found - inputs.keys()]
-    same = set().union(*(group for group in groups if not group.isdisjoint(current)))
-    stale = sorted([*renamed, *same.intersection(missing)], key=natural_key)
-    return [StaleResult(out, name, renamed.get(name), _result_files(out / name)) for name in stale]
+    names, found, described = {job.name for job in jobs}, find_records(out), source.describe()
+    for name, record in found.items():
+        check_source(out / name, record, described)
+    records = {name: found[name] for name in found if "kind" in found[name]["source"]}
+    inputs = {name: _first_input(record) for name, record in records.items()}
+    paths = {n: Path(os.path.realpath(source.root / first)) for n, (first, _) in inputs.items()}
+    files = {job.name: job.scan.files[0] for job in jobs if job.scan.files}
+    by_path = {Path(os.path.realpath(path)): name for name, path in files.items()}
+    scans = {name: by_path.get(path) for name, path in paths.items() if name not in names}
+    missing = [n for n in scans if scans[n] is None and not (inputs[n][0] and paths[n].exists())]
+    scans |= (renamed := _find_renamed(files, inputs, missing))
+    is_same = not records or renamed or source.root in (out, read_root(out))
+    if not is_same and not any(is_unchanged(paths[name], inputs[name][1]) for name in records):
+        raise FormatError(
+            f"{out}: expected results of {source.root}, got another data set "
+            f"({_join(missing or [*records])}); choose another directory, or remove them."
+        )
+    stale = (name for name, scan in scans.items() if scan is not None or name in missing)
+    return [_describe_stale(out, name, scans[name], records[name]) for name in stale]
+
+
+def find_records(out: Path) -> dict[str, Record]:
+    """Return the records of the results in an output directory, by name, in natural order.
+
+    Copied records and single results without a source are skipped. Links are followed, but no
+    folder is entered twice, nor other output directories.
+
+    Raises:
+        FormatError: If a record is corrupt.
+    """
+    records, seen = {}, set[str]()
+    for folder, folders, files in os.walk(out, followlinks=True):
+        path, real, is_top = Path(folder), os.path.realpath(folder), folder == str(out)
+        record = read_record(path, strict=True) if RECORD in files and not is_top else None
+        name = path.relative_to(out).as_posix()
+        if record and record.get("name", name) == name and isinstance(record.get("source"), dict):
+            records[name] = record
+        is_left = real in seen or (LOCK in files and not is_top)
+        folders[:] = [] if is_left else [child for child in folders if child[0] != "."]
+        seen.add(real)
+    return dict(sorted(records.items(), key=lambda item: natural_key(item[0])))
 
 
 def check_stale(results: Sequence[StaleResult], root: Path, *, prune: bool) -> None:
@@ -120,13 +133,10 @@ def check_stale(results: Sequence[StaleResult], root: Path, *, prune: bool) -> N
     Results of removed scans require ``prune``. Files that were changed since torchrg wrote them, or
     that it did not write, are never removed.
     """
-    missing = [result for result in results if result.scan is None and result.files]
+    missing = [str(result.folder) for result in results if result.scan is None and result.paths]
     if missing and not prune:
-        first, num_more = missing[:_MAX_NAMED], len(missing) - _MAX_NAMED
-        folders = ", ".join(str(result.folder) for result in first)
-        more = f" and {num_more:,} more" if num_more > 0 else ""
         raise FormatError(
-            f"{folders}{more}: no scan in {root} belongs to these results; remove them with "
+            f"{_join(missing)}: no scan in {root} belongs to these results; remove them with "
             "--prune, or keep them with --only '*'."
         )
     for result in results:
@@ -137,108 +147,91 @@ def check_stale(results: Sequence[StaleResult], root: Path, *, prune: bool) -> N
 
 
 def remove_stale(result: StaleResult) -> None:
-    """Remove a result, its record last, and then empty folders.
+    """Remove a result with its pages, its record last, and then empty folders.
 
     If the command is killed meanwhile, the next one finds the record and removes the remainder.
     """
-    folder = result.folder
-    paths = sorted(result.paths, key=lambda path: path.name == PLANES_FILE)
-    if not folder.is_symlink():
-        remove_leftovers(folder, run_mark(result.name))
-    parents = {folder, *(path.parent for path in paths)}
-    for path in paths:
+    remove_leftovers(result.folder)
+    for path in result.paths:
         path.unlink(missing_ok=True)
-    for parent in parents:
+    for parent in {path.parent for path in result.paths}:
         sync_folder(parent)
-    if result.files:
-        (folder / RECORD).unlink(missing_ok=True)
-    for parent in parents:
-        _remove_empty(parent, result.out)
+        _remove_empty(parent, {result.out, *result.page_folders})
+    _remove_record(result.folder, result.out)
 
 
-def note_data_set(jobs: Sequence[Job], removed: Sequence[StaleResult]) -> None:
-    """Add the scans of a data set to the list in its output directory.
-
-    Earlier names stay listed while their result folder exists.
-    """
-    out, existing = jobs[0].out, _read_data_sets(jobs[0].out)
-    scans = {job.name: job.input_name(job.scan.files[0]) if job.scan.files else "" for job in jobs}
-    current = scans.keys() | {result.name for result in removed}
-    unrelated = [data_set for data_set in existing if current.isdisjoint(data_set)]
-    for data_set in existing:
-        if not current.isdisjoint(data_set):
-            scans = {n: i for n, i in data_set.items() if (out / n).is_dir()} | scans
-    updated = sorted([*unrelated, dict(sorted(scans.items()))], key=min)
-    if updated != existing:
-        with marked_parts(run_mark(REPORT)), atomic_path(out / DATA_SETS) as temporary:
-            temporary.write_text(json.dumps(updated, indent=0), encoding="utf-8")
-
-
-def _read_data_sets(out: Path) -> list[DataSet]:
-    """Return the data sets listed in an output directory; none if the list is damaged."""
-    try:
-        content = json.loads((out / DATA_SETS).read_bytes())
-        data_sets = [{str(n): str(first) for n, first in scans.items()} for scans in content]
-    except (OSError, *PARSE_ERRORS):
-        return []
-    return [scans for scans in data_sets if scans]
-
-
-def _find_records(out: Path, input_folders: set[str]) -> Iterator[str]:
-    """Yield the names of results in a directory, whose folders contain a record.
-
-    Links are not followed; other output directories and input folders are not entered.
-    """
-    for folder, folders, files in os.walk(out):
-        is_top = folder == str(out)
-        if RECORD in files and not is_top:
-            yield Path(folder).relative_to(out).as_posix()
-        if folder in input_folders or (LOCK in files and not is_top):
-            folders.clear()
-
-
-def _first_input(folder: Path, kind: object) -> str:
-    """Return the first input in the record of a scan of a source type, or ""."""
-    record = read_record(folder) or {}
-    source, inputs = record.get("source"), record.get("inputs")
-    if not isinstance(source, dict) or source.get("kind") != kind:
-        return ""
+def _first_input(record: Record) -> tuple[str, Record]:
+    """Return the name and the fingerprint of the first input in a record, or an empty name."""
+    inputs = record.get("inputs")
     first = inputs[0] if isinstance(inputs, list) and inputs else None
-    return str(first.get("name", "")) if isinstance(first, dict) else ""
+    if not isinstance(first, dict):
+        return "", {}
+    return str(first.get("name", "")), {key: first.get(key) for key in ("bytes", "sha256")}
 
 
-def _result_files(folder: Path) -> dict[str, Record | None]:
-    """Return the files of a result with their fingerprints, None for files without a record."""
-    names, record = written_files(folder), read_record(folder)
-    if record is None:
-        return dict.fromkeys(names)
-    parts = (dict.fromkeys(names), record["outputs"], *record["other_layouts"].values())
-    return {name: stored or {} for part in parts for name, stored in part.items()}
+def _find_renamed(
+    files: dict[str, Path], inputs: dict[str, tuple[str, Record]], missing: Sequence[str]
+) -> dict[str, str]:
+    """Return the current names of missing scans whose first input has another name now."""
+    sizes = [inputs[name][1].get("bytes") for name in missing]
+    by_content = defaultdict[str, list[str]](list)
+    for name, path in files.items() if missing else ():
+        if path.is_file() and path.stat().st_size in sizes:
+            by_content[hash_file(path)].append(name)
+    contents = {name: str(stored.get("sha256")) for name, (_, stored) in inputs.items()}
+    return {
+        name: scan
+        for name in missing
+        for scan in by_content[contents[name]]
+        if contents.get(scan) != contents[name]  # Else it is a copy.
+    }
+
+
+def _describe_stale(out: Path, name: str, scan: str | None, record: Record) -> StaleResult:
+    """Return a stale result with the files of its record below ``out``, and its pages."""
+    folders = {Path(os.path.normpath(out / str(folder))) for folder in record.get("pages", ())}
+    paths = output_paths(out, out / name, record)
+    paths |= {folder / f"{name}{suffix}": None for folder in folders for suffix in PAGE_SUFFIXES}
+    return StaleResult(out, name, scan, paths, folders)
 
 
 def _changed_file(result: StaleResult) -> Path | None:
     """Return a file or link that prevents removing a result, or None."""
-    if not result.files:
-        return None
     folder, paths = result.folder, result.paths
     if folder.is_symlink():
         return folder
     for path, stored in paths.items():
-        is_unmodified = path.is_file() if stored is None else is_unchanged(path, stored)
-        if os.path.lexists(path) and not is_unmodified:
+        if os.path.lexists(path) and not is_unchanged(path, stored):
             return path
-    allowed = {*paths, *find_leftovers(folder, run_mark(result.name))}
-    if read_record(folder) is not None:  # A damaged record does not reveal changes.
-        allowed.add(folder / RECORD)
+    allowed = {*paths, folder / RECORD, *find_leftovers(folder)}
     entries = sorted(folder.iterdir())
     return next((path for path in entries if path not in allowed and not path.is_dir()), None)
 
 
-def _remove_empty(folder: Path, out: Path) -> None:
-    """Remove a folder and its parents in the output directory, as long as they are empty."""
-    while folder != out and folder.is_relative_to(out):
-        try:
+def _join(names: Sequence[str]) -> str:
+    """Join names for a message of one line."""
+    more = f" and {len(names) - _MAX_NAMED:,} more" if len(names) > _MAX_NAMED else ""
+    return f"{', '.join(names[:_MAX_NAMED])}{more}"
+
+
+def _remove_empty(folder: Path, tops: Collection[Path]) -> None:
+    """Remove a folder and its parents below one of ``tops``, as long as they are empty."""
+    with suppress(OSError):
+        while folder not in tops:
             folder.rmdir()
-        except OSError:
-            return
+            folder = folder.parent
+
+
+def _remove_record(folder: Path, out: Path) -> None:
+    """Remove the record in a folder and then empty folders, in one step for a killed process."""
+    if [*folder.iterdir()] != [folder / RECORD]:
+        (folder / RECORD).unlink(missing_ok=True)
+        return
+    while folder.parent != out and [*folder.parent.iterdir()] == [folder]:
+        if folder.parent.is_symlink():
+            break
         folder = folder.parent
+    with suppress(OSError):  # A mounted folder stays where it is.
+        folder = folder.rename(out / f".removed.{OUTPUT_MARK}{secrets.token_hex(4)}")
+        sync_folder(out)
+    shutil.rmtree(folder)

@@ -1,6 +1,8 @@
 """``torchrg convert``: segment a whole data set, on one machine or a Ray cluster."""
 
+import contextlib
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -23,15 +25,9 @@ from torchrg.batch.run import (
     run_plan,
     write_report,
 )
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Source, claim_pages
 from torchrg.batch.sources import CloudSource, RGBDSource
-from torchrg.batch.stale import (
-    StaleResult,
-    check_stale,
-    find_stale,
-    note_data_set,
-    remove_stale,
-)
+from torchrg.batch.stale import StaleResult, check_stale, find_stale, remove_stale
 from torchrg.batch.task import Reports
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
@@ -49,13 +45,20 @@ from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig
 from torchrg.datasets import S3DIS, FolderOfClouds, ScanNet
 from torchrg.datasets.folder import SceneDataset
+from torchrg.datasets.provenance import read_record
 from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.datasets.s3dis import find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
-from torchrg.io.files import check_writable, create_folder, free_space, remove_leftovers, run_mark
+from torchrg.io.files import (
+    OUTPUT_MARK,
+    check_writable,
+    create_folder,
+    free_space,
+    remove_leftovers,
+)
 from torchrg.plane_table import TABLE_SUFFIXES
-from torchrg.render.gallery import check_gallery, write_entry, write_index
+from torchrg.render.gallery import INDEX, Entry, check_gallery, write_entry, write_index
 from torchrg.render.page import check_library
 from torchrg.result import PLANES_FILE, RECORD, read_result
 
@@ -70,8 +73,8 @@ class Arguments:
     root: Annotated[Path, Argument("ROOT", is_positional=True)]
     """Directory of the data set, read only."""
     out: Annotated[Path, Argument("OUT", is_positional=True)]
-    """Output directory, with one folder per scan; created if missing. Finished scans are
-    skipped."""
+    """Output directory of one data set in one layout, with one folder per scan; created if missing.
+    Finished scans are skipped."""
     workers: int | None = None
     """Number of scans processed at a time. Default: one per core; on a cluster, as the memory
     allows."""
@@ -92,8 +95,8 @@ class Arguments:
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False
-    """Remove unmodified results of scans missing from ROOT. Without it, such results are listed and
-    the command stops."""
+    """Remove unmodified results of scans missing from ROOT, and their pages. Without it, such
+    results are listed and the command stops."""
     dry_run: bool = False
     """Print the plan, write nothing."""
     unit: ClassVar[str] = "scan"
@@ -287,7 +290,7 @@ def run(argv: list[str]) -> int:
         resources = (arguments.workers or num_cores(), _memory_limit(arguments), free_space(out))
         print(format_plan(plan))
         for result in stale:
-            if result.files and (result.scan is not None or arguments.prune):
+            if result.paths and (result.scan is not None or arguments.prune):
                 print_lines(f"remove {result.name}: {result.reason}")
         print(format_costs(plan, *resources, arguments.seconds_per_million))
         check_stale(stale, root, prune=arguments.prune)
@@ -300,13 +303,13 @@ def run(argv: list[str]) -> int:
         create_folder(pages)
         check_gallery(pages, [job.name for job in jobs])
     with lock_folder(out):
-        remove_leftovers(out, run_mark(REPORT))
+        remove_leftovers(out, OUTPUT_MARK)
         stale = _find_stale(scans, arguments)
         check_stale(stale, root, prune=arguments.prune)
         plan = _plan_with_bar(jobs, arguments)
         check_free_space(plan)
         _remove_stale(stale, scans)
-        return _convert(plan, out, arguments)
+        return _convert(plan, scans, arguments)
 
 
 def _check(arguments: Arguments) -> None:
@@ -362,20 +365,24 @@ def _find_stale(scans: list[Job], arguments: Arguments) -> list[StaleResult]:
 
 
 def _remove_stale(stale: list[StaleResult], scans: list[Job]) -> None:
-    """Remove stale results from the lists and the disk, and record the scans of the data set."""
-    source, out = scans[0].source, scans[0].out
-    paths = {path for result in stale for path in result.paths}
-    if paths:
-        source.write_lists(out, run_mark(REPORT), without=paths)
+    """Remove stale results from the lists, the disk, and the index of viewers."""
+    if paths := {path for result in stale for path in result.paths}:
+        scans[0].source.write_lists(scans[0].out, without=paths)
     for result in stale:
         remove_stale(result)
-        if result.files:
+        if result.paths:
             print_lines(f"{result.folder}: removed: {result.reason}")
-    note_data_set(scans, stale)
+    for folder in {folder for result in stale for folder in result.page_folders}:
+        try:
+            if (folder / INDEX).is_file():
+                _index_pages(folder, scans)
+        except (TorchrgError, OSError) as error:
+            warn(f"{folder / INDEX}: may list removed scans: {error}")
 
 
-def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
+def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     """Convert the scans of a plan, print a report, and return the exit code."""
+    out = scans[0].out
     jobs, workers, limit = plan.to_convert, arguments.workers, _memory_limit(arguments)
     for job in jobs:
         if job.memory > limit:
@@ -397,12 +404,16 @@ def _convert(plan: Plan, out: Path, arguments: Arguments) -> int:
     with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
         shown = Progress(bar, sizes, unit=arguments.unit)
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
+    for job in jobs:
+        with contextlib.suppress(OSError):
+            os.removedirs(job.folder)  # Of a scan that failed: it fails unless they are empty.
     code = _finish(report, out, unit=arguments.unit)
     if not report.disk_full:
-        plan.jobs[0].source.write_lists(out, run_mark(REPORT))
+        plan.jobs[0].source.write_lists(out)
     pages = _page_folder(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
+        print_lines(f"pages -> {_index_pages(pages, scans)}")
     return code
 
 
@@ -412,18 +423,27 @@ def _memory_limit(arguments: Arguments) -> int:
 
 
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
-    """Write the image and viewer of each finished scan, and their index."""
-    done = {scan.name: scan for scan in report.complete}
+    """Write the image and viewer of each finished scan."""
+    done = {scan.name for scan in report.complete}
     jobs = [job for job in plan.jobs if job.name in done]
-    entries = []
     for job in tqdm(jobs, desc="pages", unit="scan", leave=False, disable=None):
-        scan = done[job.name]
-        words = f"{scan.num_points:,} points, {scan.num_regions:,} planes"
         try:
-            entries.append(write_entry(folder, scan.name, read_result(job.folder), words=words))
+            claim_pages(job, folder)
+            write_entry(folder, job.name, read_result(job.folder))
         except (TorchrgError, OSError) as error:
-            warn(f"{scan.name}: no page: {error}")
-    print_lines(f"pages -> {write_index(folder, plan.jobs[0].source.root.name, entries)}")
+            warn(f"{job.name}: no page: {error}")
+
+
+def _index_pages(folder: Path, scans: list[Job]) -> Path:
+    """Write the index of the viewers of complete scans in a folder, and return its path."""
+    entries = []
+    for name, record in ((job.name, read_record(job.folder) or {}) for job in scans):
+        points, regions = record.get("points"), record.get("regions")
+        is_complete = isinstance(points, int) and isinstance(regions, int)
+        if is_complete and (folder / f"{name}.html").is_file():
+            words = f"{points:,} points, {regions:,} planes"
+            entries.append(Entry(name, f"{name}.png", f"{name}.html", words))
+    return write_index(folder, scans[0].source.root.name, entries)
 
 
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:

@@ -13,8 +13,9 @@ import torch
 
 from torchrg import scratch
 from torchrg.batch.memory import available_memory, scan_memory
-from torchrg.batch.records import Record, describe_run
-from torchrg.batch.run import REPORT, lock_folder
+from torchrg.batch.records import describe_run
+from torchrg.batch.run import lock_folder
+from torchrg.batch.stale import find_records
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, warn
@@ -33,8 +34,15 @@ from torchrg.cli.loop import (
 from torchrg.clouds import find_objects, note_on_copies, segment_cloud
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets.folder import SceneFiles
-from torchrg.datasets.layouts import check_layout, check_stems, note_on_origin, write_scan
+from torchrg.datasets.layouts import (
+    VERSION,
+    check_layout,
+    check_stems,
+    note_on_origin,
+    write_scan,
+)
 from torchrg.datasets.lists import check_lists, write_lists
+from torchrg.datasets.provenance import Record, check_source
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import (
@@ -44,7 +52,7 @@ from torchrg.io import (
     read_cloud,
     write_cloud,
 )
-from torchrg.io.files import check_space, run_mark
+from torchrg.io.files import check_space
 from torchrg.merge import merge_clouds
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
@@ -160,9 +168,12 @@ def _layout_lock(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None
         return
     check_stems(arguments.layout, {path.name: path.name for path in outputs})
     with lock_folder(arguments.out):
+        source = {"layout": arguments.layout, "version": VERSION}
+        for name, record in find_records(arguments.out).items():
+            check_source(arguments.out / name, record, source)
         check_lists(arguments.layout, _DATASET, arguments.out)
         yield
-        write_lists(arguments.layout, _DATASET, arguments.out, run_mark(REPORT))
+        write_lists(arguments.layout, _DATASET, arguments.out)
 
 
 def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:

@@ -255,7 +255,9 @@ def write_layout(
     up = "../" * len(folder.relative_to(out).parts)
     files = LAYOUTS[layout][scan.dataset](scan)
     contents = {f"{up}{path}": content for path, content in files.items()}
-    return write_files(folder, contents, describe_planes(planes, origin=origin.tolist()))
+    table = describe_planes(planes, origin=origin.tolist())
+    source = {"layout": layout, "version": VERSION}
+    return write_files(folder, contents, table, {"source": source})
 
 
 def _scannet(scan: LayoutScan) -> Files:

@@ -18,7 +18,7 @@ from torchrg.datasets.s3dis import CLASS_ORDERS, ROOMS_PER_AREA
 from torchrg.datasets.scannet import CLASSES, NYU_IDS
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-from torchrg.io.files import create_folder, marked_parts, remove_leftovers, wrap_errors
+from torchrg.io.files import OUTPUT_MARK, create_folder, remove_leftovers, wrap_errors
 
 ListEntry = dict[str, Any]
 """List entry of a scan, by key."""
@@ -45,29 +45,22 @@ def check_lists(layout: str, dataset: str, out: Path) -> None:
             )
 
 
-def write_lists(
-    layout: str, dataset: str, out: Path, mark: str, *, without: Collection[Path] = ()
-) -> None:
+def write_lists(layout: str, dataset: str, out: Path, *, without: Collection[Path] = ()) -> None:
     """Write the lists of a directory from the entries of its scans, if there are any.
+
+    The directory is locked; temporary files of a killed process are removed.
 
     Args:
         layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
         dataset: A key of its row.
         out: The output directory.
-        mark: See :func:`torchrg.io.files.marked_parts`; leftovers of a killed process are removed.
         without: Entry files below ``out`` to omit from the lists.
 
     Raises:
         FormatError: If an entry is corrupt, or a list cannot be written.
     """
     out = out.resolve()
-    remove_leftovers(out, mark)
-    with marked_parts(mark):
-        _write_all(layout, dataset, out, without)
-
-
-def _write_all(layout: str, dataset: str, out: Path, without: Collection[Path]) -> None:
-    """Write all lists of a directory."""
+    remove_leftovers(out, OUTPUT_MARK)
     if (layout, dataset) == ("mmdet3d", "ScanNet"):
         _write_names(out, [f"meta_data/scannetv2_{split}" for split in SPLIT_NAMES], without)
     folders, contents = _DATABASES.get((layout, dataset), _NO_LISTS)
@@ -107,7 +100,7 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
 def _write(out: Path, name: str | Path, text: str) -> None:
     """Write a list atomically."""
     create_folder((out / name).parent)
-    with atomic_path(out / name, within=out) as temporary:
+    with atomic_path(out / name, within=out, mark=OUTPUT_MARK) as temporary:
         # Undecodable bytes of file names stay as they are.
         temporary.write_text(text, encoding="utf-8", errors="surrogateescape")
 

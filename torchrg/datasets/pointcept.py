@@ -3,16 +3,15 @@
 ``coord`` float32, ``color`` uint8 and ``normal`` float32 of shape ``(N, 3)``; ``segment`` and
 ``instance`` int16 of shape ``(N, 1)``, ``(N, 3)`` for ScanNet++; ``segment20``, ``segment200`` and
 ``instance`` int64 of shape ``(N,)`` for ScanNet. torchrg adds ``plane`` int32 of shape ``(N,)``,
-``curvature`` float32 of shape ``(N, 1)`` (like Pointcept's features), ``planes.json``, and
-optionally ``superpoint`` int32. Pointcept ignores unknown files;
+``curvature`` float32 of shape ``(N, 1)`` (like Pointcept's features), ``planes.json``,
+``provenance.json``, and optionally ``superpoint`` int32. Pointcept ignores unknown files;
 ``import torchrg.transforms.pointcept`` makes it load these.
 """
 
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
+from torchrg.datasets.provenance import (
+    Record,
+    check_owned,
+    claim_files,
+    owned_files,
+    read_record,
+    remove_unwritten,
+    write_record,
+)
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.colors import narrow_colors, read_colors
-from torchrg.io.files import PARSE_ERRORS, create_folder, local_path
+from torchrg.io.files import create_folder, local_path
 from torchrg.io.npy import check_rows, map_array, map_folder
-from torchrg.result import PLANES_FILE, describe_planes
+from torchrg.result import PLANES_FILE, RECORD, describe_planes
 from torchrg.structures import Array, Segmentation
 
 POINT_ARRAYS = (
@@ -43,23 +51,6 @@ _SCANNET = ("segment20", "segment200")
 _LABELS = ("segment", *_SCANNET, "instance", "superpoint", "plane")
 _FEATURES = ("strength", "curvature")
 """Scalar arrays that have two axes in files."""
-
-
-_protected: ContextVar[Collection[str]] = ContextVar("_protected", default=())
-"""Names of files that :func:`write_files` does not remove."""
-
-
-@contextmanager
-def protecting_files(names: Collection[str]) -> Iterator[None]:
-    """Prevent :func:`write_files` from removing files with these names, in this thread.
-
-    Callers identify files that a user has changed by fingerprints in records.
-    """
-    token = _protected.set(names)
-    try:
-        yield
-    finally:
-        _protected.reset(token)
 
 
 def read_pointcept_scene(folder: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -101,7 +92,7 @@ def write_pointcept_scene(
 
     Files not written by this function are never changed: their arrays must have the same number of
     rows, and coordinates must equal the sample's. Files of an earlier call, as listed in
-    ``planes.json``, are replaced or removed. All files are complete before the first one appears.
+    ``provenance.json``, are replaced or removed. All files are complete before the first appears.
 
     Args:
         folder: The scene, ``OUT/Area_i/<room>``; created if missing.
@@ -123,7 +114,7 @@ def write_pointcept_scene(
     """
     target = Path(folder)
     arrays = _convert_arrays(target, sample, segmentation, superpoint=superpoint)
-    torchrg_files = _torchrg_files(target)
+    torchrg_files = owned_files(read_record(target, strict=True))
     # The arrays of torchrg are never kept as inputs: such a file of another program is an error.
     inputs = {
         name
@@ -131,8 +122,8 @@ def write_pointcept_scene(
         if f"{name}.npy" not in torchrg_files and (target / f"{name}.npy").exists()
     }
     _check_inputs(target, arrays, inputs)
-    new = {name: values for name, values in arrays.items() if name not in inputs}
-    return write_arrays(target, new, describe_planes(segmentation.planes, origin=origin))
+    new = {f"{name}.npy": values for name, values in arrays.items() if name not in inputs}
+    return write_files(target, new, describe_planes(segmentation.planes, origin=origin))
 
 
 def write_results(
@@ -148,7 +139,7 @@ def write_results(
     The folder must exist. ``coord`` ``(*, 3)`` is in the dtype to write and has the leading axes of
     the segmentation; ``fields`` are written by name. ``origin`` is the origin of the segmentation
     in the coordinates of ``coord``. Returns the names of the files; files of other origin are never
-    replaced, see :func:`torchrg.datasets.pointcept.write_arrays`.
+    replaced, see :func:`torchrg.datasets.pointcept.write_files`.
     """
     arrays: dict[str, NDArray[Any]] = {
         "coord": coord,
@@ -157,64 +148,41 @@ def write_results(
         "plane": segmentation.labels.numpy().astype(np.int32),
         **(fields or {}),
     }
-    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-    return write_arrays(folder, arrays, describe_planes(segmentation.planes, origin=origin))
-
-
-def write_arrays(
-    target: Path, arrays: Mapping[str, Array], planes: Mapping[str, object]
-) -> list[str]:
-    """Write arrays by name as ``.npy`` files and the plane table; see :func:`write_files`."""
-    return write_files(target, {f"{name}.npy": values for name, values in arrays.items()}, planes)
+    files = {f"{name}.npy": np.ascontiguousarray(values) for name, values in arrays.items()}
+    return write_files(folder, files, describe_planes(segmentation.planes, origin=origin))
 
 
 def write_files(
-    target: Path, contents: Mapping[str, Array | bytes], planes: Mapping[str, object]
+    target: Path,
+    contents: Mapping[str, Array | bytes],
+    planes: Mapping[str, object],
+    description: Record | None = None,
 ) -> list[str]:
-    """Write files and the plane table of a scene, without changing files of other origin.
+    """Write files and the plane table of a scene, and return their names.
 
-    Files of an earlier call, as listed in ``planes.json``, are replaced, and its arrays that this
-    call does not write are removed. All files are complete before the first one appears.
-
-    Args:
-        target: Folder of the scene; created if missing.
-        contents: Bytes, or arrays to write as ``.npy``, by path relative to ``target``.
-        planes: The plane table.
-
-    Returns:
-        Names of the files written.
-
-    Raises:
-        FormatError: If a file of other origin would be overwritten, or a folder is not writable.
+    ``contents`` has bytes, or arrays to write as ``.npy``, by path relative to the folder of the
+    scene. Files of an earlier call, as listed in ``provenance.json``, are replaced, or removed if
+    this call does not write them; files of other origin raise FormatError. A claim on the files
+    precedes them, when all of them are complete. ``description`` are entries of a new claim.
     """
-    paths = {name: Path(os.path.normpath(target / name)) for name in contents}
-    torchrg_files = _torchrg_files(target, contents)
-    # Files of another layout are kept and remain listed.
-    other_files = [name for name in _read_written(target) if "/" in name and name not in contents]
-    for name, path in paths.items():
-        if name not in torchrg_files and os.path.lexists(path):
-            raise FormatError(
-                f"{path}: was not written by torchrg for this scan; move it, or choose another "
-                "directory."
-            )
-    for folder in {target, *(path.parent for path in paths.values())}:
-        create_folder(folder)
-    for name in torchrg_files - set(contents) - set(_protected.get()):
-        (target / name).unlink(missing_ok=True)
+    contents = {**contents, PLANES_FILE: json.dumps(planes, indent=1).encode()}
+    earlier = read_record(target, strict=True)
+    check_owned(target, [*contents, RECORD], earlier)
+    create_folder(target)
     with ExitStack() as stack:
         # Files are renamed in reverse order: the plane table first, the coordinates last.
         for name, content in contents.items():
-            temporary = stack.enter_context(atomic_path(paths[name], within=target))
+            path = Path(os.path.normpath(target / name))
+            create_folder(path.parent)
+            temporary = stack.enter_context(atomic_path(path, within=target))
             with temporary.open("wb") as stream:
                 if isinstance(content, bytes):
                     stream.write(content)
                 else:
                     npy_format.write_array(stream, content, allow_pickle=False)
-        claim = stack.enter_context(atomic_path(target / PLANES_FILE))
-        written = [name.removesuffix(".npy") if "/" not in name else name for name in contents]
-        written += other_files
-        claim.write_text(json.dumps({"written": written, **planes}, indent=1), encoding="utf-8")
-    return [*contents, PLANES_FILE]
+        write_record(target, claim_files(earlier or description or {}, contents))
+    remove_unwritten(target, target, earlier, contents)
+    return [*contents]
 
 
 def _convert_arrays(
@@ -253,36 +221,6 @@ def _to_int16(labels: Array) -> Array:
     limits = np.iinfo(np.int16)
     fit = labels.size == 0 or (labels.min() >= limits.min and labels.max() <= limits.max)
     return labels.astype(np.int16 if fit else np.int32)
-
-
-def written_files(target: Path) -> list[str]:
-    """Return the files that torchrg wrote for a scene, relative to its folder.
-
-    Raises:
-        FormatError: If ``planes.json`` was written by another program.
-    """
-    names = _read_written(target)
-    return [name if "/" in name else f"{name}.npy" for name in names] + [PLANES_FILE] * bool(names)
-
-
-def _torchrg_files(target: Path, other_files: Collection[str] = ()) -> set[str]:
-    """Return the files that torchrg wrote here: arrays, and the files in ``other_files``."""
-    names = {name if name in other_files else f"{name}.npy" for name in _read_written(target)}
-    return names & {*(f"{name}.npy" for name in POINT_ARRAYS), *other_files}
-
-
-def _read_written(target: Path) -> list[str]:
-    """Return the names of written files listed in ``planes.json``."""
-    try:
-        written = json.loads((target / PLANES_FILE).read_text(encoding="utf-8"))["written"]
-        return sorted(map(str, set(written)))
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    except (OSError, *PARSE_ERRORS) as error:
-        raise FormatError(
-            f"{target / PLANES_FILE}: expected a plane table written by torchrg, got another file; "
-            "move it."
-        ) from error
 
 
 def _check_inputs(target: Path, arrays: Mapping[str, Array], inputs: set[str]) -> None:

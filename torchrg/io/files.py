@@ -16,9 +16,8 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 from torchrg.errors import FormatError, system_limit
 from torchrg.structures import FilePath
@@ -49,14 +48,20 @@ _UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 """First bytes of text as Excel and PowerShell write it."""
 _CHECKED_END = 1 << 16
 """Bytes checked after the last record. Padding to a page is shorter."""
+_MAX_NAME_BYTES = 255
+"""Maximum length of a file name on common file systems."""
 _URL = re.compile(r"(?:^|/)[A-Za-z][A-Za-z0-9+.-]+:/")
 """A URL, also as a path, which has a single slash. Drives of Windows have one letter."""
-_mark: ContextVar[str | None] = ContextVar("_mark", default=None)
-"""Mark in the temporary file names of :func:`atomic_path` in this context."""
+_BYTES_PER_READ = 1 << 20
+"""Bytes of a file read together, which bounds the memory."""
+OUTPUT_MARK = "7472675f6f757470"
+"""Mark of the temporary files of the one command that holds the lock of an output directory."""
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> Iterator[Path]:
+def atomic_path(
+    path: str | os.PathLike[str], *, within: Path | None = None, mark: str = ""
+) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` atomically if the block succeeds.
 
     The file is written next to its destination, flushed to disk, and renamed in one step; then the
@@ -66,6 +71,7 @@ def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> 
     Args:
         path: Destination. A symbolic link is followed.
         within: Folder on the same file system for the temporary file. Default: that of ``path``.
+        mark: 16 hexadecimal digits in its name; see :func:`remove_leftovers`. Default: random.
 
     Yields:
         The temporary path to write to.
@@ -85,19 +91,19 @@ def atomic_path(path: str | os.PathLike[str], *, within: Path | None = None) -> 
         complete
     """
     target = Path(os.path.realpath(path))
-    name = f".{target.stem}.{_mark.get() or make_mark()}{secrets.token_hex(4)}{target.suffix}"
+    end = f".{mark or make_mark()}{secrets.token_hex(4)}{target.suffix}"
+    stem = os.fsencode(f".{target.stem}")[: _MAX_NAME_BYTES - len(os.fsencode(end))]
+    name = f"{os.fsdecode(stem)}{end}"
     temporary = (target.parent if within is None else within) / name
     check_writable(path)
     try:
-        yield temporary
+        with raise_os_error(temporary, OSError):
+            yield temporary
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
         temporary.replace(target)
         sync_folder(target.parent)
     except OSError as error:
-        # NumPy's error for a short write has no number; the cause is a full disk.
-        if error.errno is None and "requested and" in str(error):
-            error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         raise FormatError(f"{path}: cannot be written: {error.strerror or error}.") from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -108,23 +114,11 @@ def make_mark() -> str:
     return secrets.token_hex(8)
 
 
-@contextmanager
-def marked_parts(mark: str) -> Iterator[None]:
-    """Make :func:`atomic_path` put a mark into temporary names in this block and thread.
+def remove_leftovers(folder: Path, mark: str = "") -> None:
+    """Remove the temporary files with a mark that a killed process left in a folder.
 
-    The mark identifies the files that a killed process leaves, so that they can be removed.
-    """
-    token = _mark.set(mark)
-    try:
-        yield
-    finally:
-        _mark.reset(token)
-
-
-def remove_leftovers(folder: Path, mark: str) -> None:
-    """Remove the marked temporary files that a killed process left in a folder.
-
-    No process may be writing there under the same mark.
+    No process may be writing there under the same mark. Default: any mark, for a folder in which
+    only this process writes.
 
     Example:
         >>> import tempfile
@@ -136,17 +130,21 @@ def remove_leftovers(folder: Path, mark: str) -> None:
         ['.a.other.txt', 'a.txt']
     """
     for path in find_leftovers(folder, mark):
-        path.unlink(missing_ok=True)
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
-def find_leftovers(folder: Path, mark: str) -> list[Path]:
-    """Return the files that :func:`remove_leftovers` would remove."""
-    name = re.compile(rf"\..*\.{mark}[0-9a-f]{{8}}(\.[^.]*)?")
+def find_leftovers(folder: Path, mark: str = "") -> list[Path]:
+    """Return what :func:`remove_leftovers` would remove; folders only with a mark."""
+    name = re.compile(rf"\..*\.{mark or '[0-9a-f]{16}'}[0-9a-f]{{8}}(\.[^.]*)?")
     with os.scandir(folder) as entries:
         return [
             Path(entry.path)
             for entry in entries
-            if name.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)
+            if name.fullmatch(entry.name)
+            and (entry.is_file(follow_symlinks=False) or (mark and not entry.is_symlink()))
         ]
 
 
@@ -158,6 +156,30 @@ def sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def is_unchanged(path: Path, stored: object) -> bool:
+    """Return whether a path is a regular file with the stored fingerprint, or any for None."""
+    is_regular = path.is_file() and not path.is_symlink()
+    if stored is None or not is_regular:
+        return is_regular
+    has_size = isinstance(stored, dict) and stored.get("bytes") == path.stat().st_size
+    return has_size and fingerprint(path) == stored
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """Return the size and the SHA-256 of a file."""
+    return {"bytes": path.stat().st_size, "sha256": hash_file(path)}
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a regular file in hexadecimal."""
+    check_regular(path)
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(_BYTES_PER_READ):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -351,11 +373,14 @@ def check_end(path: Path, stream: BinaryIO, record_bytes: int = 0) -> tuple[str,
 def raise_os_error(path: Path, *errors: type[BaseException]) -> Iterator[None]:
     """Raise the system's OSError if a library hides it while writing.
 
-    If the disk is full, writing a few extra bytes raises it. The partial file is discarded anyway.
+    On a full disk, or at a limit of the file size, writing a few extra bytes raises it. The partial
+    file is discarded anyway.
     """
     try:
         yield
-    except errors:
+    except errors as error:
+        if getattr(error, "errno", None) is not None:
+            raise
         with path.open("ab") as stream:
             stream.write(bytes(_PROBE_BYTES))
             stream.flush()
@@ -382,19 +407,6 @@ def wrap_errors(message: str, *errors: type[BaseException], repair: str = "") ->
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message without a full stop, or its class name."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-
-
-def run_mark(name: str) -> str:
-    """Return the mark of the temporary files of a scan in an output directory.
-
-    It is the same in every run, so that a run removes what a killed one left; see
-    :func:`torchrg.io.files.marked_parts`.
-
-    Example:
-        >>> run_mark("Area_1/office_1")
-        '65d1ec9889e61d51'
-    """
-    return hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
 
 
 def normalize_file_name(name: str) -> str:

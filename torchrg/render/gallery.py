@@ -10,7 +10,7 @@ from torchrg.io.files import atomic_path, check_writable
 from torchrg.render.colors import color_planes
 from torchrg.render.page import check_library, load_template, make_page, write_page
 from torchrg.render.pictures import render_cloud, write_png
-from torchrg.result import Result
+from torchrg.result import PAGE_SUFFIXES, Result
 
 INDEX = "index.html"
 """File name of the index."""
@@ -64,18 +64,17 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
             check_writable(page)
 
 
-def write_entry(folder: Path, name: str, result: Result, *, words: str = "") -> Entry:
-    """Write the image and viewer of a result, and return its index entry.
+def write_entry(folder: Path, name: str, result: Result) -> None:
+    """Write the image and viewer of a result.
 
     Raises:
         FormatError: If a file cannot be written.
         MissingDependencyError: If viewers cannot be created.
     """
-    entry = Entry(name, f"{name}.png", f"{name}.html", words)
-    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    write_planes(folder / entry.picture, result)
-    write_page(folder / entry.page, make_page(result, title=name))
-    return entry
+    picture, page = (folder / f"{name}{suffix}" for suffix in PAGE_SUFFIXES)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    write_planes(picture, result)
+    write_page(page, make_page(result, title=name))
 
 
 def write_index(folder: Path, title: str, entries: Sequence[Entry]) -> Path:
