@@ -211,3 +211,9 @@ def test_consensus_keeps_the_faces_of_a_plate_apart():
         both = ((seg.labels == found).numpy() & (face == side)).sum()
         either = ((seg.labels == found).numpy() | (face == side)).sum()
         assert both > 0.9 * either
+
+
+def test_neighbors_of_voxels_are_not_those_of_points(room):
+    points = room(2000).points
+    assert segment_planes(points, "classic", keep_neighbors=True).neighbors is not None
+    assert segment_planes(points, "classic", voxel=0.2, keep_neighbors=True).neighbors is None

@@ -136,3 +136,22 @@ def test_sizes_may_differ_by_a_rounded_pixel():
     with pytest.raises(ConfigError, match="got 224 x 172; pass the camera of the depth images"):
         camera.matrix((224, 172))
     assert torch.equal(camera._replace(size=None).matrix((999, 500)), camera.matrix())
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "focal"),
+    [
+        ("SIMPLE_PINHOLE", "525 320 240", (525, 525)),
+        ("SIMPLE_RADIAL", "525 320 240 0.01", (525, 525)),
+        ("RADIAL", "525 320 240 0.01 0.02", (525, 525)),
+        ("PINHOLE", "525 526 320 240", (525, 526)),
+        ("OPENCV", "525 526 320 240 0.01 0 0 0", (525, 526)),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*lens distortion")
+def test_models_of_colmap_have_one_focal_length_or_two(tmp_path, model, parameters, focal):
+    path = tmp_path / "cameras.txt"
+    path.write_text(
+        f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {model} 640 480 {parameters}\n"
+    )
+    assert read_camera(path)[:5] == (*focal, 319.5, 239.5, (640, 480))

@@ -5,7 +5,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.colors import read_colors
+from torchrg.io.colors import find_white, read_colors
 from torchrg.structures import Cloud
 
 RNG = np.random.default_rng(0)
@@ -233,3 +233,11 @@ def test_colors_of_16_bits_survive_formats_that_hold_them(tmp_path):
         write_cloud(tmp_path / f"b{suffix}", read_cloud(tmp_path / "b.npz"))
         narrow = np.rint(SIXTEEN / 257)
         np.testing.assert_array_equal(read_cloud(tmp_path / f"b{suffix}").fields["color"], narrow)
+
+
+@pytest.mark.parametrize(("outliers", "white"), [(4, 1), (5, 255)])
+def test_up_to_one_percent_of_values_are_outliers_of_their_range(outliers, white):
+    # Zeros and ones, which only the number of larger values tells from bytes.
+    color = np.repeat([1.0, 0.0], [400, 200])
+    color[:outliers] = 200.0
+    assert find_white(color) == white

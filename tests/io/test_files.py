@@ -11,7 +11,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
-from torchrg.io.files import atomic_path
+from torchrg.io.files import atomic_path, check_end
 from torchrg.structures import Cloud
 
 WRITTEN = [kind for kind, row in FORMATS.items() if row.write]
@@ -90,3 +90,18 @@ def test_links_are_followed(tmp_path):
     write_cloud(tmp_path / "link.ply", Cloud(np.zeros((2, 3))))
     assert (tmp_path / "link.ply").is_symlink()
     assert len(read_cloud(tmp_path / "real" / "a.ply")) == 2
+
+
+@pytest.mark.parametrize(("rest", "record_bytes", "refused"), [(11, 12, False), (12, 12, True)])
+def test_bytes_after_the_last_record_are_refused_from_a_record_on(
+    tmp_path, rest, record_bytes, refused
+):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"points" + b"x" * rest)
+    with path.open("rb") as stream:
+        stream.seek(len(b"points"))
+        if not refused:
+            assert check_end(path, stream, record_bytes) == ()
+            return
+        with pytest.raises(FormatError, match=f"got {rest} more bytes"):
+            check_end(path, stream, record_bytes)
