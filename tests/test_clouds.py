@@ -3,6 +3,8 @@
 import numpy as np
 
 from tests.cli.test_cli import CLASSIC
+from torchrg.clouds import find_objects
+from torchrg.structures import Cloud
 
 
 def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
@@ -28,3 +30,13 @@ def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
         "huge.npy: expected finite points, got none in 6,000 points; coordinates beyond 1e+12"
         in line
     )
+
+
+def test_objects_of_segment_are_those_of_segment20_where_only_these_exist():
+    fields = {"segment20": np.array([3, 4, 4]), "instance": np.array([[1, 9], [2, 9], [3, 9]])}
+    cloud = Cloud(np.zeros((3, 3)), fields)
+    assert find_objects(cloud, "segment").tolist() == [3, 4, 4]
+    # Of several labels of a point, the first.
+    assert find_objects(cloud, "instance").tolist() == [1, 2, 3]
+    both = Cloud(np.zeros((3, 3)), {**fields, "segment": np.array([7, 8, 9])})
+    assert find_objects(both, "segment").tolist() == [7, 8, 9]

@@ -242,3 +242,9 @@ def test_a_voxel_of_another_unit_is_told(scene):
         segment_planes(points, "classic", voxel=1e-5)
     with pytest.warns(UserWarning, match="got 1; add points, or reduce normals.k or the voxel"):
         segment_planes(points, "classic", voxel=100)
+
+
+def test_neighbors_of_voxels_are_not_those_of_points(room):
+    points = room(2000).points
+    assert segment_planes(points, "classic", keep_neighbors=True).neighbors is not None
+    assert segment_planes(points, "classic", voxel=0.2, keep_neighbors=True).neighbors is None

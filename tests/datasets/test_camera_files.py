@@ -229,3 +229,22 @@ def test_names_without_a_blank_are_read_as_opencv_reads_them(tmp_path):
     lines = [f"Camera1.{name}:{value}" for name, value in NAMED.items()]
     path.write_text("\n".join(["%YAML:1.0", *lines, "Viewer.PointSize:2", "Window:-.5"]))
     assert read_camera(path)[:4] == CAMERA[:4]
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "focal"),
+    [
+        ("SIMPLE_PINHOLE", "525 320 240", (525, 525)),
+        ("SIMPLE_RADIAL", "525 320 240 0.01", (525, 525)),
+        ("RADIAL", "525 320 240 0.01 0.02", (525, 525)),
+        ("PINHOLE", "525 526 320 240", (525, 526)),
+        ("OPENCV", "525 526 320 240 0.01 0 0 0", (525, 526)),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*lens distortion")
+def test_models_of_colmap_have_one_focal_length_or_two(tmp_path, model, parameters, focal):
+    path = tmp_path / "cameras.txt"
+    path.write_text(
+        f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {model} 640 480 {parameters}\n"
+    )
+    assert read_camera(path)[:5] == (*focal, 319.5, 239.5, (640, 480))

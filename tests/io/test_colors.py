@@ -5,7 +5,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.colors import read_colors
+from torchrg.io.colors import find_white, read_colors
 from torchrg.result import Result
 from torchrg.structures import Cloud
 
@@ -254,3 +254,11 @@ def test_sixteen_bits_are_rounded_where_a_file_has_eight(tmp_path):
 def test_a_result_shows_small_values_of_16_bits():
     cloud = Cloud(POINTS, {"color": EIGHT.astype(np.uint16)})
     assert Result(cloud).fields["color"].tolist() == EIGHT.tolist()
+
+
+@pytest.mark.parametrize(("outliers", "white"), [(4, 1), (5, 255)])
+def test_up_to_one_percent_of_values_are_outliers_of_their_range(outliers, white):
+    # Zeros and ones, which only the number of larger values tells from bytes.
+    color = np.repeat([1.0, 0.0], [400, 200])
+    color[:outliers] = 200.0
+    assert find_white(color) == white

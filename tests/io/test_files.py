@@ -14,7 +14,7 @@ import pytest
 from torchrg.datasets import FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
-from torchrg.io.files import atomic_path
+from torchrg.io.files import atomic_path, check_end
 from torchrg.result import read_result
 from torchrg.structures import Cloud
 
@@ -154,3 +154,18 @@ def test_headers_may_end_their_lines_as_old_macs_did(tmp_path, kind, is_ascii):
     cloud = read_cloud(path)
     assert cloud.coordinates.tolist() == points.tolist()
     assert (cloud.front is not None) == (kind == ".ply" and is_ascii)
+
+
+@pytest.mark.parametrize(("rest", "record_bytes", "refused"), [(11, 12, False), (12, 12, True)])
+def test_bytes_after_the_last_record_are_refused_from_a_record_on(
+    tmp_path, rest, record_bytes, refused
+):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"points" + b"x" * rest)
+    with path.open("rb") as stream:
+        stream.seek(len(b"points"))
+        if not refused:
+            assert check_end(path, stream, record_bytes) == ()
+            return
+        with pytest.raises(FormatError, match=f"got {rest} more bytes"):
+            check_end(path, stream, record_bytes)

@@ -128,3 +128,18 @@ def test_a_library_without_one_of_the_kernels_is_not_used(monkeypatch):
     monkeypatch.setitem(kernels.SIGNATURES, "kernel_of_tomorrow", "f[n] -> f[n]")
     with pytest.warns(UserWarning, match="of another version; install it again"):
         assert kernels._library.__wrapped__() is None
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_outputs_that_a_kernel_writes_to_must_be_contiguous(wrong):
+    # A copy would take the values that the kernel writes.
+    forest = [
+        torch.arange(4, dtype=torch.int32),
+        torch.zeros(4, dtype=torch.bool),
+        torch.zeros(4, dtype=torch.bool),
+    ]
+    strided = torch.zeros(8, dtype=forest[wrong].dtype)[::2]
+    strided.copy_(forest[wrong])
+    forest[wrong] = strided
+    with pytest.raises(ValueError, match="flatten_nodes: expected"):
+        kernels.call("flatten_nodes", *forest)

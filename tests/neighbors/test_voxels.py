@@ -1,5 +1,7 @@
 """Voxels against a loop over points."""
 
+from itertools import permutations
+
 import numpy as np
 import torch
 
@@ -42,3 +44,11 @@ def test_chosen_points_do_not_depend_on_the_order(rng):
     moved = points[torch.randperm(500, generator=rng)]
     again = moved[sample_voxels(moved, 0.3).rows]
     assert set(map(tuple, chosen.tolist())) == set(map(tuple, again.tolist()))
+
+
+def test_equally_near_points_are_chosen_by_coordinates_in_any_order():
+    # The cell of width 1 begins at the first point; all others are 0.25 from its middle.
+    near = [[0.25, 0.5, 0.5], [0.75, 0.5, 0.5], [0.5, 0.25, 0.5], [0.5, 0.5, 0.75]]
+    for others in permutations(near):
+        points = torch.tensor([[0.0, 0, 0], *others])
+        assert points[sample_voxels(points, 1.0).rows].tolist() == [[0.25, 0.5, 0.5]]

@@ -1,5 +1,6 @@
 """Faces: the double cover, sides of plates, thick planes."""
 
+import math
 from contextlib import nullcontext
 
 import pytest
@@ -201,3 +202,30 @@ def test_threads_and_disks_and_longer_lists_change_nothing(furnished, tmp_path, 
         results.append(orient_normals(points, normals, orient=side, neighbors=longer))
     results.append(turn_faces(points, -normals, side, search_knn(points, 5)))
     assert all(torch.equal(result, results[0]) for result in results)
+
+
+def test_points_across_a_plane_are_not_of_its_face(rng):
+    # A ledge 8 cm high, which growth gave to the floor it stands on.
+    floor = draw(rng, 3000, (0.0, 0, 0), (3.0, 2, 0))
+    ledge = draw(rng, 500, (1.5, 0.0, 0), (1.5, 2, 0.08), axis=0)
+    points, normals, part = sorted_cloud([floor, ledge])
+    near = search_knn(points, 20).indices
+    labels = torch.zeros(len(points), dtype=torch.int64)
+    faces, _ = find_faces(points, normals, near, labels, torch.tensor([[0.0, 0, 1]]), 0.05)
+    assert (faces[part == 0] == faces[part == 0][0]).all()
+    assert not (faces[part == 1] == faces[part == 0][0]).any()
+
+
+@pytest.mark.parametrize(("turn_deg", "num_faces"), [(5, 1), (12, 2)])
+def test_smooth_patches_end_where_exact_normals_turn_by_eight_degrees(rng, turn_deg, num_faces):
+    turn = math.radians(turn_deg)
+    left, right = (draw(rng, 2000, (x, 0.0, 0), (x + 1, 1, 0)) for x in (-1.0, 0.0))
+    slope = torch.tensor([math.cos(turn), 1, 0]), torch.tensor([math.sin(turn), 0, 0])
+    points = right[0] * slope[0]
+    points[:, 2] = (right[0] * slope[1]).sum(dim=1)
+    normals = torch.tensor([-math.sin(turn), 0, math.cos(turn)]).expand(2000, 3)
+    points, normals, part = sorted_cloud([left, (points, normals)])
+    near, none = search_knn(points, 20).indices, torch.full((len(points),), -1)
+    faces, _ = find_faces(points, normals, near, none, torch.zeros(0, 3), 0.01)
+    sides = [faces[part == side].mode().values for side in (0, 1)]
+    assert len(set(map(int, sides))) == num_faces

@@ -62,3 +62,12 @@ def test_single_wrong_normals_take_the_side_of_those_around_them(spoiled):
     near, rows = search_knn(points, 20).indices, torch.arange(len(points))
     alone = vote_free_side(points, normals, near, rows, cell_width(points, near)) > 0
     assert alone[::10].double().mean() < right[::10].double().mean()
+
+
+def test_cells_along_an_axis_are_numbered_by_nineteen_bits(rng):
+    points = torch.rand(300, 3, generator=rng, dtype=torch.float64)
+    near = cell_width(points, search_knn(points, 20).indices)
+    assert 0.1 < near < 0.5
+    points[0, 1] = 1e9
+    wide = cell_width(points, search_knn(points, 20).indices)
+    assert wide == pytest.approx(1e9 / 2**18)

@@ -297,3 +297,27 @@ def test_what_lies_apart_decides_for_itself_however_small_it_is(rng):
     oriented = orient_normals(torch.cat([points, lamp]), normals)
     assert torch.equal(oriented[:-6], inwards)
     assert (oriented[-6:, 2] < 0).all()
+
+
+def test_rounding_of_an_open_surface_decides_nothing(rng):
+    # A wall, whose normals lean down by less than they are known to.
+    points = torch.rand(400, 3, generator=rng) * torch.tensor([4.0, 0, 2.5])
+    normals = torch.nn.functional.normalize(torch.tensor([[0.0, 1, -1e-5]]), dim=1)
+    oriented = orient_normals(points, shuffled_signs(normals.expand(400, 3)), orient="consistent")
+    assert torch.equal(oriented, normals.expand(400, 3))
+
+
+def test_duplicates_of_a_seen_point_count_once():
+    # The last point was not seen; two of its neighbors look up, one down, all equally near.
+    far = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + 50
+    around = torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0]])
+    lost = torch.zeros(1, 3)
+    up = torch.tensor([[0.0, 0, 1]])
+    for copies in (1, 4):
+        points = torch.cat([far, around, around[2:].repeat(copies, 1), lost])
+        front = up.repeat(len(points), 1)
+        front[302:-1] *= -1
+        front[-1] = 0
+        oriented = orient_normals(points, -up.expand(len(points), 3), front=front)
+        assert torch.equal(oriented[-1], up[0])
+        assert torch.equal(oriented[:-1], front[:-1])

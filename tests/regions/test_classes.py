@@ -9,7 +9,7 @@ import torch
 
 from tests.made import make_storey
 from torchrg.regions import summarize_planes
-from torchrg.regions.classes import classify_planes
+from torchrg.regions.classes import _find_slabs, classify_planes
 from torchrg.result import read_result
 from torchrg.scenes import RoomLayout, make_room
 from torchrg.structures import PLANE_KINDS
@@ -148,6 +148,7 @@ def standing(width, bottom, top, tilt_deg=0.0):
         (standing(1, 0, 2.6), "vertical"),
         (standing(2.6, 0, 1.65), "wall"),
         (standing(2.6, 0, 1.35), "vertical"),
+        (standing(3, 0, 1.35), "vertical"),
         (standing(1.65, 0, 2.5), "wall"),
         (standing(1.35, 0, 2.5), "vertical"),
     ],
@@ -316,3 +317,20 @@ def test_a_real_room_has_a_ceiling_a_floor_and_nine_walls(scan, run, tmp_path):
             assert plane.center[2] > 1
         if plane.kind in SHELL:
             assert plane.area > 0.5
+
+
+@pytest.mark.parametrize(
+    ("gap", "level", "slabs"),
+    [
+        ((48, 57), 47, [52.5]),  # 6 of 10 walls end below a slab of 9 voxels, next to a ceiling
+        ((48, 57), 58, [52.5]),  # next to a floor
+        ((48, 57), 30, []),  # a table
+        ((48, 57), None, []),  # a band of windows
+        ((48, 72), 47, []),  # a hall between galleries
+    ],
+)
+def test_slabs_are_thin_gaps_of_walls_beside_a_broad_plane(gap, level, slabs):
+    bottom, top = torch.tensor([0.0, gap[1]]), torch.tensor([gap[0] - 1.0, gap[1] + 47])
+    levels = torch.tensor([] if level is None else [float(level)])
+    found = _find_slabs(bottom, top, torch.full((2,), 100.0), levels)
+    assert found.tolist() == slabs

@@ -10,7 +10,7 @@ from torchrg.errors import ShapeError
 from torchrg.neighbors import sample_voxels, search_knn
 from torchrg.neighbors.knn import restrict_to_groups
 from torchrg.result import describe_planes
-from torchrg.structures import UNLABELED
+from torchrg.structures import UNLABELED, Neighbors
 
 PRESETS = ("consensus", "classic", "paper")
 
@@ -78,10 +78,14 @@ def test_kernels_definitions_and_arrays_on_disk_agree(room, tmp_path, set_thread
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_one_object_is_as_none(preset, room):
-    points = room(4000).points
-    seg = segment_planes(points, preset)
-    same = segment_planes(points, preset, within=np.full(4000, 9, np.int16))
-    assert torch.equal(same.labels, seg.labels)
+    points = room(3000, 0.003, 1).points
+    # With copies, a position may have points of several objects.
+    for cloud in (points, torch.cat([points, points[:9]])):
+        seg = segment_planes(cloud, preset)
+        same = segment_planes(cloud, preset, within=np.full(len(cloud), 9, np.int16))
+        assert torch.equal(same.labels, seg.labels)
+        # Planes are faces in the orientation, too.
+        assert torch.equal(same.normals, seg.normals)
     assert same.planes.object.tolist() == [9] * len(seg.planes.count)
 
 
@@ -117,6 +121,15 @@ def test_nearest_neighbours_of_the_group_come_first(rng):
         assert kept.indices[row, : len(own)].tolist() == own
         assert kept.valid[row].tolist() == [True] * len(own) + [False] * (20 - len(own))
         assert (kept.indices[row, len(own) :] == row).all()
+
+
+def test_a_group_may_be_missing_at_the_last_position():
+    # Row 2 is of group 1 at position 1, and its neighbor, position 2, has no point of group 1.
+    near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
+    positions, groups = torch.tensor([0, 1, 1, 2]), torch.tensor([0, 0, 1, 0])
+    kept = restrict_to_groups(near, groups, 4, positions)
+    assert kept.valid.sum(dim=1).tolist() == [3, 3, 1, 3]
+    assert kept.indices[2].tolist() == [2, 2, 2]
 
 
 def test_points_that_are_not_finite_are_of_no_plane(room):

@@ -9,9 +9,11 @@ import torch
 from tests.regions.test_repair import flat_cloud, scattered, with_settings
 from torchrg import load_config, segment_planes
 from torchrg.regions import summarize_planes
+from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.fit import RegionPlanes, fit_regions
 from torchrg.regions.repair import assign_levels, merge_coplanar, refine_regions
-from torchrg.regions.splits import split_levels
+from torchrg.regions.splits import _have_valleys, split_levels
+from torchrg.structures import Neighbors
 
 CONFIG = with_settings(min_size=50, facet_tolerance=0.005)
 NOISE = 0.003
@@ -188,3 +190,39 @@ def test_levels_do_not_depend_on_the_order_of_points_or_on_threads(set_threads):
     set_threads(3)
     config = load_config(chunk_size=1000)
     assert torch.equal(segment_planes(points[order], config).labels, labels[order])
+
+
+def board_of(height, seed):
+    """A wall and a board whose height depends on x, from -0.3 to 0.3, and a number from 0 to 1."""
+    rng = np.random.default_rng(seed)
+    points, on_board = wall_with_board(rng, 0.0)
+    points[on_board, 2] += height(points[on_board, 0] - 1, rng.uniform(size=on_board.sum()))
+    return points
+
+
+@pytest.mark.parametrize(
+    ("height", "num_levels"),
+    [
+        (lambda x, u: 0.15 + 0.2 * x, 2),  # 11 degrees to the wall
+        (lambda x, u: 0.25 + 0.4 * x, 1),  # 22 degrees: no second level
+        (lambda x, u: 0.02 + 0.01 * u, 2),
+        (lambda x, u: 0.02 + 0.12 * (u - 0.5).clip(0), 1),  # clutter, from 2 to 8 cm
+    ],
+    ids=["parallel", "oblique", "thin", "thick"],
+)
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_a_level_is_parallel_and_thinner_than_its_step(height, num_levels, seed):
+    assert split(board_of(height, seed)).max() == num_levels - 1
+
+
+def test_a_point_between_two_levels_counts_for_the_first():
+    # The middle is halfway to the left level, which has no valley then, and far below the right.
+    average = torch.tensor([1.0, 0.5, 3.0])
+    near = Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]], dtype=torch.int32))
+    level, step, region = torch.tensor([0, -1, 1]), torch.tensor([1.0, 3.0]), torch.zeros(3).long()
+    for order in ([0, 1, 2], [2, 1, 0]):
+        rows = torch.tensor(order)
+        place = rows.argsort().to(torch.int32)
+        lists = KnnAdjacency(Neighbors(place[near.indices.long()[rows]]))
+        found = _have_valleys(level[rows], step, average[rows], region, lists)
+        assert found.tolist() == [False, True]
