@@ -118,6 +118,26 @@ def test_results_are_replaced_by_those_of_other_settings_and_no_others(job_of_a_
     assert (job.folder / "superpoint.npy").exists()
 
 
+def test_a_scan_that_failed_keeps_its_table(job_of_a_room, tmp_path):
+    job, path = job_of_a_room(table="planes.csv"), tmp_path / "in" / "room.npy"
+    assert convert_scan(job).status == "converted"
+    whole = path.read_bytes()
+    for _ in range(2):
+        path.write_bytes(b"damaged")
+        assert convert_scan(job).status == "failed"
+    path.write_bytes(whole)
+    assert convert_scan(job).status == "converted"
+    assert reason_to_convert(job) == ""
+    # Killed with another table, it is still known as torchrg's.
+    make_claim(job.folder / RECORD)
+    (job.folder / "planes.csv").write_text("half")
+    other = dataclasses.replace(job, source=dataclasses.replace(job.source, table=None))
+    assert convert_scan(other).warnings == convert_scan(job).warnings
+    (job.folder / "other.csv").write_text("of a user")
+    other = dataclasses.replace(job, source=dataclasses.replace(job.source, table="other.csv"))
+    assert "other.csv: was not written by torchrg for this scan" in convert_scan(other).reason
+
+
 def test_a_folder_that_was_there_stays(job_of_a_room, tmp_path):
     job = job_of_a_room()
     (tmp_path / "in" / "room.npy").write_bytes(b"damaged")

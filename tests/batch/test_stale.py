@@ -341,6 +341,15 @@ def test_scans_of_other_names_are_known_by_their_content(tmp_path, out, convert,
     assert files_of(out) == found
 
 
+def test_scans_that_failed_leave_no_folder(tmp_path, out, convert):
+    root = tmp_path / "in"
+    save_rooms(root, "a.npy", "sub/b.npy")
+    (root / "sub" / "b.npy").rename(root / "sub" / "b.ply")
+    (root / "sub" / "b.ply").write_text("ply\nformat")
+    assert convert("folder", root, out).code == 3
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["a"]
+
+
 def test_copies_are_no_new_names(tmp_path, out, convert):
     root = tmp_path / "in"
     save_rooms(root, "a.npy")

@@ -130,7 +130,7 @@ def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_pa
     assert reported.out.count(" 2 planes, ") == 2
     assert sorted(path.name for path in out.iterdir()) == ["1", "3"]
     assert contents(out / "1") == contents(out / "3")
-    assert len(contents(out / "1")) == 5
+    assert len(contents(out / "1")) == 6
 
 
 def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
@@ -152,6 +152,7 @@ def test_images_in_a_directory_write_what_convert_writes(tmp_path, frame, depth,
     assert run("convert", "rgbd", folder, tmp_path / "all", *CAMERA[:4], "--workers", "1").code == 0
     for name in ("0", "1"):
         written, expected = contents(out / name), contents(tmp_path / "all" / name)
+        assert json.loads(written.pop(RECORD))["claims"].keys() == written.keys()
         assert written == {key: expected[key] for key in expected if key != RECORD}
     table = (folder / "0.png", *CAMERA, "--out", tmp_path / "labels.png", "--table")
     assert run("depth", *table, tmp_path / "labels.csv").code == 0

@@ -77,7 +77,7 @@ def test_a_claim_keeps_what_is_known_of_earlier_files(tmp_path):
 def test_earlier_files_are_removed_unless_they_are_of_others(tmp_path):
     folder = tmp_path / "out" / "scan"
     folder.mkdir(parents=True)
-    names = ["again", "changed", "claimed", "unchanged", "../shared", "../../elsewhere"]
+    names = ["again", "changed", "claimed", "unchanged", "../shared", "../../other"]
     for name in (*names, "theirs"):
         (folder / name).write_text("a")
     stored = fingerprint(folder / "unchanged")
@@ -86,7 +86,7 @@ def test_earlier_files_are_removed_unless_they_are_of_others(tmp_path):
     record, paths = {"claims": claims}, {name: folder / name for name in (*names, "theirs")}
     assert remove_unwritten(tmp_path / "out", folder, record, ["again"]) == ["changed"]
     left = {name for name, path in paths.items() if path.exists()}
-    assert left == {"again", "changed", "theirs", "../../elsewhere"}
+    assert left == {"again", "changed", "theirs", "../../other"}
     # A link is not the file that was written.
     (folder / "unchanged").symlink_to(folder / "again")
     assert remove_unwritten(tmp_path / "out", folder, record, []) == ["changed", "unchanged"]

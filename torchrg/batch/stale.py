@@ -156,7 +156,7 @@ def remove_stale(result: StaleResult) -> None:
         path.unlink(missing_ok=True)
     for parent in {path.parent for path in result.paths}:
         sync_folder(parent)
-        _remove_empty(parent, {result.out, *result.page_folders})
+        remove_empty(parent, {result.out, *result.page_folders})
     _remove_record(result.folder, result.out)
 
 
@@ -214,11 +214,12 @@ def _join(names: Sequence[str]) -> str:
     return f"{', '.join(names[:_MAX_NAMED])}{more}"
 
 
-def _remove_empty(folder: Path, tops: Collection[Path]) -> None:
+def remove_empty(folder: Path, tops: Collection[Path]) -> None:
     """Remove a folder and its parents below one of ``tops``, as long as they are empty."""
     with suppress(OSError):
         while folder not in tops:
-            folder.rmdir()
+            if folder.exists():
+                folder.rmdir()
             folder = folder.parent
 
 

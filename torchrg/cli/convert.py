@@ -1,8 +1,6 @@
 """``torchrg convert``: segment a whole data set, on one machine or a Ray cluster."""
 
-import contextlib
 import dataclasses
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -27,7 +25,7 @@ from torchrg.batch.run import (
 )
 from torchrg.batch.scans import Job, Source, claim_pages
 from torchrg.batch.sources import CloudSource, RGBDSource
-from torchrg.batch.stale import StaleResult, check_stale, find_stale, remove_stale
+from torchrg.batch.stale import StaleResult, check_stale, find_stale, remove_empty, remove_stale
 from torchrg.batch.task import Reports
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
@@ -405,8 +403,7 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
         shown = Progress(bar, sizes, unit=arguments.unit)
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     for job in jobs:
-        with contextlib.suppress(OSError):
-            os.removedirs(job.folder)  # Of a scan that failed: it fails unless they are empty.
+        remove_empty(job.folder, {out})  # Scans that failed leave empty folders.
     code = _finish(report, out, unit=arguments.unit)
     if not report.disk_full:
         plan.jobs[0].source.write_lists(out)
