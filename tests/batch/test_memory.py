@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from torchrg.batch import memory
 from torchrg.batch.memory import available_memory, peak_memory, scan_memory
 
 MEASURE = """
@@ -61,3 +62,47 @@ def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, what, p
 def test_memory_is_measured():
     assert 1e7 < peak_memory() < 1e12
     assert 1e7 < available_memory() < 1e14
+
+
+@pytest.mark.parametrize(
+    ("own", "tree", "limit", "used", "cache"),
+    [
+        ("0::/slurm/job_7/step_0", "", "memory.max", "memory.current", "inactive_file"),
+        (
+            "4:cpu,memory:/slurm/job_7/step_0\n1:pids:/\n0::/",
+            "memory",
+            "memory.limit_in_bytes",
+            "memory.usage_in_bytes",
+            "total_inactive_file",
+        ),
+    ],
+)
+def test_the_least_limit_of_nested_groups_counts(
+    monkeypatch, tmp_path, own, tree, limit, used, cache
+):
+    monkeypatch.setattr(memory, "_CGROUP", tmp_path / "cgroup")
+    monkeypatch.setattr(memory, "_OWN_CGROUPS", tmp_path / "own")
+    machine = available_memory()  # No groups, as on other systems.
+    (tmp_path / "own").write_text(own)
+    assert machine / 2 < available_memory() < 2 * machine
+
+    def restrict(group, most, taken, reclaimable=None):
+        folder = tmp_path / "cgroup" / tree / group
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / limit).write_text(f"{most}\n")
+        (folder / used).write_text(f"{taken}\n")
+        if reclaimable is not None:
+            (folder / "memory.stat").write_text(f"anon 5\n{cache} {reclaimable}\nfile 3\n")
+
+    restrict("", 900_000, 1000)  # A container, in whose tree the path of its host is missing.
+    assert available_memory() == 899_000
+    restrict("slurm/job_7/step_0", "max", 100)
+    restrict("slurm/job_7", 300_000, 50_000, 20_000)
+    assert available_memory() == 270_000
+    restrict("slurm", 200_000, 50_000)
+    assert available_memory() == 150_000
+    restrict("slurm/job_7/step_0", 1000, 3000, 0)
+    assert available_memory() == 0
+    restrict("other", 10, 0)
+    restrict("slurm/job_7/step_0", 100_000, 40_000, 5000)
+    assert available_memory() == 65_000

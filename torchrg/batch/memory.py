@@ -1,6 +1,9 @@
 """Memory needed by a scan, and available memory."""
 
 import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 PROCESS_BYTES = 400_000_000
@@ -8,13 +11,13 @@ PROCESS_BYTES = 400_000_000
 _BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 400, (True, True): 600}
 """Peak memory per point or pixel with any preset, by whether there are superpoints and whether the
 large arrays are on disk."""
-_CGROUP = Path("/sys/fs/cgroup")
-"""Linux control groups, which limit containers."""
-_CGROUP_FILES = (
-    ("memory.max", "memory.current"),
-    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
-)
-"""Limit and usage of a control group, in versions 2 and 1."""
+_CGROUP, _OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+"""Linux control groups, which limit containers and cluster jobs, and those of this process."""
+_CGROUP_FILES = {
+    "": ("memory.max", "memory.current", "inactive_file"),
+    "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+}
+"""Limit, usage and reclaimable cache of a control group by controller: "" is version 2."""
 _MEMORY_FRACTION = 0.8
 """Fraction of the available memory for a batch; the remainder is for the parent process and other
 programs."""
@@ -40,16 +43,25 @@ def spare_memory() -> int:
 def available_memory() -> int:
     """Return the bytes that this process and its children can still allocate.
 
-    It is the smaller of the machine's available memory and the remainder of a control group limit.
+    It is the least of the machine's available memory and the remainders of control group limits.
     """
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    free = [_read_entry("/proc/meminfo", "MemAvailable", default=total)]
-    for limit, used in _CGROUP_FILES:
-        try:
-            free.append(int((_CGROUP / limit).read_text()) - int((_CGROUP / used).read_text()))
-        except (OSError, ValueError):
-            continue  # No such group, or no limit, which is the word "max".
-    return max(0, min(free))
+    free = _read_entry("/proc/meminfo", "MemAvailable", default=total)
+    return max(0, min([free, *_group_remainders()]))
+
+
+def _group_remainders() -> Iterator[int]:
+    """Yield what each control group of this process, and each parent, can still allocate."""
+    # A container may see a path of its host, of which only the root exists in its own tree.
+    for line in _OWN_CGROUPS.read_text().splitlines() if _OWN_CGROUPS.exists() else []:
+        _, controllers, path = line.split(":", 2)
+        for controller in set(controllers.split(",")) & _CGROUP_FILES.keys():
+            limit, used, cached = _CGROUP_FILES[controller]
+            group = _CGROUP / controller / path.lstrip("/")
+            for folder in (group, *group.parents):
+                with suppress(OSError, ValueError):  # No group, or no limit: the word "max".
+                    remainder = int((folder / limit).read_text()) - int((folder / used).read_text())
+                    yield remainder + _read_entry(folder / "memory.stat", cached, default=0, unit=1)
 
 
 def reset_peak_memory() -> None:
@@ -71,11 +83,11 @@ def peak_memory(process: int | str = "self") -> int:
     return _read_entry(f"/proc/{process}/status", "VmHWM", default=usage.ru_maxrss * 1024)
 
 
-def _read_entry(path: str, name: str, *, default: int) -> int:
-    """Return an entry of a Linux status file (in kibibytes), in bytes."""
+def _read_entry(path: str | Path, name: str, *, default: int, unit: int = 1024) -> int:
+    """Return an entry of a Linux status file in bytes."""
     try:
-        lines = Path(path).read_text(encoding="ascii").splitlines()
-        table = dict(line.split(":", 1) for line in lines if ":" in line)
-        return int(table[name].split()[0]) * 1024
-    except (OSError, KeyError, ValueError):
+        text = Path(path).read_text(encoding="ascii", errors="replace")
+    except OSError:
         return default
+    found = re.search(rf"^{name}:?\s+(\d+)", text, re.MULTILINE)
+    return int(found[1]) * unit if found else default
