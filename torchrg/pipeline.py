@@ -30,7 +30,7 @@ from torchrg.neighbors import (
     search_knn,
 )
 from torchrg.neighbors.knn import restrict_to_groups
-from torchrg.normals import ESTIMATORS
+from torchrg.normals import run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.precision import warn_about_steps
 from torchrg.regions import grow_regions, partition_points, summarize_planes
@@ -210,8 +210,7 @@ def _segment(
         config = config.with_sampling(sampling)
 
     begin("normals")
-    estimate = ESTIMATORS[config.normals.method]
-    fit = estimate(sites, neighbors, config.normals, config.chunk_size)
+    fit = run_estimator(sites, neighbors, config.normals, config.chunk_size)
 
     begin("regions")
     parts: Rows = slice(None)
