@@ -3,22 +3,29 @@
 ``torchrg segment`` and ``torchrg convert`` call :func:`segment_cloud` for each cloud.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.config import PipelineConfig, SuperpointsConfig
-from torchrg.errors import FormatError
+from torchrg.config import NormalsConfig, PipelineConfig, SuperpointsConfig
+from torchrg.errors import ConfigError, FormatError, is_out_of_memory
 from torchrg.io.fields import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
 
-__all__ = ["check_finite", "find_objects", "note_on_copies", "segment_cloud"]
+__all__ = [
+    "check_finite",
+    "describe_multipliers",
+    "find_objects",
+    "note_on_copies",
+    "segment_cloud",
+]
 __dir__ = __all__.copy
 
 _SAMPLE_SIZE = 10_000
@@ -57,7 +64,8 @@ def segment_cloud(
 
     Raises:
         FormatError: If no point is finite, or ``within`` is not a field of integers.
-        ConfigError: If normals are oriented by viewpoint and the cloud has no scanner positions.
+        ConfigError: If normals are oriented by viewpoint and the cloud has no scanner positions, or
+            if there is not enough memory for settings above their defaults.
 
     Example:
         >>> from torchrg.config import load_config
@@ -70,26 +78,60 @@ def segment_cloud(
     for note in check_finite(cloud):
         warn(note)
     objects = find_objects(cloud, within)
-    is_kept = partition is not None
-    seg = segment_planes(
-        cloud,
-        # Superpoints respect the boundaries of all planes.
-        settings.without_selection() if is_kept else settings,
-        orient=orient,
-        viewpoint=viewpoint,
-        voxel=voxel,
-        within=objects,
-        keep_neighbors=is_kept,
-        on_stage=begin,
-    )
-    if partition is None:
-        return seg, None
-    begin("superpoints")
-    colors = cloud.fields.get("color")
-    superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
-    rows = choose_planes(seg.planes, settings)
-    plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
-    return keep_planes(seg, rows), replace(superpoints, plane=plane)
+    with _naming_multipliers(cloud, settings, partition):
+        is_kept = partition is not None
+        seg = segment_planes(
+            cloud,
+            # Superpoints respect the boundaries of all planes.
+            settings.without_selection() if is_kept else settings,
+            orient=orient,
+            viewpoint=viewpoint,
+            voxel=voxel,
+            within=objects,
+            keep_neighbors=is_kept,
+            on_stage=begin,
+        )
+        if partition is None:
+            return seg, None
+        begin("superpoints")
+        colors = cloud.fields.get("color")
+        superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
+        rows = choose_planes(seg.planes, settings)
+        plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
+        return keep_planes(seg, rows), replace(superpoints, plane=plane)
+
+
+@contextmanager
+def _naming_multipliers(
+    cloud: Cloud, settings: PipelineConfig, partition: SuperpointsConfig | None
+) -> Iterator[None]:
+    """Name the settings that multiply memory in an out-of-memory error."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        multipliers = describe_multipliers(settings, partition)
+        if not is_out_of_memory(error) or not multipliers:
+            raise
+        raise ConfigError(
+            f"{cloud.source}: out of memory for {len(cloud):,} points{multipliers}; lower it, or "
+            "pass --voxel."
+        ) from error
+
+
+def describe_multipliers(settings: PipelineConfig, partition: SuperpointsConfig | None) -> str:
+    """Return the settings that need more memory than their defaults, as flags after "with".
+
+    Example:
+        >>> from torchrg.config import load_config
+        >>> describe_multipliers(load_config(**{"normals.k": 600}), None)
+        ' with --normals.k 600'
+    """
+    normals, usual, flags = settings.normals, NormalsConfig.k, []
+    for name, value in (("k", normals.k), ("adaptive-k", normals.adaptive_k or 0)):
+        flags += [f"--normals.{name} {value}"] if value > usual else []
+    if partition is not None and partition.num_levels > SuperpointsConfig().num_levels:
+        flags.append(f"{partition.num_levels} levels of superpoints")
+    return f" with {' and '.join(flags)}" if flags else ""
 
 
 def check_finite(cloud: Cloud) -> tuple[str, ...]:

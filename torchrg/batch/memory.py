@@ -10,7 +10,11 @@ PROCESS_BYTES = 400_000_000
 """Memory of a process without points: Python, torch, scipy."""
 _BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 400, (True, True): 600}
 """Peak memory per point or pixel with any preset, by whether there are superpoints and whether the
-large arrays are on disk."""
+large arrays are on disk, for at most ``_K`` neighbors and ``_NUM_LEVELS`` levels."""
+_K, _NUM_LEVELS = 50, 4
+_BYTES_PER_NEIGHBOR, _BYTES_PER_LEVEL, _BYTES_PER_PAIR = {False: 14, True: 8}, 24, 40
+"""Memory per point of each further neighbor (by whether arrays are on disk) and level, and of a
+neighborhood per pair of its points."""
 _CGROUP, _OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 """Linux control groups, which limit containers and cluster jobs, and those of this process."""
 _CGROUP_FILES = {
@@ -18,26 +22,22 @@ _CGROUP_FILES = {
     "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
 """Limit, usage and reclaimable cache of a control group by controller: "" is version 2."""
-_MEMORY_FRACTION = 0.8
-"""Fraction of the available memory for a batch; the remainder is for the parent process and other
-programs."""
 
 
-def scan_memory(num_points: int, *, superpoints: bool = False, on_disk: bool = False) -> int:
+def scan_memory(num_points: int, *, k: int = _K, num_levels: int = 0, on_disk: bool = False) -> int:
     """Return the memory that a process needs for a cloud or a depth image, in bytes.
 
-    ``superpoints``: the cloud is also partitioned; ``on_disk``: large arrays are spilled to disk.
+    ``k``: number of neighbors; ``num_levels``: levels of superpoints, 0 without superpoints;
+    ``on_disk``: large arrays are spilled to disk.
 
     Example:
         >>> scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)
         (900000000, 4400000000)
     """
-    return PROCESS_BYTES + _BYTES_PER_POINT[superpoints, on_disk] * num_points
-
-
-def spare_memory() -> int:
-    """Return the default memory limit of a batch in bytes, a fraction of the available memory."""
-    return int(_MEMORY_FRACTION * available_memory())
+    more = max(min(k, num_points) - _K, 0)
+    per_point = _BYTES_PER_POINT[num_levels > 0, on_disk] + _BYTES_PER_NEIGHBOR[on_disk] * more
+    per_point += _BYTES_PER_LEVEL * max(num_levels - _NUM_LEVELS, 0)
+    return PROCESS_BYTES + per_point * num_points + _BYTES_PER_PAIR * more * more
 
 
 def available_memory() -> int:
