@@ -1,8 +1,13 @@
 """Codes for missing points in clouds."""
 
 import numpy as np
+import pytest
+import torch
 
 from tests.cli.test_cli import CLASSIC
+from torchrg import Cloud, clouds, load_config
+from torchrg.config import SuperpointsConfig
+from torchrg.errors import ConfigError
 
 
 def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
@@ -28,3 +33,33 @@ def test_codes_for_missing_points_are_no_points(room, tmp_path, run):
         "huge.npy: expected finite points, got none in 6,000 points; coordinates beyond 1e+12"
         in line
     )
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't allocate memory: 9 bytes")])
+@pytest.mark.parametrize(
+    ("changes", "partition", "message"),
+    [
+        ({"normals.k": 600}, None, "for 9 points with --normals.k 600; lower it"),
+        (
+            {"normals.adaptive_k": 300},
+            SuperpointsConfig(counts=(9, 8, 7, 6, 5)),
+            "with --normals.adaptive-k 300 and 5 levels of superpoints; lower it",
+        ),
+    ],
+)
+def test_too_little_memory_names_the_settings(monkeypatch, error, changes, partition, message):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(clouds, "segment_planes", fail)
+    cloud = Cloud(np.eye(9, 3), source="a.ply")
+    with pytest.raises(ConfigError, match=f"^a.ply: out of memory .*{message}"):
+        clouds.segment_cloud(cloud, load_config(**changes), partition=partition)
+    with pytest.raises(type(error)):
+        clouds.segment_cloud(cloud, load_config(), partition=SuperpointsConfig())
+
+
+def test_other_errors_stay(monkeypatch):
+    monkeypatch.setattr(clouds, "segment_planes", lambda *_, **__: torch.zeros(2) + torch.zeros(3))
+    with pytest.raises(RuntimeError, match="size of tensor"):
+        clouds.segment_cloud(Cloud(np.eye(9, 3)), load_config(**{"normals.k": 600}))

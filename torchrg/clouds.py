@@ -3,14 +3,15 @@
 ``torchrg segment`` and ``torchrg convert`` call :func:`segment_cloud` for each cloud.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import wraps
+from typing import Any, Concatenate, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg._checks import Arguments
 from torchrg.config import NormalsConfig, PipelineConfig, SuperpointsConfig
 from torchrg.errors import ConfigError, FormatError, is_out_of_memory
 from torchrg.io.fields import are_integers
@@ -28,6 +29,8 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+Returned = TypeVar("Returned")
+
 _SAMPLE_SIZE = 10_000
 """Number of points from which the quantiles of coordinates are estimated."""
 _QUARTILES = (0.25, 0.75)
@@ -37,6 +40,30 @@ _MAX_EXTENT_RATIO = 1000
 the seven digits of float32, rounding steps are then 1e-4 of the extent of the middle half."""
 
 
+def _naming_multipliers(
+    segment: Callable[Concatenate[Cloud, PipelineConfig, Arguments], Returned],
+) -> Callable[Concatenate[Cloud, PipelineConfig, Arguments], Returned]:
+    """Name the settings that multiply memory in an out-of-memory error."""
+
+    @wraps(segment)
+    def call(
+        cloud: Cloud, settings: PipelineConfig, /, *args: Arguments.args, **kwargs: Arguments.kwargs
+    ) -> Returned:
+        try:
+            return segment(cloud, settings, *args, **kwargs)
+        except (MemoryError, RuntimeError) as error:
+            multipliers = describe_multipliers(settings, kwargs.get("partition"))
+            if not is_out_of_memory(error) or not multipliers:
+                raise
+            raise ConfigError(
+                f"{cloud.source}: out of memory for {len(cloud):,} points{multipliers}; lower it, "
+                "or pass --voxel."
+            ) from error
+
+    return call
+
+
+@_naming_multipliers
 def segment_cloud(
     cloud: Cloud,
     settings: PipelineConfig,
@@ -78,58 +105,43 @@ def segment_cloud(
     for note in check_finite(cloud):
         warn(note)
     objects = find_objects(cloud, within)
-    with _naming_multipliers(cloud, settings, partition):
-        is_kept = partition is not None
-        seg = segment_planes(
-            cloud,
-            # Superpoints respect the boundaries of all planes.
-            settings.without_selection() if is_kept else settings,
-            orient=orient,
-            viewpoint=viewpoint,
-            voxel=voxel,
-            within=objects,
-            keep_neighbors=is_kept,
-            on_stage=begin,
-        )
-        if partition is None:
-            return seg, None
-        begin("superpoints")
-        colors = cloud.fields.get("color")
-        superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
-        rows = choose_planes(seg.planes, settings)
-        plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
-        return keep_planes(seg, rows), replace(superpoints, plane=plane)
+    is_kept = partition is not None
+    seg = segment_planes(
+        cloud,
+        # Superpoints respect the boundaries of all planes.
+        settings.without_selection() if is_kept else settings,
+        orient=orient,
+        viewpoint=viewpoint,
+        voxel=voxel,
+        within=objects,
+        keep_neighbors=is_kept,
+        on_stage=begin,
+    )
+    if partition is None:
+        return seg, None
+    begin("superpoints")
+    colors = cloud.fields.get("color")
+    superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
+    rows = choose_planes(seg.planes, settings)
+    plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
+    return keep_planes(seg, rows), replace(superpoints, plane=plane)
 
 
-@contextmanager
-def _naming_multipliers(
-    cloud: Cloud, settings: PipelineConfig, partition: SuperpointsConfig | None
-) -> Iterator[None]:
-    """Name the settings that multiply memory in an out-of-memory error."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        multipliers = describe_multipliers(settings, partition)
-        if not is_out_of_memory(error) or not multipliers:
-            raise
-        raise ConfigError(
-            f"{cloud.source}: out of memory for {len(cloud):,} points{multipliers}; lower it, or "
-            "pass --voxel."
-        ) from error
-
-
-def describe_multipliers(settings: PipelineConfig, partition: SuperpointsConfig | None) -> str:
+def describe_multipliers(settings: PipelineConfig, partition: object = None) -> str:
     """Return the settings that need more memory than their defaults, as flags after "with".
 
     Example:
         >>> from torchrg.config import load_config
-        >>> describe_multipliers(load_config(**{"normals.k": 600}), None)
+        >>> describe_multipliers(load_config(**{"normals.k": 600}))
         ' with --normals.k 600'
     """
     normals, usual, flags = settings.normals, NormalsConfig.k, []
     for name, value in (("k", normals.k), ("adaptive-k", normals.adaptive_k or 0)):
         flags += [f"--normals.{name} {value}"] if value > usual else []
-    if partition is not None and partition.num_levels > SuperpointsConfig().num_levels:
+    if (
+        isinstance(partition, SuperpointsConfig)
+        and partition.num_levels > SuperpointsConfig().num_levels
+    ):
         flags.append(f"{partition.num_levels} levels of superpoints")
     return f" with {' and '.join(flags)}" if flags else ""
 

@@ -62,6 +62,12 @@ _STRENGTH_OF_K = 100.0
 meshed depth frames get about the same number of superpoints as Segmentator's segments."""
 
 
+_MIN_SITES = 3
+"""Minimum number of points with a plane."""
+_ABOVE_PIPELINE = 6
+"""Number of stack frames from a check in the stages to the caller of :func:`segment_planes`."""
+
+
 @eager_only
 @sequential_operations()
 def segment_planes(
@@ -200,6 +206,7 @@ def _segment(
     sites, inverse = distinct.points, distinct.inverse
     if voxel is not None:
         sites, inverse = _sample_sites(distinct, voxel)
+        _check_voxels(len(sites), len(distinct.points), voxel)
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
     if len(sites):
         k = min(config.normals.k, len(sites))
@@ -295,6 +302,20 @@ def _sample_sites(distinct: DistinctPoints, voxel: float) -> tuple[Tensor, Tenso
     order = canonical_order(distinct.points[voxels.rows])
     site = order.argsort()[voxels.inverse]
     return distinct.points[voxels.rows[order]], distinct.restore(site, fill=UNLABELED)
+
+
+def _check_voxels(num_voxels: int, num_points: int, voxel: float) -> None:
+    """Warn if a voxel size is probably in another unit than the cloud."""
+    if num_voxels < _MIN_SITES <= num_points:
+        result = f"leaves {num_voxels:,} of {num_points:,} points"
+    elif num_voxels == num_points > 0:
+        result = f"leaves all {num_points:,} points"
+    else:
+        return
+    warnings.warn(
+        f"voxel {voxel:g} {result}; check that it is in units of the cloud.",
+        stacklevel=_ABOVE_PIPELINE,
+    )
 
 
 def _split_sites(inverse: Tensor, objects: Tensor, num_sites: int) -> tuple[Rows, Tensor, Tensor]:

@@ -13,8 +13,7 @@ _BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 400
 large arrays are on disk, for at most ``_K`` neighbors and ``_NUM_LEVELS`` levels."""
 _K, _NUM_LEVELS = 50, 4
 _BYTES_PER_NEIGHBOR, _BYTES_PER_LEVEL, _BYTES_PER_PAIR = {False: 14, True: 8}, 24, 40
-"""Memory per point of each further neighbor (by whether arrays are on disk) and level, and of a
-neighborhood per pair of its points."""
+"""Memory per point of each further neighbor (False: not on disk) and level, and of ``k * k``."""
 _CGROUP, _OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 """Linux control groups, which limit containers and cluster jobs, and those of this process."""
 _CGROUP_FILES = {
@@ -41,10 +40,7 @@ def scan_memory(num_points: int, *, k: int = _K, num_levels: int = 0, on_disk: b
 
 
 def available_memory() -> int:
-    """Return the bytes that this process and its children can still allocate.
-
-    It is the least of the machine's available memory and the remainders of control group limits.
-    """
+    """Return the bytes that this process may allocate on its machine and in its control groups."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     free = _read_entry("/proc/meminfo", "MemAvailable", default=total)
     return max(0, min([free, *_group_remainders()]))

@@ -113,6 +113,9 @@ def estimate_normals(
     """Estimate the normal and curvature of every point of a cloud.
 
     Convention:
+        Float64 points without gradients are fitted relative to a local origin in float32, if its
+        rounding steps are at most a thousandth of the spacing of the points.
+
         Gradients flow from normals, curvature and residual to the points. They are the gradients of
         the fit with all selections held fixed: neighbors, inliers, sharp points, and the noise in
         ``irls``. With the covariance ``C`` of the fitted points, its eigenvalues ``l`` and
