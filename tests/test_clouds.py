@@ -1,9 +1,14 @@
 """Codes for missing points in clouds."""
 
 import numpy as np
+import pytest
+import torch
 
 from tests.cli.test_cli import CLASSIC
+from torchrg import clouds, load_config
 from torchrg.clouds import find_objects
+from torchrg.config import SuperpointsConfig
+from torchrg.errors import ConfigError
 from torchrg.structures import Cloud
 
 
@@ -40,3 +45,33 @@ def test_objects_of_segment_are_those_of_segment20_where_only_these_exist():
     assert find_objects(cloud, "instance").tolist() == [1, 2, 3]
     both = Cloud(np.zeros((3, 3)), {**fields, "segment": np.array([7, 8, 9])})
     assert find_objects(both, "segment").tolist() == [7, 8, 9]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't allocate memory: 9 bytes")])
+@pytest.mark.parametrize(
+    ("changes", "partition", "message"),
+    [
+        ({"normals.k": 600}, None, "for 9 points with --normals.k 600; lower it"),
+        (
+            {"normals.adaptive_k": 300},
+            SuperpointsConfig(counts=(9, 8, 7, 6, 5)),
+            "with --normals.adaptive-k 300 and 5 levels of superpoints; lower it",
+        ),
+    ],
+)
+def test_too_little_memory_names_the_settings(monkeypatch, error, changes, partition, message):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(clouds, "segment_planes", fail)
+    cloud = Cloud(np.eye(9, 3), source="a.ply")
+    with pytest.raises(ConfigError, match=f"^a.ply: out of memory .*{message}"):
+        clouds.segment_cloud(cloud, load_config(**changes), partition=partition)
+    with pytest.raises(type(error)):
+        clouds.segment_cloud(cloud, load_config(), partition=SuperpointsConfig())
+
+
+def test_other_errors_stay(monkeypatch):
+    monkeypatch.setattr(clouds, "segment_planes", lambda *_, **__: torch.zeros(2) + torch.zeros(3))
+    with pytest.raises(RuntimeError, match="size of tensor"):
+        clouds.segment_cloud(Cloud(np.eye(9, 3)), load_config(**{"normals.k": 600}))

@@ -176,6 +176,20 @@ def test_stages_are_announced_in_order(scene, config):
     assert stages == ["neighbors", "normals", "regions", "planes", "orientation", "done"]
 
 
+@pytest.mark.parametrize(
+    ("voxel", "message"),
+    [
+        (1e-9, "voxel 1e-09 leaves all 600 points; check that it is in units of the cloud"),
+        (1e4, "voxel 10000 leaves 1 of 600 points; check"),
+    ],
+)
+def test_a_voxel_size_in_another_unit_is_said(config, voxel, message):
+    points = torch.rand(600, 3, generator=torch.Generator().manual_seed(0)) + 1
+    with pytest.warns(UserWarning, match=message) as caught:
+        segment_planes(points, config, voxel=voxel)
+    assert caught[0].filename == __file__
+
+
 def test_wrong_shapes_are_refused():
     with pytest.raises(ShapeError, match=r"expected points of shape \(N, 3\), got \(5, 2\)"):
         segment_planes(torch.rand(5, 2))
@@ -234,14 +248,6 @@ def test_a_cloud_of_few_neighborhoods_is_told():
         segment_planes(points)
     assert caught[0].filename == __file__
     segment_planes(points, **{"normals.k": 49})
-
-
-def test_a_voxel_of_another_unit_is_told(scene):
-    points = scene.points[::4]
-    with pytest.warns(UserWarning, match="a voxel size of 1e-05 merges no points; it is a length"):
-        segment_planes(points, "classic", voxel=1e-5)
-    with pytest.warns(UserWarning, match="got 1; add points, or reduce normals.k or the voxel"):
-        segment_planes(points, "classic", voxel=100)
 
 
 def test_neighbors_of_voxels_are_not_those_of_points(room):

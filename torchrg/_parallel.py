@@ -37,6 +37,9 @@ CHUNK_SIZE = 16384
 ROWS_AT_ONCE = 65536
 """Number of rows per pass over a cloud: few calls, temporaries of bounded memory."""
 
+TYPICAL_WIDTH = 64
+"""Number of values per row, such as neighbors, up to which the numbers above apply."""
+
 CHILD_ENVIRONMENT = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
 ) | {"PYTHONSAFEPATH": "1"}
@@ -75,6 +78,19 @@ def split_rows(num_rows: int, chunk_size: int) -> list[slice]:
     return [
         slice(start, min(start + chunk_size, num_rows)) for start in range(0, num_rows, chunk_size)
     ]
+
+
+def limit_rows(num_rows: int, width: int) -> int:
+    """Return how many rows of ``width`` values take as much memory as ``num_rows`` typical ones.
+
+    At least 1 and at most ``num_rows``. Rows that wide, such as neighborhoods, may be wider than
+    the memory allows for all of ``num_rows``.
+
+    Example:
+        >>> limit_rows(16384, 50), limit_rows(16384, 640)
+        (16384, 1638)
+    """
+    return max(num_rows * TYPICAL_WIDTH // max(width, TYPICAL_WIDTH), 1)
 
 
 def map_chunks(

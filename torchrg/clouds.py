@@ -6,13 +6,22 @@
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import wraps
+from typing import Any, Concatenate, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.config import PipelineConfig, SuperpointsConfig
-from torchrg.errors import CloudWarning, FormatError, PrecisionWarning
+from torchrg._checks import Arguments
+from torchrg.config import NormalsConfig, PipelineConfig, SuperpointsConfig
+from torchrg.errors import (
+    OUT_OF_MEMORY,
+    CloudWarning,
+    ConfigError,
+    FormatError,
+    PrecisionWarning,
+    system_limit,
+)
 from torchrg.io.tables import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
@@ -20,8 +29,16 @@ from torchrg.precision import describe_placeholders
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
 
-__all__ = ["check_finite", "find_objects", "note_on_copies", "segment_cloud"]
+__all__ = [
+    "check_finite",
+    "describe_multipliers",
+    "find_objects",
+    "note_on_copies",
+    "segment_cloud",
+]
 __dir__ = __all__.copy
+
+Returned = TypeVar("Returned")
 
 _SAMPLE_SIZE = 10_000
 """Number of points from which the quantiles of coordinates are estimated."""
@@ -32,6 +49,30 @@ _MAX_EXTENT_RATIO = 1000
 the seven digits of float32, rounding steps are then 1e-4 of the extent of the middle half."""
 
 
+def _naming_multipliers(
+    segment: Callable[Concatenate[Cloud, PipelineConfig, Arguments], Returned],
+) -> Callable[Concatenate[Cloud, PipelineConfig, Arguments], Returned]:
+    """Name the settings that multiply memory in an out-of-memory error."""
+
+    @wraps(segment)
+    def call(
+        cloud: Cloud, settings: PipelineConfig, /, *args: Arguments.args, **kwargs: Arguments.kwargs
+    ) -> Returned:
+        try:
+            return segment(cloud, settings, *args, **kwargs)
+        except (MemoryError, RuntimeError) as error:
+            multipliers = describe_multipliers(settings, kwargs.get("partition"))
+            if system_limit(error) != OUT_OF_MEMORY or not multipliers:
+                raise
+            raise ConfigError(
+                f"{cloud.source}: out of memory for {len(cloud):,} points{multipliers}; lower it, "
+                "or pass --voxel."
+            ) from error
+
+    return call
+
+
+@_naming_multipliers
 def segment_cloud(
     cloud: Cloud,
     settings: PipelineConfig,
@@ -59,7 +100,8 @@ def segment_cloud(
 
     Raises:
         FormatError: If no point is finite, or ``within`` is not a field of integers.
-        ConfigError: If normals are oriented by viewpoint and the cloud has no scanner positions.
+        ConfigError: If normals are oriented by viewpoint and the cloud has no scanner positions, or
+            if there is not enough memory for settings above their defaults.
 
     Example:
         >>> from torchrg.config import load_config
@@ -100,6 +142,25 @@ def segment_cloud(
     rows = choose_planes(seg.planes, settings)
     plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
     return keep_planes(seg, rows), replace(superpoints, plane=plane)
+
+
+def describe_multipliers(settings: PipelineConfig, partition: object = None) -> str:
+    """Return the settings that need more memory than their defaults, as flags after "with".
+
+    Example:
+        >>> from torchrg.config import load_config
+        >>> describe_multipliers(load_config(**{"normals.k": 600}))
+        ' with --normals.k 600'
+    """
+    normals, usual, flags = settings.normals, NormalsConfig.k, []
+    for name, value in (("k", normals.k), ("adaptive-k", normals.adaptive_k or 0)):
+        flags += [f"--normals.{name} {value}"] if value > usual else []
+    if (
+        isinstance(partition, SuperpointsConfig)
+        and partition.num_levels > SuperpointsConfig().num_levels
+    ):
+        flags.append(f"{partition.num_levels} levels of superpoints")
+    return f" with {' and '.join(flags)}" if flags else ""
 
 
 def check_finite(cloud: Cloud) -> tuple[str, ...]:

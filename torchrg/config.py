@@ -300,6 +300,11 @@ class SelectionConfig:
         words = f"to be some of {', '.join(PLANE_KINDS)}, or none"
         _require(self, "kinds", words, kinds is None or is_list)
 
+    @property
+    def max_neighbors(self) -> int:
+        """Maximum number of listed neighbors per point; 0 for images, which need no lists."""
+        return 0
+
 
 @dataclass(frozen=True)
 class PipelineConfig(SelectionConfig):
@@ -320,6 +325,11 @@ class PipelineConfig(SelectionConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
+
+    @property
+    def max_neighbors(self) -> int:
+        """Maximum number of listed neighbors per point."""
+        return max(self.normals.k, self.normals.adaptive_k or 0)
 
     def without_selection(self) -> "PipelineConfig":
         """Return settings that keep all planes, with an up axis if ``kinds`` requires classes.

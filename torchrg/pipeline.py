@@ -29,7 +29,7 @@ from torchrg.neighbors import (
     search_knn,
 )
 from torchrg.neighbors.knn import restrict_to_groups
-from torchrg.normals import ESTIMATORS
+from torchrg.normals import run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.precision import warn_about_coordinates
 from torchrg.regions import grow_regions, partition_points, summarize_planes
@@ -65,6 +65,10 @@ _UP = torch.tensor([0.0, 0.0, 1.0])
 _STRENGTH_OF_K = 100.0
 """Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
 meshed depth frames get about the same number of superpoints as Segmentator's segments."""
+
+
+_MIN_SITES = 3
+"""Minimum number of points with a plane."""
 
 
 @eager_only
@@ -208,12 +212,7 @@ def _segment(
     sites, inverse = distinct.points, distinct.inverse
     if voxel is not None:
         sites, inverse = _sample_sites(distinct, voxel)
-        if 1 < len(sites) == len(distinct.points):
-            warn(
-                f"segment_planes: a voxel size of {voxel:g} merges no points; it is a length in "
-                "the unit of the cloud.",
-                CloudWarning,
-            )
+        _check_voxels(len(sites), len(distinct.points), voxel)
     neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
     if len(sites):
         k = min(config.normals.k, len(sites))
@@ -226,8 +225,7 @@ def _segment(
         config = config.with_sampling(sampling)
 
     begin("normals")
-    estimate = ESTIMATORS[config.normals.method]
-    fit = estimate(sites, neighbors, config.normals, config.chunk_size)
+    fit = run_estimator(sites, neighbors, config.normals, config.chunk_size)
 
     begin("regions")
     parts: Rows = slice(None)
@@ -327,6 +325,20 @@ def _sample_sites(distinct: DistinctPoints, voxel: float) -> tuple[Tensor, Tenso
     order = canonical_order(distinct.points[voxels.rows])
     site = order.argsort()[voxels.inverse]
     return distinct.points[voxels.rows[order]], distinct.restore(site, fill=UNLABELED)
+
+
+def _check_voxels(num_voxels: int, num_points: int, voxel: float) -> None:
+    """Warn if a voxel size is probably in another unit than the cloud."""
+    if num_voxels < _MIN_SITES <= num_points:
+        result = f"leaves {num_voxels:,} of {num_points:,} points"
+    elif num_voxels == num_points > 0:
+        result = f"leaves all {num_points:,} points"
+    else:
+        return
+    warn(
+        f"segment_planes: voxel {voxel:g} {result}; check that it is in units of the cloud.",
+        CloudWarning,
+    )
 
 
 def _split_sites(inverse: Tensor, objects: Tensor, num_sites: int) -> tuple[Rows, Tensor, Tensor]:

@@ -68,12 +68,7 @@ def describe_steps(
     if len(finite_points) < 3:
         return ""
     with np.errstate(over="ignore", invalid="ignore"):
-        ranks = [int(fraction * (len(finite_points) - 1)) for fraction in _QUARTILES]
-        # One rank and one column at a time take a third of the time of np.quantile.
-        low, high = np.array(
-            [[np.partition(column, k)[k] for column in finite_points.T] for k in ranks],
-            dtype=np.float64,
-        )
+        low, high = _middle_half(finite_points)
         width, reach = float((high - low).max()), np.float32(np.abs([low, high]).max())
         single = float(np.spacing(reach)) if is_single else 0.0
     step = max(single, scale)
@@ -86,6 +81,25 @@ def describe_steps(
         return ""
     step, fix = (scale, "write it with a finer scale") if is_grid else (single, fix)
     return f"coordinates have steps of {step:.2g} for a spacing of about {spacing:.1g}; {fix}"
+
+
+def is_fine_step(step: float, points: NDArray[np.floating]) -> bool:
+    """Return whether a rounding step is fine for finite points ``(N, 3)`` without measuring them.
+
+    Example:
+        >>> is_fine_step(1e-6, np.eye(3)), is_fine_step(1e-3, np.eye(3))
+        (True, False)
+    """
+    low, high = _middle_half(points)
+    return step <= _MAX_FINE_STEP * float((high - low).max()) / math.sqrt(len(points))
+
+
+def _middle_half(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the lowest and highest coordinates of the middle half of points, shape ``(2, 3)``."""
+    ranks = [int(fraction * (len(points) - 1)) for fraction in _QUARTILES]
+    # One rank and one column at a time take a third of the time of np.quantile.
+    ends = [[np.partition(column, rank)[rank] for column in points.T] for rank in ranks]
+    return np.array(ends, dtype=np.float64)
 
 
 def describe_placeholders(points: NDArray[np.floating]) -> str:

@@ -77,6 +77,13 @@ def test_what_cannot_be_done_is_one_line(rooms, tmp_path, run, limit, message):
     assert not any(tmp_path.iterdir())
 
 
+def test_settings_that_multiply_memory_are_planned(rooms, tmp_path, run):
+    flags = "--normals.k", "100000", "--limit-memory", "1"
+    done = run("segment", rooms / "a.npz", "--out", tmp_path / "x.npz", *flags)
+    # 20,000 points have 20,000 neighbors each, at 4 bytes on the disk and more in memory.
+    assert "GB for about 20,000 points with --normals.k 100000, got 1 GB; raise it" in done.error
+
+
 def test_a_full_disk_is_said_before_the_work(rooms, tmp_path, run, monkeypatch):
     monkeypatch.setattr("torchrg.io.files.free_space", lambda folder: 1000)
     monkeypatch.setattr(segment, "segment_cloud", None)

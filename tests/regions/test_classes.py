@@ -1,6 +1,7 @@
 """Classes of planes in rooms whose floors, ceilings and walls are known, and in a real scan."""
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 import torch
 
 from tests.made import make_storey
+from torchrg.batch.memory import peak_memory, reset_peak_memory
+from torchrg.regions import classes as module
 from torchrg.regions import summarize_planes
 from torchrg.regions.classes import _find_slabs, classify_planes
 from torchrg.result import read_result
@@ -334,3 +337,73 @@ def test_slabs_are_thin_gaps_of_walls_beside_a_broad_plane(gap, level, slabs):
     levels = torch.tensor([] if level is None else [float(level)])
     found = _find_slabs(bottom, top, torch.full((2,), 100.0), levels)
     assert found.tolist() == slabs
+
+
+def heights_by_counting(voxels):
+    """The heights of the room around each column (story, x, y) of voxels (story, x, y, z).
+
+    Voxel by voxel, as the constants of the module say: the neighborhood is two columns wide on each
+    side, 2 % of its voxels may lie outside, and columns double until the room is 24 voxels high.
+    """
+    found, scale = {}, 1
+    while True:
+        around = {}
+        for story, x, y, z in voxels:
+            for a in range(-2, 3):
+                for b in range(-2, 3):
+                    key = story, x // scale + a, y // scale + b
+                    around.setdefault(key, Counter())[z] += 1
+        for story, x, y in {voxel[:3] for voxel in voxels}:
+            low, high = found.get((story, x, y), (0, 0))
+            if high - low < 24:
+                held = sorted(around[story, x // scale, y // scale].elements())
+                # The smallest heights with more than 2 % at or below, and with at least 98 %.
+                num_outside = 0.02 * len(held)
+                low = held[math.floor(num_outside)]
+                high = held[math.ceil(len(held) - num_outside) - 1]
+                found[story, x, y] = low, high
+        is_one = len({(s, x // scale, y // scale) for s, x, y, _ in voxels}) == len(
+            {voxel[0] for voxel in voxels}
+        )
+        if is_one or all(high - low >= 24 for low, high in found.values()):
+            return found
+        scale *= 2
+
+
+@pytest.mark.parametrize("at_once", [2**18, 30])
+@pytest.mark.parametrize("seed", range(8))
+def test_heights_of_rooms_are_those_of_counting(monkeypatch, seed, at_once):
+    monkeypatch.setattr(module, "_VOXELS_AT_ONCE", at_once)
+    rng = np.random.default_rng(seed)
+    sides = [rng.integers(1, 4), *rng.choice([3, 20, 2000], 2), rng.choice([5, 30, 300])]
+    voxels = np.unique(rng.integers(0, sides, (rng.integers(1, 400), 4)), axis=0)
+    bits = 20
+    keys = torch.from_numpy((voxels[:, 0] << 2 * bits) | (voxels[:, 1] << bits) | voxels[:, 2])
+    columns, column = torch.unique(keys, return_inverse=True)
+    low, high = module._room_heights(columns, column, torch.from_numpy(voxels[:, 3]))
+    expected = heights_by_counting([tuple(voxel) for voxel in voxels.tolist()])
+    for row, key in zip(*np.unique(column, return_index=True), strict=True):
+        assert expected[tuple(voxels[key, :3].tolist())] == (low[row], high[row])
+
+
+def test_memory_does_not_depend_on_the_extent():
+    # Every point is a column and a level of its own: a table of both has 64 million entries.
+    positions = np.random.default_rng(0).uniform(0, 500, (8000, 3))
+    cloud = joined(
+        assemble([("slope", positions, np.array([0, 0.6, 0.8]))]),
+        assemble([surface("wall", (0, 0, 0), (2, 0, 0), (0, 0, 1))]),
+    )
+    classes(cloud)
+    reset_peak_memory()
+    before = peak_memory()
+    classes(cloud)
+    assert peak_memory() - before < 1e8
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1000.0])
+def test_classes_in_parts_and_in_any_unit(monkeypatch, unit):
+    points, normals, labels, names = assemble(room((0, 0, 0), (5, 4, 3)))
+    labels[::7] = -1
+    expected = classes((points, normals, labels, names))
+    monkeypatch.setattr(module, "_POINTS_AT_ONCE", 1000)
+    assert classes((points * unit, normals, labels, names)) == expected

@@ -9,6 +9,7 @@ import torch
 from tests.regions.test_table import one_region, rotation
 from torchrg.errors import MissingDependencyError
 from torchrg.regions import summarize_planes
+from torchrg.regions.polygons import trace_polygon
 
 
 def test_outline_of_a_frame_has_a_hole_and_its_area():
@@ -38,6 +39,20 @@ def test_outlines_of_points_and_lines_are_empty():
     labels = torch.tensor([0] * 5 + [1])
     planes = summarize_planes(points, torch.eye(3)[[2] * 6], labels, outline=True)
     assert planes.outline == ((), ())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_outline_of_a_turned_and_rounded_grid(seed):
+    # Squares of the grid are on circles up to rounding, so that some triangles overlap.
+    shapely = pytest.importorskip("shapely")
+    rng, side = np.random.default_rng(seed), np.arange(40.0)
+    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    x, y = grid[rng.random(len(grid)) < 0.9].T
+    angle = rng.uniform(0, math.pi / 2)
+    turned = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
+    outer, *holes = trace_polygon(np.round(np.stack(turned, axis=1), 12), 1.6)
+    assert shapely.Polygon(outer, holes).is_valid
+    assert math.isclose(shapely.Polygon(outer).area, 39**2, rel_tol=0.02)
 
 
 def test_outlines_without_shapely_say_how_to_get_it(monkeypatch):

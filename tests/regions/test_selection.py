@@ -117,6 +117,14 @@ def test_no_plane_may_be_left(whole):
         assert len(torchrg.select_planes(nothing, sort="area").planes) == 0
 
 
+def test_an_area_in_another_unit_is_said(whole):
+    smallest = float(whole.planes.area.min())
+    with pytest.warns(UserWarning, match=r"min_area .* keeps all planes, the smallest has"):
+        kept = torchrg.select_planes(whole, min_area=0.99e-4 * smallest)
+    assert len(kept.planes) == len(whole.planes)
+    torchrg.select_planes(whole, min_area=1.01e-4 * smallest)
+
+
 def test_classes_are_those_of_the_table_or_of_the_direction(points, whole, chosen):
     without = replace(whole, planes=replace(whole.planes, kind=None))
     assert is_equal(torchrg.select_planes(without, **ASKED), chosen)

@@ -235,6 +235,8 @@ def test_input_that_needs_gradients_is_drawn(room):
         ({"width": 0}, ConfigError, "width from 1 to 8,192, got 0"),
         ({"height": 0}, ConfigError, "height from 1 to 8,192, got 0"),
         ({"supersampling": 0}, ConfigError, "supersampling from 1 to 16, got 0"),
+        ({"width": 8192, "height": 8192}, ConfigError, "at most 67,108,864 subpixels, got 8,192 x"),
+        ({"supersampling": 16}, ConfigError, "pixels with supersampling 16; lower one of them"),
     ],
 )
 def test_wrong_arguments_are_refused(changes, error, message):

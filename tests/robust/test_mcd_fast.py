@@ -79,7 +79,17 @@ def test_equal_sets_are_kept_once():
     determinants = torch.tensor([[3.0], [1.0], [2.0], [1.0], [2.0]], dtype=torch.float64)
     members = torch.arange(5.0).reshape(1, 5, 1)
     kept = _distinct_best(_Concentrated(members, determinants), 3)
-    assert kept.flatten().tolist() == [1, 2, 0]
+    assert kept.members.flatten().tolist() == [1, 2, 0]
+    assert kept.determinants.flatten().tolist() == [1, 2, 3]
+
+
+def test_parts_of_the_starts_change_nothing(rng, monkeypatch):
+    patches = torch.randn(3, 20, 3, generator=rng)
+    whole = fit_fastmcd(patches, num_starts=300)
+    monkeypatch.setattr("torchrg.robust.mcd._LANES_IN_CACHE", 30)
+    monkeypatch.setattr("torchrg.robust.starts.ROWS_IN_CACHE", 7)
+    for one, other in zip(whole, fit_fastmcd(patches, num_starts=300), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_refusals():

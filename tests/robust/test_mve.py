@@ -60,3 +60,6 @@ def test_covers_h_points_and_leaves_out_a_cluster(dtype, rng):
 def test_refusals():
     with pytest.raises(ConfigError, match="fit_mve: expected num_starts of at least 1, got -1"):
         fit_mve(torch.zeros(5, 3), num_starts=-1)
+    # 250 points have 250 * 249 * 248 * 247 / 24 sets of 4.
+    with pytest.raises(ConfigError, match=r"at most 33,554,432 sets .*, got 158,882,750"):
+        fit_mve(torch.rand(250, 3), exhaustive=True)

@@ -45,8 +45,8 @@ class Source:
     root: Path
     settings: PipelineConfig | DepthConfig
     table: str | None
-    has_superpoints = False
-    """Whether conversion also partitions clouds into superpoints."""
+    num_levels = 0
+    """Number of levels of superpoints into which conversion also partitions clouds."""
     bytes_per_point: ClassVar[int]
     """Disk space of the results per point, to check the free space in advance."""
 
@@ -97,7 +97,8 @@ class Job:
     @property
     def memory(self) -> int:
         """Maximum memory of a process with this scan, in bytes."""
-        return scan_memory(self.scan.num_points, superpoints=self.source.has_superpoints)
+        k, num_levels = self.source.settings.max_neighbors, self.source.num_levels
+        return scan_memory(self.scan.num_points, k=k, num_levels=num_levels)
 
     @property
     def folder(self) -> Path:

@@ -74,9 +74,9 @@ class CloudSource(Source):
         return self.data.root
 
     @property
-    def has_superpoints(self) -> bool:  # type: ignore[override]
-        """Whether conversion also partitions clouds into superpoints."""
-        return self.superpoint or self.layout != "pointcept"
+    def num_levels(self) -> int:  # type: ignore[override]
+        """Number of levels of superpoints into which conversion also partitions clouds."""
+        return (self.superpoint or self.layout != "pointcept") * self.partition.num_levels
 
     def list_scans(self, out: Path) -> list[SceneFiles]:
         """Return the scenes in natural order; their results go to ``out``."""
@@ -112,7 +112,7 @@ class CloudSource(Source):
             cloud,
             self.settings,
             orient=self.orient,
-            partition=self.partition if self.has_superpoints else None,
+            partition=self.partition if self.num_levels else None,
             within=self.within,
             begin=begin,
             warn=notes.append,

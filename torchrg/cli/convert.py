@@ -10,7 +10,7 @@ from tqdm import tqdm
 from torchrg._optional import require
 from torchrg._parallel import num_cores
 from torchrg.batch.local import run_local
-from torchrg.batch.memory import spare_memory
+from torchrg.batch.memory import available_memory
 from torchrg.batch.run import (
     REPORT,
     BatchReport,
@@ -61,6 +61,9 @@ from torchrg.render.page import check_library
 from torchrg.result import PLANES_FILE, RECORD, read_result
 
 _Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
+_MEMORY_FRACTION = 0.8
+"""Fraction of the available memory for all scans by default; the remainder is for the parent
+process and other programs."""
 _Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]
 
 
@@ -416,7 +419,8 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
 
 def _memory_limit(arguments: Arguments) -> int:
     """Return the memory limit for all concurrent scans, in bytes."""
-    return flags.limit_in_bytes(arguments.limit_memory, spare_memory())
+    spare = int(_MEMORY_FRACTION * available_memory())
+    return flags.limit_in_bytes(arguments.limit_memory, spare)
 
 
 def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:

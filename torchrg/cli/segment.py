@@ -31,8 +31,8 @@ from torchrg.cli.loop import (
     sidecar_paths,
     stage_bar,
 )
-from torchrg.clouds import find_objects, note_on_copies, segment_cloud
-from torchrg.config import SuperpointsConfig
+from torchrg.clouds import describe_multipliers, find_objects, note_on_copies, segment_cloud
+from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.layouts import (
     VERSION,
@@ -228,7 +228,7 @@ def _segment(
             arguments.settings.resolved,
             orient=arguments.orient,
             viewpoint=arguments.viewpoint,
-            partition=arguments.partition if arguments.superpoints else None,
+            partition=_memory_settings(arguments)[1],
             voxel=arguments.voxel,
             within=arguments.within,
             begin=advance,
@@ -259,12 +259,25 @@ def _segment(
 
 def _check_limit(arguments: Arguments, source: str, num_points: int, limit: int) -> None:
     """Raise if a cloud exceeds the memory limit even with its large arrays on disk."""
-    minimum = scan_memory(num_points, superpoints=arguments.superpoints, on_disk=True)
+    minimum = _needed_memory(arguments, num_points, on_disk=True)
     if minimum > limit:
         raise ConfigError(
             f"{source}: expected --limit-memory of at least {minimum / 1e9:.3g} GB for about "
-            f"{num_points:,} points, got {limit / 1e9:.3g} GB; raise it, or split the cloud."
+            f"{num_points:,} points{describe_multipliers(*_memory_settings(arguments))}, got "
+            f"{limit / 1e9:.3g} GB; raise it, or split the cloud."
         )
+
+
+def _memory_settings(arguments: Arguments) -> tuple[PipelineConfig, SuperpointsConfig | None]:
+    """Return the settings that decide on the memory, without a partition if there is none."""
+    return arguments.settings.resolved, arguments.partition if arguments.superpoints else None
+
+
+def _needed_memory(arguments: Arguments, num_points: int, *, on_disk: bool) -> int:
+    """Return the memory for a cloud, in bytes."""
+    settings, partition = _memory_settings(arguments)
+    num_levels = 0 if partition is None else partition.num_levels
+    return scan_memory(num_points, k=settings.max_neighbors, num_levels=num_levels, on_disk=on_disk)
 
 
 def _array_storage(
@@ -272,12 +285,11 @@ def _array_storage(
 ) -> contextlib.AbstractContextManager[None]:
     """Return the context for large arrays: memory, or disk if they exceed the limit."""
     _check_limit(arguments, source, num_points, limit)
-    needed = scan_memory(num_points, superpoints=arguments.superpoints)
+    needed = _needed_memory(arguments, num_points, on_disk=False)
     if needed <= limit:
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
-    normals = arguments.settings.resolved.normals
-    k = max(normals.k, normals.adaptive_k or 0)
+    k = min(arguments.settings.resolved.max_neighbors, num_points)
     check_space(folder, num_points * k * scratch.BYTES_PER_NEIGHBOR, "the work")
     print_lines(
         f"{source}: about {num_points:,} points need {needed / 1e9:.2f} GB of memory, the limit "

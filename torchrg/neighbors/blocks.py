@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg._parallel import ROWS_AT_ONCE, split_rows
+from torchrg._parallel import ROWS_AT_ONCE, limit_rows, split_rows
 from torchrg.neighbors.order import MORTON_BITS, morton_codes
 
 BLOCK_SIZE = 300_000
@@ -128,7 +128,8 @@ def search_blocks(
     rows of a smaller cloud.
     """
     boxes = find_boxes(points)
-    ends = boxes.starts[np.searchsorted(boxes.starts, np.arange(0, len(points), BLOCK_SIZE))]
+    firsts = np.arange(0, len(points), limit_rows(BLOCK_SIZE, k))
+    ends = boxes.starts[np.searchsorted(boxes.starts, firsts)]
     for start, stop in itertools.pairwise(np.unique(np.append(ends, len(points))).tolist()):
         block = slice(start, stop)
         yield block, search_block(points, boxes, block, k, search)

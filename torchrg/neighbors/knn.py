@@ -18,6 +18,7 @@ from torchrg._parallel import (
     ROWS_AT_ONCE,
     ROWS_IN_CACHE,
     allowed_threads,
+    limit_rows,
     map_chunks,
     map_tasks,
     sequential_operations,
@@ -222,7 +223,7 @@ def restrict_to_groups(
         indices[rows] = torch.where(same, near, near[:, :1]).numpy(force=True)
         valid[rows] = same.numpy(force=True)
 
-    map_chunks(work, shape[0], chunk_size, device)
+    map_chunks(work, shape[0], limit_rows(chunk_size, shape[1]), device)
     return Neighbors(*(torch.from_numpy(column).to(device) for column in (indices, valid)))
 
 
@@ -345,14 +346,14 @@ def _search_cloud(
             found, requested = np.empty((len(positions), k), dtype=np.int32), pending
             pending = search_cells(positions, requested, reach, found)
             resolved = np.setdiff1d(requested, pending, assume_unique=True)
-            for chunk in split_rows(len(resolved), ROWS_IN_CACHE):
+            for chunk in split_rows(len(resolved), limit_rows(ROWS_IN_CACHE, k)):
                 rows = resolved[chunk]
                 near = found[rows]
                 distances = np.broadcast_to(0.0, near.shape)
                 if is_far is not None:
                     distances = np.linalg.norm(positions[near] - positions[rows, None], axis=2)
                 store(rows, distances, near)
-    for chunk in split_rows(len(pending), ROWS_AT_ONCE):
+    for chunk in split_rows(len(pending), limit_rows(ROWS_AT_ONCE, width)):
         store(pending[chunk], *_query(tree, positions[pending[chunk]], width))
 
 

@@ -71,7 +71,10 @@ def measure_sampling(points: Tensor, neighbors: Neighbors | SomeNeighbors) -> Sa
     flat = flatness <= np.median(flatness)
     small = np.median(_deviations(patches[flat, :_SMALL]))
     rows = rows[flat]
-    extended = lists_of(lists_of(rows)[:, ::_STRIDE].ravel()).reshape(len(rows), -1)
+    # The list of a point may already contain its nearest hundred.
+    extended = lists_of(rows)
+    if k < _LARGE:
+        extended = lists_of(extended[:, ::_STRIDE].ravel()).reshape(len(rows), -1)
     large = np.median(_deviations(_nearest(points, rows, extended, _LARGE)[-1]))
     whiteness = min(float(small / large), 1.0) if large > 0 else 1.0
     measures = whiteness, variation, float(exact.mean()), density, _height(points)

@@ -25,11 +25,14 @@ from functools import partial
 from typing import Any
 
 import torch
+from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchrg._checks import as_tensor, check_points, eager_only
-from torchrg._parallel import CHUNK_SIZE
+from torchrg._parallel import CHUNK_SIZE, limit_rows
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
+from torchrg.linalg.single import to_single
 from torchrg.neighbors import check_neighbors, distinct_points, search_knn
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
@@ -80,6 +83,22 @@ WITHOUT_GRADIENT = {"consensus"}
 """Estimators without gradients, because they select and smooth planes in several steps."""
 
 
+def run_estimator(
+    points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
+) -> NormalFit:
+    """Fit the neighborhoods of finite points ``(N, 3)``; ``chunk_size`` is for typical ones.
+
+    Float64 points are fitted in float32 if it is fine enough; the fit has the dtype of the points.
+    """
+    width = max(neighbors.indices.shape[1], config.adaptive_k or 0)
+    single, chunk_size = to_single(points), limit_rows(chunk_size, width)
+    fit = ESTIMATORS[config.method](single, neighbors, config, chunk_size)
+    if single.dtype == points.dtype:
+        return fit
+    normals, curvature, rms = (values.to(points) for values in (*fit[:2], fit.residual_rms))
+    return fit._replace(normals=normalize(normals), curvature=curvature, residual_rms=rms)
+
+
 @eager_only
 def estimate_normals(
     points: Points,
@@ -93,6 +112,9 @@ def estimate_normals(
     """Estimate the normal and curvature of every point of a cloud.
 
     Convention:
+        Float64 points without gradients are fitted relative to a local origin in float32, if its
+        rounding steps are at most a thousandth of the spacing of the points.
+
         Gradients flow from normals, curvature and residual to the points. They are the gradients of
         the fit with all selections held fixed: neighbors, inliers, sharp points, and the noise in
         ``irls``. With the covariance ``C`` of the fitted points, its eigenvalues ``l`` and
@@ -132,7 +154,6 @@ def estimate_normals(
     check_points("estimate_normals", tensor)
     warn_about_coordinates("estimate_normals", tensor)
     settings = settings_of("estimate_normals", NormalsConfig, config, changes)
-    estimate = ESTIMATORS[settings.method]
     if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():
         names = ", ".join(sorted(ESTIMATORS.keys() - WITHOUT_GRADIENT))
         raise ConfigError(
@@ -141,11 +162,11 @@ def estimate_normals(
         )
     if neighbors is not None:
         check_neighbors("estimate_normals", neighbors, tensor)
-        return estimate(tensor, neighbors, settings, chunk_size)
+        return run_estimator(tensor, neighbors, settings, chunk_size)
     distinct = distinct_points(tensor)
     size = min(settings.k, len(distinct.points))
     if size == 0:
         neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=tensor.device))
     else:
         neighbors = search_knn(distinct.points, size, max_distance=max_distance, canonical=True)
-    return estimate(distinct.points, neighbors, settings, chunk_size).map(distinct.restore)
+    return run_estimator(distinct.points, neighbors, settings, chunk_size).map(distinct.restore)

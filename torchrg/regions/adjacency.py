@@ -14,6 +14,7 @@ from torchrg import kernels, scratch
 from torchrg._parallel import (
     ROWS_IN_CACHE,
     Returned,
+    limit_rows,
     map_chunks,
     map_tasks,
     nonzero_rows,
@@ -198,11 +199,11 @@ class _RegionEdges:
         def mark(chunk: slice) -> None:
             meets[chunk] = self._at_boundary(chunk)
 
-        map_chunks(mark, len(labels), ROWS_IN_CACHE, labels.device)
+        map_chunks(mark, len(labels), self._at_once, labels.device)
         self._rows = nonzero_rows(meets).to(torch.int32)
         # Keeping small tensors of every chunk would fragment the heap (glibc).
         counts: Counter[int] = Counter()
-        for rows in torch.split(self._rows, ROWS_IN_CACHE):
+        for rows in torch.split(self._rows, self._at_once):
             values = torch.unique(self._boundary_edges(rows)[2], return_counts=True)
             counts.update(dict(zip(*(of_chunk.tolist() for of_chunk in values), strict=True)))
         self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
@@ -213,6 +214,10 @@ class _RegionEdges:
     @property
     def _width(self) -> int:
         return max(self._neighbors.indices.shape[1], 1)
+
+    @property
+    def _at_once(self) -> int:
+        return limit_rows(ROWS_IN_CACHE, self._width)
 
     def _at_boundary(self, rows: slice) -> Tensor:
         """Return which points have a neighbor in another region, shape ``(n,)``."""
@@ -248,7 +253,7 @@ class _RegionEdges:
             pair = torch.searchsorted(self._keys, keys)
             return work(_Contacts(pair, rows.index_select(0, source), targets, column))
 
-        chunks = torch.split(self._rows, ROWS_IN_CACHE)
+        chunks = torch.split(self._rows, self._at_once)
         for batch in split_rows(len(chunks), _CHUNKS_AT_ONCE):
             yield from map_tasks(find, chunks[batch], self._rows.device)
 

@@ -16,12 +16,14 @@ from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
 from torchrg._parallel import (
     CHUNK_SIZE,
     ROWS_AT_ONCE,
+    limit_rows,
     map_chunks,
     split_rows,
 )
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
+from torchrg.linalg.single import to_single
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
@@ -86,7 +88,7 @@ def grow_regions(
         signed_normals: Whether opposite normals differ by 180 degrees instead of 0 (for oriented
             normals), which separates the two sides of a thin wall.
         canonical: Whether the points are already in canonical order; saves a copy.
-        chunk_size: Points processed at a time.
+        chunk_size: Points processed at a time; fewer with more than 64 neighbors.
         **changes: Individual parameters, as in ``max_angle_deg=7``.
 
     Returns:
@@ -122,6 +124,7 @@ def grow_regions(
         cloud = _add_colors(cloud, colors, max_color_distance)
     if len(cloud.points) == 0:
         return torch.empty(0, dtype=torch.int64, device=cloud.points.device)
+    chunk_size = limit_rows(chunk_size, neighbors.indices.shape[1])
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
         cloud = _reordered(cloud, order)
@@ -197,7 +200,8 @@ def checked_cloud(
     check_neighbors(caller, neighbors, points)
     if valid is not None and valid.dtype != torch.bool:
         raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
-    reach = None
+    positions, reach = to_single(points), None
+    normals, curvature = normals.to(positions), curvature.to(positions)
     if config.plane_reach is not None:
         if residual_rms is None:
             raise ConfigError(
@@ -209,16 +213,17 @@ def checked_cloud(
         check_floating(caller, points=points, residual_rms=residual_rms)
         # The noise is unknown if the fit is exact.
         radii = map_chunks(
-            lambda rows: neighborhood_radii(points, neighbors.select(rows)),
-            len(points),
+            lambda rows: neighborhood_radii(positions, neighbors.select(rows)),
+            len(positions),
             ROWS_AT_ONCE,
-            points.device,
+            positions.device,
         )
+        residual_rms = residual_rms.to(positions)
         floor = config.coplanarity_floor * torch.cat(radii)
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid
-    columns = to_column_major(points), to_column_major(normals)
+    columns = to_column_major(positions), to_column_major(normals)
     return GrowingInput(*columns, curvature, neighbors, valid, reach)
 
 

@@ -38,8 +38,13 @@ def trace_polygon(positions: NDArray[np.float64], width: float) -> list[NDArray[
     probes = np.concatenate([(triangles + ends) / 2, triangles.mean(axis=1, keepdims=True)], axis=1)
     sampled_cells = np.floor((probes - positions.min(axis=0)) / width).astype(np.int64) + 1
     covered = occupied[sampled_cells[..., 0], sampled_cells[..., 1]].all(axis=1)
-    # Triangles sharing complete edges form a coverage, whose union is twenty times faster.
-    shape = shapely.coverage_union_all(shapely.polygons(triangles[covered]))
+    faces = shapely.polygons(triangles[covered])
+    try:
+        # Triangles sharing complete edges form a coverage, whose union is faster.
+        shape = shapely.coverage_union_all(faces)
+    except shapely.errors.GEOSException:
+        # Four points on a circle, up to rounding, may have overlapping triangles.
+        shape = shapely.union_all(faces)
     return _rings(shapely, shapely.simplify(shape, width / 6), width * width)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -22,6 +23,10 @@ from torchrg.structures import (
     Planes,
     Segmentation,
 )
+
+_MIN_RATIO = 1e-4
+"""Ratio of the minimum area to the area of the smallest plane below which it is probably given in
+another unit: square meters instead of square millimeters are 1e-6."""
 
 
 def select_planes(
@@ -79,6 +84,13 @@ def choose_planes(planes: Planes, settings: SelectionConfig) -> Tensor:
 
     If ``settings`` contain classes, the table must have them.
     """
+    smallest = float(planes.area.amin()) if len(planes) else 0.0
+    if 0 < settings.min_area < _MIN_RATIO * smallest:
+        warnings.warn(
+            f"min_area {settings.min_area:g} keeps all planes, the smallest has {smallest:.3g}; "
+            "check that it is in squared units of the cloud.",
+            stacklevel=2,
+        )
     is_kept = planes.area >= settings.min_area
     if settings.kinds is not None and planes.kind is not None:
         selected = [PLANE_KINDS.index(name) for name in settings.kinds]

@@ -44,6 +44,8 @@ the square of the radius."""
 _MAX_SIDE, _MAX_SUPERSAMPLING = 2**13, 16
 """Maximum number of pixels per side (an 8K screen), and of subpixels per pixel and axis; bounds the
 memory."""
+_MAX_SUBPIXELS = 2**26
+"""Maximum number of subpixels of an image, 70 bytes each while it is drawn."""
 _GAP_RADIUS = 0.6
 """Half the width of the gaps that are closed, in radii of a disc."""
 _MIN_COSINE = 0.05
@@ -78,6 +80,11 @@ def draw_picture(
         Shape ``(H, W, 3)``, uint8.
     """
     width, height = int(camera.width), int(camera.height)
+    if width * height * supersampling**2 > _MAX_SUBPIXELS:
+        raise ConfigError(
+            f"render_cloud: expected at most {_MAX_SUBPIXELS:,} subpixels, got {width:,} x "
+            f"{height:,} pixels with supersampling {supersampling}; lower one of them."
+        )
     project = projection_of(camera, surface.origin, finer=supersampling)
     lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)
     indices = is_shown.nonzero().squeeze(-1)
@@ -205,7 +212,8 @@ def render_cloud(
             across the largest wall that is nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
         elevation_deg: Elevation of the camera, in degrees. Default: 35, from above 90.
-        width: Width in pixels, at most 8,192.
+        width: Width in pixels, at most 8,192; with few enough subpixels, about 4,800 at the
+            default supersampling.
         height: Height in pixels, at most 8,192. Default: fitted to the cloud, from a quarter of the
             width to the width.
         supersampling: Subpixels per pixel and axis, which are averaged.

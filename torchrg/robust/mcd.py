@@ -311,15 +311,13 @@ def _search_random(
     """Concentrate random sets of P + 1 points twice, and the best of them to convergence."""
     num_points, set_size = len(columns[0]), len(columns) + 1
     sets = elemental_sets(num_points, set_size, num_starts, seed).to(floor.device)
-    marks = columns[0].new_zeros(len(sets), num_points).scatter_(1, sets, 1.0)
-    initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
-    quick = _join(
-        *(
-            _concentrate(columns, part, set_size, size, floor, max_steps=1)
-            for part in torch.split(initial, max(_LANES_IN_CACHE // len(floor), 1), dim=1)
-        )
-    )
-    return _concentrate(columns, _distinct_best(quick, num_best), size, size, floor)
+    best: list[_Concentrated] = []
+    for part in torch.split(sets, max(_LANES_IN_CACHE // len(floor), 1)):
+        marks = columns[0].new_zeros(len(part), num_points).scatter_(1, part, 1.0)
+        initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
+        quick = _concentrate(columns, initial, set_size, size, floor, max_steps=1)
+        best = [_distinct_best(_join(*best, quick), num_best)]
+    return _concentrate(columns, best[0].members, size, size, floor)
 
 
 def _search_more(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrated:
@@ -327,7 +325,7 @@ def _search_more(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrat
     planes = _concentrate(columns, *initial_sets(columns, size, "planes"), size, floor)
     random = _search_random(columns, floor, size, _NUM_MORE, _NUM_BEST_MORE, seed=0)
     found = _join(planes, random)
-    best = _distinct_best(found, _NUM_RESAMPLED).repeat(1, _NUM_SUBSETS, 1)
+    best = _distinct_best(found, _NUM_RESAMPLED).members.repeat(1, _NUM_SUBSETS, 1)
     subset_size = min(2 * len(columns), size)
     subsets = random_subsets(best, subset_size, seed=0)
     return _join(found, _concentrate(columns, subsets, subset_size, size, floor))
@@ -338,14 +336,15 @@ def _join(*parts: _Concentrated) -> _Concentrated:
     return _Concentrated(torch.cat(members, dim=1), torch.cat(determinants))
 
 
-def _distinct_best(sets: _Concentrated, number: int) -> Tensor:
-    """Members ``(K, number, M)`` of the best sets of each lane, without duplicates."""
+def _distinct_best(sets: _Concentrated, number: int) -> _Concentrated:
+    """Return the best ``number`` sets of each lane, duplicates last."""
     values, order = sets.determinants.sort(dim=0, stable=True)
     repeated = torch.zeros_like(values, dtype=torch.bool)
     repeated[1:] = values[1:] == values[:-1]
     ranks = torch.where(repeated, torch.inf, values).argsort(dim=0, stable=True)[:number]
     chosen = order.gather(0, ranks)
-    return sets.members.gather(1, chosen.expand(len(sets.members), -1, -1))
+    members = sets.members.gather(1, chosen.expand(len(sets.members), -1, -1))
+    return _Concentrated(members, sets.determinants.gather(0, chosen))
 
 
 def _concentrate(

@@ -27,6 +27,9 @@ from torchrg.robust.weights import (
 _LANES_PER_CHUNK = 1024
 """Number of sets times patches processed at a time, so that their data fits into the cache."""
 
+_MAX_SETS = 2**25
+"""Maximum number of sets of an exhaustive search, 32 bytes each for P = 3: 170 points."""
+
 
 @patchwise
 def fit_mve(
@@ -74,6 +77,11 @@ def fit_mve(
         num_points, num_coordinates = len(columns[0]), len(columns)
         corners = num_coordinates + 1
         number = comb(num_points, corners) if exhaustive else num_starts
+        if exhaustive and number > _MAX_SETS:
+            raise ConfigError(
+                f"fit_mve: expected at most {_MAX_SETS:,} sets with exhaustive, got {number:,} of "
+                f"{num_points:,} points; set num_starts instead."
+            )
         sets = elemental_sets(num_points, corners, number, seed).to(floor.device)
         best, chosen = _smallest_ellipsoid(columns, sets, floor, size)
         weights = torch.zeros_like(columns[0]).scatter_(0, sets[chosen].t(), 1.0)

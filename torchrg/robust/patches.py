@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrg._checks import Arguments, as_tensor, check_floating, check_shapes
 from torchrg._opaque import opaque
-from torchrg._parallel import map_chunks
+from torchrg._parallel import limit_rows, map_chunks
 from torchrg.errors import ConfigError, warn
 from torchrg.linalg import flatness_tolerance, second_moments, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
@@ -226,7 +226,9 @@ def _fit_groups(
             block = block.gather(1, order[..., None].expand(-1, -1, size))
             _store(out, chosen, _spread(fit(block), order, num_points))
 
-        map_chunks(work, len(rows), chunk_size, patches.device, min_rows=_MIN_PATCHES)
+        # Typical points have three coordinates.
+        at_once = limit_rows(chunk_size, count * size // 3)
+        map_chunks(work, len(rows), at_once, patches.device, min_rows=_MIN_PATCHES)
     return out
 
 

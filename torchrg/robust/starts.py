@@ -1,7 +1,7 @@
 """Initial sets of robust searches: deterministic scatters, planes and random sets."""
 
 from functools import lru_cache
-from itertools import combinations
+from itertools import chain, combinations
 from math import comb
 from statistics import NormalDist
 from typing import Literal
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
 from torchrg.linalg import machine_epsilon
 from torchrg.robust.lanes import (
     covariance_entries,
@@ -277,11 +278,17 @@ def elemental_sets(num_points: int, size: int, num_sets: int, seed: int) -> Tens
     Returns point indices ``(S, size)``: all sets if there are at most ``5 * num_sets``, otherwise
     ``num_sets`` of them.
     """
-    if comb(num_points, size) <= 5 * num_sets:
-        return torch.tensor(list(combinations(range(num_points), size)), device="cpu")
+    number = comb(num_points, size)
+    if number <= 5 * num_sets:
+        indices = chain.from_iterable(combinations(range(num_points), size))
+        return torch.from_numpy(np.fromiter(indices, np.int64, number * size)).view(-1, size)
     generator = torch.Generator().manual_seed(seed)
-    draws = torch.rand(num_sets, num_points, generator=generator, device="cpu")
-    return draws.argsort(dim=1, stable=True)[:, :size]
+    parts = []
+    for rows in split_rows(num_sets, limit_rows(ROWS_IN_CACHE, num_points)):
+        shape = rows.stop - rows.start, num_points
+        draws = torch.rand(shape, generator=generator, device="cpu")
+        parts.append(draws.argsort(dim=1, stable=True)[:, :size].clone())
+    return torch.cat(parts)
 
 
 def random_subsets(sets: Tensor, size: int, seed: int) -> Tensor:

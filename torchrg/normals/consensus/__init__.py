@@ -7,7 +7,7 @@ selection), ``smoothing``; ``constants`` documents every number.
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_IN_CACHE
+from torchrg._parallel import ROWS_IN_CACHE, limit_rows
 from torchrg.config import NormalsConfig
 from torchrg.neighbors import measure_sampling, search_knn
 from torchrg.normals.consensus import constants
@@ -63,7 +63,8 @@ def estimate_consensus(
         >>> bool((fit.normals[:400].abs() == torch.tensor([0.0, 0, 1])).all())
         True
     """
-    size = min(chunk_size, ROWS_IN_CACHE)
+    width = max(neighbors.indices.shape[1], config.adaptive_k or 0)
+    size = min(chunk_size, limit_rows(ROWS_IN_CACHE, width))
     fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
     if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
         return fit._replace(sharp=torch.zeros_like(fit.valid))

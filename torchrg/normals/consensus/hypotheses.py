@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_IN_CACHE, split_rows
+from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
 from torchrg.linalg import above, at_most
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
@@ -51,7 +51,8 @@ def vote_planes(
     reach = constants.VOTE_REACH * noise
     ranks = candidate_ranks(sq_distances.shape[1]).to(noise.device)
     normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
-    for chunk in split_rows(len(noise), max(ROWS_IN_CACHE // (1 + len(ranks)), 1)):
+    at_once = limit_rows(ROWS_IN_CACHE // (1 + len(ranks)), sq_distances.shape[1])
+    for chunk in split_rows(len(noise), at_once):
         near = columns[0][chunk], columns[1][chunk], columns[2][chunk]
         normals[chunk] = _best_normals(near, weights[chunk], start[chunk], reach[chunk], ranks)
     for _ in range(constants.NUM_REFITS):

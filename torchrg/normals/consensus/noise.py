@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, map_chunks, nonzero_rows
+from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, limit_rows, map_chunks, nonzero_rows
 from torchrg.linalg import above, coordinate_resolution
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
@@ -253,5 +253,5 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
             ascending = torch.where(near.valid, near_values, torch.inf).sort(dim=1).values
             out[:] = ascending.gather(1, ranks.long() - 1).squeeze(1)
 
-    map_chunks(work, len(values), ROWS_IN_CACHE, values.device)
+    map_chunks(work, len(values), limit_rows(ROWS_IN_CACHE, k), values.device)
     return quantiles

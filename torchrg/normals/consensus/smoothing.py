@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import ROWS_IN_CACHE, map_chunks, map_selected
+from torchrg._parallel import ROWS_IN_CACHE, limit_rows, map_chunks, map_selected
 from torchrg.linalg import signs
 from torchrg.linalg.eigen import square_root
 from torchrg.linalg.moments import (
@@ -155,7 +155,8 @@ def choose_planes(
             points, *neighbors, *planes, noise, chosen, ranks
         )
 
-    size = max(min(chunk_size, ROWS_IN_CACHE // (1 if are_served else len(ranks))), 1)
+    at_once = ROWS_IN_CACHE // (1 if are_served else len(ranks))
+    size = min(chunk_size, limit_rows(at_once, neighbors.indices.shape[1]))
     map_chunks(work, len(rows), size, rows.device)
     return TangentPlanes(normals, offsets)
 

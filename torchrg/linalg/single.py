@@ -1,0 +1,34 @@
+"""Float64 points as float32, the precision of the kernels."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrg.precision import is_fine_step
+from torchrg.structures import FARTHEST, bounding_box, local_origin
+
+
+def to_single(points: Tensor) -> Tensor:
+    """Return finite float64 points ``(N, 3)`` as float32, if its steps are fine for their spacing.
+
+    Estimators and region growing depend on differences of coordinates alone. The points are
+    therefore relative to :func:`torchrg.structures.local_origin`, as those of a cloud are. Other
+    points are unchanged: of another dtype or device, or with gradients.
+
+    Example:
+        >>> points = 5e5 + torch.rand(100, 3, dtype=torch.float64)
+        >>> to_single(points).dtype, to_single(points * torch.tensor([1e9, 1, 1])).dtype
+        (torch.float32, torch.float64)
+    """
+    is_plain = points.device.type == "cpu" and not points.requires_grad
+    if points.dtype != torch.float64 or not is_plain or len(points) == 0:
+        return points
+    coordinates = points.numpy()
+    low, high = bounding_box(coordinates)
+    origin = local_origin(low, high)
+    reach = float(np.abs([low - origin, high - origin]).max())
+    if not 1 / FARTHEST < reach < FARTHEST:
+        return points
+    if not is_fine_step(float(np.spacing(np.float32(reach))), coordinates):
+        return points
+    return torch.from_numpy((coordinates - origin).astype(np.float32))
