@@ -407,9 +407,17 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     for job in jobs:
         remove_empty(job.folder, {out})  # Scans that failed leave empty folders.
-    code = _finish(report, out, unit=arguments.unit)
+    # Files come before lines, whose reader may have gone.
+    unreported = ""
+    try:
+        write_report(out, report)
+    except FormatError as error:
+        unreported = str(error)
     if not report.disk_full:
         plan.jobs[0].source.write_lists(out)
+    code = _finish(report, out, unit=arguments.unit)
+    if unreported:
+        code = fail(unreported, code=code or USAGE_ERROR)
     pages = _page_folder(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
@@ -448,26 +456,21 @@ def _index_pages(folder: Path, scans: list[Job]) -> Path:
 
 
 def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
-    """Write and print the report, and return the exit code."""
+    """Print the report, and return the exit code; results removed meanwhile are not complete."""
     if report.with_status("kept") == list(report.scans):
         print("nothing to do")
     else:
         print(format_report(report, unit=unit))
     for scan in report.scans:
         print_failure(scan)
-    try:
-        write_report(out, report)
-    except FormatError as error:
-        if not report.disk_full:
-            raise
-        warn(str(error))
-    state = f"{len(report.complete):,} of {len(report.scans):,} scans are complete"
+    num_complete = sum((out / scan.name / RECORD).is_file() for scan in report.complete)
+    state = f"{num_complete:,} of {len(report.scans):,} scans are complete"
     hint = "Rerun the same command to resume."
     if report.disk_full:
         return fail(f"{out}: the disk is full; {state}. Free space. {hint}", code=SOME_FAILED)
     if report.interrupted:
         return fail(f"interrupted; {state}. {hint}", code=INTERRUPTED)
-    if len(report.complete) < len(report.scans):
+    if num_complete < len(report.scans):
         return fail(f"{state}; see {out / REPORT}.", code=SOME_FAILED)
     print_lines(f"{state} -> {out}")
     return 0
