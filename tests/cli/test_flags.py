@@ -119,7 +119,12 @@ def test_a_matrix_of_numpy_is_a_camera(tmp_path):
     for array in (INTRINSICS.numpy(), INTRINSICS.numpy().ravel(), np.array([50, 50, 39.5, 29.5])):
         np.save(tmp_path / "K.npy", array)
         assert parse_intrinsics(f"{tmp_path / 'K.npy'}") == Pinhole(50.0, 50.0, 39.5, 29.5)
-    for array in (np.zeros((60, 80)), np.array(["a"]), np.zeros(9, complex)):
+    for array, message in (
+        (np.zeros((60, 80)), r"a matrix of .*, got 4,800 numbers; pass --intrinsics fx,fy,cx,cy"),
+        (np.array(["a"]), "an array of numbers, got: <U1"),
+        (np.zeros(9, complex), "an array of numbers, got: complex128"),
+        (np.ones(4, bool), "an array of numbers, got: bool"),
+    ):
         np.save(tmp_path / "K.npy", array)
-        with pytest.raises(FormatError, match=r"K\.npy: expected the numbers of a camera, got: "):
+        with pytest.raises(FormatError, match=rf"K\.npy: expected {message}"):
             parse_intrinsics(f"{tmp_path / 'K.npy'}")

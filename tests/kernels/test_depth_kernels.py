@@ -119,7 +119,7 @@ def test_threads_do_not_matter(depth, set_threads):
     assert_same(*found)
 
 
-@pytest.mark.filterwarnings("ignore:.*a field of view of")
+@pytest.mark.filterwarnings("ignore:.*a field of view of", "ignore:.*expected a median depth")
 def test_images_are_segmented_as_by_definition(depth):
     camera = make_intrinsics(*FOCAL, depth.shape[1] / 2, depth.shape[0] / 2)
     found = segment_depth(depth, camera, DepthConfig(min_size=20))

@@ -184,7 +184,7 @@ def describe_improbable_view(
         doubt = "with an optical axis off the center; pass the camera of images of this size"
     elif error > max(_SLIGHTLY_OFF_CENTER, 3 * _off_center(axis[::-1], size)):
         doubt = "which fit better with cx and cy exchanged; swap them"
-    elif size[0] == 2 * size[1]:
+    elif 2 < size[0] == 2 * size[1]:
         doubt = "of a panorama, by its ratio of 2:1; project it to perspective images"
     else:
         return ""
