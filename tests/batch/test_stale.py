@@ -21,6 +21,7 @@ from torchrg.config import load_config
 from torchrg.datasets import ScanNet
 from torchrg.datasets.layouts import LAYOUTS
 from torchrg.io.files import OUTPUT_MARK, remove_leftovers
+from torchrg.result import PAGE_SUFFIXES
 from torchrg.scenes import make_room
 
 FIRST, MOVED, LAST = SCANS = ("scene0001_00", "scene0002_00", "scene0003_00")
@@ -381,9 +382,16 @@ def test_another_layout_goes_to_another_directory(root, out, run, convert):
     assert (out / "a" / RECORD).is_file()
 
 
-def test_pages_leave_with_their_scan(tmp_path, out, convert):
+def test_pages_leave_with_their_scan(tmp_path, out, convert, monkeypatch):
     pytest.importorskip("jinja2")
     root, pages = tmp_path / "in", tmp_path / "pages"
+
+    def write_entry(folder, name, result):
+        for suffix in PAGE_SUFFIXES:
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / f"{name}{suffix}").write_text(f"{len(result.cloud)} points")
+
+    monkeypatch.setattr("torchrg.cli.convert.write_entry", write_entry)
     save_rooms(root, "a.npy", "b.npy", "sub/c.npy", "s.npy")
     assert convert("folder", root, out, "--pages", pages).code == 0
     (root / "b.npy").unlink()
