@@ -152,9 +152,11 @@ def label_regions(
     fitted = min_points if config.facet_tolerance is None else min(min_points, MIN_FITTED)
     labels, fits = rank_by_size(roots, fitted), RegionFits(cloud, config)
     if config.cut_bridges and bool((labels >= 0).any()):
-        mixed = find_mixed_regions(cloud, labels, fits.get(labels), config, chunk_size)
-        if mixed is not None:
-            cores = rank_by_size(grow(mixed.part, config, chunk_size), int(config.min_size))
+        found = find_mixed_regions(cloud, labels, fits.get(labels), config, chunk_size)
+        if found is not None:
+            mixed, part = found
+            cores = rank_by_size(grow(part, config, chunk_size), int(config.min_size))
+            del found, part  # Its lists may take as much memory as those of the cloud.
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
             labels = rank_by_size(labels, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):

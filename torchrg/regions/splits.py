@@ -104,8 +104,6 @@ class MixedRegions(NamedTuple):
     Attributes:
         rows: Points that may be of another surface, ascending, shape ``(n,)``: the points off the
             plane if nearly all points are on it, otherwise the complete region.
-        part: These points as a cloud with core limits; a point is valid only where the surface is
-            as smooth as is typical for the region.
         near: Points on the plane of a region with nearly all points on it, and with a normal within
             the maximum angle of the plane normal, shape ``(N,)``, bool.
         aligned: Points in ``near`` with a normal within the core limits.
@@ -113,7 +111,6 @@ class MixedRegions(NamedTuple):
     """
 
     rows: Tensor
-    part: GrowingInput
     near: Tensor
     aligned: Tensor
     on_plane: Tensor
@@ -134,8 +131,11 @@ def find_mixed_regions(
     planes: RegionPlanes,
     config: GrowingConfig,
     chunk_size: int,
-) -> MixedRegions | None:
+) -> tuple[MixedRegions, GrowingInput] | None:
     """Detect regions that may contain several surfaces; None if there are none.
+
+    Also returns their ``rows`` as a cloud with core limits; a point is valid only where the surface
+    is as smooth as is typical for the region.
 
     ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` the planes of the
     regions.
@@ -163,14 +163,14 @@ def find_mixed_regions(
         torch.zeros_like(off).index_fill_(0, remaining[turn <= deg_to_sq_chord(limit)], True)
         for limit in (config.max_angle_deg, _CORE_FRACTION * config.max_angle_deg)
     )
-    faces = _subset(cloud, labels, rows)
+    faces = _subset(cloud, labels, rows, chunk_size)
     smooth = _are_smooth(faces, labels[rows], _SMOOTH_FRACTION * config.max_angle_deg, chunk_size)
     faces = faces._replace(
         valid=faces.valid & smooth,
         reach=None if faces.reach is None else _CORE_FRACTION * faces.reach,
         angle_fraction=_CORE_FRACTION,
     )
-    return MixedRegions(rows, faces, near, aligned, on_plane)
+    return MixedRegions(rows, near, aligned, on_plane), faces
 
 
 def cut_bridges(
@@ -183,7 +183,7 @@ def cut_bridges(
 ) -> Tensor:
     """Split regions whose surfaces are connected only by a few points.
 
-    ``grown`` ``(n,)`` are the cores in the ``part`` of the mixed regions, 0 to C-1 or
+    ``grown`` ``(n,)`` are the cores in the ``rows`` of the mixed regions, 0 to C-1 or
     :data:`torchrg.UNLABELED`. If nearly all points are on a plane, the plane is a core too. Cores
     are one surface if a tenth of the edges between them pass the full limits, or if one plane
     explains both. Regions with several surfaces are split: each remaining point joins the core of
@@ -196,8 +196,13 @@ def cut_bridges(
         return labels
     cores = torch.full_like(labels, UNLABELED).index_copy_(0, mixed.rows, grown)
     cores, on_core_plane = _add_plane_cores(labels, cores, mixed)
-    near_cores = cloud.neighbors.gather(cores.to(torch.int32), rows)
-    rows = rows[((near_cores >= 0) & (near_cores != cores[rows, None])).any(dim=1)]
+    narrow = cores.to(torch.int32)
+
+    def meets_other(chunk: Tensor) -> Tensor:
+        near = cloud.neighbors.gather(narrow, chunk)
+        return ((near >= 0) & (near != narrow[chunk, None])).any(dim=1)
+
+    rows = rows[torch.cat([meets_other(chunk) for chunk in torch.split(rows, chunk_size)])]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
     cores = _join_curved(cloud, labels, cores, mixed.on_plane)
     split = torch.bincount(_core_regions(labels, cores), minlength=len(mixed.on_plane)) > 1
@@ -270,20 +275,24 @@ def _are_smooth(
     return fractions >= _MIN_SMOOTH_RATIO * typical[regions]
 
 
-def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor) -> GrowingInput:
+def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor, chunk_size: int) -> GrowingInput:
     """Return a subset of points as a cloud, with neighbors limited to the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
-    near = cloud.neighbors.select(rows)
-    local_rows = near.gather(row_of)
-    counted = (near.gather(labels.to(torch.int32)) == labels[rows, None]) & (local_rows >= 0)
-    counted &= near.mask()
-    itself = torch.arange(len(rows), dtype=torch.int32, device=rows.device)[:, None]
+    narrow, local = labels.to(torch.int32), row_of[rows]
+    indices = cloud.neighbors.indices.new_empty(len(rows), cloud.neighbors.indices.shape[1])
+    counted = torch.empty_like(indices, dtype=torch.bool)
+    for chunk in split_rows(len(rows), chunk_size):
+        near, itself = cloud.neighbors.select(rows[chunk]), local[chunk, None]
+        local_rows = near.gather(row_of)
+        same = (near.gather(narrow) == narrow[rows[chunk], None]) & (local_rows >= 0)
+        counted[chunk] = same & near.mask()
+        indices[chunk] = torch.where(counted[chunk], local_rows, itself)
     return cloud._replace(
         points=cloud.points.T[:, rows].T,
         normals=cloud.normals.T[:, rows].T,
         curvature=cloud.curvature[rows],
-        neighbors=Neighbors(torch.where(counted, local_rows, itself), counted),
+        neighbors=Neighbors(indices, counted),
         valid=cloud.valid[rows],
         reach=None if cloud.reach is None else cloud.reach[rows],
         colors=None if cloud.colors is None else cloud.colors[rows],
@@ -294,12 +303,14 @@ def _find_edges(
     cloud: GrowingInput, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _InnerEdges:
     """Return the edges of the given points."""
-    near = cloud.neighbors.select(rows)
-    inside = (near.gather(labels) == labels[rows, None]) & near.mask()
-    passed = torch.zeros_like(inside)
+    near, narrow = cloud.neighbors.select(rows), labels.to(torch.int32)
+    inside = torch.empty_like(near.indices, dtype=torch.bool)
+    passed = torch.empty_like(inside)
     for chunk in split_rows(len(rows), chunk_size):
-        passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0]
-    return _InnerEdges(rows, near.indices.long(), inside, passed & inside)
+        same = near.gather(narrow, chunk) == narrow[rows[chunk], None]
+        inside[chunk] = same & near.mask(chunk)
+        passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0] & inside[chunk]
+    return _InnerEdges(rows, near.indices, inside, passed)
 
 
 def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tensor:
@@ -308,9 +319,10 @@ def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tenso
     from scipy.sparse.csgraph import connected_components
 
     num_cores = int(cores.max()) + 1
-    ours, theirs = cores[edges.rows, None].expand_as(edges.targets), cores[edges.targets]
+    narrow = cores.to(torch.int32)
+    ours, theirs = narrow[edges.rows, None], Neighbors(edges.targets).gather(narrow)
     between = edges.inside & (theirs >= 0) & (theirs != ours)
-    first, second = ours[between], theirs[between]
+    first, second = ours.expand_as(theirs)[between].long(), theirs[between].long()
     keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
     keys, indices = torch.unique(keys, return_inverse=True)
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
@@ -333,7 +345,7 @@ def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
     cores = cores.clone()
     unassigned = torch.arange(len(edges.rows), device=cores.device)
     while len(unassigned):
-        targets = edges.targets[unassigned]
+        targets = edges.targets[unassigned].long()
         connected = edges.passed[unassigned] & (cores[targets] >= 0)
         nearest = connected.to(torch.uint8).argmax(dim=1, keepdim=True)
         joined = connected.any(dim=1)
