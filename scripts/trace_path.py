@@ -26,7 +26,7 @@ NUM_POINTS = 8_000
 WIDTH = 118
 """Line width in characters."""
 
-MAX_FILES = {"classic": 23, "paper": 31, "consensus": 32}
+MAX_FILES = {"classic": 26, "paper": 34, "consensus": 35}
 """Maximum number of files per preset, enforced by a test."""
 
 

@@ -81,7 +81,7 @@ def split_rows(num_rows: int, chunk_size: int) -> list[slice]:
 
 
 def limit_rows(num_rows: int, width: int) -> int:
-    """Return how many rows of ``width`` values take as much memory as ``num_rows`` typical ones.
+    """Return the number of rows of ``width`` values that take the memory of typical ``num_rows``.
 
     At least 1 and at most ``num_rows``. Rows that wide, such as neighborhoods, may be wider than
     the memory allows for all of ``num_rows``.

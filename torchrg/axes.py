@@ -1,6 +1,7 @@
 """Units of the axes of a cloud, and the axis that is up, checked against the data."""
 
 import re
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -127,7 +128,7 @@ def likely_up(
     if len(normals) == 0:
         return ""
     low, high = np.quantile(positions, _QUANTILES, axis=0)
-    level = (positions - low) / np.maximum(high - low, np.finfo(np.float64).tiny)
+    level = (positions - low) / np.maximum(high - low, sys.float_info.min)
     faces = np.abs(normals @ np.column_stack([np.eye(3), up])) >= _MIN_ALONG
     for i, axis in enumerate("xyz"):
         ends = [faces[:, i] & at for at in (level[:, i] <= _END, level[:, i] >= 1 - _END)]

@@ -152,9 +152,9 @@ def describe_multipliers(settings: PipelineConfig, partition: object = None) -> 
         >>> describe_multipliers(load_config(**{"normals.k": 600}))
         ' with --normals.k 600'
     """
-    normals, usual, flags = settings.normals, NormalsConfig.k, []
+    normals, default, flags = settings.normals, NormalsConfig.k, []
     for name, value in (("k", normals.k), ("adaptive-k", normals.adaptive_k or 0)):
-        flags += [f"--normals.{name} {value}"] if value > usual else []
+        flags += [f"--normals.{name} {value}"] if value > default else []
     if (
         isinstance(partition, SuperpointsConfig)
         and partition.num_levels > SuperpointsConfig().num_levels

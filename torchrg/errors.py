@@ -114,6 +114,6 @@ _LIBRARIES = {"torchrg", "torch", "contextlib", "functools"}
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Warn at the line of the user that called torchrg."""
     level, frame = 2, sys._getframe(1)  # noqa: SLF001
-    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in _LIBRARIES:
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _LIBRARIES:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, category, stacklevel=level)

@@ -144,7 +144,7 @@ def test_the_least_limit_of_nested_groups_counts(
     monkeypatch, tmp_path, own, tree, limit, used, cache
 ):
     monkeypatch.setattr(memory, "_CGROUP", tmp_path / "cgroup")
-    monkeypatch.setattr(memory, "_OWN_CGROUPS", tmp_path / "own")
+    monkeypatch.setattr(memory, "_PROCESS_CGROUPS", tmp_path / "own")
     machine = available_memory()  # No groups, as on other systems.
     (tmp_path / "own").write_text(own)
     assert machine / 2 < available_memory() < 2 * machine

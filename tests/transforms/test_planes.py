@@ -209,6 +209,8 @@ ARGUMENTS = {
     "up": (0.0, 1.0, 0.0),
     "size": 0.25,
     "planes": True,
+    "depth_scale": 1000.0,
+    "depth_kind": "ray",
 }
 """A value of each argument that is not its default."""
 

@@ -14,7 +14,7 @@ large arrays are on disk, for at most ``_K`` neighbors and ``_NUM_LEVELS`` level
 _K, _NUM_LEVELS = 50, 4
 _BYTES_PER_NEIGHBOR, _BYTES_PER_LEVEL, _BYTES_PER_PAIR = {False: 14, True: 8}, 24, 40
 """Memory per point of each further neighbor (False: not on disk) and level, and of ``k * k``."""
-_CGROUP, _OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_CGROUP, _PROCESS_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 """Linux control groups, which limit containers and cluster jobs, and those of this process."""
 _CGROUP_FILES = {
     "": ("memory.max", "memory.current", "inactive_file"),
@@ -49,7 +49,7 @@ def available_memory() -> int:
 def _group_remainders() -> Iterator[int]:
     """Yield what each control group of this process, and each parent, can still allocate."""
     # A container may see a path of its host, of which only the root exists in its own tree.
-    for line in _OWN_CGROUPS.read_text().splitlines() if _OWN_CGROUPS.exists() else []:
+    for line in _PROCESS_CGROUPS.read_text().splitlines() if _PROCESS_CGROUPS.exists() else []:
         _, controllers, path = line.split(":", 2)
         for controller in set(controllers.split(",")) & _CGROUP_FILES.keys():
             limit, used, cached = _CGROUP_FILES[controller]

@@ -32,3 +32,16 @@ def to_single(points: Tensor) -> Tensor:
     if not is_fine_step(float(np.spacing(np.float32(reach))), coordinates):
         return points
     return torch.from_numpy((coordinates - origin).astype(np.float32))
+
+
+def is_single(values: Tensor) -> bool:
+    """Return whether values of any dtype are float32 numbers, as those computed by kernels.
+
+    Example:
+        >>> is_single(torch.tensor([0.1, torch.nan]).double())
+        True
+        >>> is_single(torch.tensor([0.1], dtype=torch.float64))
+        False
+    """
+    same = values.float().to(values.dtype) == values
+    return bool((same | values.isnan()).all())

@@ -26,7 +26,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchrg._checks import as_tensor, check_points, eager_only
 from torchrg._parallel import CHUNK_SIZE, limit_rows
@@ -96,7 +95,7 @@ def run_estimator(
     if single.dtype == points.dtype:
         return fit
     normals, curvature, rms = (values.to(points) for values in (*fit[:2], fit.residual_rms))
-    return fit._replace(normals=normalize(normals), curvature=curvature, residual_rms=rms)
+    return fit._replace(normals=normals, curvature=curvature, residual_rms=rms)
 
 
 @eager_only

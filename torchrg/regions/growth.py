@@ -23,7 +23,7 @@ from torchrg._parallel import (
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
-from torchrg.linalg.single import to_single
+from torchrg.linalg.single import is_single, to_single
 from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
@@ -156,7 +156,7 @@ def label_regions(
         if found is not None:
             mixed, part = found
             cores = rank_by_size(grow(part, config, chunk_size), int(config.min_size))
-            del found, part  # Its lists may take as much memory as those of the cloud.
+            del found, part  # Its lists may be as large as those of the cloud.
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
             labels = rank_by_size(labels, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
@@ -202,7 +202,9 @@ def checked_cloud(
     check_neighbors(caller, neighbors, points)
     if valid is not None and valid.dtype != torch.bool:
         raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
-    positions, reach = to_single(points), None
+    # Normals of another source may have more digits, which decide at the limits.
+    is_estimated = is_single(normals) and is_single(curvature)
+    positions, reach = to_single(points) if is_estimated else points, None
     normals, curvature = normals.to(positions), curvature.to(positions)
     if config.plane_reach is not None:
         if residual_rms is None:
