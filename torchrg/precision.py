@@ -87,7 +87,8 @@ def is_fine_step(step: float, points: NDArray[np.floating]) -> bool:
     """Return whether a rounding step is fine for finite points ``(N, 3)`` without measuring them.
 
     Example:
-        >>> is_fine_step(1e-6, np.eye(3)), is_fine_step(1e-3, np.eye(3))
+        >>> points = np.arange(12.0).reshape(4, 3)
+        >>> is_fine_step(1e-6, points), is_fine_step(1.0, points)
         (True, False)
     """
     low, high = _middle_half(points)

@@ -17,7 +17,8 @@ def to_single(points: Tensor) -> Tensor:
 
     Example:
         >>> points = 5e5 + torch.rand(100, 3, dtype=torch.float64)
-        >>> to_single(points).dtype, to_single(points * torch.tensor([1e9, 1, 1])).dtype
+        >>> outlier = points[:1] + 1e9
+        >>> to_single(points).dtype, to_single(torch.cat([points, outlier])).dtype
         (torch.float32, torch.float64)
     """
     is_plain = points.device.type == "cpu" and not points.requires_grad
