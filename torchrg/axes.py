@@ -49,7 +49,7 @@ def describe_units(points: NDArray[np.floating], header: Mapping[str, Any] | Non
 
     Args:
         points: Coordinates with z up, shape ``(N, 3)``; points that are not finite are ignored.
-        header: See :attr:`torchrg.Cloud.header`; the reference system in it decides.
+        header: See ``Cloud.header``; the reference system in it decides.
 
     Example:
         >>> room = np.random.default_rng(0).random((1000, 3))
