@@ -63,6 +63,11 @@ def make_claim(path):
     path.write_text(json.dumps({**record, "claims": claims}))
 
 
+def interrupt(*_):
+    """Take the place of a function at which the process is killed."""
+    raise KeyboardInterrupt
+
+
 @pytest.fixture
 def job_of_a_room(room, tmp_path):
     """``job_of_a_room(...)``: a job for a small room whose results go to ``out/room``."""
@@ -118,7 +123,7 @@ def test_results_are_replaced_by_those_of_other_settings_and_no_others(job_of_a_
     assert (job.folder / "superpoint.npy").exists()
 
 
-def test_a_scan_that_failed_keeps_its_table(job_of_a_room, tmp_path):
+def test_a_scan_that_failed_keeps_its_table(job_of_a_room, tmp_path, room, monkeypatch):
     job, path = job_of_a_room(table="planes.csv"), tmp_path / "in" / "room.npy"
     assert convert_scan(job).status == "converted"
     whole = path.read_bytes()
@@ -128,11 +133,15 @@ def test_a_scan_that_failed_keeps_its_table(job_of_a_room, tmp_path):
     path.write_bytes(whole)
     assert convert_scan(job).status == "converted"
     assert reason_to_convert(job) == ""
-    # Killed with another table, it is still known as torchrg's.
-    make_claim(job.folder / RECORD)
-    (job.folder / "planes.csv").write_text("half")
+    # A new table is known as torchrg's when the conversion is killed then.
+    np.save(path, room(400).points)
+    with monkeypatch.context() as patch:
+        patch.setattr("torchrg.batch.scans.remove_unwritten", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            convert_scan(job)
     other = dataclasses.replace(job, source=dataclasses.replace(job.source, table=None))
-    assert convert_scan(other).warnings == convert_scan(job).warnings
+    assert convert_scan(other).warnings == ()
+    assert not (job.folder / "planes.csv").exists()
     (job.folder / "other.csv").write_text("of a user")
     other = dataclasses.replace(job, source=dataclasses.replace(job.source, table="other.csv"))
     assert "other.csv: was not written by torchrg for this scan" in convert_scan(other).reason

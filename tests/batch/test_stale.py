@@ -380,6 +380,9 @@ def test_another_layout_goes_to_another_directory(root, out, run, convert):
     # A single result in the directory of a data set is none of its scans.
     assert convert("scannet", root, out, "--layout", "mask3d").code == 0
     assert (out / "a" / RECORD).is_file()
+    single = ("segment", out.parent / "in" / "a.npy", "--out", out.parent / "single", "--layout")
+    assert run(*single, "npy").code == 0
+    assert "a: expected results in layout mask3d, got npy; " in run(*single, "mask3d").error
 
 
 def test_pages_leave_with_their_scan(tmp_path, out, convert, monkeypatch):
@@ -394,6 +397,8 @@ def test_pages_leave_with_their_scan(tmp_path, out, convert, monkeypatch):
     monkeypatch.setattr("torchrg.cli.convert.write_entry", write_entry)
     save_rooms(root, "a.npy", "b.npy", "sub/c.npy", "s.npy")
     assert convert("folder", root, out, "--pages", pages).code == 0
+    # A conversion without pages forgets none.
+    assert convert("folder", root, out, "--only", "b", "--force").code == 0
     (root / "b.npy").unlink()
     (root / "sub" / "c.npy").rename(root / "d.npy")
     (pages / "b.txt").write_text("mine")
@@ -422,6 +427,7 @@ def test_other_directories_are_left_alone_and_other_kinds_are_refused(tmp_path, 
     error = convert("scannet", root, out).error
     assert f"{out}/a: expected results of convert scannet, got folder; choose another" in error
     (tmp_path / "in" / "b.npy").unlink()
+    (out / "more" / "x" / RECORD).write_text("{")
     assert convert("folder", tmp_path / "in", out, "--prune").code == 0
     assert not (out / "b").exists()
     for name in ("a", "more/x"):
