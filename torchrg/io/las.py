@@ -10,6 +10,7 @@ import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
@@ -56,6 +57,8 @@ _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
 type, a size and a version."""
 _STORAGE_USER_IDS = ("laszip encoded", "copc")
 """User IDs of the records that describe how points are stored."""
+_PARAMETERS = attrgetter("name", "dtype", "description", "offsets", "scales", "no_data")
+"""Parameters of an extra dimension, in laspy's order."""
 _UNDOCUMENTED = "Un-registered ExtraBytes"
 """Description that laspy gives to undocumented extra bytes."""
 _RANGE_BITS = 0b110
@@ -248,15 +251,8 @@ def _add_dimensions(
     dimensions, params = dict[str, Values](), list[Any]()
     for extra in _input_dimensions(cloud.header.get("las"), columns):
         if extra.holds(columns):
-            dimension = extra.dimension
-            more = (
-                dimension.description,
-                dimension.offsets,
-                dimension.scales,
-                dimension.no_data,
-            )
-            params.append(laspy.ExtraBytesParams(dimension.name, dimension.dtype, *more))
-            dimensions[dimension.name] = extra.join(columns)
+            params.append(laspy.ExtraBytesParams(*_PARAMETERS(extra.dimension)))
+            dimensions[extra.dimension.name] = extra.join(columns)
             columns = {name: c for name, c in columns.items() if name not in extra.columns}
     standard = set(header.point_format.dimension_names)
     for name, column in columns.items():
