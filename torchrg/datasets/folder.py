@@ -386,9 +386,7 @@ def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> No
     """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
         more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
-        warn(
-            f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.",
-        )
+        warn(f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.")
 
 
 def list_dir(folder: str | os.PathLike[str]) -> list[Path]:

@@ -64,13 +64,6 @@ def read_depth(
     millimeters, 5000 for TUM, 1 for meters. It is not stored in the files and never guessed.
     Distances along the ray, ``"ray"``, need the camera; see
     :func:`torchrg.depth.values.convert_depth`.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "depth.npy"
-        >>> np.save(path, np.array([[1500, 0]], dtype=np.uint16))
-        >>> read_depth(path, depth_scale=1000)
-        tensor([[1.5000, 0.0000]])
     """
     source = local_path(path)
     refuse_form(source)
@@ -263,9 +256,8 @@ def read_nearest(
     for time in times:
         index = bisect_left(other_times, time)
         candidates = range(max(index - 1, 0), min(index + 1, len(other_times)))
-        best = min(candidates, key=lambda i: abs(other_times[i] - time), default=None)
-        if best is not None and abs(other_times[best] - time) > _MAX_SECONDS:
-            best = None
+        near = [i for i in candidates if abs(other_times[i] - time) <= _MAX_SECONDS]
+        best = min(near, key=lambda i: abs(other_times[i] - time), default=None)
         nearest.append(None if best is None else values[best])
     return nearest
 
