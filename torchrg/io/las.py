@@ -21,7 +21,7 @@ from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN
 from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
-from torchrg.io.fields import Columns, Values, assemble_cloud
+from torchrg.io.fields import Columns, Values, assemble_cloud, check_coordinates
 from torchrg.io.files import (
     PARSE_ERRORS,
     atomic_path,
@@ -84,10 +84,7 @@ def read_las(path: Path, size: int) -> Cloud:
     _check_header(path, size)
     with _open_reader(laspy, path) as reader:
         header = reader.header
-        if header.point_count == 0:
-            raise FormatError(
-                f"{path}: expected at least one point, got none; check the source of the file."
-            )
+        check_coordinates(path, (header.point_count, 3), np.dtype(np.float64))
         check_grid(path, "x, y, z", header.scales, header.offsets)
         for dimension in header.point_format.extra_dimensions:
             if dimension.is_scaled:
