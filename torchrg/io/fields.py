@@ -168,12 +168,7 @@ def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) 
 
 
 def backup_name(name: str) -> str:
-    """Return the backup name of a cloud field that a result replaces.
-
-    Example:
-        >>> backup_name("labels"), backup_name("normals")
-        ('label_input', 'normals_input')
-    """
+    """Return the backup name of a cloud field that a result replaces."""
     return f"{'label' if name == 'labels' else name}_input"
 
 

@@ -42,10 +42,6 @@ def distance_outside(
         high: Maximum coordinates, shape ``(3,)``.
         box: Minimum and maximum coordinates by the header, shape ``(2, 3)``.
         step: Step of the coordinates.
-
-    Example:
-        >>> distance_outside([0, 0, 0], [1, 1, 1], [[0, 0, 0], [1, 1, 0.5]])
-        0.5
     """
     # Programs that compute no box write zeros.
     if not np.isfinite(box).all() or not np.any(box):
