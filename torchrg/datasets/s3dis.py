@@ -316,12 +316,8 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> NDArray[np.floa
         if not words:
             continue
         row = [float(word) for word in words if _NUMBER.fullmatch(word)]
-        if (
-            len(words) != _NUM_COLUMNS
-            or len(row) != _NUM_COLUMNS
-            or b"\r" in text
-            or not _are_points(np.array([row]))
-        ):
+        is_row = len(words) == len(row) == _NUM_COLUMNS and b"\r" not in text
+        if not is_row or not _are_points(np.array([row])):
             shown = original.split(b"\n")[number - 1].removesuffix(b"\r")
             shown = shown if len(shown) <= 80 else shown[:77] + b"..."
             raise FormatError(
