@@ -26,8 +26,6 @@ Transform = Callable[[SampleDict], Sample]
 """A function that data sets apply to each sample."""
 _ID_ARRAYS = {"instance", "plane", "superpoint"}
 """Arrays whose IDs start at 0 in each scene."""
-_FIELD_KEYS = {"normals": "normal"}
-"""Sample keys of cloud fields, if they differ."""
 _MAX_PROSE_BYTES = 1 << 16
 """Maximum size of a text file that is read to see whether it contains points."""
 _LINKS = "links to files that were already read, or to a parent folder"
@@ -268,7 +266,7 @@ class FolderOfClouds(SceneDataset):
             return {**read_pointcept_scene(path), "name": name}
         cloud = self.read_cloud(index)
         fields = {
-            _FIELD_KEYS.get(field, field): as_tensor(str(path), field, values)
+            "normal" if field == "normals" else field: as_tensor(str(path), field, values)
             for field, values in cloud.fields.items()
             if values.dtype.kind in "fiub"
         }

@@ -75,17 +75,14 @@ class ListedFrame(NamedTuple):
     camera: Pinhole | None = None
 
 
-Camera = Callable[[Path], Pinhole | None]
-"""Function that returns the camera of a recording without a camera file, if it is known."""
-
-
 class FrameLayout(NamedTuple):
     """Layout of a folder of frames.
 
     Attributes:
         frames: Function that yields the frames of a recording in natural order.
         mark: Name pattern of an entry in every recording; empty if any folder is a recording.
-        camera: Camera of a recording without a camera file; None if unknown or per frame.
+        camera: Function that returns the camera of a recording without a camera file, if it is
+            known; None if it never is, or is per frame.
         depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
         locations: Path patterns of recordings below the root folder.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
@@ -94,7 +91,7 @@ class FrameLayout(NamedTuple):
 
     frames: Callable[[Path], Iterable[ListedFrame]]
     mark: str = ""
-    camera: Camera | None = None
+    camera: Callable[[Path], Pinhole | None] | None = None
     depth_scale: float | None = None
     locations: tuple[str, ...] = ("", "*/")
     signs: tuple[str, ...] = ("",)
