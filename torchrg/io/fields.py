@@ -179,12 +179,6 @@ def add_result_fields(
 
     A field with the name of a result is renamed as :func:`backup_name` returns. If that name is
     taken, the cloud is itself a result; then the input field is kept and the result is replaced.
-
-    Example:
-        >>> first = add_result_fields({"labels": np.array([7])}, {"labels": np.array([0])})
-        >>> again = add_result_fields(first, {"labels": np.array([1])})
-        >>> {name: values.tolist() for name, values in again.items()}
-        {'label_input': [7], 'labels': [1]}
     """
     unchanged = {name: values for name, values in fields.items() if name not in results}
     backups = {backup_name(name): fields[name] for name in results if name in fields}

@@ -55,8 +55,6 @@ _POINTWISE, _MAX_LAZ_VERSION = 1, 3
 _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
 """Offsets in LASzip's record of the chunk size in points, and of the number of items. An item is a
 type, a size and a version."""
-_STORAGE_USER_IDS = ("laszip encoded", "copc")
-"""User IDs of the records that describe how points are stored."""
 _PARAMETERS = attrgetter("name", "dtype", "description", "offsets", "scales", "no_data")
 """Parameters of an extra dimension, in laspy's order."""
 _UNDOCUMENTED = "Un-registered ExtraBytes"
@@ -94,7 +92,7 @@ def read_las(path: Path, size: int) -> Cloud:
         parts = list(map(_chunk_columns, reader.chunk_iterator(_POINTS_PER_CHUNK)))
     # Compression does not matter for the cloud, and laspy cannot write an octree.
     for records in (header.vlrs, header.evlrs or []):
-        records[:] = [r for r in records if r.user_id not in _STORAGE_USER_IDS]
+        records[:] = [r for r in records if r.user_id not in ("laszip encoded", "copc")]
     standard = set(header.point_format.standard_dimension_names)
     names = list(parts[0])
     unused = {n for n in names if n in standard and not any(chunk[n].any() for chunk in parts)}
