@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.errors import FormatError
-from torchrg.io.colors import narrow_colors
+from torchrg.io.colors import BYTE, WORD, narrow_colors
 from torchrg.io.files import (
     PARSE_ERRORS,
     check_available,
@@ -44,7 +44,6 @@ _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
 """Header of a binary PGM: width, height and maximum value."""
 _MAX_HEADER_BYTES = 512
-_MAX_8_BIT, _MAX_16_BIT = 255, 65535
 MAX_PIXELS = 1 << 26
 """Maximum pixels of an image, 8192 x 8192. No depth camera has more, and converting them to
 meters takes 1.5 GB. Running out of memory in a library would end the process."""
@@ -136,7 +135,7 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
     check_file(source)
     content = source.read_bytes()
     header = _PGM.match(content)
-    if header is None or not _MAX_8_BIT < int(header[3]) <= _MAX_16_BIT:
+    if header is None or not BYTE < int(header[3]) <= WORD:
         raise FormatError(
             f"{source}: expected a 16-bit binary PGM, P5, got {content[:16]!r}; 8 bits cannot "
             "represent depth."

@@ -179,10 +179,8 @@ def _all_images(folder: Path) -> Iterator[ListedFrame]:
         DepthWarning: If images are skipped.
     """
     images = [path for path in find_files(folder) if path.suffix.lower() in DEPTH_SUFFIXES]
-    words = {
-        path: {*re.findall("[a-z]+", path.relative_to(folder).as_posix().lower())}
-        for path in images
-    }
+    names = {path: path.relative_to(folder).as_posix().lower() for path in images}
+    words = {path: {*re.findall("[a-z]+", name)} for path, name in names.items()}
     chosen = [path for path in images if words[path].isdisjoint(_NON_DEPTH_WORDS)]
     if any("depth" in words[path] for path in chosen):
         chosen = [path for path in chosen if "depth" in words[path]]

@@ -40,7 +40,6 @@ CLASS_ORDERS = {
 }  # fmt: skip
 """Class names by index, in the order of Pointcept, MMDetection3D and PointNet, and in the order of
 Superpoint Transformer and KPConv."""
-_OTHER_CLASS = "clutter"
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms per area in the release, 272 in all."""
 ANNOTATIONS = "Annotations"
@@ -181,7 +180,7 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
     classes = class_names(class_order)
     objects, notes = _list_room(path)
     coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
-    numbers = [classes.index(name if name in classes else _OTHER_CLASS) for name, _ in objects]
+    numbers = [classes.index(name if name in classes else "clutter") for name, _ in objects]
     notes += [f"{file.name} read as clutter" for name, file in objects if name not in classes]
     first: dict[bytes, str] = {}
     for (_, file), coord in zip(objects, coords, strict=True):
