@@ -98,14 +98,6 @@ def read_camera(path: Path) -> Pinhole:
     Warns:
         DepthWarning: If the lens distorts images, which torchrg does not correct, or a focal length
             is negative.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "camera.json"
-        >>> camera = {"width": 8, "height": 6, "intrinsic_matrix": [9, 0, 0, 0, 9, 0, 3.5, 2.5, 1]}
-        >>> _ = path.write_text(json.dumps(camera))
-        >>> read_camera(path)[:5]
-        (9.0, 9.0, 3.5, 2.5, (8, 6))
     """
     record = read_record(path)
     if isinstance(record.get("frames"), list) and "fl_x" not in record:

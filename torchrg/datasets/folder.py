@@ -26,8 +26,6 @@ Transform = Callable[[SampleDict], Sample]
 """A function that data sets apply to each sample."""
 _ID_ARRAYS = {"instance", "plane", "superpoint"}
 """Arrays whose IDs start at 0 in each scene."""
-_FIELD_KEYS = {"normals": "normal"}
-"""Sample keys of cloud fields, if they differ."""
 _MAX_PROSE_BYTES = 1 << 16
 """Maximum size of a text file that is read to see whether it contains points."""
 _LINKS = "links to files that were already read, or to a parent folder"
@@ -268,7 +266,7 @@ class FolderOfClouds(SceneDataset):
             return {**read_pointcept_scene(path), "name": name}
         cloud = self.read_cloud(index)
         fields = {
-            _FIELD_KEYS.get(field, field): as_tensor(str(path), field, values)
+            "normal" if field == "normals" else field: as_tensor(str(path), field, values)
             for field, values in cloud.fields.items()
             if values.dtype.kind in "fiub"
         }
@@ -386,9 +384,7 @@ def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> No
     """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
         more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
-        warn(
-            f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.",
-        )
+        warn(f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.")
 
 
 def list_dir(folder: str | os.PathLike[str]) -> list[Path]:

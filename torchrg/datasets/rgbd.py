@@ -20,12 +20,7 @@ from torchrg.datasets.rgbd_files import (
     read_depth,
     refuse_form,
 )
-from torchrg.datasets.rgbd_layouts import (
-    FRAME_LAYOUTS,
-    ListedFrame,
-    find_layout,
-    find_recordings,
-)
+from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, ListedFrame, find_layout, find_recordings
 from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view
 from torchrg.depth.values import DepthKind, check_conversion
 from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError, warn
@@ -118,12 +113,7 @@ class RGBDFrames(SceneDataset):
         (torch.Size([1, 4, 6]), 1.5, ['depth', 'intrinsics', 'name'])
     """
 
-    def __init__(
-        self,
-        frames: Sequence[RGBDFrame],
-        *,
-        transform: Transform | None = None,
-    ) -> None:
+    def __init__(self, frames: Sequence[RGBDFrame], *, transform: Transform | None = None) -> None:
         is_path = isinstance(frames, os.PathLike)
         if is_path or not all(isinstance(frame, RGBDFrame) for frame in frames):
             raise ConfigError(

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.errors import FormatError
-from torchrg.io.colors import narrow_colors
+from torchrg.io.colors import BYTE, WORD, narrow_colors
 from torchrg.io.files import (
     PARSE_ERRORS,
     check_available,
@@ -44,7 +44,6 @@ _PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
 """Header of a binary PGM: width, height and maximum value."""
 _MAX_HEADER_BYTES = 512
-_MAX_8_BIT, _MAX_16_BIT = 255, 65535
 MAX_PIXELS = 1 << 26
 """Maximum pixels of an image, 8192 x 8192. No depth camera has more, and converting them to
 meters takes 1.5 GB. Running out of memory in a library would end the process."""
@@ -64,13 +63,6 @@ def read_depth(
     millimeters, 5000 for TUM, 1 for meters. It is not stored in the files and never guessed.
     Distances along the ray, ``"ray"``, need the camera; see
     :func:`torchrg.depth.values.convert_depth`.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "depth.npy"
-        >>> np.save(path, np.array([[1500, 0]], dtype=np.uint16))
-        >>> read_depth(path, depth_scale=1000)
-        tensor([[1.5000, 0.0000]])
     """
     source = local_path(path)
     refuse_form(source)
@@ -143,7 +135,7 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
     check_file(source)
     content = source.read_bytes()
     header = _PGM.match(content)
-    if header is None or not _MAX_8_BIT < int(header[3]) <= _MAX_16_BIT:
+    if header is None or not BYTE < int(header[3]) <= WORD:
         raise FormatError(
             f"{source}: expected a 16-bit binary PGM, P5, got {content[:16]!r}; 8 bits cannot "
             "represent depth."
@@ -263,9 +255,8 @@ def read_nearest(
     for time in times:
         index = bisect_left(other_times, time)
         candidates = range(max(index - 1, 0), min(index + 1, len(other_times)))
-        best = min(candidates, key=lambda i: abs(other_times[i] - time), default=None)
-        if best is not None and abs(other_times[best] - time) > _MAX_SECONDS:
-            best = None
+        near = [i for i in candidates if abs(other_times[i] - time) <= _MAX_SECONDS]
+        best = min(near, key=lambda i: abs(other_times[i] - time), default=None)
         nearest.append(None if best is None else values[best])
     return nearest
 

@@ -41,11 +41,11 @@ _TUM_INTRINSICS = {
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
 """fx, fy, cx, cy of the three cameras, from the data set's documentation."""
-_ICL_NUIM_INTRINSICS = (481.2, -480.0, 319.5, 239.5)
-"""The scenes were rendered with y up, so the vertical focal length is negative."""
-_SEVEN_SCENES_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)
-"""Width and height of the images of these cameras, in pixels."""
+"""Width and height of the images of all built-in cameras, in pixels."""
+_ICL_NUIM_CAMERA = Pinhole(481.2, -480.0, 319.5, 239.5, _KINECT_SIZE)
+"""The scenes were rendered with y up, so the vertical focal length is negative."""
+_SEVEN_SCENES_CAMERA = Pinhole(585.0, 585.0, 320.0, 240.0, _KINECT_SIZE)
 _NON_DEPTH_WORDS = frozenset(
     re.findall(
         "[a-z]+",
@@ -55,7 +55,6 @@ _NON_DEPTH_WORDS = frozenset(
     )
 )
 """Words in the names of files and folders of images that are not depth."""
-_IPHONES = ("", "iphone/", "*/iphone/", "data/*/iphone/")
 _SCANNETPP_COLOR = {"width": 1920, "height": 1440}
 """Size of the color images, to which ScanNet++ intrinsics refer."""
 _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
@@ -76,17 +75,14 @@ class ListedFrame(NamedTuple):
     camera: Pinhole | None = None
 
 
-Camera = Callable[[Path], Pinhole | None]
-"""Function that returns the camera of a recording without a camera file, if it is known."""
-
-
 class FrameLayout(NamedTuple):
     """Layout of a folder of frames.
 
     Attributes:
         frames: Function that yields the frames of a recording in natural order.
         mark: Name pattern of an entry in every recording; empty if any folder is a recording.
-        camera: Camera of a recording without a camera file; None if unknown or per frame.
+        camera: Function that returns the camera of a recording without a camera file, if it is
+            known; None if it never is, or is per frame.
         depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
         locations: Path patterns of recordings below the root folder.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
@@ -95,7 +91,7 @@ class FrameLayout(NamedTuple):
 
     frames: Callable[[Path], Iterable[ListedFrame]]
     mark: str = ""
-    camera: Camera | None = None
+    camera: Callable[[Path], Pinhole | None] | None = None
     depth_scale: float | None = None
     locations: tuple[str, ...] = ("", "*/")
     signs: tuple[str, ...] = ("",)
@@ -173,11 +169,6 @@ def _color_image(path: Path) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _fixed_camera(fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return a function that returns one camera for all recordings."""
-    return lambda folder: Pinhole(fx, fy, cx, cy, _KINECT_SIZE)
-
-
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
     """Yield all depth images below a folder, with one camera, without colors and poses.
 
@@ -188,10 +179,8 @@ def _all_images(folder: Path) -> Iterator[ListedFrame]:
         DepthWarning: If images are skipped.
     """
     images = [path for path in find_files(folder) if path.suffix.lower() in DEPTH_SUFFIXES]
-    words = {
-        path: {*re.findall("[a-z]+", path.relative_to(folder).as_posix().lower())}
-        for path in images
-    }
+    names = {path: path.relative_to(folder).as_posix().lower() for path in images}
+    words = {path: {*re.findall("[a-z]+", name)} for path, name in names.items()}
     chosen = [path for path in images if words[path].isdisjoint(_NON_DEPTH_WORDS)]
     if any("depth" in words[path] for path in chosen):
         chosen = [path for path in chosen if "depth" in words[path]]
@@ -311,7 +300,7 @@ FRAME_LAYOUTS = {
         _scannetpp_frames,
         "pose_intrinsic_imu.json",
         depth_scale=1000.0,
-        locations=_IPHONES,
+        locations=("", "iphone/", "*/iphone/", "data/*/iphone/"),
     ),
     "arkitscenes": FrameLayout(
         _arkitscenes_frames,
@@ -325,7 +314,7 @@ FRAME_LAYOUTS = {
     "replica": FrameLayout(_replica_frames, "traj.txt"),
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
     "icl-nuim": FrameLayout(
-        _icl_nuim_frames, "depth", _fixed_camera(*_ICL_NUIM_INTRINSICS), 5000.0, signs=()
+        _icl_nuim_frames, "depth", lambda folder: _ICL_NUIM_CAMERA, 5000.0, signs=()
     ),
     "scannet": FrameLayout(
         _named_frames("depth/*", "color/*", "pose/*.txt"),
@@ -337,7 +326,7 @@ FRAME_LAYOUTS = {
     "7-scenes": FrameLayout(
         _DOTTED_FRAMES,
         "frame-*.depth.png",
-        _fixed_camera(*_SEVEN_SCENES_INTRINSICS),
+        lambda folder: _SEVEN_SCENES_CAMERA,
         1000.0,
         locations=("", "*/", "*/*/"),
     ),

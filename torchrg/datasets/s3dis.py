@@ -40,7 +40,6 @@ CLASS_ORDERS = {
 }  # fmt: skip
 """Class names by index, in the order of Pointcept, MMDetection3D and PointNet, and in the order of
 Superpoint Transformer and KPConv."""
-_OTHER_CLASS = "clutter"
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms per area in the release, 272 in all."""
 ANNOTATIONS = "Annotations"
@@ -181,7 +180,7 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
     classes = class_names(class_order)
     objects, notes = _list_room(path)
     coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
-    numbers = [classes.index(name if name in classes else _OTHER_CLASS) for name, _ in objects]
+    numbers = [classes.index(name if name in classes else "clutter") for name, _ in objects]
     notes += [f"{file.name} read as clutter" for name, file in objects if name not in classes]
     first: dict[bytes, str] = {}
     for (_, file), coord in zip(objects, coords, strict=True):
@@ -265,8 +264,7 @@ def read_annotation(
     table = _parse_fast(content)
     if table is None or not _are_points(table):
         table = _parse_lines(path, content, original)
-    coord = np.stack([column.astype(np.float32) for column in table[:3]], axis=1)
-    color = np.stack(table[3:], axis=1)
+    coord, color = table[:, :3].astype(np.float32), table[:, 3:]
     is_fraction = bool((color % 1).any()) and find_white(color) == 1
     return coord, color if is_fraction else np.rint(color).astype(np.uint8), repairs
 
@@ -291,26 +289,24 @@ def _restore_bits(path: Path, original: bytes) -> tuple[bytes, list[str]]:
     return content, repairs
 
 
-def _parse_fast(content: bytes) -> list[NDArray[np.float64]] | None:
+def _parse_fast(content: bytes) -> NDArray[np.float64] | None:
     """Parse lines of six numbers; None if any line differs."""
     # Arrow treats a lone CR as a line end, but it is a minus sign that lost its bit.
     if content.count(b"\r") != content.count(b"\r\n"):
         return None
     require("pyarrow", extra="text", purpose="read S3DIS")
     table = parse_numbers(content, _NUM_COLUMNS)
-    return None if table is None or len(table) == 0 else list(table.T)
+    return None if table is None or len(table) == 0 else table
 
 
-def _are_points(table: list[NDArray[np.float64]]) -> bool:
-    """Whether columns contain float32 coordinates and byte-sized colors."""
+def _are_points(table: NDArray[np.float64]) -> bool:
+    """Whether rows are float32 coordinates and byte-sized colors."""
     lows, highs = [-_MAX_COORDINATE] * 3 + [0.0] * 3, [_MAX_COORDINATE] * 3 + [255.0] * 3
-    return all(
-        bool(low <= np.rint(column.min()) and np.rint(column.max()) <= high)
-        for column, low, high in zip(table, lows, highs, strict=True)
-    )
+    low, high = np.rint([table.min(axis=0), table.max(axis=0)])
+    return bool((low >= lows).all() and (high <= highs).all())
 
 
-def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np.float64]]:
+def _parse_lines(path: Path, content: bytes, original: bytes) -> NDArray[np.float64]:
     """Parse line by line; an error names the first line that is not a point."""
     rows: list[list[float]] = []
     for number, line in enumerate(content.split(b"\n"), start=1):
@@ -319,12 +315,8 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np
         if not words:
             continue
         row = [float(word) for word in words if _NUMBER.fullmatch(word)]
-        if (
-            len(words) != _NUM_COLUMNS
-            or len(row) != _NUM_COLUMNS
-            or b"\r" in text
-            or not _are_points([np.array([x]) for x in row])
-        ):
+        is_row = len(words) == len(row) == _NUM_COLUMNS and b"\r" not in text
+        if not is_row or not _are_points(np.array([row])):
             shown = original.split(b"\n")[number - 1].removesuffix(b"\r")
             shown = shown if len(shown) <= 80 else shown[:77] + b"..."
             raise FormatError(
@@ -336,4 +328,4 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> list[NDArray[np
         raise FormatError(
             f"{path}: expected at least one point, got none; the file may be corrupt."
         )
-    return list(np.array(rows).T)
+    return np.array(rows)

@@ -412,12 +412,8 @@ def _groups(
         ids = {(key, entries[key]) for key in ("id", "objectId") if key in entries}
         repeated += [numbers[0]] if seen & ids else []
         seen |= ids
-        yield (
-            label,
-            numbers,
-            member_ids.tolist(),
-            np.flatnonzero(np.isin(vertex_segments, member_ids)),
-        )
+        rows = np.flatnonzero(np.isin(vertex_segments, member_ids))
+        yield label, numbers, member_ids.tolist(), rows
     _warn_entries(path, "objects share an ID with an earlier one and are merged into it", repeated)
 
 

@@ -110,9 +110,8 @@ def join_strips(
     joins &= ~torch.isin(face, strip[joins])
     if not bool(joins.any()):
         return labels
-    highest = contacts.new_zeros(num_regions).scatter_reduce(
-        0, strip[joins], contacts[joins], "amax"
-    )
+    highest = contacts.new_zeros(num_regions)
+    highest = highest.scatter_reduce(0, strip[joins], contacts[joins], "amax")
     joins &= contacts == highest[strip]
     unchanged = torch.arange(num_regions, device=labels.device)
     target = torch.where(highest > 0, num_regions, unchanged)

@@ -19,33 +19,24 @@ from torchrg.robust.scale import MAD_FACTOR
 
 _FORWARD_STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
 """Row and column steps to the adjacent pixels that come later."""
-
 _ALL_STEPS = (*_FORWARD_STEPS, *((-down, -right) for down, right in _FORWARD_STEPS))
-
 _NUM_PASSES = 2
 """Passes of boundary assignment and merging: assigned pixels may make regions adjacent."""
-
 _ASSIGN_REACH = 3.0
 """Maximum distance of a pixel to the plane of the adjacent flat region, in standard deviations of
 the noise: 99.7 % of its pixels are within."""
-
 _MERGE_TOLERANCE = 1.2
 """Maximum ratio of the RMS distances to the joint plane and to the own plane of two merged flat
 regions, as for clouds; see :class:`torchrg.config.GrowingConfig`."""
-
 _MAX_NOISE = 3.0
 """Maximum thickness of a planar region in units of the noise, regardless of its bend."""
-
 _MAX_BEND = 0.03
 """Maximum thickness of a planar region as a fraction of its extent, regardless of the noise. A
 slightly bent surface is one plane; a column is 0.4 of its extent thick."""
-
 _NUM_FITS = 2
 """Fits of a region's plane, a plain and a reweighted one: its pixels are already near the plane."""
-
 _MAX_MOVES = 16
 """Maximum displacement of a boundary, in pixels: windows hardly reach farther from their center."""
-
 _MIN_COSINE = 0.85
 """Minimum cosine of the angle between a step perpendicular to a crease and one that counts."""
 

@@ -98,9 +98,8 @@ class PixelPlanes(NamedTuple):
             parts.append(torch.cat([torch.full_like(grid, SIDE * size), grid]))
         for sides in NARROW:
             middles = torch.stack([self.pixels // width, self.pixels % width]).to(dtype).cpu()
-            parts.append(
-                torch.cat([middles.new_tensor(sides)[:, None].expand_as(middles), middles])
-            )
+            lengths = middles.new_tensor(sides)[:, None].expand_as(middles)
+            parts.append(torch.cat([lengths, middles]))
         windows = torch.cat(parts, dim=1).to(index.device)[:, self.choice.window.flatten()[index]]
         return windows[:2], windows[2:]
 
@@ -218,12 +217,11 @@ def rate_windows(
 def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
     """Return the RMS deviation of the half-size windows that cover each window."""
     height, width = shape
-    corner = SIDE
-    padded = deviation.new_full((2 * height + corner, 2 * width + corner), torch.inf)
+    padded = deviation.new_full((2 * height + SIDE, 2 * width + SIDE), torch.inf)
     padded[REACH : REACH + deviation.shape[0], REACH : REACH + deviation.shape[1]] = deviation
     squares, count = deviation.new_zeros(shape), deviation.new_zeros(shape)
-    for row in (0, corner):
-        for column in (0, corner):
+    for row in (0, SIDE):
+        for column in (0, SIDE):
             quarter = padded[row : row + 2 * height : 2, column : column + 2 * width : 2]
             counted = quarter.isfinite()
             squares += torch.where(counted, quarter * quarter, 0.0)

@@ -7,7 +7,6 @@ from torchrg import kernels
 from torchrg._parallel import allowed_threads, map_tasks, split_rows
 
 _CPU = torch.device("cpu")
-
 _MIN_ROWS = 32
 """Minimum number of rows per thread that outweighs its start."""
 

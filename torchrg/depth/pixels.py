@@ -15,7 +15,6 @@ from torchrg.linalg import deg_to_sq_chord, sq_chords
 _WIDE_ANGLE_FACTOR = 1.75
 """Factor of the maximum angle between the normals of two windows that both contain both pixels. On
 a column, large windows turn by more than the angle from one cell to the next."""
-
 _MAX_SLOPE_NOISE = 1.0
 """Maximum slope difference, in standard deviations, of two windows that both contain both pixels,
 at any angle. The small windows of a narrow surface turn by noise alone."""

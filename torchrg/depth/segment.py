@@ -88,10 +88,7 @@ def segment_depth(
     intrinsics = read_intrinsics("segment_depth", intrinsics, depth)
     intrinsics = intrinsics[0] if intrinsics.shape[:-2] == (1,) else intrinsics
     check_shapes(
-        "segment_depth",
-        depth=(depth, "H W"),
-        intrinsics=(intrinsics, "3 3"),
-        pose=(pose, "4 4"),
+        "segment_depth", depth=(depth, "H W"), intrinsics=(intrinsics, "3 3"), pose=(pose, "4 4")
     )
     check_rigid("segment_depth", "pose", pose)
     check_view("segment_depth", intrinsics, (depth.shape[1], depth.shape[0]))

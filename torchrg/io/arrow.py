@@ -27,11 +27,6 @@ def parse_numbers(
     Returns:
         The numbers, shape ``(N, num_columns)``. None if a line contains anything else, valid or
         not, or if pyarrow is not installed.
-
-    Example:
-        >>> table = parse_numbers(b"0 1.5 -2\n3 4 1e3\n", 3)
-        >>> table is None or table.tolist() == [[0, 1.5, -2], [3, 4, 1000]]
-        True
     """
     try:
         arrow, csv = map(importlib.import_module, ("pyarrow", "pyarrow.csv"))

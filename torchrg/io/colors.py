@@ -33,10 +33,6 @@ def find_white(color: Array) -> int:
 
     Args:
         color: Real numbers of any type and shape, without NaN.
-
-    Example:
-        >>> find_white(np.array([0.2, 0.9, 1.3])), find_white(np.array([0.0, 1.0, 200.0]))
-        (1, 255)
     """
     if color.dtype.itemsize == 1 and color.dtype.kind in "ub":
         return BYTE if color.dtype.kind == "u" else 1
@@ -67,13 +63,6 @@ def read_colors(
         limits: Minimum and maximum of each channel, shape ``(2, 3)``, if the file states them.
             Default: 0 and :func:`find_white`.
         error: Exception class to raise if more than a few values fit no range.
-
-    Example:
-        >>> colors, notes = read_colors("a.ply", np.array([[0.5, 0.2, 1.0000001]]))
-        >>> colors.tolist(), notes
-        ([[128, 51, 255]], ())
-        >>> read_colors("a.ply", np.array([[0.5, 0.2, 0.1], [0.5, 0.2, 1.3]]))[1]
-        ('color values beyond 0..1 are clipped: 1 of 6',)
     """
     notes, dtype, white = list[str](), color.dtype, None
     if dtype.kind not in "fiub" or color.shape[-1:] != (3,):
@@ -152,14 +141,7 @@ def _range_notes(color: Array, white: int) -> list[str]:
 
 
 def narrow_colors(color: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Round colors to uint8; :func:`find_white` chooses their range.
-
-    Example:
-        >>> narrow_colors(np.array([128, 385, 65535], np.uint16)).tolist()
-        [0, 1, 255]
-        >>> narrow_colors(np.array([128, 129, 255], np.uint16)).tolist()
-        [128, 129, 255]
-    """
+    """Round colors to uint8; :func:`find_white` chooses their range."""
     if color.dtype == np.uint8 or color.size == 0:
         return color.astype(np.uint8, copy=False)
     return _scale_to_bytes(color, find_white(color))

@@ -42,10 +42,9 @@ class FieldNames(NamedTuple):
 def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str, Values]:
     """Convert a cloud to named columns: ``x y z`` first, then its fields.
 
-    Labels become int32 if they fit, colors uint8 (or uint16 if the format supports it;
-    see :func:`torchrg.io.colors.read_colors`), booleans
-    uint8, and half precision float32. A multi-column field is split into ``name_0``,
-    ``name_1`` and so on, unless the format has ``vectors``.
+    Labels become int32 if they fit, colors uint8 (or uint16 if the format supports it), booleans
+    uint8, and half precision float32. A multi-column field is split into ``name_0``, ``name_1`` and
+    so on, unless the format has ``vectors``.
     """
     columns: dict[str, Values] = {axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")}
     for name, values in cloud.fields.items():
@@ -134,10 +133,6 @@ def narrow_integers(values: Values, codes: Collection[str]) -> Values:
     """Convert 64-bit integers to the first type of ``codes`` that holds them all.
 
     Values that fit none of these types, and values of other dtypes, are unchanged.
-
-    Example:
-        >>> narrow_integers(np.array([0, 2**31]), ("i4", "u4")).dtype
-        dtype('uint32')
     """
     if not _is_64_bit(values):
         return values

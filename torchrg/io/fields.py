@@ -97,9 +97,11 @@ def assemble_cloud(
         name: _stack(path, [remaining[column] for column in parts])
         for name, parts in sources.items()
     }
-    for name, check in (("labels", _convert_labels), ("normals", _convert_normals)):
-        if name in fields:
-            fields[name] = check(path, fields[name])
+    if "labels" in fields:
+        fields["labels"] = _convert_labels(path, fields["labels"])
+    if "normals" in fields:
+        fields["normals"] = _convert_normals(path, fields["normals"])
+
     if "color" in fields:
         color = fields["color"]
         if set(integers).issuperset(sources["color"]) and are_integers(color):
@@ -166,12 +168,7 @@ def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) 
 
 
 def backup_name(name: str) -> str:
-    """Return the backup name of a cloud field that a result replaces.
-
-    Example:
-        >>> backup_name("labels"), backup_name("normals")
-        ('label_input', 'normals_input')
-    """
+    """Return the backup name of a cloud field that a result replaces."""
     return f"{'label' if name == 'labels' else name}_input"
 
 
@@ -182,12 +179,6 @@ def add_result_fields(
 
     A field with the name of a result is renamed as :func:`backup_name` returns. If that name is
     taken, the cloud is itself a result; then the input field is kept and the result is replaced.
-
-    Example:
-        >>> first = add_result_fields({"labels": np.array([7])}, {"labels": np.array([0])})
-        >>> again = add_result_fields(first, {"labels": np.array([1])})
-        >>> {name: values.tolist() for name, values in again.items()}
-        {'label_input': [7], 'labels': [1]}
     """
     unchanged = {name: values for name, values in fields.items() if name not in results}
     backups = {backup_name(name): fields[name] for name in results if name in fields}
@@ -320,17 +311,12 @@ def _convert_labels(path: Path, labels: Values) -> NDArray[np.int64]:
 
 def _convert_normals(path: Path, normals: Values) -> NDArray[np.floating]:
     """Convert normals to float32 or float64, shape ``(N, 3)``."""
-    _check_triples(path, "normals", normals)
-    return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
-
-
-def _check_triples(path: Path, name: str, values: Values) -> None:
-    """Check that a field has three real numbers per point."""
-    if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
+    if normals.shape[1:] != (3,) or normals.dtype.kind not in "fiu":
         raise FormatError(
-            f"{path}: expected {name} of shape (N, 3), got shape {_row_shape(values)} "
-            f"of {values.dtype}; rename or remove that field."
+            f"{path}: expected normals of shape (N, 3), got shape {_row_shape(normals)} "
+            f"of {normals.dtype}; rename or remove that field."
         )
+    return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
 
 
 def _row_shape(values: Values) -> str:

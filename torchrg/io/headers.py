@@ -18,14 +18,7 @@ extent. Programs round the box."""
 
 
 def check_grid(path: Path, what: str, scales: ArrayLike, offsets: ArrayLike) -> None:
-    """Check that a scale and offset keep integers distinct and within range.
-
-    Example:
-        >>> check_grid(Path("a.las"), "x, y, z", [0.1, 0.1, 0], [7, 7, 7])  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.FormatError: a.las: expected a scale and offset of x, y, z that ...
-    """
+    """Check that a scale and offset keep integers distinct and within range."""
     scale, offset = np.abs(np.array([scales, offsets], np.float64))
     min_extent = np.maximum(np.spacing(offset), _MIN_EXTENT)
     is_grid = (scale * MAX_INTEGER >= min_extent) & (scale <= FARTHEST) & (offset <= FARTHEST)
@@ -49,10 +42,6 @@ def distance_outside(
         high: Maximum coordinates, shape ``(3,)``.
         box: Minimum and maximum coordinates by the header, shape ``(2, 3)``.
         step: Step of the coordinates.
-
-    Example:
-        >>> distance_outside([0, 0, 0], [1, 1, 1], [[0, 0, 0], [1, 1, 0.5]])
-        0.5
     """
     # Programs that compute no box write zeros.
     if not np.isfinite(box).all() or not np.any(box):

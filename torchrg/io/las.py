@@ -10,6 +10,7 @@ import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
@@ -20,7 +21,7 @@ from torchrg._optional import require
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN
 from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
-from torchrg.io.fields import Columns, Values, assemble_cloud
+from torchrg.io.fields import Columns, Values, assemble_cloud, check_coordinates
 from torchrg.io.files import (
     PARSE_ERRORS,
     atomic_path,
@@ -54,8 +55,8 @@ _POINTWISE, _MAX_LAZ_VERSION = 1, 3
 _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
 """Offsets in LASzip's record of the chunk size in points, and of the number of items. An item is a
 type, a size and a version."""
-_STORAGE_USER_IDS = ("laszip encoded", "copc")
-"""User IDs of the records that describe how points are stored."""
+_PARAMETERS = attrgetter("name", "dtype", "description", "offsets", "scales", "no_data")
+"""Parameters of an extra dimension, in laspy's order."""
 _UNDOCUMENTED = "Un-registered ExtraBytes"
 """Description that laspy gives to undocumented extra bytes."""
 _RANGE_BITS = 0b110
@@ -81,10 +82,7 @@ def read_las(path: Path, size: int) -> Cloud:
     _check_header(path, size)
     with _open_reader(laspy, path) as reader:
         header = reader.header
-        if header.point_count == 0:
-            raise FormatError(
-                f"{path}: expected at least one point, got none; check the source of the file."
-            )
+        check_coordinates(path, (header.point_count, 3), np.dtype(np.float64))
         check_grid(path, "x, y, z", header.scales, header.offsets)
         for dimension in header.point_format.extra_dimensions:
             if dimension.is_scaled:
@@ -94,7 +92,7 @@ def read_las(path: Path, size: int) -> Cloud:
         parts = list(map(_chunk_columns, reader.chunk_iterator(_POINTS_PER_CHUNK)))
     # Compression does not matter for the cloud, and laspy cannot write an octree.
     for records in (header.vlrs, header.evlrs or []):
-        records[:] = [r for r in records if r.user_id not in _STORAGE_USER_IDS]
+        records[:] = [r for r in records if r.user_id not in ("laszip encoded", "copc")]
     standard = set(header.point_format.standard_dimension_names)
     names = list(parts[0])
     unused = {n for n in names if n in standard and not any(chunk[n].any() for chunk in parts)}
@@ -248,15 +246,8 @@ def _add_dimensions(
     dimensions, params = dict[str, Values](), list[Any]()
     for extra in _input_dimensions(cloud.header.get("las"), columns):
         if extra.holds(columns):
-            dimension = extra.dimension
-            more = (
-                dimension.description,
-                dimension.offsets,
-                dimension.scales,
-                dimension.no_data,
-            )
-            params.append(laspy.ExtraBytesParams(dimension.name, dimension.dtype, *more))
-            dimensions[dimension.name] = extra.join(columns)
+            params.append(laspy.ExtraBytesParams(*_PARAMETERS(extra.dimension)))
+            dimensions[extra.dimension.name] = extra.join(columns)
             columns = {name: c for name, c in columns.items() if name not in extra.columns}
     standard = set(header.point_format.dimension_names)
     for name, column in columns.items():

@@ -30,7 +30,6 @@ _ENCODINGS = ("ascii", "binary", "binary_compressed")
 DEFAULT_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and quaternion w x y z of the sensor."""
 _FIELD_NAMES = FieldNames(normals=("normal_x", "normal_y", "normal_z"), vectors=True)
-_PACKED_COLORS = ("rgb", "rgba")
 _MAX_LZF_RATIO = 88
 """Maximum bytes per byte of LZF data: three bytes refer to at most 264."""
 
@@ -246,10 +245,8 @@ def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Valu
         (name, "f8" if _is_padding(name) else header.dtype[name].base, header.dtype[name].shape)
         for name in header.dtype.names or ()
     ]
-    line_number = header.num_lines + 1
-    return read_rows(
-        path, stream, np.dtype(parts), header.num_points, "points", line_number=line_number
-    )
+    dtype, number = np.dtype(parts), header.num_lines + 1
+    return read_rows(path, stream, dtype, header.num_points, "points", line_number=number)
 
 
 def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
@@ -301,7 +298,7 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
 
 def _unpack_color(name: str, values: Values) -> dict[str, Values]:
     """Split a packed color into channels; return any other field unchanged."""
-    if name.lower() not in _PACKED_COLORS or values.ndim != 1 or values.dtype.itemsize != 4:
+    if name.lower() not in ("rgb", "rgba") or values.ndim != 1 or values.dtype.itemsize != 4:
         return {name: values}
     channels = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
     # Little-endian order: blue, green, red, alpha.

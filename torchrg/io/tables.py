@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError, warn
+from torchrg.io.colors import BYTE, WORD
 
 Table = NDArray[Any]
 """Numbers of shape ``(N, C)``."""
-_TRIPLES = _NORMAL, _COLOR = ("nx", "ny", "nz"), ("red", "green", "blue")
+_NORMAL, _COLOR = ("nx", "ny", "nz"), ("red", "green", "blue")
 """Names of three columns whose meaning their values show."""
-_BYTE, _WORD = 255, 65535
-"""Maximum of an 8-bit and of a 16-bit channel."""
 _MAX_COLUMNS = 15
 """Maximum number of unnamed columns. Programs write up to a dozen values per point; more columns
 mean features, a transposed table, or cameras such as LLFF's 17 numbers."""
@@ -37,14 +36,7 @@ _NAME_THEM = "name the columns with --columns"
 
 
 def check_table(path: Path, table: Table) -> None:
-    """Raise FormatError if an unnamed table is no point cloud: cameras, poses, or transposed.
-
-    Example:
-        >>> check_table(Path("k.txt"), np.array([[525, 0, 320], [0, 525, 240], [0, 0, 1]]))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.FormatError: k.txt: expected points, got a 3 x 3 camera matrix; pass the ...
-    """
+    """Raise FormatError if an unnamed table is no point cloud: cameras, poses, or transposed."""
     num_rows, num_columns = table.shape
     if num_columns > _MAX_COLUMNS:
         raise FormatError(
@@ -98,10 +90,6 @@ def guess_column_names(table: Table, *, color_last: bool = False) -> list[str]:
 
     Columns of small integers may mean ``intensity red green blue`` or ``red green blue label``. The
     values cannot distinguish the two unless one is constant, so they stay numbered.
-
-    Example:
-        >>> guess_column_names(np.array([[0.5, 0.5, 0.5, -1640.0, 255.0, 128.0, 0.0]]))
-        ['x', 'y', 'z', 'intensity', 'red', 'green', 'blue']
     """
     num_columns = table.shape[1]
     names = ["x", "y", "z", *(f"column_{i}" for i in range(4, num_columns + 1))]
@@ -127,16 +115,17 @@ def _guess_triple(three: Table) -> tuple[str, str, str] | None:
     """Return names for three columns, shape ``(n, 3)``, if they can be a normal or a color."""
     if _are_units(three):
         return _NORMAL
-    is_color = three.size == 0 or (
-        three.min() >= 0 and three.max() <= _BYTE and are_integers(three)
-    )
-    return _COLOR if is_color else None
+    return _COLOR if _is_color(three, BYTE) else None
 
 
 def _is_wide_color(three: Table) -> bool:
     """Whether three columns can be a 16-bit color with every channel above the 8-bit maximum."""
-    in_range = three.min() >= 0 and three.max() <= _WORD and three.max(axis=0).min() > _BYTE
-    return bool(in_range) and are_integers(three)
+    return bool(three.max(axis=0).min() > BYTE) and _is_color(three, WORD)
+
+
+def _is_color(three: Table, white: int) -> bool:
+    """Whether three columns are integers from 0 to ``white``."""
+    return bool(three.min() >= 0 and three.max() <= white) and are_integers(three)
 
 
 def warn_about_counters(path: Path, table: Table, names: Sequence[str]) -> None:
@@ -146,8 +135,8 @@ def warn_about_counters(path: Path, table: Table, names: Sequence[str]) -> None:
     """
     if len(table) < _MIN_COUNTED or len(names) < 4:
         return
-    meanings = {*_TRIPLES[0], *_TRIPLES[1]}
-    unknown = [i for i, name in enumerate(names) if name not in meanings]
+    unknown = [i for i, name in enumerate(names) if name not in (*_NORMAL, *_COLOR)]
+
     counting = [i for i in unknown if _only_rises(table[:, i])]
     whole = [i for i in counting if are_integers(table[:, i])]
     others = [i for i in unknown if i not in counting]

@@ -121,7 +121,8 @@ def read_rows(
 ) -> Values:
     """Read rows of a structured type from an ASCII file, starting at ``line_number``.
 
-    ``content`` names the rows in messages.
+    ``content`` names the rows in messages. Blank lines are ignored, and no more lines are read than
+    needed.
     """
     # A digit and a separator per number; the last separator may be missing.
     min_bytes, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
@@ -129,7 +130,18 @@ def read_rows(
     content = f"{num_rows:,} {content}"
     check_available(path, start, min_bytes, content, available=available, at_least=True)
     lines = (_standardize(raw.decode("latin-1")) for raw in stream)
-    return _read_table(path, lines, dtype, line_number, num_rows)
+    parts, count = [np.empty(0, dtype)], 0
+    while count < num_rows:
+        block = list(islice(lines, min(LINES_PER_CHUNK, num_rows - count)))
+        if not block:
+            raise FormatError(
+                f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got "
+                f"{count:,}; the file is truncated or its header is wrong, write or copy it again."
+            )
+        parts.append(_parse(path, block, dtype, line_number))
+        count += len(parts[-1])
+        line_number += len(block)
+    return np.concatenate(parts)
 
 
 def _standardize(text: str) -> str:
@@ -146,36 +158,16 @@ def skip_lines(stream: BinaryIO, count: int) -> int:
     return passed
 
 
-def _read_table(
-    path: Path, lines: Iterator[str], dtype: np.dtype[Any], line_number: int, num_rows: int
-) -> Values:
-    """Read rows of numbers, ignoring blank lines.
-
-    No more lines are read than needed; ``line_number`` is the number of the first one.
-    """
-    parts, count = [np.empty(0, dtype)], 0
-    while count < num_rows:
-        block = list(islice(lines, min(LINES_PER_CHUNK, num_rows - count)))
-        if not block:
-            raise FormatError(
-                f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got "
-                f"{count:,}; the file is truncated or its header is wrong, write or copy it again."
-            )
-        parts.append(_parse(path, block, dtype, line_number))
-        count += len(parts[-1])
-        line_number += len(block)
-    return np.concatenate(parts)
-
-
 def _parse_blocks(path: Path, stream: TextIO, preamble: "_Preamble") -> Iterator[Values]:
     """Yield tables of the first point and of the lines that follow it in a stream."""
     dtype = np.dtype([("row", "f8", (preamble.num_columns,))])
     line, number = preamble.line, preamble.line_number
+    skipped = [i for i, name in enumerate(preamble.names or ()) if name == SKIPPED]
     while block := line + _standardize(stream.read(CHARACTERS_PER_READ) + stream.readline()):
         table = parse_numbers(block.encode(), preamble.num_columns, *preamble.dialect)
         if table is None:
             lines = _extract_counts(block.split("\n"), preamble.counts)
-            table = _parse(path, lines, dtype, number, preamble.dialect, preamble.skipped)["row"]
+            table = _parse(path, lines, dtype, number, preamble.dialect, skipped)["row"]
         yield table
         line, number = "", number + block.count("\n")
 
@@ -289,11 +281,6 @@ class _Preamble(NamedTuple):
         """Indices of columns that are integers in the first point."""
         words = self.dialect.split(self.line.split(_COMMENTS[0])[0])
         return [i for i, word in enumerate(words) if word.removeprefix("-").isdecimal()]
-
-    @property
-    def skipped(self) -> list[int]:
-        """Indices of skipped columns."""
-        return [i for i, name in enumerate(self.names or ()) if name == SKIPPED]
 
 
 def _read_preamble(path: Path, lines: Iterable[str], columns: Sequence[str] | None) -> _Preamble:
