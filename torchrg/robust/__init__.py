@@ -3,7 +3,7 @@
 Breakdown points are measured by ``python scripts/bench.py breakdown``. All estimators tolerate
 distant outliers, and outliers in a shell around the patch, up to 45 % except DetMM. A compact
 cluster of 30 % breaks DetMCD, DetS and DetMM, whose published starts use the coordinate axes.
-FastMCD tolerates it, and :func:`fit_detmcd` with ``starts="planes"`` even 45 % beside a flat patch
+FastMCD tolerates it, and :func:`fit_detmcd` with ``starts="planes"`` even 45 % near a flat patch
 of three coordinates, where FastMCD finds a determinant smaller than that of the plane: 22
 coinciding points and five others. ``starts="planes"`` and :func:`fit_mve` are for such patches;
 use the default starts for points of more coordinates.

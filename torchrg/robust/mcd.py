@@ -128,7 +128,7 @@ def fit_detmcd(
         starts: ``"paper"``: sets of ceil(K / 2) points, as published. ``"robustbase"``: of h
             points, as in R. ``"planes"``: the h points nearest to the best four of 64 planes
             through P points; a third of the cost, rotation invariant, and robust against clusters
-            beside flat patches of P = 3. Other data break it: if a fifth of 50 normal points shifts
+            near flat patches of P = 3. Other data break it: if a fifth of 50 normal points shifts
             by 10 in each coordinate, 7 % of the fits at P = 3; at P = 10 most if the axes differ.
             ``"more"``: these, 24 fixed random sets of P + 1 points, and subsets of the best sets
             found so far. It reaches the best known minimum in 47 of 53 reference patches,
