@@ -390,3 +390,10 @@ def test_superpoints_of_numbers_beyond_that_of_points_are_numbered_anew(tmp_path
     found = torchrg.read_result(tmp_path / "a.npz").superpoints
     assert found.labels.tolist() == numbers.tolist()
     assert len(found.plane) == numbers.max() + 1
+
+
+def test_planes_of_labels_without_normals_are_flat():
+    cloud = Cloud(
+        np.random.default_rng(0).random((60, 3)) * [1, 0, 1], {"labels": np.zeros(60, int)}
+    )
+    assert Result(cloud).planes.curved.tolist() == [False]

@@ -1,8 +1,11 @@
 """Borders of regions move to the lines where their planes meet."""
 
+from collections import Counter
+
+import numpy as np
 import torch
 
-from torchrg.depth.growth import InverseCloud, move_to_creases
+from torchrg.depth.growth import InverseCloud, PixelGrid, move_to_creases
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import fit_planes
 
@@ -77,3 +80,16 @@ def test_unlabelled_pixels_and_whole_images_stay():
     assert bool((back[10:20] == -1).all())
     one = torch.zeros_like(truth)
     assert torch.equal(move(surface, one, truth=truth, reach=[0.1, 0.1]), one)
+
+
+def test_contacts_are_those_of_each_pixel_with_its_eight_neighbors():
+    labels = torch.randint(-1, 3, (9, 7), generator=torch.Generator().manual_seed(0))
+    expected = Counter()
+    for row, column in np.ndindex(9, 7):
+        for down, right in np.ndindex(3, 3):
+            other = row + down - 1, column + right - 1
+            if 0 <= other[0] < 9 and 0 <= other[1] < 7:
+                pair = sorted((int(labels[row, column]), int(labels[other])))
+                expected[tuple(pair)] += pair[0] >= 0 and pair[0] != pair[1]
+    pairs, counts = PixelGrid(labels.shape).contacts(labels.flatten())
+    assert dict(zip(map(tuple, pairs.tolist()), counts.tolist(), strict=True)) == +expected

@@ -360,6 +360,7 @@ def test_scales_of_extra_dimensions_are_checked(described, value):
         ([(155, "<d", 7.0), (163, "<d", 5e5)], "its points lie up to .* outside the box in its"),
         ([(219, "<d", np.nan)], None),
         ([(place, "<d", 0.0) for place in range(179, 227, 8)], None),
+        ([(place, "<I", 0) for place in range(111, 131, 4)], None),  # many programs count none
         ([(111, "<I", 99)], r"its header counts 50 points, but \d+ returns"),
     ],
 )
@@ -526,3 +527,20 @@ def test_missing_package_is_named(tmp_path, monkeypatch):
         read_cloud(tmp_path / "a.las")
     with pytest.raises(MissingDependencyError, match=r"pip install 'torchrg\[las\]'"):
         check_output(tmp_path / "a.laz")
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_new_file_does_not_name_the_day_on_which_it_was_written(tmp_path, suffix):
+    path = tmp_path / f"new{suffix}"
+    write_cloud(path, Cloud(np.random.default_rng(0).random((9, 3))))
+    assert path.read_bytes()[90:94] == bytes(4)
+
+
+def test_extended_records_come_out_again(tmp_path, scanned):
+    source, copy = scanned(7, "1.4"), tmp_path / "copy.las"
+    data = laspy.read(source)
+    data.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("own", 7, "a note", b"content")])
+    data.write(source)
+    write_cloud(copy, read_cloud(source))
+    (record,) = laspy.read(copy).evlrs
+    assert (record.user_id, record.record_id, record.record_data_bytes()) == ("own", 7, b"content")

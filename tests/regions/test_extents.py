@@ -106,3 +106,15 @@ def test_a_circle_of_many_corners_takes_no_square_of_them():
     angle = np.linspace(0, 2 * np.pi, 20_001)[:-1]
     sides = rectangles(np.stack([np.cos(angle), np.sin(angle)], axis=1)).sides
     torch.testing.assert_close(sides, torch.full((1, 2), 2.0).double(), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ties_go_to_the_smallest_angle_whatever_rounding_says(seed):
+    # The rectangles along the three edges of a hexagon have one area.
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0.01, math.radians(29))
+    hexagon = np.array([[math.cos(turn), math.sin(turn)] for turn in np.arange(6) * math.pi / 3])
+    places = turned(hexagon, angle)[rng.permutation(6)]
+    boxes = rectangles(places + rng.normal(size=2))
+    along = torch.atan2(boxes.directions[0, :, 1], boxes.directions[0, :, 0]) % (math.pi / 2)
+    np.testing.assert_allclose(along, angle, atol=1e-9)

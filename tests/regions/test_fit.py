@@ -10,7 +10,7 @@ from tests.regions.test_repair import OFF, flat_cloud, scattered, sheet, with_se
 from tests.regions.test_splits import CONFIG, bumpy
 from torchrg import segment_planes
 from torchrg.linalg.moments import Segments
-from torchrg.regions.fit import RegionFits, fit_planes, fit_regions
+from torchrg.regions.fit import RegionFits, canonicalize_sign, fit_planes, fit_regions
 
 
 def test_planes_are_fitted_again_only_when_labels_have_changed():
@@ -21,6 +21,24 @@ def test_planes_are_fitted_again_only_when_labels_have_changed():
     assert fits.get(labels.clone()) is planes
     other = (cloud.points[:, 0] > 0.6).long()
     assert torch.equal(fits.get(other).center, fit_regions(cloud, other, OFF).center)
+
+
+def test_an_arc_without_width_is_curved_although_it_lies_in_a_plane():
+    turn = torch.linspace(0, 1.5, 200, dtype=torch.float64)
+    normals = torch.stack([turn.sin(), 0 * turn, turn.cos()], dim=1)
+    fit = fit_planes(Segments(torch.zeros(200, dtype=torch.int64)), 2 * normals, normals)
+    assert fit.normal.abs()[0].tolist() == pytest.approx([0, 1, 0])
+    assert fit.thickness.item() < 1e-9
+    assert fit.curved.tolist() == [True]
+
+
+@pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-9])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_last_of_the_largest_components_is_positive_within_rounding(rounding, sign):
+    normals = torch.tensor([[1, -1, 0], [-1, 0.5, 1], [1, 1, -1], [-1, 0.9, 0.9]]).double()
+    expected = torch.tensor([-1.0, 1, -1, -1])
+    moved = sign * (normals + torch.tensor([rounding, 0, 0]).double())
+    assert torch.equal(canonicalize_sign(moved), expected[:, None] * sign * moved)
 
 
 def test_planes_of_large_regions_are_those_of_all_their_points():

@@ -171,3 +171,20 @@ def test_wrong_shapes_are_refused():
         grow_regions(points.float(), normals, curvature, neighbors)
     with pytest.raises(ShapeError, match="expected valid of bool"):
         grow_regions(points, normals, curvature, neighbors, valid=curvature)
+
+
+def test_residuals_within_rounding_do_not_limit_the_reach(rng):
+    # An exact plane: what its points are off by says nothing of its noise.
+    points = torch.rand(200, 3, generator=rng, dtype=torch.float64)
+    points[:, 2] = 1e-9 * torch.randn(200, generator=rng)
+    normals = torch.eye(3, dtype=torch.float64)[[2] * 200]
+    config = papers_growing(**{**vars(CLASSIC), "plane_reach": 4.0})
+    labels = grow_regions(
+        points,
+        normals,
+        torch.zeros(200, dtype=torch.float64),
+        search_knn(points, 12),
+        config,
+        residual_rms=torch.full((200,), 1e-12, dtype=torch.float64),
+    )
+    assert labels.unique().tolist() == [0]

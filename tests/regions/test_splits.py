@@ -226,3 +226,13 @@ def test_a_point_between_two_levels_counts_for_the_first():
         lists = KnnAdjacency(Neighbors(place[near.indices.long()[rows]]))
         found = _have_valleys(level[rows], step, average[rows], region, lists)
         assert found.tolist() == [False, True]
+
+
+def test_a_level_on_a_level_is_found_in_the_second_search():
+    points, on_board = wall_with_board(np.random.default_rng(14), 0.02, count=12_000)
+    on_frame = (np.abs(points[:, 0] - 1) < 0.12) & (np.abs(points[:, 1] - 0.5) < 0.12)
+    points[on_frame, 2] += 0.03
+    labels = split(points)
+    assert labels.max() == 2
+    kinds = on_board.astype(int) + on_frame
+    assert min(max(iou(labels == n, kinds == kind) for n in range(3)) for kind in range(3)) > 0.9

@@ -256,3 +256,36 @@ def test_rounding_does_not_decide_the_sign_of_a_normal():
             unit * flat, truth.expand(200, 3), torch.zeros(200, dtype=torch.int64)
         )
         assert torch.allclose(planes.normal[0], truth, atol=1e-9)
+
+
+def test_copies_count_in_the_number_of_points_alone():
+    points, turn = rectangle(np.random.default_rng(14), 300, 4.0, 1.5, noise=0.01)
+    normals = turn[:, 2].expand(300, 3)
+    once = summarize_planes(points, normals, one_region(points))
+    crowd = torch.cat([points, points[:1].expand(200, 3)])
+    copied = summarize_planes(crowd, turn[:, 2].expand(500, 3), one_region(crowd))
+    assert (once.count.tolist(), copied.count.tolist()) == ([300], [500])
+    for name in PLANE_COLUMNS:
+        if name != "count":
+            assert torch.equal(getattr(copied, name), getattr(once, name)), name
+
+
+@pytest.mark.parametrize("canonical", [True, False])
+def test_regions_that_share_positions_have_all_of_them(canonical):
+    # Two objects at the same positions: each has the whole grid.
+    grid = torch.cartesian_prod(torch.arange(5.0), torch.arange(4.0), torch.zeros(1))
+    points = grid.repeat_interleave(2, dim=0)
+    labels, normals = torch.arange(40) % 2, torch.eye(3)[[2] * 40]
+    planes = summarize_planes(points, normals, labels, canonical=canonical)
+    assert planes.extent.tolist() == [[4.0, 3.0]] * 2
+    assert planes.centroid.tolist() == [[2.0, 1.5, 0.0]] * 2
+
+
+def test_the_centroid_is_the_mean_of_all_points_of_the_region():
+    points, turn = rectangle(np.random.default_rng(15), 500, 4.0, 1.5, noise=0.01)
+    # The fit ignores the points off the plane.
+    points[:60] += turn[:, 2] * 0.5 + turn[:, 0] * 2
+    planes = summarize_planes(points, turn[:, 2].expand(500, 3), one_region(points))
+    torch.testing.assert_close(planes.centroid[0], points.mean(dim=0))
+    others = summarize_planes(points[60:], turn[:, 2].expand(440, 3), one_region(points[60:]))
+    assert angle_deg(planes.normal[0], others.normal[0]) < 0.02

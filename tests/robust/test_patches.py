@@ -90,3 +90,15 @@ def test_a_covariance_beyond_the_largest_number_is_not_valid(estimator, dtype, r
 def test_a_fit_is_shown_in_one_line(rng):
     fit = fit_detmcd(torch.randn(2, 4, 30, 3, generator=rng))
     assert repr(fit) == "RobustFit((2, 4) patches, 30 points, 3 coordinates)"
+
+
+def test_a_raw_covariance_beyond_the_largest_number_is_not_valid(dtype, rng):
+    patches = torch.randn(40, 12, 3, generator=rng, dtype=dtype)
+    fit = fit_detmcd(patches)
+    raw, final = (m.abs().amax(dim=(1, 2)).double() for m in (fit.raw_covariance, fit.covariance))
+    row = int((raw / final).argmax())
+    assert raw[row] > 1.5 * final[row]
+    # Between both: the final covariance alone would fit.
+    scale = (torch.finfo(dtype).max / (raw[row] * final[row]).sqrt()).sqrt()
+    assert not fit_detmcd(patches[row] * float(scale)).valid
+    assert fit_detmcd(patches[row] * float(scale) / 2).valid

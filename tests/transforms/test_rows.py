@@ -168,3 +168,9 @@ def test_a_batch_with_a_list_keeps_every_cloud_in_step():
 def test_clouds_that_do_not_lie_one_after_the_other_are_refused(key, values):
     with pytest.raises(ConfigError, match=f"expected {key} to ascend"):
         CenterCloud()(sample_of(**{key: values}))
+
+
+def test_an_empty_cloud_at_the_end_of_a_batch_stays():
+    # Only PyG's ptr tells it from no cloud.
+    clouds = {"batch": np.repeat([0, 1], [25, 15]), "ptr": np.array([0, 25, 40, 40])}
+    assert KeepFinite()(sample_of(**clouds))["ptr"].tolist() == [0, 23, 38, 38]
