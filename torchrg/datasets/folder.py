@@ -393,12 +393,7 @@ def list_dir(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Return a locale-independent key for natural sorting of names with numbers.
-
-    Example:
-        >>> sorted(["chair_10.txt", "chair_2.txt", "Chair_1.txt"], key=natural_key)
-        ['Chair_1.txt', 'chair_2.txt', 'chair_10.txt']
-    """
+    """Return a locale-independent key for natural sorting of names with numbers."""
     parts = re.split(r"([0-9]+)", name)
     key: list[tuple[int, int | str]] = [
         (0, int(piece)) if piece.isdigit() else (1, piece.lower()) for piece in parts if piece

@@ -266,8 +266,7 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
     for name, image in _depth_images(folder, "results/depth*"):
         color = _color_image(folder / "results" / f"frame{name}")
-        has_row = name.isdecimal() and int(name) < len(poses)
-        pose = poses[int(name)] if has_row else None
+        pose = poses[int(name)] if name.isdecimal() and int(name) < len(poses) else None
         yield ListedFrame(name, image, color, pose, (calibration, track), camera)
 
 

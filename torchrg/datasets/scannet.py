@@ -271,10 +271,9 @@ def _warn_missing_scans(lists: Mapping[str, tuple[str, Path]], scans: set[str]) 
     """Warn if the lists contain names of missing scans."""
     missing = [name for name in lists if name not in scans]
     if missing:
-        first = missing[0]
         warn(
-            f"{lists[first][1]}: {len(missing):,} of {len(lists):,} listed scans are missing "
-            f"(first: {shortened(first)}); download them, or correct the names.",
+            f"{lists[missing[0]][1]}: {len(missing):,} of {len(lists):,} listed scans are missing "
+            f"(first: {shortened(missing[0])}); download them, or correct the names.",
         )
 
 

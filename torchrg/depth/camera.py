@@ -95,10 +95,6 @@ def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa:
 
     Warns:
         DepthWarning: If a ``PinholeCamera`` has another image size.
-
-    Example:
-        >>> read_intrinsics("f", torch.eye(4)[None], torch.zeros(2, 3)).shape
-        torch.Size([1, 3, 3])
     """
     tensor = as_tensor(caller, "intrinsics", getattr(source, "camera_matrix", source))
     tensor = tensor[..., :3, :3] if tensor.shape[-2:] == (4, 4) else tensor
@@ -254,10 +250,6 @@ class Pinhole(NamedTuple):
         Raises:
             ConfigError: If the aspect ratio of the images differs by more than a pixel, or the
                 optical axis is outside them.
-
-        Example:
-            >>> Pinhole(600.0, 600.0, 319.5, 239.5, (640, 480)).matrix((160, 120))[0].tolist()
-            [150.0, 0.0, 79.5]
         """
         fx, fy, cx, cy, calibrated, _ = self
         if size is None:
@@ -308,11 +300,10 @@ def find_intrinsics(points: Tensor) -> Tensor | None:
     seen = points.isfinite().all(dim=-1) & (points[..., 2] > 0)
     rows, columns = (indices.double() for indices in seen.nonzero().unbind(dim=1))
     x, y, z = points[seen].double().unbind(dim=1)
-    lines = [_fit_line(x / z, columns), _fit_line(y / z, rows)]
-    if any(line is None for line in lines):
+    across, down = _fit_line(x / z, columns), _fit_line(y / z, rows)
+    if across is None or down is None:
         return None
-    (fx, cx), (fy, cy) = (line for line in lines if line is not None)
-    return make_intrinsics(fx, fy, cx, cy)
+    return make_intrinsics(across[0], down[0], across[1], down[1])
 
 
 def reprojection_error(points: Tensor, intrinsics: Tensor) -> float:

@@ -120,12 +120,11 @@ def _segment(
     seen = depth > 0
     inverse = torch.where(seen, 1 / depth.double(), 0.0)
     fx, fy, cx, cy = (float(intrinsics[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    focal = (fx, fy)
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
     v = torch.arange(depth.shape[0], device=depth.device).double() - cy
     image, x, y = Image(inverse, seen, u, v), u / fx, v / fy
-    planes = fit_pixels(image, focal=focal, noise=config.noise, dtype=depth.dtype)
-    pixels = describe_pixels(image, planes, focal, config)
+    planes = fit_pixels(image, focal=(fx, fy), noise=config.noise, dtype=depth.dtype)
+    pixels = describe_pixels(image, planes, (fx, fy), config)
     joins, flat, edge = (pixels.right, pixels.down), *planes.choice[1:]
     del planes
     cloud = _inverse_cloud(image, pixels, x, y)

@@ -42,10 +42,8 @@ _BOUNDS = tuple(f"{axis}{end}" for end in ("Minimum", "Maximum") for axis in "xy
 _MAX_DEVIATION, _MAX_ROTATION = 0.01, 2.0
 """Maximum deviation of a quaternion's norm from 1 without a note, and maximum factor from 1 without
 an error. Programs round quaternions."""
-_PAGE_BYTES = 1024
-"""Page size of the standard; the last four bytes are the CRC-32C of the page."""
-_CONTENT_BYTES = 1020
-"""Bytes of a page without its checksum."""
+_PAGE_BYTES, _CONTENT_BYTES = 1024, 1020
+"""Page size of the standard, with and without the CRC-32C of the page in its last four bytes."""
 _XML_ENTRY = struct.Struct("<24xQQ")
 """File offset (counting checksums) and length of the XML, in the file header."""
 _MAX_DEPTH, _MAX_CHILDREN = 100, 1_000

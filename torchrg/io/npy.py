@@ -75,12 +75,11 @@ byte-identical."""
 def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
     """Read a ``.npy`` file; ``columns`` names the columns of an unstructured array."""
     shape, dtype = _check_npy(path, size)
-    names = dtype.names
-    if names is not None:
+    if dtype.names is not None:
         if columns is not None:
             raise FormatError(
                 f"{path}: column names apply to unstructured arrays only; this array has fields "
-                f"{', '.join(names)}. Omit the names."
+                f"{', '.join(dtype.names)}. Omit the names."
             )
         records = np.load(path, allow_pickle=False).reshape(-1)
         return assemble_cloud(path, {name: records[name] for name in records.dtype.names})

@@ -118,12 +118,7 @@ class _Header(NamedTuple):
     @property
     def field_names(self) -> list[str]:
         """Names of the fields that are not padding."""
-        return [name for name in self.dtype.names or () if not _is_padding(name)]
-
-
-def _is_padding(name: str) -> bool:
-    """Whether a field of the record type is padding; names of other fields contain no blank."""
-    return name.startswith(f"{_PADDING} ")
+        return [name for name in self.dtype.names or () if self.dtype[name].base.kind != "V"]
 
 
 def _read_header(path: Path, stream: BinaryIO) -> _Header:
@@ -154,8 +149,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
     encoding = " ".join(entries.words("DATA"))
     if encoding not in _ENCODINGS:
         raise entries.error("DATA", f"one of {', '.join(_ENCODINGS)}")
-    dtype, viewpoint = _record_type(entries), entries.viewpoint()
-    return _Header(dtype, width, height, viewpoint, encoding, number)
+    return _Header(_record_type(entries), width, height, entries.viewpoint(), encoding, number)
 
 
 class _HeaderLines(NamedTuple):
@@ -241,8 +235,9 @@ def _record_type(entries: _HeaderLines) -> np.dtype[np.void]:
 def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
     """Read the points of an ASCII file."""
     # Padding has no type in ASCII: it is COUNT words to skip.
+    fields = header.field_names
     parts = [
-        (name, "f8" if _is_padding(name) else header.dtype[name].base, header.dtype[name].shape)
+        (name, header.dtype[name].base if name in fields else "f8", header.dtype[name].shape)
         for name in header.dtype.names or ()
     ]
     dtype, number = np.dtype(parts), header.num_lines + 1

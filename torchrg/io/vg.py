@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.io.colors import read_colors
-from torchrg.io.fields import Values
 from torchrg.io.files import atomic_path
 from torchrg.structures import UNLABELED, Cloud
 
@@ -22,8 +21,7 @@ _PLANE = 0
 def write_vg(path: Path, cloud: Cloud, planes: NDArray[np.floating] | None = None) -> None:
     """Write a text file; ``planes`` ``(M, 4)`` are indexed by label, or fitted if None."""
     number = "%.9g" if cloud.coordinates.dtype == np.float32 else "%.17g"
-    colors: Values = cloud.fields.get("color", np.zeros((0, 3), np.uint8))
-    colors, _ = read_colors(path, colors)
+    colors, _ = read_colors(path, cloud.fields.get("color", np.zeros((0, 3), np.uint8)))
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
         for key, rows, fmt in (
             ("points", cloud.coordinates, number),
