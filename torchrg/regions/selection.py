@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg.config import SelectionConfig, settings_of
-from torchrg.errors import ConfigError
+from torchrg.errors import CloudWarning, ConfigError, warn
 from torchrg.linalg import unit_direction
 from torchrg.regions.kinds import find_kinds
 from torchrg.structures import (
@@ -86,10 +85,10 @@ def choose_planes(planes: Planes, settings: SelectionConfig) -> Tensor:
     """
     smallest = float(planes.area.amin()) if len(planes) else 0.0
     if 0 < settings.min_area < _MIN_RATIO * smallest:
-        warnings.warn(
+        warn(
             f"min_area {settings.min_area:g} keeps all planes, the smallest has {smallest:.3g}; "
             "check that it is in squared units of the cloud.",
-            stacklevel=2,
+            CloudWarning,
         )
     is_kept = planes.area >= settings.min_area
     if settings.kinds is not None and planes.kind is not None:
