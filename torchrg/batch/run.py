@@ -73,7 +73,9 @@ def lock_folder(folder: Path) -> Iterator[None]:
         ) from None
     except (OSError, NotImplementedError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise FormatError(f"{folder / LOCK}: cannot be locked: {reason}.") from error
+        raise FormatError(
+            f"{folder / LOCK}: cannot be locked: {reason}; choose a directory on another file system."
+        ) from error
     try:
         yield
     finally:

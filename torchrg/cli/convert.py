@@ -283,7 +283,10 @@ def run(argv: list[str]) -> int:
     arguments = parse(chosen, remaining, prog=f"torchrg convert {kind}", default=start)
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
-    with print_warnings():
+    listing = tqdm(
+        desc=f"listing the scans in {root}", bar_format="{desc}", leave=False, disable=None
+    )
+    with listing, print_warnings():
         scans = list_jobs(arguments.source(root), out)
     jobs = match_jobs(scans, arguments.only)
     if arguments.dry_run:
