@@ -74,7 +74,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
     except (OSError, NotImplementedError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FormatError(
-            f"{folder / LOCK}: cannot be locked: {reason}; choose a directory on another file system."
+            f"{folder / LOCK}: cannot be locked: {reason}; choose one on another disk."
         ) from error
     try:
         yield
