@@ -18,9 +18,10 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg._optional import require
+from torchrg._parallel import split_rows
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN
-from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
+from torchrg.io.columns import FieldNames, flatten_cloud
 from torchrg.io.fields import Columns, Values, assemble_cloud, check_coordinates
 from torchrg.io.files import (
     PARSE_ERRORS,
@@ -197,7 +198,7 @@ def write_las(path: Path, cloud: Cloud) -> None:
             temporary.open("wb+") as file,
             laspy.open(file, mode="w", header=header, do_compress=is_laz, closefd=False) as writer,
         ):
-            for rows in row_slices(len(cloud), _POINTS_PER_CHUNK):
+            for rows in split_rows(len(cloud), _POINTS_PER_CHUNK):
                 points = cloud.coordinates[rows].astype(np.float64, copy=False)
                 record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
                 data = laspy.LasData(header, record)
@@ -208,7 +209,10 @@ def write_las(path: Path, cloud: Cloud) -> None:
             if header.version.minor >= 4 and header.evlrs is not None:
                 writer.write_evlrs(header.evlrs)
         if not has_date:
-            _erase_date(temporary)
+            # Identical runs produce byte-identical files.
+            with temporary.open("rb+") as stream:
+                stream.seek(_DATE_AT)
+                stream.write(bytes(_DATE_BYTES))
 
 
 def _header(laspy: ModuleType, cloud: Cloud, *, colored: bool) -> Any:  # noqa: ANN401
@@ -493,10 +497,3 @@ def _fits(values: Values, dtype: np.dtype[Any]) -> bool:
             return np.array_equal(values.astype(dtype), values, equal_nan=values.dtype.kind == "f")
     limits = np.iinfo(dtype)
     return are_integers(values) and bool(values.min() >= limits.min and values.max() <= limits.max)
-
-
-def _erase_date(path: Path) -> None:
-    """Clear the creation date, so that identical runs produce byte-identical files."""
-    with path.open("rb+") as stream:
-        stream.seek(_DATE_AT)
-        stream.write(bytes(_DATE_BYTES))
