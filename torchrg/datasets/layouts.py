@@ -13,7 +13,7 @@ import pickletools
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +48,6 @@ _MAX_OBJECTS = 999
 object ID, from one."""
 _MAX_EXACT = 2**24
 """Limit up to which float32 represents every integer."""
-_S3DIS_FOLDER = "Stanford3dDataset_v1.2_Aligned_Version"
-"""Folder in which MMDetection3D expects the room names."""
 VERSION = 2
 """Layout version; increment it when files change, so that existing scans are converted again."""
 
@@ -66,8 +64,8 @@ class LayoutScan:
             ``"ScanNet"`` without any.
         coord: Coordinates, shape ``(N, 3)``, float32.
         normal: Unit normals, shape ``(N, 3)``.
-        superpoint: Superpoint of each point, shape ``(N,)``.
-        plane: Plane ID of each point, -1 for none, shape ``(N,)``.
+        superpoint: Superpoint of each point, shape ``(N,)``, int64.
+        plane: Plane ID of each point, -1 for none, shape ``(N,)``, int64.
         inputs: Optional inputs: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the class
             of each point, -1 for none, ``category``, its NYU40 ID, 0 for none, and ``instance``,
             its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
@@ -81,8 +79,8 @@ class LayoutScan:
     dataset: str
     coord: NDArray[np.float32]
     normal: NDArray[np.floating]
-    superpoint: NDArray[np.integer]
-    plane: NDArray[np.integer]
+    superpoint: NDArray[np.int64]
+    plane: NDArray[np.int64]
     inputs: Mapping[str, NDArray[Any]]
     objects: Sequence[tuple[Mapping[str, Any], NDArray[np.integer]]] | None = None
     coarser: Sequence[NDArray[np.integer]] = ()
@@ -190,25 +188,23 @@ def write_scan(
     Every layout except ``"pointcept"`` needs superpoints, and uses one ``level`` of them. 16-bit
     colors are rounded to 8 bits, as readers of layouts expect.
     """
+    fields: dict[str, Any] = {} if scene.dataset is None else {**cloud.fields}
     if "color" in cloud.fields:
-        color = narrow_colors(cloud.fields["color"])
-        cloud = replace(cloud, fields={**cloud.fields, "color": color})
+        fields["color"] = narrow_colors(cloud.fields["color"])
     levels = [] if superpoints is None else [*superpoints.by_level().values()][level:]
     superpoint = levels[0] if levels else None
     if layout == "pointcept" or superpoint is None:
         origin = cloud.origin.tolist()
         if scene.dataset is not None:
-            sample = {**cloud.fields, "coord": cloud.coordinates}
+            sample = {**fields, "coord": cloud.coordinates}
             return write_pointcept_scene(folder, sample, seg, superpoint=superpoint, origin=origin)
-        fields = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
         fields |= {} if superpoint is None else {"superpoint": superpoint}
         return write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
     split, stem = split_name(scene.name)
-    is_known = scene.dataset is not None
     objects = None
     if layout == "scannet" and scene.dataset == "ScanNet" and scene.path.is_file():
         objects = read_objects(scene.path, len(cloud))
-    inputs = {**cloud.fields, **cloud.header} if is_known else cloud.fields
+    inputs = fields if scene.dataset is None else {**fields, **cloud.header}
     scan = LayoutScan(
         stem,
         split,
@@ -216,9 +212,9 @@ def write_scan(
         dataset=scene.dataset if scene.dataset is not None else "ScanNet",
         coord=cloud.points.numpy(),
         normal=seg.normals.numpy(),
-        superpoint=superpoint,
+        superpoint=superpoint.astype(np.int64),
         plane=seg.labels.numpy(),
-        inputs={k: np.asarray(v) for k, v in inputs.items() if is_known or k == "color"},
+        inputs={k: np.asarray(v) for k, v in inputs.items()},
         objects=objects,
         coarser=levels[1:],
     )
@@ -314,14 +310,13 @@ def _json(content: Any) -> bytes:  # noqa: ANN401
 def _mmdet3d(scan: LayoutScan) -> Files:
     """Return MMDetection3D files: the input of ``create_data``, and the input of its loaders."""
     vertices = np.hstack([scan.coord, scan.color.astype(np.float32)])
-    superpoint = scan.superpoint.astype(np.int64)
     prefix = f"scannet_instance_data/{scan.name}"
     files: Files = {
         f"{prefix}_vert.npy": vertices,
-        f"{prefix}_sp_label.npy": superpoint,
-        f"{prefix}_plane.npy": scan.plane.astype(np.int64),
+        f"{prefix}_sp_label.npy": scan.superpoint,
+        f"{prefix}_plane.npy": scan.plane,
         f"points/{scan.name}.bin": vertices.tobytes(),
-        f"super_points/{scan.name}.bin": superpoint.tobytes(),
+        f"super_points/{scan.name}.bin": scan.superpoint.tobytes(),
     }
     if scan.ground_truth is not None or scan.split == "test":
         files[f"meta_data/scannetv2_{scan.split}/{scan.name}.json"] = _json({"name": scan.name})
@@ -348,7 +343,6 @@ def _mmdet3d_s3dis(scan: LayoutScan) -> Files:
     """Return MMDetection3D files for S3DIS, relative to the room's corner, with all objects."""
     low = scan.coord.min(axis=0).astype(np.float64)
     points = np.hstack([scan.coord - low, scan.color]).astype(np.float32)
-    superpoint = scan.superpoint.astype(np.int64)
     segment, instance = _labels(scan)
     instance += 1
     prefix = f"s3dis_data/{scan.name}"
@@ -356,9 +350,9 @@ def _mmdet3d_s3dis(scan: LayoutScan) -> Files:
         f"{prefix}_point.npy": points,
         f"{prefix}_sem_label.npy": segment,
         f"{prefix}_ins_label.npy": instance,
-        f"{_S3DIS_FOLDER}/{scan.folder}/plane.npy": scan.plane.astype(np.int64),
+        f"Stanford3dDataset_v1.2_Aligned_Version/{scan.folder}/plane.npy": scan.plane,
         f"points/{scan.name}.bin": points.tobytes(),
-        f"super_points/{scan.name}.bin": superpoint.tobytes(),
+        f"super_points/{scan.name}.bin": scan.superpoint.tobytes(),
         f"semantic_mask/{scan.name}.bin": segment.tobytes(),
         f"instance_mask/{scan.name}.bin": instance.tobytes(),
     }
@@ -389,29 +383,25 @@ def _boxes(
 def _spformer(scan: LayoutScan) -> Files:
     """Return SPFormer files: a tuple with the superpoints in the middle."""
     coord, color, *ground_truth = _centered(scan)
-    content = (coord, color, scan.superpoint.astype(np.int64), *ground_truth)
+    content = (coord, color, scan.superpoint, *ground_truth)
     return {
         f"{scan.split}/{scan.name}_inst_nostuff.pth": _to_pickle(content),
-        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
+        f"planes/{scan.name}.pth": _to_pickle(scan.plane),
     }
 
 
 def _isbnet(scan: LayoutScan) -> Files:
-    """Return files of ISBNet and its successors: a tuple, and a file of superpoints."""
-    return {
-        f"{scan.split}/{scan.name}_inst_nostuff.pth": _to_pickle(_centered(scan)),
-        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint.astype(np.int64)),
-        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
-    }
+    """Return files of ISBNet and its successors: a tuple, and a file of superpoints.
 
-
-def _isbnet_s3dis(scan: LayoutScan) -> Files:
-    """Return ISBNet files for S3DIS: unchanged coordinates and colors, objects of all classes."""
-    content = (scan.coord, scan.color.astype(np.float32), *_labels(scan))
+    S3DIS rooms have unchanged coordinates and colors, and objects of all classes.
+    """
+    folder, content = scan.split, _centered(scan)
+    if scan.dataset == "S3DIS":
+        folder, content = "preprocess", (scan.coord, scan.color.astype(np.float32), *_labels(scan))
     return {
-        f"preprocess/{scan.name}_inst_nostuff.pth": _to_pickle(content),
-        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint.astype(np.int64)),
-        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
+        f"{folder}/{scan.name}_inst_nostuff.pth": _to_pickle(content),
+        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint),
+        f"planes/{scan.name}.pth": _to_pickle(scan.plane),
     }
 
 
@@ -434,10 +424,8 @@ def _mask3d(scan: LayoutScan) -> Files:
     labels = None if scan.ground_truth is None else (scan.category, scan.ground_truth[1])
     # Mask3D identifies a scan by its mesh folder.
     entry = {"scene": scan.name, "raw_filepath": f"{scan.name}/{scan.name}_vh_clean_2.ply"}
-    paths = (
-        f"{SPLIT_NAMES[scan.split]}/{_mask3d_name(scan.name)}",
-        f"{SPLIT_NAMES[scan.split]}/{scan.name}",
-    )
+    mode = SPLIT_NAMES[scan.split]
+    paths = f"{mode}/{_mask3d_name(scan.name)}", f"{mode}/{scan.name}"
     return _mask3d_files(scan, *paths, labels, entry, first_class=0)
 
 
@@ -467,7 +455,7 @@ def _mask3d_files(
         "color_std": ((color**2).sum(axis=0) / (255 * num_values)).tolist(),
         **entry,
     }
-    files: Files = {f"planes/{scan.name}.npy": scan.plane.astype(np.int64)}
+    files: Files = {f"planes/{scan.name}.npy": scan.plane}
     _check_range(scan, "superpoints", scan.superpoint, 0, _MAX_EXACT)
     columns: list[NDArray[Any]] = [scan.coord, scan.color, scan.normal, scan.superpoint[:, None]]
     if labels is not None:
@@ -502,10 +490,7 @@ def _mask3d_name(name: str) -> str:
 
 def _npy(scan: LayoutScan) -> Files:
     """Return a folder of plain arrays, as used by GrowSP and others."""
-    return {
-        f"superpoints/{scan.name}.npy": scan.superpoint.astype(np.int64),
-        f"planes/{scan.name}.npy": scan.plane.astype(np.int64),
-    }
+    return {f"superpoints/{scan.name}.npy": scan.superpoint, f"planes/{scan.name}.npy": scan.plane}
 
 
 def _nag(scan: LayoutScan) -> Files:
@@ -515,9 +500,7 @@ def _nag(scan: LayoutScan) -> Files:
     if scan.ground_truth is not None and numbers is not None:
         # The last column counts points without a class.
         one_hot = np.eye(len(numbers), dtype=np.int64)[numbers]
-        values["y"] = one_hot[
-            np.where(scan.ground_truth[0] < 0, len(numbers) - 1, scan.ground_truth[0])
-        ]
+        values["y"] = one_hot[scan.ground_truth[0].clip(min=-1)]
     fine, *coarse = (torch.from_numpy(level).long() for level in (scan.superpoint, *scan.coarser))
     parts = Superpoints(fine, torch.full((int(fine.max()) + 1,), UNLABELED), tuple(coarse))
     levels = make_nag(scan.coord, parts, data=dict, **values)
@@ -535,7 +518,7 @@ LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
     "scannet": dict.fromkeys(("ScanNet", "ScanNet++", ""), _scannet),
     "mmdet3d": {"ScanNet": _mmdet3d, "S3DIS": _mmdet3d_s3dis},
     "spformer": {"ScanNet": _spformer},
-    "isbnet": {"ScanNet": _isbnet, "S3DIS": _isbnet_s3dis},
+    "isbnet": dict.fromkeys(("ScanNet", "S3DIS"), _isbnet),
     "mask3d": {"ScanNet": _mask3d, "S3DIS": _mask3d_s3dis},
     "nag": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _nag),
     "npy": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _npy),
