@@ -129,7 +129,11 @@ class ScanNet(SceneDataset):
                 "got none; pass the folder that contains scans or data."
             )
         lists = _read_lists(self.root)
-        _warn_missing_scans(lists, {scene.name for scene in scenes})
+        known = {scene.name for scene in scenes}
+        if missing := [name for name in lists if name not in known]:
+            count, path = f"{len(missing):,} of {len(lists):,}", lists[missing[0]][1]
+            what = f"{count} listed scans are missing; download them, or correct the names"
+            _warn_entries(path, what, missing)
         named = [scene._replace(name=f"{_split(scene, lists)}/{scene.name}") for scene in scenes]
         self.scenes = [
             scene for scene in named if split is None or scene.name.startswith(f"{split}/")
@@ -265,16 +269,6 @@ def _read_lists(root: Path) -> dict[str, tuple[str, Path]]:
             lists |= dict.fromkeys(names, (split, path))
             _warn_entries(path, f"scans of another split are in {split}, too, which counts", both)
     return lists
-
-
-def _warn_missing_scans(lists: Mapping[str, tuple[str, Path]], scans: set[str]) -> None:
-    """Warn if the lists contain names of missing scans."""
-    missing = [name for name in lists if name not in scans]
-    if missing:
-        warn(
-            f"{lists[missing[0]][1]}: {len(missing):,} of {len(lists):,} listed scans are missing "
-            f"(first: {shortened(missing[0])}); download them, or correct the names.",
-        )
 
 
 def _split(scene: SceneFiles, lists: Mapping[str, tuple[str, Path]]) -> str:

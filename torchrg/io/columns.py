@@ -117,16 +117,12 @@ def _split_field(name: str, values: Values, field_names: FieldNames) -> dict[str
 def check_exact(path: Path, columns: Columns) -> None:
     """Check that float64, and thus text, represents all 64-bit integers exactly."""
     for name, column in columns.items():
-        if _is_64_bit(column) and max(-int(column.min()), int(column.max())) >= MAX_EXACT_INTEGER:
+        is_integer = column.dtype.kind in "iu"
+        if is_integer and max(-int(column.min()), int(column.max())) >= MAX_EXACT_INTEGER:
             raise FormatError(
                 f"{path}: field {name} contains integers beyond 2^53, which this format rounds; "
                 "remove the field or write .npz."
             )
-
-
-def _is_64_bit(values: Values) -> bool:
-    """Return whether values are 64-bit integers and not empty."""
-    return values.dtype.kind in "iu" and values.dtype.itemsize == 8 and values.size > 0
 
 
 def narrow_integers(values: Values, codes: Collection[str]) -> Values:
@@ -134,9 +130,9 @@ def narrow_integers(values: Values, codes: Collection[str]) -> Values:
 
     Values that fit none of these types, and values of other dtypes, are unchanged.
     """
-    if not _is_64_bit(values):
+    if values.dtype.kind not in "iu" or values.dtype.itemsize < 8:
         return values
-    low, high = int(values.min()), int(values.max())
+    low, high = int(values.min(initial=0)), int(values.max(initial=0))
     for code in codes:
         limits = np.iinfo(code)
         if limits.min <= low and high <= limits.max:
