@@ -1,7 +1,7 @@
 """File layouts of superpoints and planes for superpoint networks.
 
 :data:`LAYOUTS` has a function for each program family and data set. It returns the files of one
-scan by path below the output directory; :func:`write_layout` writes them, and
+scan by path below the output directory; :func:`write_scan` writes them, and
 :mod:`torchrg.datasets.lists` writes index files for programs that need them. Superpoints are int64
 in every layout, because programs that read raw bytes expect that.
 """
@@ -31,7 +31,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io.colors import narrow_colors
 from torchrg.io.files import normalize_file_name
 from torchrg.plane_table import describe_planes
-from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints
+from torchrg.structures import UNLABELED, Cloud, Segmentation, Superpoints
 
 Files = dict[str, NDArray[Any] | bytes]
 """File contents by path below the output directory: arrays for ``.npy`` files, or bytes."""
@@ -126,17 +126,6 @@ def split_name(name: str) -> tuple[str, str]:
     return (head, tail) if head in SPLIT_NAMES else ("", name.replace("/", "_"))
 
 
-def layout_stem(layout: str, name: str, folder: str) -> str:
-    """Return the file stem that must be unique per scan in a layout.
-
-    ``name`` and ``folder`` are the scan's name and path in its data set.
-    """
-    if layout == "scannet":
-        return folder
-    _, stem = split_name(name)
-    return _mask3d_name(stem) if layout == "mask3d" else stem
-
-
 def check_layout(layout: str, dataset: str, what: str) -> None:
     """Raise if a layout does not support a data set (``what``), or needs a missing package."""
     layouts = [name for name, forms in LAYOUTS.items() if dataset in forms]
@@ -156,7 +145,8 @@ def check_stems(layout: str, paths: Mapping[str, str]) -> None:
     """
     owners: dict[str, str] = {}
     for name, path in paths.items() if layout != "pointcept" else ():
-        stem = layout_stem(layout, name, path)
+        stem = path if layout == "scannet" else split_name(name)[1]
+        stem = _mask3d_name(stem) if layout == "mask3d" else stem
         other = owners.setdefault(normalize_file_name(stem), name)
         if other != name:
             raise FormatError(
@@ -183,10 +173,14 @@ def write_scan(
     *,
     level: int = 0,
 ) -> list[str]:
-    """Write a scene in a layout to the folder of its name; return paths relative to that folder.
+    """Write a scene in a layout, and ``planes.json``; return paths relative to its folder.
 
-    Every layout except ``"pointcept"`` needs superpoints, and uses one ``level`` of them. 16-bit
-    colors are rounded to 8 bits, as readers of layouts expect.
+    The folder has the name of the scene. Every layout except ``"pointcept"`` needs superpoints, and
+    uses one ``level`` of them. 16-bit colors are rounded to 8 bits, as readers of layouts expect.
+
+    Raises:
+        FormatError: If some points are not finite, which programs other than Pointcept do not
+            support, or a file of other origin would be overwritten.
     """
     fields: dict[str, Any] = {} if scene.dataset is None else {**cloud.fields}
     if "color" in cloud.fields:
@@ -200,6 +194,11 @@ def write_scan(
             return write_pointcept_scene(folder, sample, seg, superpoint=superpoint, origin=origin)
         fields |= {} if superpoint is None else {"superpoint": superpoint}
         return write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
+    if num_bad := int(np.count_nonzero(superpoint < 0)):
+        raise FormatError(
+            f"{folder}: expected finite points for layout {layout}, got {num_bad:,} non-finite of "
+            f"{len(cloud):,}; remove them, or choose layout pointcept."
+        )
     split, stem = split_name(scene.name)
     objects = None
     if layout == "scannet" and scene.dataset == "ScanNet" and scene.path.is_file():
@@ -218,42 +217,12 @@ def write_scan(
         objects=objects,
         coarser=levels[1:],
     )
-    out = folder.parents[scene.name.count("/")]
-    return write_layout(layout, folder, out, scan, seg.planes, cloud.origin)
-
-
-def write_layout(
-    layout: str, folder: Path, out: Path, scan: LayoutScan, planes: Planes, origin: NDArray[Any]
-) -> list[str]:
-    """Write the files of a scan in a layout, and ``planes.json`` in a folder of the scan.
-
-    Args:
-        layout: A key of :data:`LAYOUTS`.
-        folder: The folder of the scan, below ``out``.
-        out: The output directory.
-        scan: The scan.
-        planes: Its plane table.
-        origin: Origin of the table's coordinates; see :func:`torchrg.result.describe_planes`.
-
-    Returns:
-        Paths of the files written, relative to ``folder``.
-
-    Raises:
-        FormatError: If some points are not finite, which these programs do not support, or a file
-            of other origin would be overwritten.
-    """
-    num_bad = int(np.count_nonzero(scan.superpoint < 0))
-    if num_bad:
-        raise FormatError(
-            f"{folder}: expected finite points for layout {layout}, got {num_bad:,} non-finite of "
-            f"{len(scan.coord):,}; remove them, or choose layout pointcept."
-        )
-    up = "../" * len(folder.relative_to(out).parts)
+    # Layouts name files from the output directory.
+    up = "../" * (scene.name.count("/") + 1)
     files = LAYOUTS[layout][scan.dataset](scan)
     contents = {f"{up}{path}": content for path, content in files.items()}
-    table = describe_planes(planes, origin=origin.tolist())
-    source = {"layout": layout, "version": VERSION}
-    return write_files(folder, contents, table, {"source": source})
+    table = describe_planes(seg.planes, origin=cloud.origin.tolist())
+    return write_files(folder, contents, table, {"source": {"layout": layout, "version": VERSION}})
 
 
 def _scannet(scan: LayoutScan) -> Files:
