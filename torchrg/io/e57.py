@@ -103,7 +103,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     is zero there. The front of a point is the direction to its scanner, if the pose has one.
     """
     pye57 = require("pye57", extra="e57", purpose="read E57 files")
-    _check_pages(path)
+    _check_pages(path, size)
     _check_tree(path, size)
     message = f"{path}: expected an E57 file, got: "
     errors = (pye57.libe57.E57Exception, *PARSE_ERRORS)
@@ -235,14 +235,13 @@ def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud:
     return front, notes
 
 
-def _check_pages(path: Path) -> None:
+def _check_pages(path: Path, size: int) -> None:
     """Check the checksum of each page before libe57 does.
 
     A libe57 reader that meets a corrupt page during construction leaks its two megabytes. libe57
     itself reports an incomplete last page.
     """
     crc32c = require("google_crc32c", extra="e57", purpose="read E57 files")
-    size = path.stat().st_size
     with path.open("rb") as stream:
         for start in range(0, size if size % _PAGE_BYTES == 0 else 0, _PAGE_BYTES):
             page = stream.read(_PAGE_BYTES)

@@ -39,8 +39,6 @@ PARSE_ERRORS = (
 """Exceptions that third-party readers raise on corrupt files, in addition to their own classes."""
 ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, *PARSE_ERRORS)
 """Exceptions raised on corrupt archives."""
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Error numbers of a full disk or an exceeded quota."""
 _PROBE_BYTES = 1 << 20
 """Bytes written to test whether a disk is full. They exceed the buffer of a library, so they do not
 fit if its last write failed."""
@@ -211,9 +209,9 @@ def create_folder(path: Path) -> None:
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error or one of its causes is a full disk."""
+    """Return whether an error or one of its causes is a full disk, or an exceeded quota."""
     while error is not None:
-        if isinstance(error, OSError) and error.errno in _DISK_FULL:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return True
         error = error.__cause__
     return False

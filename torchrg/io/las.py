@@ -10,7 +10,6 @@ import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
@@ -56,8 +55,6 @@ _POINTWISE, _MAX_LAZ_VERSION = 1, 3
 _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
 """Offsets in LASzip's record of the chunk size in points, and of the number of items. An item is a
 type, a size and a version."""
-_PARAMETERS = attrgetter("name", "dtype", "description", "offsets", "scales", "no_data")
-"""Parameters of an extra dimension, in laspy's order."""
 _UNDOCUMENTED = "Un-registered ExtraBytes"
 """Description that laspy gives to undocumented extra bytes."""
 _RANGE_BITS = 0b110
@@ -250,8 +247,10 @@ def _add_dimensions(
     dimensions, params = dict[str, Values](), list[Any]()
     for extra in _input_dimensions(cloud.header.get("las"), columns):
         if extra.holds(columns):
-            params.append(laspy.ExtraBytesParams(*_PARAMETERS(extra.dimension)))
-            dimensions[extra.dimension.name] = extra.join(columns)
+            d = extra.dimension
+            parameters = (d.name, d.dtype, d.description, d.offsets, d.scales, d.no_data)
+            params.append(laspy.ExtraBytesParams(*parameters))
+            dimensions[d.name] = extra.join(columns)
             columns = {name: c for name, c in columns.items() if name not in extra.columns}
     standard = set(header.point_format.dimension_names)
     for name, column in columns.items():

@@ -24,13 +24,7 @@ from torch import Tensor
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
 from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints, OrientNormals
-from torchrg.transforms.rows import (
-    TORCHRG_KEYS,
-    Entries,
-    SampleDict,
-    extend_list,
-    per_point_keys,
-)
+from torchrg.transforms.rows import TORCHRG_KEYS, Entries, SampleDict, extend_list, per_point_keys
 from torchrg.transforms.sample import (
     CenterCloud,
     CloudTransform,
