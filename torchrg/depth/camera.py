@@ -205,7 +205,7 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     is 0.
 
     Raises:
-        ConfigError: If a focal length is 0, or a value is not finite.
+        ConfigError: If a focal length is 0, or a value is not within 1e12.
 
     Example:
         >>> make_intrinsics(525, 525, 319.5, 239.5)[0].tolist()

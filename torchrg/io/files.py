@@ -438,7 +438,7 @@ def header_lines(path: Path, stream: BinaryIO, last: str) -> Iterator[tuple[int,
 
 
 def parse_count(word: str) -> int | None:
-    """Return a number of points or records, or None if a word is no possible one."""
+    """Parse a count of points or records; return None for any other word."""
     is_count = word.isascii() and word.isdecimal() and len(word) <= _MAX_DIGITS
     return int(word) if is_count else None
 
