@@ -82,8 +82,8 @@ class CloudSource(Source):
         """Return the scenes in natural order; their results go to ``out``."""
         self.data.check_output(self.layout, out)
         for scene in self.data.scenes:
-            what = scene.dataset or scene.name
-            check_layout(self.layout, _layout_dataset(scene), what)
+            dataset = "ScanNet" if scene.dataset is None else scene.dataset
+            check_layout(self.layout, dataset, scene.dataset or scene.name)
         in_place = out == self.root
         return [
             scene._replace(
@@ -165,11 +165,6 @@ class CloudSource(Source):
     def _list_dataset(self) -> str:
         """Data set that determines the lists."""
         return "S3DIS" if self.data.kind == "s3dis" else "ScanNet"
-
-
-def _layout_dataset(scene: SceneFiles) -> str:
-    """Return the data set whose layouts apply to a scene."""
-    return "ScanNet" if scene.dataset is None else scene.dataset
 
 
 @dataclass(frozen=True)

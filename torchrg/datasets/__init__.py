@@ -10,9 +10,8 @@ applied to it; ``data.scenes`` lists the scenes without reading them, as :class:
 
 The guide with recipes for other programs shows how their loaders use these results.
 
-To add a data set, derive from :class:`SceneDataset`: it works in a loader, and
-:class:`torchrg.batch.sources.CloudSource` converts it. To add a layout of depth frames, add a row
-to :data:`~torchrg.datasets.rgbd_layouts.FRAME_LAYOUTS`.
+To add a data set, see :class:`SceneDataset`; to add a layout of depth frames,
+:mod:`torchrg.datasets.rgbd_layouts`.
 """
 
 from torchrg.datasets.collate import collate_offset

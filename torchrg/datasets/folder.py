@@ -24,8 +24,6 @@ from torchrg.transforms.rows import Sample, SampleDict
 
 Transform = Callable[[SampleDict], Sample]
 """A function that data sets apply to each sample."""
-_ID_ARRAYS = {"instance", "plane", "superpoint"}
-"""Arrays whose IDs start at 0 in each scene."""
 _MAX_PROSE_BYTES = 1 << 16
 """Maximum size of a text file that is read to see whether it contains points."""
 _LINKS = "links to files that were already read, or to a parent folder"
@@ -211,9 +209,9 @@ class FolderOfClouds(SceneDataset):
                     f"{path.parent}: expected coord.npy next to {path.name}, got none; copy it, or "
                     "rename the file if it is a cloud."
                 )
-        others = [path for path in paths if columns is None and is_other(path)]
-        warn_skipped(self.root, others, "files without points")
-        paths = [path for path in paths if path not in {*others}] if others else paths
+        others = dict.fromkeys(path for path in paths if columns is None and is_other(path))
+        warn_skipped(self.root, [*others], "files without points")
+        paths = [path for path in paths if path not in others]
         if not paths:
             raise FormatError(
                 f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
@@ -300,7 +298,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
             f"{folder}: expected folders with coord.npy, got none; pass the folder of an area."
         )
     scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
-    for key in _ID_ARRAYS & set(scenes[0]):
+    for key in {"instance", "plane", "superpoint"} & set(scenes[0]):
         first = 0
         for labels in (scene[key] for scene in scenes if key in scene):
             labels[labels >= 0] += first

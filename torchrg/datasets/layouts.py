@@ -1,7 +1,7 @@
 """File layouts of superpoints and planes for superpoint networks.
 
 :data:`LAYOUTS` has a function for each program family and data set. It returns the files of one
-scan by path below the output directory; :func:`write_layout` writes them, and
+scan by path below the output directory; :func:`write_scan` writes them, and
 :mod:`torchrg.datasets.lists` writes index files for programs that need them. Superpoints are int64
 in every layout, because programs that read raw bytes expect that.
 """
@@ -13,7 +13,7 @@ import pickletools
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io.colors import narrow_colors
 from torchrg.io.files import normalize_file_name
 from torchrg.plane_table import describe_planes
-from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints
+from torchrg.structures import UNLABELED, Cloud, Segmentation, Superpoints
 
 Files = dict[str, NDArray[Any] | bytes]
 """File contents by path below the output directory: arrays for ``.npy`` files, or bytes."""
@@ -48,8 +48,6 @@ _MAX_OBJECTS = 999
 object ID, from one."""
 _MAX_EXACT = 2**24
 """Limit up to which float32 represents every integer."""
-_S3DIS_FOLDER = "Stanford3dDataset_v1.2_Aligned_Version"
-"""Folder in which MMDetection3D expects the room names."""
 VERSION = 2
 """Layout version; increment it when files change, so that existing scans are converted again."""
 
@@ -66,8 +64,8 @@ class LayoutScan:
             ``"ScanNet"`` without any.
         coord: Coordinates, shape ``(N, 3)``, float32.
         normal: Unit normals, shape ``(N, 3)``.
-        superpoint: Superpoint of each point, shape ``(N,)``.
-        plane: Plane ID of each point, -1 for none, shape ``(N,)``.
+        superpoint: Superpoint of each point, shape ``(N,)``, int64.
+        plane: Plane ID of each point, -1 for none, shape ``(N,)``, int64.
         inputs: Optional inputs: ``color`` ``(N, 3)`` uint8; ``segment20`` or ``segment``, the class
             of each point, -1 for none, ``category``, its NYU40 ID, 0 for none, and ``instance``,
             its object, -1 for none, each ``(N,)``; ``axis_align_matrix`` ``(4, 4)``.
@@ -81,8 +79,8 @@ class LayoutScan:
     dataset: str
     coord: NDArray[np.float32]
     normal: NDArray[np.floating]
-    superpoint: NDArray[np.integer]
-    plane: NDArray[np.integer]
+    superpoint: NDArray[np.int64]
+    plane: NDArray[np.int64]
     inputs: Mapping[str, NDArray[Any]]
     objects: Sequence[tuple[Mapping[str, Any], NDArray[np.integer]]] | None = None
     coarser: Sequence[NDArray[np.integer]] = ()
@@ -128,17 +126,6 @@ def split_name(name: str) -> tuple[str, str]:
     return (head, tail) if head in SPLIT_NAMES else ("", name.replace("/", "_"))
 
 
-def layout_stem(layout: str, name: str, folder: str) -> str:
-    """Return the file stem that must be unique per scan in a layout.
-
-    ``name`` and ``folder`` are the scan's name and path in its data set.
-    """
-    if layout == "scannet":
-        return folder
-    _, stem = split_name(name)
-    return _mask3d_name(stem) if layout == "mask3d" else stem
-
-
 def check_layout(layout: str, dataset: str, what: str) -> None:
     """Raise if a layout does not support a data set (``what``), or needs a missing package."""
     layouts = [name for name, forms in LAYOUTS.items() if dataset in forms]
@@ -158,7 +145,8 @@ def check_stems(layout: str, paths: Mapping[str, str]) -> None:
     """
     owners: dict[str, str] = {}
     for name, path in paths.items() if layout != "pointcept" else ():
-        stem = layout_stem(layout, name, path)
+        stem = path if layout == "scannet" else split_name(name)[1]
+        stem = _mask3d_name(stem) if layout == "mask3d" else stem
         other = owners.setdefault(normalize_file_name(stem), name)
         if other != name:
             raise FormatError(
@@ -185,30 +173,37 @@ def write_scan(
     *,
     level: int = 0,
 ) -> list[str]:
-    """Write a scene in a layout to the folder of its name; return paths relative to that folder.
+    """Write a scene in a layout, and ``planes.json``; return paths relative to its folder.
 
-    Every layout except ``"pointcept"`` needs superpoints, and uses one ``level`` of them. 16-bit
-    colors are rounded to 8 bits, as readers of layouts expect.
+    The folder has the name of the scene. Every layout except ``"pointcept"`` needs superpoints, and
+    uses one ``level`` of them. 16-bit colors are rounded to 8 bits, as readers of layouts expect.
+
+    Raises:
+        FormatError: If some points are not finite, which programs other than Pointcept do not
+            support, or a file of other origin would be overwritten.
     """
+    fields: dict[str, Any] = {} if scene.dataset is None else {**cloud.fields}
     if "color" in cloud.fields:
-        color = narrow_colors(cloud.fields["color"])
-        cloud = replace(cloud, fields={**cloud.fields, "color": color})
+        fields["color"] = narrow_colors(cloud.fields["color"])
     levels = [] if superpoints is None else [*superpoints.by_level().values()][level:]
     superpoint = levels[0] if levels else None
     if layout == "pointcept" or superpoint is None:
         origin = cloud.origin.tolist()
         if scene.dataset is not None:
-            sample = {**cloud.fields, "coord": cloud.coordinates}
+            sample = {**fields, "coord": cloud.coordinates}
             return write_pointcept_scene(folder, sample, seg, superpoint=superpoint, origin=origin)
-        fields = {name: cloud.fields[name] for name in cloud.fields.keys() & {"color"}}
         fields |= {} if superpoint is None else {"superpoint": superpoint}
         return write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
+    if num_bad := int(np.count_nonzero(superpoint < 0)):
+        raise FormatError(
+            f"{folder}: expected finite points for layout {layout}, got {num_bad:,} non-finite of "
+            f"{len(cloud):,}; remove them, or choose layout pointcept."
+        )
     split, stem = split_name(scene.name)
-    is_known = scene.dataset is not None
     objects = None
     if layout == "scannet" and scene.dataset == "ScanNet" and scene.path.is_file():
         objects = read_objects(scene.path, len(cloud))
-    inputs = {**cloud.fields, **cloud.header} if is_known else cloud.fields
+    inputs = fields if scene.dataset is None else {**fields, **cloud.header}
     scan = LayoutScan(
         stem,
         split,
@@ -216,48 +211,18 @@ def write_scan(
         dataset=scene.dataset if scene.dataset is not None else "ScanNet",
         coord=cloud.points.numpy(),
         normal=seg.normals.numpy(),
-        superpoint=superpoint,
+        superpoint=superpoint.astype(np.int64),
         plane=seg.labels.numpy(),
-        inputs={k: np.asarray(v) for k, v in inputs.items() if is_known or k == "color"},
+        inputs={k: np.asarray(v) for k, v in inputs.items()},
         objects=objects,
         coarser=levels[1:],
     )
-    out = folder.parents[scene.name.count("/")]
-    return write_layout(layout, folder, out, scan, seg.planes, cloud.origin)
-
-
-def write_layout(
-    layout: str, folder: Path, out: Path, scan: LayoutScan, planes: Planes, origin: NDArray[Any]
-) -> list[str]:
-    """Write the files of a scan in a layout, and ``planes.json`` in a folder of the scan.
-
-    Args:
-        layout: A key of :data:`LAYOUTS`.
-        folder: The folder of the scan, below ``out``.
-        out: The output directory.
-        scan: The scan.
-        planes: Its plane table.
-        origin: Origin of the table's coordinates; see :func:`torchrg.result.describe_planes`.
-
-    Returns:
-        Paths of the files written, relative to ``folder``.
-
-    Raises:
-        FormatError: If some points are not finite, which these programs do not support, or a file
-            of other origin would be overwritten.
-    """
-    num_bad = int(np.count_nonzero(scan.superpoint < 0))
-    if num_bad:
-        raise FormatError(
-            f"{folder}: expected finite points for layout {layout}, got {num_bad:,} non-finite of "
-            f"{len(scan.coord):,}; remove them, or choose layout pointcept."
-        )
-    up = "../" * len(folder.relative_to(out).parts)
+    # Layouts name files from the output directory.
+    up = "../" * (scene.name.count("/") + 1)
     files = LAYOUTS[layout][scan.dataset](scan)
     contents = {f"{up}{path}": content for path, content in files.items()}
-    table = describe_planes(planes, origin=origin.tolist())
-    source = {"layout": layout, "version": VERSION}
-    return write_files(folder, contents, table, {"source": source})
+    table = describe_planes(seg.planes, origin=cloud.origin.tolist())
+    return write_files(folder, contents, table, {"source": {"layout": layout, "version": VERSION}})
 
 
 def _scannet(scan: LayoutScan) -> Files:
@@ -314,14 +279,13 @@ def _json(content: Any) -> bytes:  # noqa: ANN401
 def _mmdet3d(scan: LayoutScan) -> Files:
     """Return MMDetection3D files: the input of ``create_data``, and the input of its loaders."""
     vertices = np.hstack([scan.coord, scan.color.astype(np.float32)])
-    superpoint = scan.superpoint.astype(np.int64)
     prefix = f"scannet_instance_data/{scan.name}"
     files: Files = {
         f"{prefix}_vert.npy": vertices,
-        f"{prefix}_sp_label.npy": superpoint,
-        f"{prefix}_plane.npy": scan.plane.astype(np.int64),
+        f"{prefix}_sp_label.npy": scan.superpoint,
+        f"{prefix}_plane.npy": scan.plane,
         f"points/{scan.name}.bin": vertices.tobytes(),
-        f"super_points/{scan.name}.bin": superpoint.tobytes(),
+        f"super_points/{scan.name}.bin": scan.superpoint.tobytes(),
     }
     if scan.ground_truth is not None or scan.split == "test":
         files[f"meta_data/scannetv2_{scan.split}/{scan.name}.json"] = _json({"name": scan.name})
@@ -348,7 +312,6 @@ def _mmdet3d_s3dis(scan: LayoutScan) -> Files:
     """Return MMDetection3D files for S3DIS, relative to the room's corner, with all objects."""
     low = scan.coord.min(axis=0).astype(np.float64)
     points = np.hstack([scan.coord - low, scan.color]).astype(np.float32)
-    superpoint = scan.superpoint.astype(np.int64)
     segment, instance = _labels(scan)
     instance += 1
     prefix = f"s3dis_data/{scan.name}"
@@ -356,9 +319,9 @@ def _mmdet3d_s3dis(scan: LayoutScan) -> Files:
         f"{prefix}_point.npy": points,
         f"{prefix}_sem_label.npy": segment,
         f"{prefix}_ins_label.npy": instance,
-        f"{_S3DIS_FOLDER}/{scan.folder}/plane.npy": scan.plane.astype(np.int64),
+        f"Stanford3dDataset_v1.2_Aligned_Version/{scan.folder}/plane.npy": scan.plane,
         f"points/{scan.name}.bin": points.tobytes(),
-        f"super_points/{scan.name}.bin": superpoint.tobytes(),
+        f"super_points/{scan.name}.bin": scan.superpoint.tobytes(),
         f"semantic_mask/{scan.name}.bin": segment.tobytes(),
         f"instance_mask/{scan.name}.bin": instance.tobytes(),
     }
@@ -389,29 +352,25 @@ def _boxes(
 def _spformer(scan: LayoutScan) -> Files:
     """Return SPFormer files: a tuple with the superpoints in the middle."""
     coord, color, *ground_truth = _centered(scan)
-    content = (coord, color, scan.superpoint.astype(np.int64), *ground_truth)
+    content = (coord, color, scan.superpoint, *ground_truth)
     return {
         f"{scan.split}/{scan.name}_inst_nostuff.pth": _to_pickle(content),
-        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
+        f"planes/{scan.name}.pth": _to_pickle(scan.plane),
     }
 
 
 def _isbnet(scan: LayoutScan) -> Files:
-    """Return files of ISBNet and its successors: a tuple, and a file of superpoints."""
-    return {
-        f"{scan.split}/{scan.name}_inst_nostuff.pth": _to_pickle(_centered(scan)),
-        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint.astype(np.int64)),
-        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
-    }
+    """Return files of ISBNet and its successors: a tuple, and a file of superpoints.
 
-
-def _isbnet_s3dis(scan: LayoutScan) -> Files:
-    """Return ISBNet files for S3DIS: unchanged coordinates and colors, objects of all classes."""
-    content = (scan.coord, scan.color.astype(np.float32), *_labels(scan))
+    S3DIS rooms have unchanged coordinates and colors, and objects of all classes.
+    """
+    folder, content = scan.split, _centered(scan)
+    if scan.dataset == "S3DIS":
+        folder, content = "preprocess", (scan.coord, scan.color.astype(np.float32), *_labels(scan))
     return {
-        f"preprocess/{scan.name}_inst_nostuff.pth": _to_pickle(content),
-        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint.astype(np.int64)),
-        f"planes/{scan.name}.pth": _to_pickle(scan.plane.astype(np.int64)),
+        f"{folder}/{scan.name}_inst_nostuff.pth": _to_pickle(content),
+        f"superpoints/{scan.name}.pth": _to_pickle(scan.superpoint),
+        f"planes/{scan.name}.pth": _to_pickle(scan.plane),
     }
 
 
@@ -434,10 +393,8 @@ def _mask3d(scan: LayoutScan) -> Files:
     labels = None if scan.ground_truth is None else (scan.category, scan.ground_truth[1])
     # Mask3D identifies a scan by its mesh folder.
     entry = {"scene": scan.name, "raw_filepath": f"{scan.name}/{scan.name}_vh_clean_2.ply"}
-    paths = (
-        f"{SPLIT_NAMES[scan.split]}/{_mask3d_name(scan.name)}",
-        f"{SPLIT_NAMES[scan.split]}/{scan.name}",
-    )
+    mode = SPLIT_NAMES[scan.split]
+    paths = f"{mode}/{_mask3d_name(scan.name)}", f"{mode}/{scan.name}"
     return _mask3d_files(scan, *paths, labels, entry, first_class=0)
 
 
@@ -467,7 +424,7 @@ def _mask3d_files(
         "color_std": ((color**2).sum(axis=0) / (255 * num_values)).tolist(),
         **entry,
     }
-    files: Files = {f"planes/{scan.name}.npy": scan.plane.astype(np.int64)}
+    files: Files = {f"planes/{scan.name}.npy": scan.plane}
     _check_range(scan, "superpoints", scan.superpoint, 0, _MAX_EXACT)
     columns: list[NDArray[Any]] = [scan.coord, scan.color, scan.normal, scan.superpoint[:, None]]
     if labels is not None:
@@ -502,10 +459,7 @@ def _mask3d_name(name: str) -> str:
 
 def _npy(scan: LayoutScan) -> Files:
     """Return a folder of plain arrays, as used by GrowSP and others."""
-    return {
-        f"superpoints/{scan.name}.npy": scan.superpoint.astype(np.int64),
-        f"planes/{scan.name}.npy": scan.plane.astype(np.int64),
-    }
+    return {f"superpoints/{scan.name}.npy": scan.superpoint, f"planes/{scan.name}.npy": scan.plane}
 
 
 def _nag(scan: LayoutScan) -> Files:
@@ -515,9 +469,7 @@ def _nag(scan: LayoutScan) -> Files:
     if scan.ground_truth is not None and numbers is not None:
         # The last column counts points without a class.
         one_hot = np.eye(len(numbers), dtype=np.int64)[numbers]
-        values["y"] = one_hot[
-            np.where(scan.ground_truth[0] < 0, len(numbers) - 1, scan.ground_truth[0])
-        ]
+        values["y"] = one_hot[scan.ground_truth[0].clip(min=-1)]
     fine, *coarse = (torch.from_numpy(level).long() for level in (scan.superpoint, *scan.coarser))
     parts = Superpoints(fine, torch.full((int(fine.max()) + 1,), UNLABELED), tuple(coarse))
     levels = make_nag(scan.coord, parts, data=dict, **values)
@@ -535,7 +487,7 @@ LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
     "scannet": dict.fromkeys(("ScanNet", "ScanNet++", ""), _scannet),
     "mmdet3d": {"ScanNet": _mmdet3d, "S3DIS": _mmdet3d_s3dis},
     "spformer": {"ScanNet": _spformer},
-    "isbnet": {"ScanNet": _isbnet, "S3DIS": _isbnet_s3dis},
+    "isbnet": dict.fromkeys(("ScanNet", "S3DIS"), _isbnet),
     "mask3d": {"ScanNet": _mask3d, "S3DIS": _mask3d_s3dis},
     "nag": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _nag),
     "npy": dict.fromkeys(("ScanNet", "ScanNet++", "S3DIS", ""), _npy),

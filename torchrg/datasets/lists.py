@@ -84,8 +84,7 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
     removed = {path.stem for path in _entry_files(out, folders, without)}
     for folder, scans in listed_in.items() if any(listed_in.values()) or removed else ():
         path = out / f"{folder}.txt"
-        with wrap_errors(f"{path}: expected one name per line, got: ", ValueError):
-            text = path.read_text("utf-8", "surrogateescape") if path.is_file() else ""
+        text = path.read_text("utf-8", "surrogateescape") if path.is_file() else ""
         existing = [line.strip() for line in text.splitlines() if line.strip()]
         moved = removed.union(*listed_in.values()) - set(scans)
         listed = [name for name in existing if name not in moved]
@@ -120,13 +119,9 @@ def _read_entries(out: Path, folder: str, without: Collection[Path]) -> list[Lis
         message = f"{path}: expected an entry of a list, got: "
         with wrap_errors(message, ValueError, repair="; move it, and convert the scan again"):
             entry = json.loads(path.read_text(encoding="utf-8"))
-        files = {key: str(out / entry[key]) for key in _FILES & entry.keys()}
-        entries.append(entry | files)
+        keys = {"filepath", "instance_gt_filepath"} & entry.keys()
+        entries.append(entry | {key: str(out / entry[key]) for key in keys})
     return entries
-
-
-_FILES = {"filepath", "instance_gt_filepath"}
-"""Keys of an entry that are file paths."""
 
 
 def _mask3d(entries: ListEntries) -> dict[str, object]:

@@ -33,6 +33,7 @@ from torchrg.datasets.provenance import (
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
 from torchrg.io.colors import narrow_colors, read_colors
+from torchrg.io.columns import narrow_integers
 from torchrg.io.files import create_folder, local_path
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, RECORD, describe_planes
@@ -206,7 +207,8 @@ def _convert_arrays(
         if name in _SCANNET or (name == "instance" and not entries.keys().isdisjoint(_SCANNET)):
             arrays[name] = values.astype(np.int64)
         elif name in ("segment", "instance"):
-            arrays[name] = _to_int16(values).reshape(len(values), -1)
+            integers = narrow_integers(values.astype(np.int64), ("i2", "i4"))
+            arrays[name] = integers.reshape(len(values), -1)
         elif name == "color":
             arrays[name] = narrow_colors(read_colors(target / "color.npy", values)[0])
         elif name in _FEATURES:
@@ -214,13 +216,6 @@ def _convert_arrays(
         else:
             arrays[name] = np.ascontiguousarray(values, dtypes.get(name, np.float32))
     return arrays
-
-
-def _to_int16(labels: Array) -> Array:
-    """Convert labels to int16, or to int32 if they do not fit."""
-    limits = np.iinfo(np.int16)
-    fit = labels.size == 0 or (labels.min() >= limits.min and labels.max() <= limits.max)
-    return labels.astype(np.int16 if fit else np.int32)
 
 
 def _check_inputs(target: Path, arrays: Mapping[str, Array], inputs: set[str]) -> None:

@@ -38,9 +38,6 @@ _CONVERTERS = {
     ".exr": "read it with OpenEXR, save it as .npy, usually in meters",
 }
 """How to convert unsupported recordings and images to frames, by suffix."""
-_PNG = b"\x89PNG"
-_PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16
-"""Width and height in a PNG header, and their offset."""
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
 """Header of a binary PGM: width, height and maximum value."""
 _MAX_HEADER_BYTES = 512
@@ -161,8 +158,8 @@ def image_size(path: Path) -> tuple[int, int] | None:
             return width, height
         with path.open("rb") as stream:
             head = stream.read(_MAX_HEADER_BYTES)
-        if head.startswith(_PNG):
-            width, height = _PNG_SIZE.unpack_from(head, _PNG_SIZE_AT)
+        if head.startswith(b"\x89PNG"):
+            width, height = struct.unpack_from(">II", head, offset=16)
             return width, height
     except (OSError, *PARSE_ERRORS):
         return None

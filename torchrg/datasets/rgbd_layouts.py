@@ -134,39 +134,37 @@ def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
     tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
     numbers, matrices = read_trajectory(tracks[0]) if tracks else ([], [])
     poses = {f"{number:.0f}": pose for number, pose in zip(numbers, matrices, strict=True)}
-    for name, image in _depth_images(folder, "depth/*"):
-        yield ListedFrame(name, image, _color_image(folder / "rgb" / name), poses.get(name), tracks)
+    for frame in _list_frames(folder, "depth/*", "rgb/*"):
+        yield frame._replace(pose=poses.get(frame.name), sources=tracks)
 
 
 def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterator[ListedFrame]]:
     """Return a function that yields frames by file name patterns; ``*`` is the frame name."""
 
     def frames(folder: Path) -> Iterator[ListedFrame]:
-        for name, image in _depth_images(folder, depth):
-            if name.endswith(".rendered"):
-                continue
-            path = folder / pose.replace("*", name)
-            posed = (read_matrix(path), (path,)) if path.is_file() else (None, ())
-            yield ListedFrame(name, image, _color_image(folder / color.replace("*", name)), *posed)
+        for frame in _list_frames(folder, depth, color):
+            path = folder / pose.replace("*", frame.name)
+            is_posed = path.is_file()
+            if not frame.name.endswith(".rendered"):
+                yield frame._replace(pose=read_matrix(path), sources=(path,)) if is_posed else frame
 
     return frames
 
 
-def _depth_images(folder: Path, pattern: str) -> Iterator[tuple[str, Path]]:
-    """Yield names and depth images of a folder, in natural order; the pattern has no suffix."""
-    subfolder, _, name = pattern.rpartition("/")
-    before, after = name.split("*")
+def _list_frames(folder: Path, depth: str, color: str) -> Iterator[ListedFrame]:
+    """Yield the depth images of a folder with their color images, in natural order.
+
+    ``*`` in the patterns, which have no suffix, is the name of a frame.
+    """
+    subfolder, _, pattern = depth.rpartition("/")
+    before, after = pattern.split("*")
     check_folder(folder / subfolder)
     for path in list_dir(folder / subfolder):
         fits = path.stem.startswith(before) and path.stem.endswith(after)
         if path.suffix.lower() in DEPTH_SUFFIXES and fits:
-            yield path.stem.removeprefix(before).removesuffix(after), path
-
-
-def _color_image(path: Path) -> Path | None:
-    """Return the color image for a path without suffix, or None."""
-    paths = (path.with_name(f"{path.name}{suffix}") for suffix in _COLOR_SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
+            name = path.stem.removeprefix(before).removesuffix(after)
+            colors = (folder / f"{color.replace('*', name)}{end}" for end in _COLOR_SUFFIXES)
+            yield ListedFrame(name, path, next(filter(Path.is_file, colors), None))
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
@@ -233,22 +231,20 @@ def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     Cameras are files of the same name, with times that may differ by a millisecond; poses are in
     ``lowres_wide.traj``.
     """
-    images = [*_depth_images(folder, "lowres_depth/*")]
+    frames = [*_list_frames(folder, "lowres_depth/*", "lowres_wide/*")]
     with wrap_errors(
         f"{folder / 'lowres_depth'}: expected seconds at the ends of names: ", ValueError
     ):
-        times = [float(name.rpartition("_")[2]) for name, _ in images]
+        times = [float(frame.name.rpartition("_")[2]) for frame in frames]
     track = folder / "lowres_wide.traj"
     tracks = (track,) if track.is_file() else ()
     poses = read_nearest(times, track, read_axis_angles)
-    for (name, image), time, pose in zip(images, times, poses, strict=True):
-        exact = folder / "lowres_wide_intrinsics" / f"{name}.pincam"
-        video = name.rpartition("_")[0]
+    for frame, time, pose in zip(frames, times, poses, strict=True):
+        exact = folder / "lowres_wide_intrinsics" / f"{frame.name}.pincam"
+        video = frame.name.rpartition("_")[0]
         near = [exact.with_name(f"{video}_{time + off:.3f}.pincam") for off in (-0.001, 0.001)]
         path = next((path for path in (exact, *near) if path.is_file()), exact)
-        camera = read_camera(path)
-        color = _color_image(folder / "lowres_wide" / name)
-        yield ListedFrame(name, image, color, pose, (path, *tracks), camera)
+        yield frame._replace(pose=pose, sources=(path, *tracks), camera=read_camera(path))
 
 
 def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -264,10 +260,10 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     track = folder / "traj.txt"
     rows = read_numbers(track, 16, "16 numbers, those of a matrix,")
     poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
-    for name, image in _depth_images(folder, "results/depth*"):
-        color = _color_image(folder / "results" / f"frame{name}")
-        pose = poses[int(name)] if name.isdecimal() and int(name) < len(poses) else None
-        yield ListedFrame(name, image, color, pose, (calibration, track), camera)
+    for frame in _list_frames(folder, "results/depth*", "results/frame*"):
+        row = int(frame.name) if frame.name.isdecimal() else len(poses)
+        pose = poses[row] if row < len(poses) else None
+        yield frame._replace(pose=pose, sources=(calibration, track), camera=camera)
 
 
 def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -282,15 +278,16 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
             "iphone/prepare_iphone_data.py of the data set's toolbox."
         )
     records = read_mapping(path)
-    for name, image in _depth_images(folder, "depth/*"):
-        record = records.get(name)
+    for frame in _list_frames(folder, "depth/*", "rgb/*"):
+        record = records.get(frame.name)
         if not isinstance(record, dict):
-            raise FormatError(f"{path}: expected an entry for {name}, which has depth, got none.")
+            raise FormatError(
+                f"{path}: expected an entry for {frame.name}, which has depth, got none."
+            )
         camera = parse_camera(path, _SCANNETPP_COLOR | record)
         has_pose = record.get("aligned_pose") is not None
         pose = parse_matrix(path, record, "aligned_pose", 4) if has_pose else None
-        color = _color_image(folder / "rgb" / name)
-        yield ListedFrame(name, image, color, pose, (path,), camera)
+        yield frame._replace(pose=pose, sources=(path,), camera=camera)
 
 
 _DOTTED_FRAMES = _named_frames("*.depth", "*.color", "*.pose.txt")

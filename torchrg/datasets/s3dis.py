@@ -48,8 +48,6 @@ _OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
 _NUM_COLUMNS = 6
 _CONTROL_BYTES = bytes(sorted(set(range(32)) - set(b"\t\n\r")))
 """Bytes that never occur in a text of numbers."""
-_LOST_BIT = 0x20
-"""Bit that the corrupt bytes of the releases have lost."""
 _MAX_COORDINATE = float(np.finfo(np.float32).max)
 """Largest coordinate, in meters, that float32 arrays can store."""
 _NUMBER = re.compile(rb"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -270,10 +268,10 @@ def read_annotation(
 
 
 def _restore_bits(path: Path, original: bytes) -> tuple[bytes, list[str]]:
-    """Restore the lost bit of control bytes, and list the repairs."""
+    """Restore the lost bit 0x20 of control bytes, and list the repairs."""
     if len(original.translate(None, _CONTROL_BYTES)) == len(original):
         return original, []
-    table = bytes(byte | _LOST_BIT if byte in _CONTROL_BYTES else byte for byte in range(256))
+    table = bytes(byte | 0x20 if byte in _CONTROL_BYTES else byte for byte in range(256))
     content = original.translate(table)
     bad = np.flatnonzero(np.frombuffer(original, np.uint8) != np.frombuffer(content, np.uint8))
     ends = np.flatnonzero(np.frombuffer(original, np.uint8) == ord("\n"))

@@ -24,7 +24,7 @@ from torchrg.io import read_cloud
 from torchrg.io.files import PARSE_ERRORS, decode_file, local_path, wrap_errors
 from torchrg.linalg.rigid import check_rigid
 from torchrg.plane_table import Arrays
-from torchrg.structures import Cloud
+from torchrg.structures import UNLABELED, Cloud
 from torchrg.transforms.rows import SampleDict
 
 MESH, MESH_PLUSPLUS = "_vh_clean_2.ply", "mesh_aligned_0.05.ply"
@@ -66,7 +66,6 @@ _MAX_CLASS = 65_535
 """Largest class ID: labels of the release have 16 bits."""
 _MAX_ID = np.iinfo(np.int32).max
 """Largest object ID in ScanNet."""
-_MISSING = -1
 
 
 class ScanNet(SceneDataset):
@@ -129,7 +128,11 @@ class ScanNet(SceneDataset):
                 "got none; pass the folder that contains scans or data."
             )
         lists = _read_lists(self.root)
-        _warn_missing_scans(lists, {scene.name for scene in scenes})
+        known = {scene.name for scene in scenes}
+        if missing := [name for name in lists if name not in known]:
+            count, path = f"{len(missing):,} of {len(lists):,}", lists[missing[0]][1]
+            what = f"{count} listed scans are missing; download them, or correct the names"
+            _warn_entries(path, what, missing)
         named = [scene._replace(name=f"{_split(scene, lists)}/{scene.name}") for scene in scenes]
         self.scenes = [
             scene for scene in named if split is None or scene.name.startswith(f"{split}/")
@@ -267,16 +270,6 @@ def _read_lists(root: Path) -> dict[str, tuple[str, Path]]:
     return lists
 
 
-def _warn_missing_scans(lists: Mapping[str, tuple[str, Path]], scans: set[str]) -> None:
-    """Warn if the lists contain names of missing scans."""
-    missing = [name for name in lists if name not in scans]
-    if missing:
-        warn(
-            f"{lists[missing[0]][1]}: {len(missing):,} of {len(lists):,} listed scans are missing "
-            f"(first: {shortened(missing[0])}); download them, or correct the names.",
-        )
-
-
 def _split(scene: SceneFiles, lists: Mapping[str, tuple[str, Path]]) -> str:
     """Return the split of a scan."""
     if lists:
@@ -304,7 +297,7 @@ def _scannet_labels(files: Mapping[str, Path], root: Path, count: int) -> Arrays
     words = _read_categories(root)
     arrays: Arrays = {}
     if "groups" in files and "segments" in files:
-        instance = np.full(count, _MISSING, dtype=np.int64)
+        instance = np.full(count, UNLABELED, dtype=np.int64)
         numbers = np.zeros((count, 2), dtype=np.int64)
         owners: dict[int, int] = {}
         shared, unknown = [], []
@@ -346,7 +339,7 @@ def _scannetpp_labels(mesh: Path, root: Path, count: int) -> Arrays:
     renamed = _read_mapping(root)
     if not {"segments", "groups"} <= files.keys() or not classes or renamed is None:
         return {}
-    segment = np.full((count, _MAX_LABELS), _MISSING, dtype=np.int16)
+    segment = np.full((count, _MAX_LABELS), UNLABELED, dtype=np.int16)
     instance = segment.copy()
     sizes = np.full(segment.shape, np.inf)
     used = np.zeros(count, dtype=np.int64)
@@ -514,5 +507,5 @@ def _scannetpp_classes(root: Path) -> dict[str | None, int]:
 def _index_in(numbers: NDArray[np.integer], ids: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the index of each number in an ascending list, -1 if it is missing."""
     indices = np.searchsorted(ids, numbers).clip(max=len(ids) - 1)
-    classes: NDArray[np.int64] = np.where(np.array(ids)[indices] == numbers, indices, _MISSING)
+    classes: NDArray[np.int64] = np.where(np.array(ids)[indices] == numbers, indices, UNLABELED)
     return classes

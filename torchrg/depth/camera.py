@@ -205,7 +205,7 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     is 0.
 
     Raises:
-        ConfigError: If a focal length is 0, or a value is not finite.
+        ConfigError: If a focal length is 0, or a value is not within 1e12.
 
     Example:
         >>> make_intrinsics(525, 525, 319.5, 239.5)[0].tolist()
@@ -213,11 +213,7 @@ def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     """
     rows = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
     matrix = torch.tensor(rows, dtype=torch.float64, device="cpu")
-    if not bool(matrix.isfinite().all()) or fx == 0 or fy == 0:
-        raise ConfigError(
-            "make_intrinsics: expected finite fx, fy, cx, cy with fx and fy not 0, got "
-            f"{fx}, {fy}, {cx}, {cy}."
-        )
+    check_camera("make_intrinsics", matrix)
     return matrix
 
 

@@ -1,8 +1,8 @@
 """Plane of each depth pixel, from the largest flat window around it."""
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -162,14 +162,13 @@ def _measure_noise(
     squares: Mapping[int, Tensor], noise: tuple[float, float] | None, dtype: torch.dtype
 ) -> tuple[dict[int, WindowNoise], float]:
     """Return the noise of windows of each size and the jitter of rays, measured in threads."""
-    noises: dict[int, WindowNoise] = {}
-    jitter: list[float] = []
-    tasks = [
-        lambda: noises.update(noise_by_size(squares, noise, dtype)),
-        lambda: jitter.append(find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)),
+    steep = squares[_STEEP_SIZE]
+    tasks: list[Callable[[], Any]] = [
+        lambda: noise_by_size(squares, noise, dtype),
+        lambda: find_jitter(steep, _STEEP_SIZE),
     ]
-    map_tasks(lambda task: task(), tasks, squares[_STEEP_SIZE].device)
-    return noises, jitter[0]
+    noises, jitter = map_tasks(lambda task: task(), tasks, steep.device)
+    return noises, jitter
 
 
 def rate_windows(

@@ -135,7 +135,6 @@ def _segment(
     boundary = boundary[~curved[labels[boundary]]]
     normals[boundary] = plane_normals[labels[boundary]]
     valid.view(-1)[boundary] = True
-
     if pose is not None:
         pose = pose.to(normals)
         normals, plane_normals = normals @ pose[:3, :3].T, plane_normals @ pose[:3, :3].T

@@ -1,11 +1,12 @@
 """Conversion of clouds to file columns."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from torchrg._parallel import split_rows
 from torchrg.errors import FormatError
 from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.fields import MAX_EXACT_INTEGER, SKIPPED, Columns, Values, backup_name
@@ -16,7 +17,6 @@ _RECORDS_PER_CHUNK = 1 << 20
 """Number of records converted and written at a time, which bounds the memory."""
 _MAX_NAME = 255
 """Maximum number of letters of a field name, as of a file name."""
-_LABELS = ("labels", backup_name("labels"))
 
 
 class FieldNames(NamedTuple):
@@ -51,7 +51,7 @@ def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str
         if name == SKIPPED:
             raise FormatError(f"{path}: a field cannot be named {name!r}; rename it.")
         values = _to_storable(path, name, values, field_names)
-        if name in _LABELS:
+        if name in ("labels", backup_name("labels")):
             values = narrow_integers(values, ("i4",))
         for column_name, column in _split_field(name, values, field_names).items():
             if column_name in columns:
@@ -117,16 +117,12 @@ def _split_field(name: str, values: Values, field_names: FieldNames) -> dict[str
 def check_exact(path: Path, columns: Columns) -> None:
     """Check that float64, and thus text, represents all 64-bit integers exactly."""
     for name, column in columns.items():
-        if _is_64_bit(column) and max(-int(column.min()), int(column.max())) >= MAX_EXACT_INTEGER:
+        is_integer = column.dtype.kind in "iu"
+        if is_integer and max(-int(column.min()), int(column.max())) >= MAX_EXACT_INTEGER:
             raise FormatError(
                 f"{path}: field {name} contains integers beyond 2^53, which this format rounds; "
                 "remove the field or write .npz."
             )
-
-
-def _is_64_bit(values: Values) -> bool:
-    """Return whether values are 64-bit integers and not empty."""
-    return values.dtype.kind in "iu" and values.dtype.itemsize == 8 and values.size > 0
 
 
 def narrow_integers(values: Values, codes: Collection[str]) -> Values:
@@ -134,9 +130,9 @@ def narrow_integers(values: Values, codes: Collection[str]) -> Values:
 
     Values that fit none of these types, and values of other dtypes, are unchanged.
     """
-    if not _is_64_bit(values):
+    if values.dtype.kind not in "iu" or values.dtype.itemsize < 8:
         return values
-    low, high = int(values.min()), int(values.max())
+    low, high = int(values.min(initial=0)), int(values.max(initial=0))
     for code in codes:
         limits = np.iinfo(code)
         if limits.min <= low and high <= limits.max:
@@ -159,11 +155,5 @@ def write_records(path: Path, header: Sequence[str], columns: Columns) -> None:
     num_rows = len(next(iter(columns.values())))
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         stream.write("".join(f"{line}\n" for line in header).encode())
-        for rows in row_slices(num_rows, _RECORDS_PER_CHUNK):
+        for rows in split_rows(num_rows, _RECORDS_PER_CHUNK):
             to_records(columns, rows).tofile(stream)
-
-
-def row_slices(num_rows: int, chunk_size: int) -> Iterator[slice]:
-    """Yield consecutive slices of at most ``chunk_size`` rows."""
-    for start in range(0, num_rows, chunk_size):
-        yield slice(start, min(start + chunk_size, num_rows))

@@ -12,7 +12,6 @@ import struct
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import accumulate, pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -104,7 +103,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     is zero there. The front of a point is the direction to its scanner, if the pose has one.
     """
     pye57 = require("pye57", extra="e57", purpose="read E57 files")
-    _check_pages(path)
+    _check_pages(path, size)
     _check_tree(path, size)
     message = f"{path}: expected an E57 file, got: "
     errors = (pye57.libe57.E57Exception, *PARSE_ERRORS)
@@ -155,7 +154,12 @@ def read_e57(path: Path, size: int) -> Cloud:
         notes += (f"{sum(map(bool, absent))} of {len(scans)} scans lack {missing}, zero there",)
     if num_images:
         notes += (f"images left out: {num_images}",)
-    columns = {name: _concatenate(blocks, name, counts) for name in names}
+    columns = {
+        name: np.concatenate(
+            [block.pop(name, np.zeros(n, "u1")) for block, n in zip(blocks, counts, strict=True)]
+        )
+        for name in names
+    }
     if len(scans) > 1:
         columns["scan"] = np.repeat(np.arange(len(scans), dtype=np.int32), counts)
     header = {"scans": scans} | ({SYSTEM: system} if system else {})
@@ -203,22 +207,6 @@ def _unify_colors(
     return tuple(notes)
 
 
-def _concatenate(blocks: Sequence[_Block], name: str, counts: Sequence[int]) -> Values:
-    """Concatenate a column of all scans (zero if missing) and remove it from the scans."""
-    parts = [block.pop(name, None) for block in blocks]
-    dtype = np.result_type(*(np.uint8 if column is None else column for column in parts))
-    joined = np.zeros(sum(counts), dtype)
-    for column, rows in zip(parts, _scan_rows(counts), strict=True):
-        if column is not None:
-            joined[rows] = column
-    return joined
-
-
-def _scan_rows(counts: Sequence[int]) -> list[slice]:
-    """Return the row slice of each scan."""
-    return [slice(*ends) for ends in pairwise(accumulate(counts, initial=0))]
-
-
 def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud: Cloud) -> Fronts:
     """Return the direction from each point to its scanner, and notes on implausible positions.
 
@@ -239,21 +227,21 @@ def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud:
     if not inside.any():
         return None, notes
     front = np.zeros((len(cloud), 3), np.float32)
-    for position, is_inside, rows in zip(positions, inside, _scan_rows(counts), strict=True):
+    parts = (np.split(values, np.cumsum(counts)[:-1]) for values in (front, cloud.coordinates))
+    for position, is_inside, part, points in zip(positions, inside, *parts, strict=True):
         if is_inside:
-            front[rows] = position - cloud.coordinates[rows]
+            part[:] = position - points
     front[~cloud.finite] = 0
     return front, notes
 
 
-def _check_pages(path: Path) -> None:
+def _check_pages(path: Path, size: int) -> None:
     """Check the checksum of each page before libe57 does.
 
     A libe57 reader that meets a corrupt page during construction leaks its two megabytes. libe57
     itself reports an incomplete last page.
     """
     crc32c = require("google_crc32c", extra="e57", purpose="read E57 files")
-    size = path.stat().st_size
     with path.open("rb") as stream:
         for start in range(0, size if size % _PAGE_BYTES == 0 else 0, _PAGE_BYTES):
             page = stream.read(_PAGE_BYTES)

@@ -101,7 +101,6 @@ def assemble_cloud(
         fields["labels"] = _convert_labels(path, fields["labels"])
     if "normals" in fields:
         fields["normals"] = _convert_normals(path, fields["normals"])
-
     if "color" in fields:
         color = fields["color"]
         if set(integers).issuperset(sources["color"]) and are_integers(color):

@@ -39,8 +39,6 @@ PARSE_ERRORS = (
 """Exceptions that third-party readers raise on corrupt files, in addition to their own classes."""
 ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, *PARSE_ERRORS)
 """Exceptions raised on corrupt archives."""
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Error numbers of a full disk or an exceeded quota."""
 _PROBE_BYTES = 1 << 20
 """Bytes written to test whether a disk is full. They exceed the buffer of a library, so they do not
 fit if its last write failed."""
@@ -52,7 +50,11 @@ _MAX_NAME_BYTES = 255
 """Maximum length of a file name on common file systems."""
 _URL = re.compile(r"(?:^|/)[A-Za-z][A-Za-z0-9+.-]+:/")
 """A URL, also as a path, which has a single slash. Drives of Windows have one letter."""
-_BYTES_PER_READ = 1 << 20
+_MAX_HEADER_BYTES = 1 << 20
+"""Maximum bytes of a header of lines; a longer one counts as corrupt."""
+_MAX_DIGITS = 18
+"""Maximum digits of a count; larger ones may not fit 64 bits."""
+BYTES_PER_READ = 1 << 20
 """Bytes of a file read together, which bounds the memory."""
 OUTPUT_MARK = "7472675f6f757470"
 """Mark of the temporary files of the one command that holds the lock of an output directory."""
@@ -91,7 +93,7 @@ def atomic_path(
         complete
     """
     target = Path(os.path.realpath(path))
-    end = f".{mark or make_mark()}{secrets.token_hex(4)}{target.suffix}"
+    end = f".{mark or secrets.token_hex(8)}{secrets.token_hex(4)}{target.suffix}"
     stem = os.fsencode(f".{target.stem}")[: _MAX_NAME_BYTES - len(os.fsencode(end))]
     name = f"{os.fsdecode(stem)}{end}"
     temporary = (target.parent if within is None else within) / name
@@ -107,11 +109,6 @@ def atomic_path(
         raise FormatError(f"{path}: cannot be written: {error.strerror or error}.") from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def make_mark() -> str:
-    """Return a unique mark for the temporary file names of one run."""
-    return secrets.token_hex(8)
 
 
 def remove_leftovers(folder: Path, mark: str = "") -> None:
@@ -177,7 +174,7 @@ def hash_file(path: Path) -> str:
     check_regular(path)
     digest = hashlib.sha256()
     with path.open("rb") as stream:
-        while block := stream.read(_BYTES_PER_READ):
+        while block := stream.read(BYTES_PER_READ):
             digest.update(block)
     return digest.hexdigest()
 
@@ -212,9 +209,9 @@ def create_folder(path: Path) -> None:
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error or one of its causes is a full disk."""
+    """Return whether an error or one of its causes is a full disk, or an exceeded quota."""
     while error is not None:
-        if isinstance(error, OSError) and error.errno in _DISK_FULL:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return True
         error = error.__cause__
     return False
@@ -420,6 +417,30 @@ def normalize_file_name(name: str) -> str:
         True
     """
     return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())
+
+
+def header_lines(path: Path, stream: BinaryIO, last: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and words of each line of a header, up to one that begins with ``last``.
+
+    The stream is then at the first data byte.
+    """
+    number, words = 0, list[str]()
+    while words[:1] != [last]:
+        number += 1
+        raw = stream.readline(_MAX_HEADER_BYTES)
+        if not raw.endswith(b"\n") or stream.tell() > _MAX_HEADER_BYTES:
+            raise FormatError(
+                f"{path}: line {number}: expected the header to end with {last!r}; the file "
+                "is truncated or of another format, write or copy it again."
+            )
+        words = split_words(raw)
+        yield number, words
+
+
+def parse_count(word: str) -> int | None:
+    """Parse a count of points or records; return None for any other word."""
+    is_count = word.isascii() and word.isdecimal() and len(word) <= _MAX_DIGITS
+    return int(word) if is_count else None
 
 
 def split_words(raw: bytes) -> list[str]:

@@ -10,7 +10,6 @@ import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
@@ -18,9 +17,10 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg._optional import require
+from torchrg._parallel import split_rows
 from torchrg.errors import FormatError
 from torchrg.io.colors import WIDEN
-from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
+from torchrg.io.columns import FieldNames, flatten_cloud
 from torchrg.io.fields import Columns, Values, assemble_cloud, check_coordinates
 from torchrg.io.files import (
     PARSE_ERRORS,
@@ -55,8 +55,6 @@ _POINTWISE, _MAX_LAZ_VERSION = 1, 3
 _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
 """Offsets in LASzip's record of the chunk size in points, and of the number of items. An item is a
 type, a size and a version."""
-_PARAMETERS = attrgetter("name", "dtype", "description", "offsets", "scales", "no_data")
-"""Parameters of an extra dimension, in laspy's order."""
 _UNDOCUMENTED = "Un-registered ExtraBytes"
 """Description that laspy gives to undocumented extra bytes."""
 _RANGE_BITS = 0b110
@@ -197,7 +195,7 @@ def write_las(path: Path, cloud: Cloud) -> None:
             temporary.open("wb+") as file,
             laspy.open(file, mode="w", header=header, do_compress=is_laz, closefd=False) as writer,
         ):
-            for rows in row_slices(len(cloud), _POINTS_PER_CHUNK):
+            for rows in split_rows(len(cloud), _POINTS_PER_CHUNK):
                 points = cloud.coordinates[rows].astype(np.float64, copy=False)
                 record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
                 data = laspy.LasData(header, record)
@@ -208,7 +206,10 @@ def write_las(path: Path, cloud: Cloud) -> None:
             if header.version.minor >= 4 and header.evlrs is not None:
                 writer.write_evlrs(header.evlrs)
         if not has_date:
-            _erase_date(temporary)
+            # Identical runs produce byte-identical files.
+            with temporary.open("rb+") as stream:
+                stream.seek(_DATE_AT)
+                stream.write(bytes(_DATE_BYTES))
 
 
 def _header(laspy: ModuleType, cloud: Cloud, *, colored: bool) -> Any:  # noqa: ANN401
@@ -246,8 +247,10 @@ def _add_dimensions(
     dimensions, params = dict[str, Values](), list[Any]()
     for extra in _input_dimensions(cloud.header.get("las"), columns):
         if extra.holds(columns):
-            params.append(laspy.ExtraBytesParams(*_PARAMETERS(extra.dimension)))
-            dimensions[extra.dimension.name] = extra.join(columns)
+            d = extra.dimension
+            parameters = (d.name, d.dtype, d.description, d.offsets, d.scales, d.no_data)
+            params.append(laspy.ExtraBytesParams(*parameters))
+            dimensions[d.name] = extra.join(columns)
             columns = {name: c for name, c in columns.items() if name not in extra.columns}
     standard = set(header.point_format.dimension_names)
     for name, column in columns.items():
@@ -493,10 +496,3 @@ def _fits(values: Values, dtype: np.dtype[Any]) -> bool:
             return np.array_equal(values.astype(dtype), values, equal_nan=values.dtype.kind == "f")
     limits = np.iinfo(dtype)
     return are_integers(values) and bool(values.min() >= limits.min and values.max() <= limits.max)
-
-
-def _erase_date(path: Path) -> None:
-    """Clear the creation date, so that identical runs produce byte-identical files."""
-    with path.open("rb+") as stream:
-        stream.seek(_DATE_AT)
-        stream.write(bytes(_DATE_BYTES))

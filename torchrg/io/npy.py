@@ -33,6 +33,7 @@ from torchrg.io.fields import (
 )
 from torchrg.io.files import (
     ARCHIVE_ERRORS,
+    BYTES_PER_READ,
     PARSE_ERRORS,
     atomic_path,
     check_available,
@@ -63,13 +64,8 @@ _MAX_ARRAYS = 10_000
 """Maximum number of arrays of an archive: to check an array takes a fifth of a millisecond."""
 _MAX_CHECKED = 1 << 30
 """Maximum total size of skipped arrays that are read to verify their checksums (seconds)."""
-_BYTES_PER_READ = 1 << 20
-"""Bytes decompressed together, which bounds the memory."""
 _MAX_HEADER_BYTES = 1 << 16
 """Bytes read to parse an array header, of which NumPy accepts up to 10,000."""
-_EARLIEST_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-"""Constant time of every archive member, the earliest possible, so that identical results are
-byte-identical."""
 
 
 def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Cloud:
@@ -216,7 +212,8 @@ def write_npz(
         zipfile.ZipFile(temporary, "w", allowZip64=True) as archive,
     ):
         for name, values in arrays.items():
-            member = zipfile.ZipInfo(f"{name}.npy", _EARLIEST_ZIP_TIME)
+            # The default time of a member is constant: identical results are byte-identical.
+            member = zipfile.ZipInfo(f"{name}.npy")
             with archive.open(member, "w", force_zip64=True) as file:
                 _write_array(file, values)
 
@@ -324,7 +321,7 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
 
 def _drain(stream: IO[bytes]) -> None:
     """Read a member to its end, which verifies its checksum, and discard the data."""
-    while stream.read(_BYTES_PER_READ):
+    while stream.read(BYTES_PER_READ):
         pass
 
 

@@ -16,12 +16,10 @@ import numpy as np
 from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, write_records
 from torchrg.io.fields import Columns, Values, assemble_cloud
-from torchrg.io.files import check_available, check_end, open_lines, split_words
+from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
 from torchrg.io.text import read_rows
 from torchrg.structures import FARTHEST, Cloud
 
-_MAX_HEADER_BYTES = 1 << 16
-"""Maximum bytes of a header; a longer one counts as corrupt."""
 _MAX_RECORD_BYTES = 1 << 20
 """Maximum bytes of a point; a larger one counts as corrupt."""
 _PADDING = "_"
@@ -128,16 +126,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
     0.7. The lines may have any order, except that ``DATA`` is last.
     """
     lines: dict[str, tuple[int, list[str]]] = {}
-    number = 0
-    while "DATA" not in lines:
-        number += 1
-        raw = stream.readline(_MAX_HEADER_BYTES)
-        if not raw.endswith(b"\n") or stream.tell() > _MAX_HEADER_BYTES:
-            raise FormatError(
-                f"{path}: line {number}: expected the header to end with a line DATA; "
-                "the file is truncated or not a PCD file, write or copy it again."
-            )
-        words = split_words(raw)
+    for number, words in header_lines(path, stream, "DATA"):
         if words and not words[0].startswith("#"):
             lines["FIELDS" if words[0] == "COLUMNS" else words[0]] = (number, words[1:])
     entries = _HeaderLines(path, lines)
@@ -181,11 +170,10 @@ class _HeaderLines(NamedTuple):
         if default is not None and key not in self.lines:
             return default
         words = self.words(key)
-        if len(words) != count or not all(w.isascii() and w.isdecimal() for w in words):
-            raise self.error(key, f"{count} integer{'s' if count > 1 else ''}")
-        if any(len(word) > 18 for word in words):
-            raise self.error(key, "a size that fits a file")
-        return [int(word) for word in words]
+        numbers = [number for number in map(parse_count, words) if number is not None]
+        if not len(words) == len(numbers) == count:
+            raise self.error(key, f"{count} integer{'s' if count > 1 else ''} of up to 18 digits")
+        return numbers
 
     def viewpoint(self) -> tuple[float, ...]:
         """Return position and quaternion of the sensor, or an empty tuple if they are invalid."""

@@ -24,7 +24,7 @@ from torchrg.io.columns import (
     write_records,
 )
 from torchrg.io.fields import MAX_EXACT_INTEGER, Values, assemble_cloud
-from torchrg.io.files import check_available, check_end, open_lines, split_words
+from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
 from torchrg.io.text import read_rows, skip_lines
 from torchrg.mesh import Fronts, find_fronts
 from torchrg.structures import Cloud
@@ -47,8 +47,6 @@ _READ_TYPES = {
     "bool": "u1",
 }
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_MAX_HEADER_BYTES = 1 << 20
-"""Maximum bytes of a header; a longer one counts as corrupt."""
 _VERTEX_LISTS = ("vertex_indices", "vertex_index")
 """Names of the vertex list of a face."""
 _BYTES_PER_READ = 1 << 19
@@ -114,7 +112,9 @@ def write_ply(path: Path, cloud: Cloud) -> None:
     """
     columns = flatten_cloud(path, cloud, FieldNames())
     check_exact(path, columns)
-    columns = {name: _to_ply_type(column) for name, column in columns.items()}
+    narrow = {name: narrow_integers(column, ("i4", "u4")) for name, column in columns.items()}
+    # Each type of eight bytes becomes double, the only one of PLY.
+    columns = {n: c.astype("f8", copy=False) if c.itemsize == 8 else c for n, c in narrow.items()}
     words = {code: word for word, code in _TYPES.items()}
     header = [
         "ply",
@@ -125,13 +125,6 @@ def write_ply(path: Path, cloud: Cloud) -> None:
         "end_header",
     ]
     write_records(path, header, columns)
-
-
-def _to_ply_type(column: Values) -> Values:
-    """Convert a column to a PLY type that represents its values."""
-    column = narrow_integers(column, ("i4", "u4"))
-    is_wide = column.dtype.kind in "iu" and column.dtype.itemsize == 8
-    return column.astype(np.float64) if is_wide else column
 
 
 class _Property(NamedTuple):
@@ -192,32 +185,21 @@ class _Header(NamedTuple):
 
 def _read_header(path: Path, stream: BinaryIO) -> _Header:
     """Read the header and leave the stream at the first data byte."""
-    byte_order: str | None = None
+    formats = list[str]()
     elements: list[_Element] = []
-    number = 0
-    while True:
-        number += 1
-        raw = stream.readline(_MAX_HEADER_BYTES)
-        words = split_words(raw)
+    for number, words in header_lines(path, stream, "end_header"):
+        shown = repr(" ".join(words)[:40])
         if number == 1 and words != ["ply"]:
-            raise FormatError(f"{path}: line 1: expected 'ply', got {_excerpt(raw)}.")
-        if not raw.endswith(b"\n") or stream.tell() > _MAX_HEADER_BYTES:
-            raise FormatError(
-                f"{path}: line {number}: expected the header to end with 'end_header'; "
-                "the file is truncated or not a PLY file, write or copy it again."
-            )
+            raise FormatError(f"{path}: line 1: expected 'ply', got {shown}.")
         match words:
             case [] | ["ply" | "comment" | "obj_info", *_]:
                 continue
             case ["format", word, _] if word in _BYTE_ORDERS:
-                byte_order = _BYTE_ORDERS[word]
+                formats.append(word)
                 continue
-            case ["end_header"] if byte_order is not None:
-                elements = [element for element in elements if element.properties]
-                return _Header(byte_order, elements, number, stream.tell())
-            case ["element", name, count] if (
-                count.isascii() and count.isdecimal() and len(count) < 19
-            ):
+            case ["end_header"] if formats:
+                break
+            case ["element", name, count] if parse_count(count) is not None:
                 names = [element.name for element in elements]
                 elements.append(_Element(name, int(count), []))
             case ["property", "list", length, code, name] if (
@@ -231,18 +213,15 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
                 elements[-1].properties.append(_Property(name, _READ_TYPES[code]))
             case _:
                 raise FormatError(
-                    f"{path}: line {number}: expected a line of a PLY header, got {_excerpt(raw)}; "
-                    "write the file again."
+                    f"{path}: line {number}: expected a line of a PLY header, got {shown}; write "
+                    "the file again."
                 )
         if name in names:
             raise FormatError(
                 f"{path}: line {number}: expected distinct names, got {name!r} twice; rename one."
             )
-
-
-def _excerpt(raw: bytes) -> str:
-    """Format the beginning of a line for a message."""
-    return repr(raw[:40].decode("latin-1").strip())
+    elements = [element for element in elements if element.properties]
+    return _Header(_BYTE_ORDERS[formats[-1]], elements, number, stream.tell())
 
 
 def _read_vertices(
@@ -473,7 +452,10 @@ def _read_lines(
             )
         lines, counts = (column[:left] for column in _count_words(block))
         ends = np.cumsum(counts)
-        numbers = _parse_words(block.split()[: counts.sum()])
+        words = list[float]()
+        with suppress(ValueError):  # Up to the first word that is no number.
+            words += map(float, block.split()[: counts.sum()])
+        numbers = np.array(words)
         content = np.append(numbers.view(np.uint8), np.zeros(_MARGIN, np.uint8))
         records = _find_records(content, element, "", (ends - counts) * 8)
         if left == element.num_records and element.name != "vertex":
@@ -482,7 +464,7 @@ def _read_lines(
         wrong = np.flatnonzero(~is_complete | (records.ends + surplus != ends * 8))
         if len(wrong):
             line = int(lines[wrong[0]])
-            shown = _excerpt(block.split(b"\n")[line])
+            shown = repr(block.split(b"\n")[line][:40].decode("latin-1").strip())
             raise FormatError(
                 f"{path}: line {line_number + line}: expected a record of {element.name}, got "
                 f"{shown}; correct this line."
@@ -493,16 +475,6 @@ def _read_lines(
         if not left:
             end = len(b"\n".join(block.split(b"\n")[: lines[-1] + 1]))
             stream.seek(end - len(block), os.SEEK_CUR)
-
-
-def _parse_words(words: list[bytes]) -> NDArray[np.float64]:
-    """Parse words as numbers, up to the first that is not a number."""
-    with suppress(ValueError):
-        return np.fromiter(map(float, words), np.float64, len(words))
-    numbers = list[float]()
-    with suppress(ValueError):
-        numbers += map(float, words)
-    return np.array(numbers)
 
 
 def _count_words(block: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -136,7 +136,6 @@ def warn_about_counters(path: Path, table: Table, names: Sequence[str]) -> None:
     if len(table) < _MIN_COUNTED or len(names) < 4:
         return
     unknown = [i for i, name in enumerate(names) if name not in (*_NORMAL, *_COLOR)]
-
     counting = [i for i in unknown if _only_rises(table[:, i])]
     whole = [i for i in counting if are_integers(table[:, i])]
     others = [i for i in unknown if i not in counting]

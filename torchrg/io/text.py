@@ -20,11 +20,12 @@ from typing import Any, BinaryIO, NamedTuple, TextIO
 
 import numpy as np
 
+from torchrg._parallel import split_rows
 from torchrg.errors import FormatError, warn
 from torchrg.io.arrow import parse_numbers
-from torchrg.io.columns import FieldNames, check_exact, flatten_cloud, row_slices
+from torchrg.io.columns import FieldNames, check_exact, flatten_cloud
 from torchrg.io.fields import SKIPPED, Values, assemble_table, check_names
-from torchrg.io.files import atomic_path, check_available, find_encoding
+from torchrg.io.files import atomic_path, check_available, find_encoding, parse_count
 from torchrg.structures import Cloud
 
 LINES_PER_CHUNK = 65_536
@@ -41,8 +42,6 @@ _WINDOWS_NAN = re.compile(r"1[.,]#[A-Z]+[0-9]*|nan\([a-z]*\)", re.IGNORECASE)
 _COLMAP = "POINT3D_ID, X, Y, Z"
 """Comment above the points in COLMAP's ``points3D.txt``, whose rows list the images that see a
 point."""
-_MAX_DIGITS = 18
-"""Maximum digits of a point count; no file stores more points."""
 
 
 class _Dialect(NamedTuple):
@@ -98,7 +97,7 @@ def write_text(path: Path, cloud: Cloud) -> None:
         # Nine digits identify a float32; Python's shortest repr identifies a float64.
         formats = {"f4": "%.9g", "f8": "%r"}
         row = " ".join(formats.get(c.dtype.str[1:], "%d") for c in columns.values()) + "\n"
-        for rows in row_slices(len(cloud), LINES_PER_CHUNK):
+        for rows in split_rows(len(cloud), LINES_PER_CHUNK):
             block = [column[rows].tolist() for column in columns.values()]
             out.write(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
 
@@ -166,28 +165,15 @@ def _parse_blocks(path: Path, stream: TextIO, preamble: "_Preamble") -> Iterator
     while block := line + _standardize(stream.read(CHARACTERS_PER_READ) + stream.readline()):
         table = parse_numbers(block.encode(), preamble.num_columns, *preamble.dialect)
         if table is None:
-            lines = _extract_counts(block.split("\n"), preamble.counts)
+            lines = block.split("\n")
+            # Each scan in a Cyclone file begins with its count. Blank it.
+            for index, text in enumerate(lines) if preamble.counts else ():
+                if (count := parse_count(text.strip())) is not None:
+                    preamble.counts.append(count)
+                    lines[index] = ""
             table = _parse(path, lines, dtype, number, preamble.dialect, skipped)["row"]
         yield table
         line, number = "", number + block.count("\n")
-
-
-def _extract_counts(lines: list[str], counts: list[int]) -> list[str]:
-    """Blank the lines that are point counts, and append these counts to ``counts``.
-
-    Each scan in a Cyclone file begins with its count. Without a first count, lines are unchanged.
-    """
-    if counts:
-        for index, line in enumerate(lines):
-            if (count := _parse_count(line.strip())) is not None:
-                counts.append(count)
-                lines[index] = ""
-    return lines
-
-
-def _parse_count(text: str) -> int | None:
-    """Parse a line as a point count, or return None."""
-    return int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else None
 
 
 def _parse(
@@ -304,7 +290,7 @@ def _read_preamble(path: Path, lines: Iterable[str], columns: Sequence[str] | No
         elif not bare.strip():
             continue
         elif len(words) == 1 and are_numbers[0]:
-            count = _parse_count(words[0])
+            count = parse_count(words[0])
             if count is None:
                 raise FormatError(
                     f"{path}: line {number}: expected a point count or a point, got "

@@ -14,9 +14,6 @@ from torchrg.io.colors import read_colors
 from torchrg.io.files import atomic_path
 from torchrg.structures import UNLABELED, Cloud
 
-_PLANE = 0
-"""Group type of a plane."""
-
 
 def write_vg(path: Path, cloud: Cloud, planes: NDArray[np.floating] | None = None) -> None:
     """Write a text file; ``planes`` ``(M, 4)`` are indexed by label, or fitted if None."""
@@ -33,7 +30,7 @@ def write_vg(path: Path, cloud: Cloud, planes: NDArray[np.floating] | None = Non
         groups = _find_groups(cloud, planes)
         out.write(f"num_groups: {len(groups)}\n")
         for index, (plane, rows) in enumerate(groups):
-            out.write(f"group_type: {_PLANE}\nnum_group_parameters: 4\n")
+            out.write("group_type: 0\nnum_group_parameters: 4\n")  # Type 0 is a plane.
             out.write(f"group_parameters: {' '.join(f'{value:.17g}' for value in plane)}\n")
             out.write(f"group_label: plane_{index}\ngroup_color: {_group_color(index)}\n")
             out.write(f"group_num_point: {len(rows)}\n{' '.join(map(str, rows))}\n")

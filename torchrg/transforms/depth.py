@@ -82,9 +82,7 @@ class DepthTransform(SampleTransform):
 
     def _expand(self, name: str, values: Tensor, shape: tuple[int, int, int]) -> Tensor:
         """Return one matrix per image; a single matrix applies to all images."""
-        expanded = (
-            values.expand(shape) if values.ndim == 2 and values.shape == shape[1:] else values
-        )
+        expanded = values.expand(shape) if values.shape == shape[1:] else values
         if expanded.shape != shape:
             raise ShapeError(
                 f"{type(self).__name__}: expected {name} of shape {shape[1:]} or {shape}, got "

@@ -383,20 +383,15 @@ class AlignAxes(SampleTransform):
         """Return a new sample with transformed coordinates and normals."""
         coord = self.read(sample, "coord")
         parts = cloud_rows(sample, len(coord))
-        transforms = [
-            align_axes(segment_planes(coord[rows], self.config, orient="none"), up=self.up).to(
-                coord.device
-            )
-            for rows in parts
-        ]
+        clouds = (segment_planes(coord[rows], self.config, orient="none") for rows in parts)
+        transforms = [align_axes(cloud, up=self.up).to(coord.device) for cloud in clouds]
         moved = {"coord": _transform(coord, parts, transforms, shifted=True)}
         for name in ("normal", "front"):
             if self.key(sample, name) in sample:
                 moved[name] = _transform(self.read(sample, name), parts, transforms, shifted=False)
         changes = {self.key(sample, name): values for name, values in moved.items()}
-        return self.replace(
-            sample, changes | {self.key(sample, "axis_align_matrix"): torch.stack(transforms)}
-        )
+        changes[self.key(sample, "axis_align_matrix")] = torch.stack(transforms)
+        return self.replace(sample, changes)
 
 
 def _transform(

@@ -16,22 +16,22 @@ Without Pointcept, the import has no effect.
 """
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from torch import Tensor
 
 from torchrg.errors import MissingDependencyError
 from torchrg.transforms import planes
 from torchrg.transforms.planes import AlignAxes, GrowRegions, MakeSuperpoints, OrientNormals
-from torchrg.transforms.rows import (
-    TORCHRG_KEYS,
-    Entries,
-    Sample,
-    SampleDict,
-    extend_list,
-    per_point_keys,
+from torchrg.transforms.rows import TORCHRG_KEYS, Entries, SampleDict, extend_list, per_point_keys
+from torchrg.transforms.sample import (
+    CenterCloud,
+    CloudTransform,
+    KeepFinite,
+    NeighborSearch,
+    SampleVoxels,
 )
-from torchrg.transforms.sample import CenterCloud, KeepFinite, SampleTransform, SampleVoxels
 
 __all__ = ["EstimateNormals", "SegmentPlanes", "index_operator", "point_collate_fn"]
 __dir__ = __all__.copy
@@ -44,23 +44,13 @@ _FILES = ("plane", "curvature", "superpoint")
 """Arrays of a scene folder that Pointcept's data sets would ignore."""
 
 
-class _ColumnFeatures(SampleTransform):
+class _ColumnFeatures(CloudTransform):
     """Mixin that adds a second axis to features, as Pointcept's ``Collect`` requires."""
 
-    def replace(
-        self,
-        sample: Sample,
-        values: Entries,
-        *,
-        per_point: Sequence[str] = (),
-    ) -> Sample:
-        """Return a new sample of the same type with other values by key."""
-        columns = {self.key(sample, name) for name in _FEATURES}
-        expanded = {
-            key: value[:, None] if key in columns and value.ndim == 1 else value
-            for key, value in values.items()
-        }
-        return super().replace(sample, expanded, per_point=per_point)
+    def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
+        """Return the new entries of one cloud from the entries that are read."""
+        added = super().add(cloud, search)
+        return {name: v[:, None] if name in _FEATURES else v for name, v in added.items()}
 
 
 class EstimateNormals(_ColumnFeatures, planes.EstimateNormals):
