@@ -11,39 +11,42 @@ struct Candidates {
   alignas(32) double x[MAX_CANDIDATES], y[MAX_CANDIDATES], z[MAX_CANDIDATES],
       square[MAX_CANDIDATES];
   int32_t row[MAX_CANDIDATES], chosen[MAX_CHOSEN + 1];
-  alignas(32) double distance[MAX_CHOSEN];
-  alignas(32) int64_t rank[MAX_CHOSEN];
-  int32_t row_of[MAX_CHOSEN];
+  alignas(32) float key[MAX_CHOSEN];  // their squared distances, rounded
+  alignas(32) int32_t rank[MAX_CHOSEN];
+  int32_t sorted[MAX_CHOSEN];
 };
 
 // Sorts selected candidates by distance, then row; returns the k-th distance.
 INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
   const int width = padded(count);
-  for (int i = 0; i < width; i++) {
-    const int candidate = all.chosen[i < count ? i : 0];
-    all.distance[i] = square_root(all.square[candidate]), all.row_of[i] = all.row[candidate];
-    all.rank[i] = 0;
+  for (int i = 0; i < width; i++) all.key[i] = float(all.square[all.chosen[i < count ? i : 0]]);
+  for (int i = 0; i < width; i += LANES) {
+    const Lanes keys = load(all.key + i);
+    Flags rank{};
+    for (int j = 0; j < count; j++) rank -= Lanes{} + all.key[j] < keys;
+    __builtin_memcpy(all.rank + i, &rank, sizeof rank);
   }
-  for (int j = 0; j < count; j++) {
-    const double distance = all.distance[j];
-    for (int i = 0; i < width; i++) all.rank[i] += distance < all.distance[i];
+  int64_t sum = 0;
+  for (int i = 0; i < count; i++) sum += all.rank[i], all.sorted[all.rank[i]] = all.chosen[i];
+  if (sum != int64_t(count) * (count - 1) / 2) {
+    // Equal keys share a rank: place them one after another, and sort each run.
+    for (int i = 0; i < count; i++) all.sorted[i] = -1;
+    for (int i = 0; i < count; i++) {
+      int at = all.rank[i];
+      while (all.sorted[at] >= 0) at++;
+      const int candidate = all.chosen[i];
+      const double distance = square_root(all.square[candidate]);
+      for (; at > all.rank[i]; at--) {
+        const int before = all.sorted[at - 1];
+        const double other = square_root(all.square[before]);
+        if (other < distance || (other == distance && all.row[before] < all.row[candidate])) break;
+        all.sorted[at] = before;
+      }
+      all.sorted[at] = candidate;
+    }
   }
-  double farthest = 0;
-  bool is_tied = false;
-  for (int i = 0; i < k; i++) sorted[i] = -1;
-  for (int i = 0; i < count; i++) {
-    if (all.rank[i] >= k) continue;
-    is_tied |= sorted[all.rank[i]] != -1;
-    sorted[all.rank[i]] = all.row_of[i];
-    farthest = larger(farthest, all.distance[i]);
-  }
-  for (int i = 0; is_tied && i < count; i++) {
-    int64_t rank = all.rank[i];
-    for (int j = 0; j < count; j++)
-      rank += all.distance[j] == all.distance[i] && all.row_of[j] < all.row_of[i];
-    if (rank < k) sorted[rank] = all.row_of[i];
-  }
-  return farthest;
+  for (int j = 0; j < k; j++) sorted[j] = all.row[all.sorted[j]];
+  return square_root(all.square[all.sorted[k - 1]]);
 }
 
 // Inserts two zero bits between the bits of a number below 2^21.
