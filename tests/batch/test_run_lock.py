@@ -19,6 +19,7 @@ with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
 """
+UNLOCKABLE = r"\.torchrg\.lock: cannot be locked: .*; choose one on another disk"
 
 
 @pytest.fixture(autouse=True)
@@ -44,11 +45,11 @@ def test_the_second_is_refused_until_the_first_has_ended(tmp_path):
 def test_a_file_of_others_in_the_place_of_the_lock_is_told_and_stays(tmp_path):
     (tmp_path / "theirs").write_text("theirs")
     (tmp_path / LOCK).symlink_to("theirs")
-    with pytest.raises(FormatError, match=r"\.torchrg\.lock: cannot be locked: .*; choose one on another disk"):
+    with pytest.raises(FormatError, match=UNLOCKABLE):
         lock_folder(tmp_path).__enter__()
     (tmp_path / LOCK).unlink()
     (tmp_path / LOCK).mkdir()
-    with pytest.raises(FormatError, match=r"\.torchrg\.lock: cannot be locked: .*; choose one on another disk"):
+    with pytest.raises(FormatError, match=UNLOCKABLE):
         lock_folder(tmp_path).__enter__()
     assert (tmp_path / "theirs").read_text() == "theirs"
 
