@@ -4,13 +4,10 @@ Files and flags hold only differences.
 """
 
 import dataclasses
-import difflib
 import itertools
 import math
-import numbers
-import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -19,6 +16,8 @@ from typing import Any, Literal, NoReturn, TypeVar
 import torch
 
 from torchrg._parallel import CHUNK_SIZE
+from torchrg._synonyms import advice_on, nearest_name
+from torchrg._values import SettingError, convert
 from torchrg.errors import ConfigError
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
@@ -49,10 +48,8 @@ Auto = Literal["auto"]
 """Value of a setting that is determined from the data; see :meth:`PipelineConfig.with_sampling`."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """Up axis of the coordinates."""
-NO_FLAG = {"is_flag": False}
-"""Metadata of a setting available in files and Python, but not as a flag."""
-SHORT_FLAG = {"has_part": False}
-"""Metadata of a setting whose flag omits the name of its section."""
+SHORT_FLAG = {"is_short": True}
+"""Metadata of a setting that is an option of commands, without the name of its section."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class NormalsConfig:
     inlier_quantile: float = 0.975
     """Chi-square quantile of the squared distance below which a neighbor counts as an inlier of a
     robust fit."""
-    irls_decay: float = field(default=1.05, metadata=NO_FLAG)
+    irls_decay: float = 1.05
     """Factor, above 1, by which irls shrinks its scale in each step. The authors use 1.01, which
     takes five times as long as 1.05."""
     adaptive_k: int | None = None
@@ -142,7 +139,7 @@ class GrowingConfig:
     neighborhood (eq. 11)."""
     coplanarity_scope: Literal["all", "connected"] = "all"
     """Neighbors used for that median and Qn: all, or connected ones (Algorithm 2)."""
-    coplanarity_floor: float = field(default=0.005, metadata=NO_FLAG)
+    coplanarity_floor: float = 0.005
     """Lower bound of Qn in the coplanarity test, as a fraction of the distance to the farthest
     neighbor. On exact and quantized surfaces most residuals are equal, so Qn is 0."""
     plane_reach: float | None = 4.0
@@ -164,7 +161,7 @@ class GrowingConfig:
     mesh facets and warped reconstructions. auto: 1/240 of the cloud height (11 mm in a room) if
     deviations grow with scale, less than half of that (5 mm) if the noise is white. None disables
     merging."""
-    faceted: bool | Auto = field(default="auto", metadata=NO_FLAG)
+    faceted: bool | Auto = "auto"
     """Whether flat surfaces deviate from planes by shape (mesh facets, warped reconstructions)
     rather than by noise. If true, points instead of normals decide whether a region is flat;
     requires facet_tolerance. auto: measured."""
@@ -174,10 +171,10 @@ class GrowingConfig:
     absorb: bool = True
     """Assign unlabeled points (and regions below min_size) to an adjacent flat region on whose
     plane they lie."""
-    absorb_reach: float = field(default=3.0, metadata=NO_FLAG)
+    absorb_reach: float = 3.0
     """Maximum distance between an absorbed point and the plane of its region, in thicknesses of the
     region."""
-    absorb_angle_deg: float = field(default=45.0, metadata=NO_FLAG)
+    absorb_angle_deg: float = 45.0
     """Maximum angle between the normals of an absorbed point and the plane, in degrees."""
     refine_borders: bool = True
     """Reassign boundary points to the region that explains them best, using the line of
@@ -185,7 +182,7 @@ class GrowingConfig:
     merge_coplanar: bool = True
     """Merge adjacent coplanar regions, and regions within the noise of a larger one (from the
     residuals of the normals)."""
-    merge_tolerance: float = field(default=1.2, metadata=NO_FLAG)
+    merge_tolerance: float = 1.2
     """Maximum thickness of a region about the merged plane, in multiples of its thickness about its
     own plane. Used by merge_coplanar."""
 
@@ -295,10 +292,7 @@ class SelectionConfig:
     def __post_init__(self) -> None:
         check_values(self)
         _require(self, "min_area", ">= 0", self.min_area >= 0)
-        kinds: Any = self.kinds
-        is_list = isinstance(kinds, tuple) and len(kinds) > 0 and set(kinds) <= set(PLANE_KINDS)
-        words = f"to be some of {', '.join(PLANE_KINDS)}, or none"
-        _require(self, "kinds", words, kinds is None or is_list)
+        _require(self, "kinds", f"to be some of {', '.join(PLANE_KINDS)} or none", self.kinds != ())
 
     @property
     def max_neighbors(self) -> int:
@@ -356,9 +350,11 @@ class PipelineConfig(SelectionConfig):
         Example:
             >>> config = load_config("paper").with_angle(8)
             >>> config.normals.sharp_angle_deg, config.growing.max_angle_deg
-            (8, 8)
+            (8.0, 8.0)
         """
-        _check_angle("PipelineConfig", angle_deg)
+        angle_deg = convert(angle_deg, float, "angle_deg", "PipelineConfig")
+        if not 0 <= angle_deg <= 90:
+            raise SettingError("PipelineConfig", "angle_deg", f"in [0, 90], got {angle_deg!r}")
         parts = {
             section: dataclasses.replace(getattr(self, section), **{name: angle_deg})
             for section, name in _ANGLES.items()
@@ -484,7 +480,7 @@ class DepthConfig(SelectionConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         parts: tuple[float, ...] = (1.0, 0.0) if self.noise is None else self.noise
-        is_noise = len(parts) == 2 and min(parts) >= 0 and max(parts) > 0
+        is_noise = min(parts) >= 0 and max(parts) > 0
         _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
         _require(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
         _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
@@ -507,9 +503,11 @@ def preset_names() -> list[str]:
 def load_config(config: AnyConfig = DEFAULT_PRESET, **changes: Any) -> PipelineConfig:  # noqa: ANN401
     """Load settings from a preset, YAML file or dictionary, and override individual values.
 
-    Values omitted by a file or dictionary come from ``consensus``, or from the preset in ``base``.
+    Values omitted by a file or dictionary come from ``consensus``, or from ``base``: a preset, or
+    in Python also settings.
     Keys are sections, or dotted settings such as ``normals.k``. A top-level ``angle_deg`` sets both
-    angles: see :meth:`PipelineConfig.with_angle`.
+    angles: see :meth:`PipelineConfig.with_angle`. Values can be words, as on the command line:
+    ``"50"``, ``"no"``, ``"none"``, ``"wall,floor"``.
 
     Args:
         config: A name from :func:`preset_names`, the path of a ``.yaml`` file, a dictionary, or
@@ -524,7 +522,7 @@ def load_config(config: AnyConfig = DEFAULT_PRESET, **changes: Any) -> PipelineC
             invalid.
 
     Example:
-        >>> load_config("classic", **{"normals.k": 30}).normals.k
+        >>> load_config({"base": "classic", "normals.k": 30}).normals.k
         30
         >>> load_config({"base": "classic", "growing": {"min_size": 20}}).growing.min_size
         20
@@ -595,11 +593,13 @@ def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
 
 def _apply_to_base(values: object, where: str) -> PipelineConfig:
     """Apply the values of a file or dictionary to its base."""
-    base = PipelineConfig()
+    base: object = PipelineConfig()
     if isinstance(values, Mapping) and "base" in values:
-        expected = f"{where}: expected base to be one of"
-        base = _read_config(_preset_file(values["base"], expected=expected), where)
+        base = values["base"]
         values = {key: value for key, value in values.items() if key != "base"}
+    if not isinstance(base, PipelineConfig):
+        expected = f"{where}: expected base to be one of"
+        base = _read_config(_preset_file(base, expected=expected), where)
     return _override(base, values, where)
 
 
@@ -619,136 +619,65 @@ def _preset_file(name: object, *, expected: str) -> Path:
     return _preset_folder() / f"{name}.yaml"
 
 
-def _override(config: Settings, values: object, where: str) -> Settings:
-    """Override settings; raise for unknown keys and wrong types.
+def _override(config: Settings, values: object, where: str, prefix: str = "") -> Settings:
+    """Override settings; raise for unknown keys and wrong values.
 
-    ``where`` is the file and section, or the caller, for messages.
+    ``where`` is the file or the caller, and ``prefix`` the section with a dot, for messages.
     """
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where}: expected a mapping of settings, got {values!r}.")
-    kind, settings = type(config), dict[str, Any]()
-    hints, dotted = typing.get_type_hints(kind), dict[str, dict[str, Any]]()
+        name = prefix.removesuffix(".") or "settings"
+        raise SettingError(where, name, f"to be a mapping, got {values!r}")
+    kind, own, dotted = type(config), dict[str, Any](), dict[str, dict[str, Any]]()
     for key, value in values.items():
         section, dot, name = str(key).partition(".")
+        if section not in vars(config) and (key, kind) != ("angle_deg", PipelineConfig):
+            fix = _fix_for(str(key), value, config, prefix)
+            raise ConfigError(f"{where}: unknown setting {f'{prefix}{key}'!r}; {fix}.")
         if dot:
             dotted.setdefault(section, {})[name] = value
         else:
-            settings[section] = value
-    if isinstance(config, PipelineConfig) and "angle_deg" in settings:
-        angle = _convert(settings.pop("angle_deg"), float, f"{where}: angle_deg")
-        _check_angle(where, angle)
-        # Explicit values of the two angles take precedence.
-        config = typing.cast(Settings, config.with_angle(angle))
-    for key, value in settings.items():
-        if key not in hints:
-            raise ConfigError(f"{where}: unknown setting {key!r}; {_fix_for(key, value, kind)}.")
-        current = getattr(config, key)
-        at = f"{where}: {key}"
-        is_section = dataclasses.is_dataclass(current) and not dataclasses.is_dataclass(value)
-        settings[key] = (
-            _override(current, value, at) if is_section else _convert(value, hints[key], at)
-        )
+            own[section] = value
     try:
-        changed = dataclasses.replace(config, **settings)  # type: ignore[type-var]
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    return _override(changed, dotted, where) if dotted else changed
+        if "angle_deg" in own:  # Explicit values of the two angles take precedence.
+            config = typing.cast(Any, config).with_angle(own.pop("angle_deg"))
+        for key, value in own.items():
+            current = getattr(config, key)
+            if dataclasses.is_dataclass(current) and not dataclasses.is_dataclass(value):
+                own[key] = _override(current, value, where, f"{prefix}{key}.")
+        changed = dataclasses.replace(config, **own)  # type: ignore[type-var]
+    except SettingError as error:
+        if error.where == where:  # Of a section.
+            raise
+        raise SettingError(where, f"{prefix}{error.name}", error.problem) from None
+    return _override(changed, dotted, where, prefix) if dotted else changed
 
 
-_FIXES = {
-    "preset": "pass the preset as the first argument, config",
-    "radius": "neighborhoods have k points; max_distance bounds their radius",
-    "offset": "batches with an offset are supported by torchrg.transforms",
-    "n": "the numbers of superpoints are counts",
-}
-"""Fixes for setting names of other libraries."""
-
-
-def _fix_for(key: str, value: object, kind: type) -> str:
+def _fix_for(key: str, value: object, config: object, prefix: str) -> str:
     """Return the fix for an unknown key."""
-    names = valid_names = [*typing.get_type_hints(kind), *["angle_deg"] * (kind is PipelineConfig)]
-    for section, section_kind in _SECTIONS.items() if kind is PipelineConfig else ():
-        names = [*names, *(f"{section}.{name}" for name in typing.get_type_hints(section_kind))]
-    tails = {name.rpartition(".")[2]: name for name in reversed(names)}
-    if key in tails:
-        return f"it is {tails[key]}, as in **{{{tails[key]!r}: {value!r}}}"
-    if key in _FIXES:
-        return _FIXES[key]
-    if near := difflib.get_close_matches(key, [*tails, *names], 1):
-        return f"the nearest is {tails.get(near[0], near[0])}"
-    return f"{kind.__name__} has {', '.join(valid_names)}"
-
-
-def _convert(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
-    """Convert a value to its annotated type, or raise."""
-    unions = (types.UnionType, typing.Union)
-    choices = typing.get_args(hint) if typing.get_origin(hint) in unions else (hint,)
-    for choice in choices:
-        if typing.get_origin(choice) is Literal:
-            if value in typing.get_args(choice):
-                return value
-        elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value) if abs(value) <= FARTHEST else value  # The range check raises.
-        elif typing.get_origin(choice) is tuple and isinstance(value, str) and _is_words(choice):
-            return _convert(tuple(value.replace(" ", "").split(",")), choice, where)
-        elif typing.get_origin(choice) is tuple and not isinstance(value, str | Mapping | None):
-            kind, *others = typing.get_args(choice)
-            parts = tuple(value) if isinstance(value, Iterable) else (value,)
-            if others == [...] or len(parts) == len(others) + 1:
-                return tuple(_convert(item, kind, where) for item in parts)
-        elif type(value) is choice:
-            return value
-    allowed = [_type_name(choice) for choice in choices]
-    raise ConfigError(f"{where}: expected {' or '.join(allowed)}, got {value!r}.")
-
-
-def _is_words(choice: Any) -> bool:  # noqa: ANN401
-    """Return whether a tuple consists of choices, which are separated by commas."""
-    return typing.get_origin(typing.get_args(choice)[0]) is Literal
-
-
-def _type_name(choice: Any) -> str:  # noqa: ANN401
-    """Return the name of a type for messages."""
-    if typing.get_origin(choice) is Literal:
-        return "one of " + ", ".join(map(str, typing.get_args(choice)))
-    names = {type(None): "null", tuple: "numbers"}
-    return names.get(typing.get_origin(choice) or choice, getattr(choice, "__name__", ""))
-
-
-def _check_angle(where: str, angle_deg: float) -> None:
-    """Raise if the angle is out of range."""
-    if not 0 <= angle_deg <= 90:
-        raise ConfigError(f"{where}: expected angle_deg in [0, 90], got {angle_deg!r}.")
+    names = [*vars(config), *["angle_deg"] * isinstance(config, PipelineConfig)]
+    if name := nearest_name(key, [*names, *(name for name, _ in _flat_values(config))]):
+        return f"the nearest is {prefix}{name}, as in {{{f'{prefix}{name}'!r}: {value!r}}}"
+    return advice_on(key) or f"{type(config).__name__} has {', '.join(names)}"
 
 
 def check_values(config: Any) -> None:  # noqa: ANN401
-    """Raise unless choices are valid, and numbers of their type and at most 1e12."""
-    for name, hint in typing.get_type_hints(type(config)).items():
-        value, kinds = getattr(config, name), _kinds_of(hint)
-        if typing.get_origin(hint) is Literal:
-            names = ", ".join(typing.get_args(hint))
-            _require(config, name, f"to be one of {names}", value in typing.get_args(hint))
-        kind = numbers.Real if float in kinds else numbers.Integral
-        words = "a number" if float in kinds else "an integer"
-        is_open = kinds.isdisjoint({int, float}) or value is None or value == "auto"
-        for number in () if is_open else value if isinstance(value, tuple | list) else (value,):
-            is_number = isinstance(number, kind) and not isinstance(number, bool)
-            _require(config, name, f"to be {words}", is_number and number == number)
-            bounds = f"in [-{FARTHEST:g}, {FARTHEST:g}]"
-            _require(config, name, bounds, abs(number) <= FARTHEST)
-
-
-def _kinds_of(hint: Any) -> set[Any]:  # noqa: ANN401
-    """Return the types in an annotation."""
-    parts = typing.get_args(hint)
-    return set().union(*map(_kinds_of, parts)) if parts else {hint}
+    """Convert settings to their annotated types, or raise; numbers are at most 1e12."""
+    kind = type(config)
+    for name, hint in typing.get_type_hints(kind).items():
+        value = getattr(config, name)
+        if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+            value = _override(typing.cast(Any, hint)(), value, kind.__name__, f"{name}.")
+        vars(config)[name] = value = convert(value, hint, name, kind.__name__)
+        for number in value if isinstance(value, tuple) else (value,):
+            is_far = isinstance(number, int | float) and abs(number) > FARTHEST
+            _require(config, name, f"in [-{FARTHEST:g}, {FARTHEST:g}]", not is_far)
 
 
 def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401
     """Raise if a setting is invalid."""
     if not holds:
-        value = getattr(config, name)
-        raise ConfigError(f"{type(config).__name__}: expected {name} {requirement}, got {value!r}.")
+        problem = f"{requirement}, got {getattr(config, name)!r}"
+        raise SettingError(type(config).__name__, name, problem)
 
 
 def _preset_folder() -> Path:
@@ -761,7 +690,7 @@ def _raise_immutable(config: object, name: str, value: object) -> NoReturn:
     """Raise an error that shows how to copy settings with a change."""
     kind = type(config)
     section = next((key for key, type_ in _SECTIONS.items() if type_ is kind), "")
-    whole = f"load_config(config, **{{'{section}.{name}': {value!r}}})"
+    whole = f"load_config({{'base': config, '{section}.{name}': {value!r}}})"
     raise dataclasses.FrozenInstanceError(
         f"{kind.__name__} is immutable; use "
         f"{whole if section else f'dataclasses.replace(config, {name}={value!r})'}."
@@ -796,7 +725,7 @@ def _format_call(config: Any) -> str:  # noqa: ANN401
         for name, preset in _values_of_presets().items()
     }
     preset, differing = min(others.items(), key=lambda item: len(item[1]))
-    return f"load_config({preset!r}{f', **{differing}' if differing else ''})"
+    return f"load_config({ {'base': preset, **differing} if differing else preset!r})"
 
 
 _KINDS: list[Any] = [

@@ -113,7 +113,7 @@ class Arguments:
 
 
 @dataclass(frozen=True)
-class CloudArguments(Arguments):
+class CloudArguments(flags.PlaneSettings, Arguments):
     """Additional arguments of data sets of point clouds."""
 
     pages: Path | None = None
@@ -135,7 +135,6 @@ class CloudArguments(Arguments):
     replacing ScanNet's; its superpoints do not cross objects. S3DIS supports neither scannet nor
     spformer; ScanNet++ supports no other layout with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
-    settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
     def data(self, root: Path) -> SceneDataset:
         """Open the data set."""
@@ -145,8 +144,7 @@ class CloudArguments(Arguments):
         """Return the clouds of the data set with the settings of their results."""
         names = ("layout", "partition", "level", "orient", "within", "table")
         output: dict[str, Any] = {name: getattr(self, name) for name in names}
-        settings = self.settings.resolved
-        return CloudSource(self.data(root), settings, superpoint=self.superpoints, **output)
+        return CloudSource(self.data(root), self.settings, superpoint=self.superpoints, **output)
 
 
 @dataclass(frozen=True)
@@ -277,10 +275,7 @@ def run(argv: list[str]) -> int:
     kind, *remaining = flags.expand_counts(argv)
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
-    chosen, start = KINDS[kind], {}
-    if issubclass(chosen, CloudArguments):
-        start["settings"] = flags.PlaneSettings.from_arguments(remaining)
-    arguments = parse(chosen, remaining, prog=f"torchrg convert {kind}", default=start)
+    arguments = parse(KINDS[kind], remaining, prog=f"torchrg convert {kind}")
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
     with print_warnings():

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +20,7 @@ from torchrg.config import (
     PipelineConfig,
     SelectionConfig,
     SuperpointsConfig,
-    load_config,
+    settings_of,
 )
 from torchrg.datasets.camera_files import SUFFIXES, read_camera
 from torchrg.depth.camera import Pinhole
@@ -133,51 +132,40 @@ WithinFlag = Annotated[
 Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "nag", "npy"]
 
 
-@dataclass(frozen=True)
+def _base_settings(options: Mapping[str, Any]) -> PipelineConfig:
+    """Return the settings of the preset or file, with the options that concern several settings.
+
+    The up axis is z unless the file sets another. With --table, polygons are traced if shapely is
+    installed.
+    """
+    angle = options.get("angle_deg")
+    changes = {} if angle is None else {"angle_deg": angle}
+    preset = options.get("preset", DEFAULT_PRESET)
+    config = settings_of("", PipelineConfig, options.get("config") or preset, changes)
+    has_outline = options.get("table") is not None and find_spec("shapely") is not None
+    planes = dataclasses.replace(
+        config.planes,
+        up=config.planes.up or "z",
+        outline=config.planes.outline or has_outline,
+    )
+    return dataclasses.replace(config, planes=planes)
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlaneSettings:
-    """Settings of the plane segmentation: preset or file, overridden by flags."""
+    """Settings of the plane segmentation: preset or file, overridden by words."""
 
     preset: str = DEFAULT_PRESET
     """Preset to start from: consensus (adapts to the data), or classic, classic_increment, detmm,
-    paper, algorithm2 for comparison. Flags override it."""
+    paper, algorithm2 for comparison. Settings override it."""
     config: Path | None = None
     """YAML settings file, instead of a preset. Settings it omits keep their defaults."""
     angle_deg: float | None = None
     """The paper's single threshold, in degrees: sets both --normals.sharp-angle-deg and
     --growing.max-angle-deg, which take precedence."""
-    resolved: Annotated[PipelineConfig, Argument(is_inline=True)] = dataclasses.field(
-        default_factory=PipelineConfig
+    settings: Annotated[PipelineConfig, Argument(base=_base_settings)] = dataclasses.field(
+        default_factory=lambda: _base_settings({})
     )
-
-    @classmethod
-    def from_arguments(cls, argv: list[str]) -> "PlaneSettings":
-        """Return the settings of the preset or file in the arguments, as defaults of the flags.
-
-        The up axis is z unless the file sets another. With --table, polygons are traced if shapely
-        is installed.
-
-        Example:
-            >>> settings = PlaneSettings.from_arguments(["scan.pcd", "--preset=classic"])
-            >>> settings.resolved.normals.method
-            'pca'
-        """
-        values = {"--preset": "", "--config": "", "--angle-deg": ""}
-        for argument, following in pairwise((*argv, "")):
-            name, equals, value = argument.partition("=")
-            name = name.replace("_", "-")
-            if name in values:
-                values[name] = value if equals else following
-        resolved = load_config(values["--config"] or values["--preset"] or DEFAULT_PRESET)
-        planes = dataclasses.replace(resolved.planes, up=resolved.planes.up or "z")
-        if any(argument.partition("=")[0] == "--table" for argument in argv):
-            outline = planes.outline or find_spec("shapely") is not None
-            planes = dataclasses.replace(planes, outline=outline)
-        resolved = dataclasses.replace(resolved, planes=planes)
-        try:
-            angle = float(values["--angle-deg"])
-        except ValueError:  # Missing, or invalid and rejected by the parser.
-            return cls(resolved=resolved)
-        return cls(resolved=resolved.with_angle(angle))
 
 
 def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
@@ -209,10 +197,6 @@ def reason_for_no_plane(settings: SelectionConfig) -> str:
     """
     is_chosen = settings.min_area > 0 or settings.kinds is not None
     return "no plane passes --min-area and --kinds" if is_chosen else "no region is large enough"
-
-
-SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]
-"""Argument type with the flags ``--preset``, ``--config``, ``--normals.k`` and so on."""
 
 
 def split_columns(columns: str | None) -> tuple[str, ...] | None:
@@ -247,11 +231,11 @@ def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) 
 
 
 def expand_counts(argv: Sequence[str]) -> list[str]:
-    """Move the numbers after ``--superpoints`` into a separate flag.
+    """Move the numbers after ``--superpoints`` into a setting.
 
     Example:
         >>> expand_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
-        ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
+        ['a.ply', '--superpoints', '--partition.counts=1000,300', '--merge']
     """
     spelled: list[str] = []
     for argument in argv:
@@ -259,7 +243,7 @@ def expand_counts(argv: Sequence[str]) -> list[str]:
         is_after = spelled[-1:] and spelled[-1] in names
         name, _, numbers = argument.rpartition("=")
         if re.fullmatch(r"\d+(,\d+)*", numbers) and (name in names or (is_after and not name)):
-            spelled += [name] * bool(name) + ["--partition.counts", *numbers.split(",")]
+            spelled += [name] * bool(name) + [f"--partition.counts={numbers}"]
         else:
             spelled.append(argument)
     return spelled
