@@ -29,10 +29,9 @@ SYNONYMS = {
     "picture": ("image", "plot", "render", "visualize"),
     "table": ("csv", "planes_csv"),
     "seed": ("random_seed", "random_state"),
-    "threads": ("n_threads", "num_threads"),
     "up": ("up_axis", "vertical_axis"),
     "voxel": ("downsample", "grid_size", "leaf_size", "voxel_down_sample", "voxel_size"),
-    "workers": ("jobs", "n_jobs", "num_workers", "processes"),
+    **dict.fromkeys(("workers", "threads"), ("jobs", "n_jobs", "num_threads", "num_workers")),
 }
 """Words of other libraries by the name in torchrg."""
 _ADVICE = {
@@ -52,11 +51,10 @@ _ADVICE = {
     ("out", *SYNONYMS["out"]): "torchrg.write_cloud writes a result",
     ("preset",): "pass the preset as the first argument, config, or as the key base",
     ("radius",): "neighborhoods have k points; max_distance bounds their radius",
-    ("threads", "workers", *SYNONYMS["threads"], *SYNONYMS["workers"]): "torch.set_num_threads "
-    "sets the number of threads",
+    ("threads", "workers", *SYNONYMS["threads"]): "torch.set_num_threads sets the number of "
+    "threads",
     ("voxel", *SYNONYMS["voxel"]): "pass voxel to segment_planes, SegmentPlanes or torchrg segment",
 }
-_MEANINGS = {word: name for name, words in SYNONYMS.items() for word in words}
 _FIXES = {word: advice for words, advice in _ADVICE.items() for word in words}
 
 
@@ -74,7 +72,7 @@ def nearest_name(word: str, names: Iterable[str]) -> str:
     known = {name.rpartition(".")[2]: name for name in reversed([*names])}
     known |= {name: name for name in names}
     section, dot, last = word.rpartition(".")
-    for meant in (last, _MEANINGS.get(last)):
+    for meant in (last, *(name for name, words in SYNONYMS.items() if last in words)):
         for name in (f"{section}{dot}{meant}", meant):
             if name in known:
                 return known[name]

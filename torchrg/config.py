@@ -275,6 +275,9 @@ class PlanesConfig:
     outline: bool = False
     """Trace the polygon of each plane (needs shapely)."""
 
+    def __post_init__(self) -> None:
+        check_values(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionConfig:

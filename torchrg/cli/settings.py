@@ -20,7 +20,6 @@ class Arguments(flags.PlaneSettings):
     depth, --superpoints has partition, and other commands have the remaining sections.
 
     Examples:
-        torchrg settings
         torchrg settings growing
         torchrg settings normals --preset paper
     """
