@@ -246,13 +246,13 @@ def _build(kind: type[Command], flags: Sequence[Flag], words: Mapping[str, Any])
                 for path, word in words.items()
                 if path.startswith(start)
             }
-            base = argument.base(values) if argument.base else _default_of(field)
             try:
+                base = argument.base(values) if argument.base else _default_of(field)
                 values[field.name] = settings_of("", typing.cast(type, hint), base, changes)
             except SettingError as error:
                 if error.where:  # A file.
                     raise
-                name = names.get(f"{start}{error.name}", error.name)
+                name = names.get(f"{start}{error.name}") or names[error.name]
                 raise SettingError("", name, error.problem) from None
     return kind(**values)
 
