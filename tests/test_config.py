@@ -3,12 +3,16 @@
 import dataclasses
 import math
 import types
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
+from torchrg.cli import segment
+from torchrg.cli.arguments import list_flags, parse
 from torchrg.config import (
     DepthConfig,
     GrowingConfig,
@@ -183,28 +187,47 @@ SETTINGS = [
 """Every setting of planes, by its class and name."""
 
 
+def doors(kind, name, folder):
+    """Return functions that make settings from one value, and return that of the settings."""
+    own = attrgetter(name)
+    yield lambda given: own(kind(**{name: given}))
+    yield lambda given: own(settings_of("f", kind, {name: given}))
+    if kind is DepthConfig:
+        return
+    sections = {NormalsConfig: "normals.", GrowingConfig: "growing.", PlanesConfig: "planes."}
+    dotted = f"{sections.get(kind, '')}{name}"
+    whole = attrgetter(dotted)
+    yield lambda given: whole(load_config(**{dotted: given}))
+    yield lambda given: whole(SegmentPlanes({dotted: given}).config)
+
+    def from_file(given):
+        path = folder / "mine.yaml"
+        path.write_text(yaml.safe_dump({dotted: given}))
+        return whole(load_config(path))
+
+    def from_command(given):
+        flags = {flag.path: flag.name for flag in list_flags(segment.Arguments)}
+        flag = flags.get(f"settings.{dotted}", f"--{dotted}")
+        line = ["a.ply", "--out", "b.npz", f"{flag}={given}"]
+        return whole(parse(segment.Arguments, line, prog="torchrg segment").settings)
+
+    if not dataclasses.is_dataclass(own(kind())):
+        yield from_file
+        yield from_command
+
+
 @pytest.mark.parametrize(("kind", "name"), SETTINGS)
-def test_every_setting_takes_its_value_in_words_and_refuses_others_at_every_door(kind, name):
-    section = {NormalsConfig: "normals.", GrowingConfig: "growing.", PlanesConfig: "planes."}
+def test_every_setting_takes_its_value_in_words_and_refuses_others_at_every_door(
+    kind, name, tmp_path
+):
     value = getattr(kind(), name)
-    ways = [lambda given: getattr(kind(**{name: given}), name)]
-    if kind is not DepthConfig:
-        dotted = f"{section.get(kind, '')}{name}"
-        part = dotted.split(".")[0] if "." in dotted else None
-        for load in (load_config, lambda **keys: load_config(keys)):
-            ways.append(
-                lambda given, load=load: getattr(
-                    getattr(load(**{dotted: given}), part) if part else load(**{dotted: given}),
-                    name,
-                )
-            )
-    for ask in ways:
+    for ask in doors(kind, name, tmp_path):
         if not dataclasses.is_dataclass(value):
             assert ask(str(value)) == value
             assert type(ask(str(value))) is type(value)
-        assert ask(value) == value
-        for wrong in (object(), "no such value", math.nan, [value, value, value]):
-            with pytest.raises(ConfigError, match=f"expected .*{name} to be"):
+        for wrong in ("no such value", math.nan, [[value], [value]], b"no"):
+            shown = name.replace("_", "[_-]")
+            with pytest.raises(ConfigError, match=f"expected .*{shown} to be"):
                 ask(wrong)
 
 

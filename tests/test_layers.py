@@ -8,9 +8,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
-    {"axes", "errors", "version", "_parallel"},
+    {"axes", "errors", "version", "_parallel", "_synonyms"},
     {"precision"},
-    {"_checks", "_optional", "scratch", "structures"},
+    {"_checks", "_optional", "_values", "scratch", "structures"},
     {"kernels"},
     {"_opaque", "linalg", "mesh", "neighbors", "config", "plane_table"},
     {"robust"},

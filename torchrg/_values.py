@@ -81,14 +81,16 @@ def _convert_to(kind: Any, value: Any) -> Any:  # noqa: ANN401
             return number
     if typing.get_origin(kind) is Literal and is_word:
         return items[items.index(value)]
-    if typing.get_origin(kind) is tuple and not isinstance(value, Mapping | None):
+    if typing.get_origin(kind) is tuple and not isinstance(value, Mapping | bytes | None):
         parts = value.replace(" ", "").split(",") if is_word else value
         parts = tuple(parts) if isinstance(parts, Iterable) else (parts,)
         if ... in items or len(parts) == len(items):
             return tuple(convert(part, items[0], "") for part in parts)
     if kind is Path and isinstance(value, str | Path):
         return Path(value)
-    if (kind is str or dataclasses.is_dataclass(kind)) and isinstance(value, kind):
+    if kind is str and is_word:
+        return value
+    if dataclasses.is_dataclass(kind) and type(value) is kind:
         return value
     raise ValueError
 

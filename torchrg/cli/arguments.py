@@ -55,6 +55,7 @@ _COLUMN = 28
 _MAX_LENGTH = 40
 """Maximum length of a default listed in the short help, in characters."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", bool: "{true,false}"}
+_NUMBER = re.compile(r"\d*\.?\d+(e-?\d+)?")
 _ROLE = re.compile(r":\w+:`~?([^`]+)`")
 
 
@@ -180,7 +181,7 @@ def _take_settings(
                 example = f", as in {flag.name} true" if flag.hint is bool else ""
                 raise ConfigError(f"expected a value for {flag.name}{example}.")
             values = [word if equals else waiting.pop()]
-            while _is_list(flag.hint) and waiting and re.fullmatch(r"\d*\.?\d+(e-?\d+)?", waiting[-1]):
+            while _is_list(flag.hint) and waiting and _NUMBER.fullmatch(waiting[-1]):
                 values.append(waiting.pop())
             words[flag.path] = ",".join(values)
         elif left and left[-1].startswith("--") and re.fullmatch("-[xyz]", argument):
