@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import pytest
 from command_page import PROGS as KINDS
 
-from torchrg.cli import flags, main
+from torchrg.cli import main
 from torchrg.cli.arguments import Argument, example_lines, list_flags, parse
 from torchrg.config import check_values
 from torchrg.errors import ConfigError
@@ -107,7 +107,9 @@ class Command:
         ("a --out b --part.counts 3,4", {"part": Part(counts=(3, 4))}),
         ("a --out b --place 1 -2 1e3", {"place": (1.0, -2.0, 1000.0)}),
         ("a --out b --place none", {}),
+        ("--place 1 -2 .5 a --out b", {"place": (1.0, -2.0, 0.5)}),
         ("a,b --out b", {"file": Path("a,b")}),
+        ("--out b -- --a", {"file": Path("--a")}),
         ("a --out c --kind other --out b", {"kind": "other"}),
     ],
 )
@@ -123,7 +125,7 @@ def test_fields_become_what_is_written(line, changes):
         ("a", "missing required --out for a."),
         ("a --out", "expected a value for --out. See"),
         ("a --out b --part.size wide", "expected --part.size to be a number or none, got 'wide'."),
-        ("a --out b --place 1 2", "expected --place to be 3 numbers or none, got ['1', '2']. See"),
+        ("a --out b --place 1 2", "expected --place to be 3 numbers or none, got '1,2'. See"),
         ("a --out b --part.counts 1,x", "expected --part.counts to be integers or none, got '1,x'"),
         ("a --out b --kind two", "expected --kind to be one of one, other or none, got 'two'. See"),
         ("a --out b --part.is-on", "expected a value for --part.is-on, as in --part.is-on true."),
@@ -133,6 +135,8 @@ def test_fields_become_what_is_written(line, changes):
         ("a --output b --size 2", "unrecognized option --size. Did you mean --part.size? See"),
         ("a -o b --is_on", "unrecognized option --is-on. Did you mean --part.is-on? See"),
         ("a --out b --kind one two", "expected one value for --kind, got one two; separate"),
+        ("a --out -y two", "expected one value for --out, got -y two; separate values with commas"),
+        ("a --out=b two", "unrecognized argument two."),
         ("a --out b --part.is-on c", "expected --part.is-on to be true or false, got 'c'. See"),
         (
             "a --out b --part.no-is-on",
@@ -192,7 +196,7 @@ def test_examples_are_understood(prog, capsys):
     for line in examples:
         assert line.startswith(f"{prog} ")
         arguments = shlex.split(line)[len(prog.split()) :]
-        parse(kind, flags.expand_counts(arguments), prog=prog)
+        parse(kind, arguments, prog=prog)
 
 
 @pytest.mark.parametrize("prog", KINDS)

@@ -5,7 +5,6 @@ words ``--section.name VALUE``, passed unparsed to :mod:`torchrg.config`, and fo
 section. ``--help`` lists common options, ``--help-all`` all options, ``torchrg settings`` settings.
 """
 
-import argparse
 import ast
 import dataclasses
 import functools
@@ -21,7 +20,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, NamedTuple, NoReturn, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from torchrg._synonyms import advice_on, nearest_name
 from torchrg._values import SettingError, convert, kinds_of
@@ -55,7 +54,8 @@ _COLUMN = 28
 _MAX_LENGTH = 40
 """Maximum length of a default listed in the short help, in characters."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", bool: "{true,false}"}
-_NUMBER = re.compile(r"\d*\.?\d+(e-?\d+)?")
+_NUMBER = re.compile(r"-?\d*\.?\d+(e-?\d+)?")
+_COUNTS = re.compile(r"\d+(,\d+)*")
 _ROLE = re.compile(r":\w+:`~?([^`]+)`")
 
 
@@ -67,6 +67,7 @@ class Argument:
         metavar: Placeholder for the value.
         text: Help text, for types that several commands share.
         is_positional: Whether the argument has no flag.
+        numbers: Path of the setting for numbers after a switch.
         base: Function that returns the settings that words override, from the options by field;
             the words are then without the name of the field.
     """
@@ -74,6 +75,7 @@ class Argument:
     metavar: str | None = None
     text: str | None = None
     is_positional: bool = False
+    numbers: str = ""
     base: Callable[[Mapping[str, Any]], object] | None = None
 
 
@@ -91,11 +93,18 @@ class Flag(NamedTuple):
     """Section of a setting, as in its name; empty for options."""
     hint: object
     is_required: bool
+    numbers: str = ""
+    """Path of the setting for numbers after a switch."""
 
     @property
     def is_positional(self) -> bool:
         """Whether the argument has no flag."""
         return not self.name.startswith("-")
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether the option takes no value."""
+        return self.hint is bool and not self.section
 
 
 def parse(kind: type[Command], arguments: Sequence[str], *, prog: str) -> Command:
@@ -114,101 +123,93 @@ def parse(kind: type[Command], arguments: Sequence[str], *, prog: str) -> Comman
         print(format_help(kind, flags, prog=prog, complete="--help-all" in arguments))
         raise SystemExit(0)
     try:
-        example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
-        return _build(kind, flags, _read(flags, arguments, prog, example))
+        words = _read(flags, arguments)
+        _check_required(flags, words, kind)
+        return _build(kind, flags, words)
     except ConfigError as error:
         raise ConfigError(f"{error} See {prog} --help.") from None
 
 
-class _Parser(argparse.ArgumentParser):
-    """Parser that raises instead of printing."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise the message, reworded."""
-        for pattern, text in (
-            (r"argument (--[^:/]*).*: expected .*", r"expected a value for \1"),
-            (r"argument (--[^:/]*).*: ignored explicit .*", r"expected no value for \1"),
-        ):
-            message = re.sub(pattern, text, message)
-        raise ConfigError(f"{message}.")
-
-
-def _read(
-    flags: Sequence[Flag], arguments: Sequence[str], prog: str, example: str
-) -> dict[str, Any]:
+def _read(flags: Sequence[Flag], arguments: Sequence[str]) -> dict[str, Any]:
     """Return the words of the arguments by path."""
-    parser = _Parser(prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
+    named = {name: flag for flag in flags for name in (flag.name, *ALIASES.get(flag.name, ()))}
+    words, inputs, waiting = dict[str, Any](), list[str](), [*reversed(arguments)]
+    while waiting:
+        name, equals, word = (argument := waiting.pop()).partition("=")
+        flag = named.get(name.replace("_", "-")) if name.startswith("-") else None
+        if argument == "--":
+            inputs += reversed(waiting)
+            break
+        if flag is None:
+            if name.startswith("-"):
+                raise ConfigError(_describe_unknown(argument, flags))
+            inputs.append(argument)
+        elif flag.is_switch:
+            words[flag.path] = True
+            if flag.numbers and (equals or (waiting and _COUNTS.fullmatch(waiting[-1]))):
+                words[flag.numbers] = word if equals else waiting.pop()
+            elif equals:
+                raise ConfigError(f"expected no value for {flag.name}.")
+        elif equals or (waiting and not _is_name(waiting[-1])):
+            values = [word if equals else waiting.pop()]
+            while waiting and _continues(values, flag.hint, waiting[-1]):
+                values.append(waiting.pop())
+            words[flag.path] = ",".join(values)
+        else:
+            example = f", as in {flag.name} true" if flag.hint is bool else ""
+            raise ConfigError(f"expected a value for {flag.name}{example}.")
     for flag in flags:
-        takes: dict[str, Any] = {"nargs": "*"} if _is_list(flag.hint) else {}
-        if flag.is_positional:
-            parser.add_argument(flag.path, metavar=flag.name, **{"nargs": "?", **takes})
-        elif "." not in flag.path:
-            # Underscores are accepted too.
-            underscored = f"--{flag.name[2:].replace('-', '_')}"
-            spellings = dict.fromkeys((flag.name, underscored, *ALIASES.get(flag.name, ())))
-            takes = {"action": "store_true"} if flag.hint is bool else takes
-            parser.add_argument(*spellings, dest=flag.path, **takes)
-    words, left = _take_settings(flags, arguments)
-    namespace, unknown = parser.parse_known_args(left)
-    if unknown:
-        raise ConfigError(_describe_unknown(unknown[0], flags, arguments))
-    words |= vars(namespace)
-    missing = [
-        flag.name for flag in flags if flag.is_required and words.get(flag.path) in (None, [])
-    ]
-    if missing:
-        inputs = [words[flag.path] for flag in flags if flag.is_positional and flag.path in words]
-        given = " ".join(" ".join(each) if isinstance(each, list) else each for each in inputs)
-        purpose = f" for {given}" if given else ""
-        raise ConfigError(f"missing required {' and '.join(missing)}{purpose}.{example}")
+        if flag.is_positional and inputs:
+            is_list = typing.get_origin(flag.hint) is tuple
+            words[flag.path], inputs = (inputs, []) if is_list else (inputs[0], inputs[1:])
+    if inputs:
+        raise ConfigError(_describe_extra(inputs[0], named, arguments))
     return words
 
 
-def _take_settings(
-    flags: Sequence[Flag], arguments: Sequence[str]
-) -> tuple[dict[str, Any], list[str]]:
-    """Return the words of the settings by path, and the other arguments.
-
-    A value that starts with a dash, as in ``--orient -z``, is joined with its option.
-    """
-    settings = {flag.name: flag for flag in flags if "." in flag.path}
-    words, left = dict[str, Any](), list[str]()
-    waiting = [*reversed(arguments)]
-    while waiting:
-        name, equals, word = (argument := waiting.pop()).partition("=")
-        if flag := settings.get(name.replace("_", "-")):
-            if not equals and (not waiting or waiting[-1].startswith("--")):
-                example = f", as in {flag.name} true" if flag.hint is bool else ""
-                raise ConfigError(f"expected a value for {flag.name}{example}.")
-            values = [word if equals else waiting.pop()]
-            while _is_list(flag.hint) and waiting and _NUMBER.fullmatch(waiting[-1]):
-                values.append(waiting.pop())
-            words[flag.path] = ",".join(values)
-        elif left and left[-1].startswith("--") and re.fullmatch("-[xyz]", argument):
-            left[-1] += f"={argument}"
-        else:
-            left.append(argument)
-    return words, left
+def _is_name(argument: str) -> bool:
+    """Return whether an argument is an option rather than a value, such as -y or -3."""
+    return argument.startswith("--") or argument in itertools.chain(*ALIASES.values())
 
 
-def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]) -> str:
-    """Return a message about an unknown flag or argument, with a fix."""
-    if os.path.lexists(word):  # A file name that starts like a flag.
+def _continues(values: Sequence[str], hint: object, argument: str) -> bool:
+    """Return whether an argument is a further value of a list: a number, or a text."""
+    kinds = [kind for kind in kinds_of(hint) if typing.get_origin(kind) is tuple]
+    items = typing.get_args(kinds[0]) if kinds else ()
+    if not items or (... not in items and len(values) == len(items)):
+        return False
+    is_text = items[0] is str and not _is_name(argument)
+    return is_text or (items[0] in (int, float) and _NUMBER.fullmatch(argument) is not None)
+
+
+def _check_required(flags: Sequence[Flag], words: Mapping[str, Any], kind: type) -> None:
+    """Raise if a required argument is missing."""
+    if missing := [flag.name for flag in flags if flag.is_required and flag.path not in words]:
+        inputs = [words[flag.path] for flag in flags if flag.is_positional and flag.path in words]
+        joined = " ".join(" ".join(each) if isinstance(each, list) else each for each in inputs)
+        purpose = f" for {joined}" if joined else ""
+        example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
+        raise ConfigError(f"missing required {' and '.join(missing)}{purpose}.{example}")
+
+
+def _describe_extra(word: str, named: Mapping[str, Flag], arguments: Sequence[str]) -> str:
+    """Return a message about an argument too many, with a fix if it follows an option."""
+    before = [*itertools.takewhile(lambda argument: argument != word, arguments)]
+    names = [argument.partition("=")[0].replace("_", "-") for argument in before]
+    starts = [index for index, name in enumerate(names) if name in named]
+    name, *values = before[starts[-1] :] if starts else [""]
+    if not values or named[names[starts[-1]]].is_switch:
+        return f"unrecognized argument {word}."
+    return (
+        f"expected one value for {name}, got {' '.join([*values, word])}; separate values with "
+        f"commas: {name} {','.join([*values, word])}."
+    )
+
+
+def _describe_unknown(word: str, flags: Sequence[Flag]) -> str:
+    """Return a message about an unknown option, with a fix."""
+    if os.path.lexists(word):  # A file name that starts like an option.
         return f"unrecognized option {word}. Did you mean ./{word}?"
-    if not word.startswith("-"):
-        start = list(arguments).index(word)
-        before = [index for index in range(start) if arguments[index].startswith("-")]
-        if not before:
-            return f"unrecognized argument {word}."
-        words = [*itertools.takewhile(lambda x: x[:1] != "-", arguments[before[-1] + 1 :])]
-        flag_name = arguments[before[-1]]
-        takes_one = any(flag.name == flag_name and flag.hint is not bool for flag in flags)
-        if len(words) == 1 or not takes_one:
-            return f"unrecognized argument {word}."
-        return (
-            f"expected one value for {flag_name}, got {' '.join(words)}; separate values with "
-            f"commas: {flag_name} {','.join(words)}."
-        )
     unknown = word.partition("=")[0].replace("_", "-")
     key = unknown.lstrip("-").replace("-", "_")
     names = {flag.name[2:].replace("-", "_"): flag for flag in flags if not flag.is_positional}
@@ -219,25 +220,13 @@ def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]
     return f"unrecognized option {unknown}{f': {advice}' if advice else ''}."
 
 
-def _is_list(hint: object) -> bool:
-    """Return whether a value takes several arguments; choices are one, separated by commas."""
-    return any(typing.get_origin(kind) is tuple and not _choices(kind) for kind in kinds_of(hint))
-
-
-def _choices(kind: object) -> tuple[str, ...]:
-    """Return the choices for the items of a tuple; empty for other types."""
-    items = typing.get_args(kind)[:1] if typing.get_origin(kind) is tuple else ()
-    return typing.get_args(items[0]) if items and typing.get_origin(items[0]) is Literal else ()
-
-
 def _build(kind: type[Command], flags: Sequence[Flag], words: Mapping[str, Any]) -> Command:
     """Build a dataclass: convert the options, and load the settings with their words."""
-    values = {}
-    for flag in (flag for flag in flags if flag.path in words and "." not in flag.path):
-        typed = words[flag.path]
-        # A path can contain commas.
-        is_one = isinstance(typed, list) and len(typed) == 1 and flag.hint != tuple[Path, ...]
-        values[flag.path] = convert(typed[0] if is_one else typed, flag.hint, flag.name)
+    values = {
+        flag.path: convert(words[flag.path], flag.hint, flag.name)
+        for flag in flags
+        if flag.path in words and "." not in flag.path
+    }
     names = {flag.path: flag.name for flag in flags}
     for field, hint, argument in _fields(kind):
         if dataclasses.is_dataclass(hint):
@@ -356,7 +345,8 @@ def list_flags(
         else:
             spelling = f"{name} {argument.metavar or _metavar(hint)}"
         is_required = value is dataclasses.MISSING
-        yield Flag(f"{path}{field.name}", name, spelling, text, front, hint, is_required)
+        place = f"{path}{field.name}"
+        yield Flag(place, name, spelling, text, front, hint, is_required, argument.numbers)
 
 
 def _fields(kind: Any) -> Iterator[tuple["dataclasses.Field[Any]", object, Argument]]:  # noqa: ANN401
@@ -414,8 +404,8 @@ def _metavar(hint: object) -> str:
     if typing.get_origin(hint) is Literal:
         return "{" + ",".join(map(str, choices)) + "}"
     if typing.get_origin(hint) is tuple:
-        if words := _choices(hint):
-            return f"{{{','.join(words)}}},..."
+        if typing.get_origin(choices[0]) is Literal:
+            return f"{_metavar(choices[0])},..."
         return f"{_metavar(choices[0])}..." if ... in choices else " ".join(map(_metavar, choices))
     return " or ".join(map(_metavar, choices)) if choices else _METAVARS[typing.cast(type, hint)]
 

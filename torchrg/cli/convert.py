@@ -119,7 +119,7 @@ class CloudArguments(flags.PlaneSettings, Arguments):
     pages: Path | None = None
     """Also write an image and an interactive viewer of each finished scan, and an index.html, into
     this directory (pip install 'torchrg[view]'). Default: no pages."""
-    superpoints: bool = False
+    superpoints: flags.SuperpointsFlag = False
     """Also partition all points into superpoints. Optional numbers set how many per level, as in
     --superpoints 1000,300."""
     orient: flags.OrientFlag = "auto"
@@ -272,7 +272,7 @@ def run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
         raise SystemExit(0 if argv else USAGE_ERROR)
-    kind, *remaining = flags.expand_counts(argv)
+    kind, *remaining = argv
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
     arguments = parse(KINDS[kind], remaining, prog=f"torchrg convert {kind}")

@@ -2,8 +2,7 @@
 
 import dataclasses
 import os
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -12,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 
-from torchrg.cli.arguments import ALIASES, Argument
+from torchrg.cli.arguments import Argument
 from torchrg.cli.ending import print_warnings, warn
 from torchrg.config import (
     DEFAULT_PRESET,
@@ -129,6 +128,7 @@ WithinFlag = Annotated[
         "one more object. Default: no constraint.",
     ),
 ]
+SuperpointsFlag = Annotated[bool, Argument(numbers="partition.counts")]
 Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "nag", "npy"]
 
 
@@ -228,25 +228,6 @@ def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) 
         raise ConfigError(
             "expected text or .npy input for --columns, got files with named columns."
         )
-
-
-def expand_counts(argv: Sequence[str]) -> list[str]:
-    """Move the numbers after ``--superpoints`` into a setting.
-
-    Example:
-        >>> expand_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
-        ['a.ply', '--superpoints', '--partition.counts=1000,300', '--merge']
-    """
-    spelled: list[str] = []
-    for argument in argv:
-        names = ("--superpoints", *ALIASES["--superpoints"])
-        is_after = spelled[-1:] and spelled[-1] in names
-        name, _, numbers = argument.rpartition("=")
-        if re.fullmatch(r"\d+(,\d+)*", numbers) and (name in names or (is_after and not name)):
-            spelled += [name] * bool(name) + [f"--partition.counts={numbers}"]
-        else:
-            spelled.append(argument)
-    return spelled
 
 
 def check_level(level: int, config: SuperpointsConfig) -> None:

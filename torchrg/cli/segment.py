@@ -93,7 +93,7 @@ class Arguments(flags.PlaneSettings):
     voxel: float | None = None
     """Voxel size, in units of the cloud. Segments one point per voxel and copies the result to all
     points of that voxel. Default: no downsampling."""
-    superpoints: bool = False
+    superpoints: flags.SuperpointsFlag = False
     """Also partition all points into superpoints, stored as "superpoint" (finest), "superpoint_1"
     and so on. Optional numbers set how many per level, as in --superpoints 1000,300. Uses point
     colors if the cloud has them. Images then show superpoints instead of planes."""
@@ -118,7 +118,7 @@ class Arguments(flags.PlaneSettings):
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _reject_images(argv)
-    arguments = parse(Arguments, flags.expand_counts(argv), prog="torchrg segment")
+    arguments = parse(Arguments, argv, prog="torchrg segment")
     if arguments.layout not in (None, "pointcept"):
         arguments = dataclasses.replace(arguments, superpoints=True)
     if not arguments.superpoints and arguments.partition != SuperpointsConfig():
