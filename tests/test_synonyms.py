@@ -21,7 +21,7 @@ NAMES = ["out", "up", "voxel", "threads", "normals.k", "growing.min_size", "part
         ("voxel_size", "voxel"),
         ("output", "out"),
         ("growing.min_siz", "growing.min_size"),
-        ("tread", "threads"),
+        ("thread", "threads"),
         ("bed", ""),
         ("gpu", ""),
         ("quiet", ""),

@@ -51,6 +51,7 @@ _ADVICE = {
     "torchrg.write_cloud writes a result": f"out {_OUTPUT}",
     "pass the preset as the first argument, config, or as the key base": "preset",
     "neighborhoods have k points; max_distance bounds their radius": "radius",
+    "leave it out: the default adapts to the data; up sets the up axis": "laser rgbd s3dis scannet",
     "torch.set_num_threads sets the number of threads": f"threads workers {_THREADS}",
     "pass voxel to segment_planes, SegmentPlanes or torchrg segment": f"voxel {_VOXEL}",
 }

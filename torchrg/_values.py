@@ -25,22 +25,13 @@ _TYPE_NAMES = {
 
 
 class SettingError(ConfigError):
-    """A wrong value.
-
-    Args:
-        where: Caller or file, or "" for the command line.
-        name: Name of the setting.
-        problem: Requirement and value, as in ``>= 3, got 2``.
-    """
+    """A wrong value: caller or file ("" for a command), name, and a problem as ``>= 3, got 2``."""
 
     def __init__(self, where: str, name: str = "", problem: str = "") -> None:
-        super().__init__(where, name, problem)
+        # Unpickling passes the message.
+        message = f"{where}{': ' if where else ''}expected {name} {problem}." if name else where
+        super().__init__(message)
         self.where, self.name, self.problem = where, name, problem
-
-    def __str__(self) -> str:
-        """Return the message."""
-        message = f"expected {self.name} {self.problem}."
-        return f"{self.where}: {message}" if self.where else message
 
 
 def convert(value: Any, hint: Any, name: str, where: str = "") -> Any:  # noqa: ANN401

@@ -606,19 +606,11 @@ def _apply_to_base(values: object, where: str) -> PipelineConfig:
     return _override(base, values, where)
 
 
-_REMOVED_PRESETS = ("s3dis", "scannet", "laser", "rgbd")
-"""Presets of earlier versions, one per kind of data; replaced by measurement."""
-
-
 def _preset_file(name: object, *, expected: str) -> Path:
     """Return the file of a preset; raise if it does not exist."""
-    if name in _REMOVED_PRESETS:
-        raise ConfigError(
-            f"{expected} {', '.join(preset_names())}, got {name!r}; leave it out: the default "
-            "adapts to the data. Set the up axis with up."
-        )
     if name not in preset_names():
-        raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}.")
+        advice = advice_on(str(name)) and f"; {advice_on(str(name))}"
+        raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}{advice}.")
     return _preset_folder() / f"{name}.yaml"
 
 
@@ -630,7 +622,7 @@ def _override(config: Settings, values: object, where: str, prefix: str = "") ->
     if not isinstance(values, Mapping):
         name = prefix.removesuffix(".") or "settings"
         raise SettingError(where, name, f"to be a mapping, got {values!r}")
-    kind, own, dotted = type(config), dict[str, Any](), dict[str, dict[str, Any]]()
+    kind, direct, dotted = type(config), dict[str, Any](), dict[str, dict[str, Any]]()
     for key, value in values.items():
         section, dot, name = str(key).partition(".")
         if section not in vars(config) and (key, kind) != ("angle_deg", PipelineConfig):
@@ -639,15 +631,15 @@ def _override(config: Settings, values: object, where: str, prefix: str = "") ->
         if dot:
             dotted.setdefault(section, {})[name] = value
         else:
-            own[section] = value
+            direct[section] = value
     try:
-        if "angle_deg" in own:  # Explicit values of the two angles take precedence.
-            config = typing.cast(Any, config).with_angle(own.pop("angle_deg"))
-        for key, value in own.items():
+        if "angle_deg" in direct:  # Explicit values of the two angles take precedence.
+            config = typing.cast(Any, config).with_angle(direct.pop("angle_deg"))
+        for key, value in direct.items():
             current = getattr(config, key)
             if dataclasses.is_dataclass(current) and not dataclasses.is_dataclass(value):
-                own[key] = _override(current, value, where, f"{prefix}{key}.")
-        changed = dataclasses.replace(config, **own)  # type: ignore[type-var]
+                direct[key] = _override(current, value, where, f"{prefix}{key}.")
+        changed = dataclasses.replace(config, **direct)  # type: ignore[type-var]
     except SettingError as error:
         if error.where == where:  # Of a section.
             raise

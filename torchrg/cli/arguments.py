@@ -186,8 +186,8 @@ def _check_required(flags: Sequence[Flag], words: Mapping[str, Any], kind: type)
     """Raise if a required argument is missing."""
     if missing := [flag.name for flag in flags if flag.is_required and flag.path not in words]:
         inputs = [words[flag.path] for flag in flags if flag.is_positional and flag.path in words]
-        joined = " ".join(" ".join(each) if isinstance(each, list) else each for each in inputs)
-        purpose = f" for {joined}" if joined else ""
+        typed = " ".join(" ".join(each) if isinstance(each, list) else each for each in inputs)
+        purpose = f" for {typed}" if typed else ""
         example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
         raise ConfigError(f"missing required {' and '.join(missing)}{purpose}.{example}")
 
@@ -237,7 +237,7 @@ def _build(kind: type[Command], flags: Sequence[Flag], words: Mapping[str, Any])
                 if path.startswith(start)
             }
             try:
-                base = argument.base(values) if argument.base else _default_of(field)
+                base = argument.base(values) if argument.base else None
                 values[field.name] = settings_of("", typing.cast(type, hint), base, changes)
             except SettingError as error:
                 if error.where:  # A file.
@@ -327,7 +327,9 @@ def list_flags(
     """
     texts = _field_docstrings(kind)
     for field, hint, argument in _fields(kind):
-        value = _default_of(field) if default is None else getattr(default, field.name)
+        value = field.default if default is None else getattr(default, field.name)
+        if default is None and field.default_factory is not dataclasses.MISSING:
+            value = field.default_factory()
         if dataclasses.is_dataclass(hint):
             inner = "" if argument.base else field.name
             yield from list_flags(hint, value, f"{path}{field.name}.", inner)
@@ -345,8 +347,8 @@ def list_flags(
         else:
             spelling = f"{name} {argument.metavar or _metavar(hint)}"
         is_required = value is dataclasses.MISSING
-        place = f"{path}{field.name}"
-        yield Flag(place, name, spelling, text, front, hint, is_required, argument.numbers)
+        dotted = f"{path}{field.name}"
+        yield Flag(dotted, name, spelling, text, front, hint, is_required, argument.numbers)
 
 
 def _fields(kind: Any) -> Iterator[tuple["dataclasses.Field[Any]", object, Argument]]:  # noqa: ANN401
@@ -383,19 +385,13 @@ def _field_docstrings(kind: type) -> dict[str, str]:
     return texts
 
 
-def _default_of(field: "dataclasses.Field[Any]") -> object:
-    """Return the value of a field if no argument sets it."""
-    factory = field.default_factory
-    return field.default if factory is dataclasses.MISSING else factory()
-
-
 def _default_sentence(value: object, *, is_setting: bool) -> str:
     """Return the sentence about a default; empty for command flags that are off."""
     is_off = value is None or value is False or value == ()
     if value is dataclasses.MISSING or (is_off and not is_setting):
         return ""
-    words = map(str, value) if isinstance(value, tuple) else (str(value),)
-    return f"Default: {','.join(words).lower() if isinstance(value, bool) else ','.join(words)}."
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return f"Default: {','.join(map(str, value)) if isinstance(value, tuple) else text}."
 
 
 def _metavar(hint: object) -> str:

@@ -138,16 +138,11 @@ def _base_settings(options: Mapping[str, Any]) -> PipelineConfig:
     The up axis is z unless the file sets another. With --table, polygons are traced if shapely is
     installed.
     """
-    angle = options.get("angle_deg")
-    changes = {} if angle is None else {"angle_deg": angle}
-    preset = options.get("preset", DEFAULT_PRESET)
-    config = settings_of("", PipelineConfig, options.get("config") or preset, changes)
-    has_outline = options.get("table") is not None and find_spec("shapely") is not None
-    planes = dataclasses.replace(
-        config.planes,
-        up=config.planes.up or "z",
-        outline=config.planes.outline or has_outline,
-    )
+    source = options.get("config") or options.get("preset", DEFAULT_PRESET)
+    changes = {name: options[name] for name in ("angle_deg",) if options.get(name) is not None}
+    config = settings_of("", PipelineConfig, source, changes)
+    outline = bool(options.get("table") and find_spec("shapely")) or config.planes.outline
+    planes = dataclasses.replace(config.planes, up=config.planes.up or "z", outline=outline)
     return dataclasses.replace(config, planes=planes)
 
 
