@@ -34,6 +34,13 @@ class SettingError(ConfigError):
         self.where, self.name, self.problem = where, name, problem
 
 
+def expect(config: object, name: str, requirement: str, holds: bool) -> None:
+    """Raise if a setting does not meet a requirement."""
+    if not holds:
+        problem = f"{requirement}, got {getattr(config, name)!r}"
+        raise SettingError(type(config).__name__, name, problem)
+
+
 def convert(value: Any, hint: Any, name: str, where: str = "") -> Any:  # noqa: ANN401
     """Convert a value, or the words for it, to its annotated type.
 

@@ -17,7 +17,7 @@ import torch
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg._synonyms import advice_on, nearest_name
-from torchrg._values import SettingError, convert
+from torchrg._values import SettingError, convert, expect
 from torchrg.errors import ConfigError
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
@@ -91,13 +91,13 @@ class NormalsConfig:
 
     def __post_init__(self) -> None:
         check_values(self)
-        _require(self, "k", ">= 3", self.k >= 3)
+        expect(self, "k", ">= 3", self.k >= 3)
         limit = self.adaptive_k
-        _require(self, "adaptive_k", ">= k or none", limit is None or limit >= self.k)
-        _require(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
-        _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
-        _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
-        _require(self, "irls_decay", "> 1", self.irls_decay > 1)
+        expect(self, "adaptive_k", ">= k or none", limit is None or limit >= self.k)
+        expect(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
+        expect(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
+        expect(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
+        expect(self, "irls_decay", "> 1", self.irls_decay > 1)
 
     def with_sampling(self, sampling: Sampling) -> "NormalsConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
@@ -188,24 +188,24 @@ class GrowingConfig:
 
     def __post_init__(self) -> None:
         check_values(self)
-        _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
-        _require(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
+        expect(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
+        expect(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
         within = self.connectivity is None or 0 <= self.connectivity <= 1
-        _require(self, "connectivity", "in [0, 1] or none", within)
-        _require(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
+        expect(self, "connectivity", "in [0, 1] or none", within)
+        expect(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
         for name in ("max_distance", "plane_reach"):
             value = getattr(self, name)
-            _require(self, name, ">= 0 or none", value is None or value >= 0)
+            expect(self, name, ">= 0 or none", value is None or value >= 0)
         facets = self.facet_tolerance
         is_open = facets is None or facets == "auto"
-        _require(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets or 0) > 0)
+        expect(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets or 0) > 0)
         size = self.min_size
-        _require(self, "min_size", ">= 1 or auto", size == "auto" or int(size) >= 1)
+        expect(self, "min_size", ">= 1 or auto", size == "auto" or int(size) >= 1)
         residual = self.max_plane_residual
-        _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
-        _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
-        _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
-        _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
+        expect(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
+        expect(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
+        expect(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
+        expect(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
     def with_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
@@ -294,8 +294,8 @@ class SelectionConfig:
 
     def __post_init__(self) -> None:
         check_values(self)
-        _require(self, "min_area", ">= 0", self.min_area >= 0)
-        _require(self, "kinds", f"to be some of {', '.join(PLANE_KINDS)} or none", self.kinds != ())
+        expect(self, "min_area", ">= 0", self.min_area >= 0)
+        expect(self, "kinds", f"to be some of {', '.join(PLANE_KINDS)} or none", self.kinds != ())
 
     @property
     def max_neighbors(self) -> int:
@@ -321,7 +321,7 @@ class PipelineConfig(SelectionConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
+        expect(self, "chunk_size", ">= 1", self.chunk_size >= 1)
 
     @property
     def max_neighbors(self) -> int:
@@ -438,13 +438,13 @@ class SuperpointsConfig:
     def __post_init__(self) -> None:
         check_values(self)
         is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths)
-        _require(self, "strengths", "one or more numbers > 0, ascending", is_list)
+        expect(self, "strengths", "one or more numbers > 0, ascending", is_list)
         counts = self.counts
         is_list = counts is None or (len(counts) > 0 and _ascends(0, *reversed(counts)))
-        _require(self, "counts", "one or more integers > 0, descending, or none", is_list)
-        _require(self, "min_size", ">= 1", self.min_size >= 1)
+        expect(self, "counts", "one or more integers > 0, descending, or none", is_list)
+        expect(self, "min_size", ">= 1", self.min_size >= 1)
         extent = self.max_extent
-        _require(self, "max_extent", "> 0 or none", extent is None or extent > 0)
+        expect(self, "max_extent", "> 0 or none", extent is None or extent > 0)
 
     @property
     def num_levels(self) -> int:
@@ -484,13 +484,13 @@ class DepthConfig(SelectionConfig):
         super().__post_init__()
         parts: tuple[float, ...] = (1.0, 0.0) if self.noise is None else self.noise
         is_noise = min(parts) >= 0 and max(parts) > 0
-        _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
-        _require(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
-        _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
-        _require(self, "max_step", ">= 0", self.max_step >= 0)
+        expect(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
+        expect(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
+        expect(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
+        expect(self, "max_step", ">= 0", self.max_step >= 0)
         needs_up = self.kinds is not None and self.up is None
-        _require(self, "up", "with kinds, as -y for a level camera", not needs_up)
-        _require(self, "min_size", ">= 1", self.min_size >= 1)
+        expect(self, "up", "with kinds, as -y for a level camera", not needs_up)
+        expect(self, "min_size", ">= 1", self.min_size >= 1)
 
 
 def preset_names() -> list[str]:
@@ -665,14 +665,7 @@ def check_values(config: Any) -> None:  # noqa: ANN401
         vars(config)[name] = value = convert(value, hint, name, kind.__name__)
         for number in value if isinstance(value, tuple) else (value,):
             is_far = isinstance(number, int | float) and abs(number) > FARTHEST
-            _require(config, name, f"in [-{FARTHEST:g}, {FARTHEST:g}]", not is_far)
-
-
-def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401
-    """Raise if a setting is invalid."""
-    if not holds:
-        problem = f"{requirement}, got {getattr(config, name)!r}"
-        raise SettingError(type(config).__name__, name, problem)
+            expect(config, name, f"in [-{FARTHEST:g}, {FARTHEST:g}]", not is_far)
 
 
 def _preset_folder() -> Path:

@@ -94,7 +94,6 @@ class Flag(NamedTuple):
     hint: object
     is_required: bool
     numbers: str = ""
-    """Path of the setting for numbers after a switch."""
 
     @property
     def is_positional(self) -> bool:
@@ -288,19 +287,11 @@ def _short_entry(flag: Flag) -> str:
 
 def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
     """Group arguments by title: required, options, settings, performance."""
-    titles = (REQUIRED, "options", _SETTINGS, _PERFORMANCE)
-    groups: dict[str, list[Flag]] = {title: [] for title in titles}
+    groups: dict[str, list[Flag]] = {REQUIRED: [], "options": [], _SETTINGS: [], _PERFORMANCE: []}
     for flag in flags:
-        if flag.is_required:
-            group = REQUIRED
-        elif flag.name in RESOURCES:
-            group = _PERFORMANCE
-        else:
-            group = _SETTINGS if "." in flag.path or flag.name in _STARTS else "options"
-        groups[group].append(flag)
-    # Positional arguments come first, in their order.
-    groups[REQUIRED].sort(key=lambda flag: not flag.is_positional)
-    groups[_PERFORMANCE].sort(key=lambda flag: RESOURCES.index(flag.name))
+        title = _SETTINGS if "." in flag.path or flag.name in _STARTS else "options"
+        title = _PERFORMANCE if flag.name in RESOURCES else title
+        groups[REQUIRED if flag.is_required else title].append(flag)
     return {title: members for title, members in groups.items() if members}
 
 

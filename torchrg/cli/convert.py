@@ -324,17 +324,12 @@ def _check(arguments: Arguments) -> None:
     if _page_folder(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):
-        flags.check_level(arguments.level, arguments.partition)
+        is_on = arguments.superpoints or arguments.layout != "pointcept"
+        flags.check_superpoints(arguments.partition, arguments.level, is_on=is_on)
         if arguments.orient == "viewpoint" and not isinstance(arguments, FolderArguments):
             raise ConfigError(
                 "expected --orient auto, interior, up or none, got viewpoint; this data set "
                 "stores no scanner positions."
-            )
-        has_superpoints = arguments.superpoints or arguments.layout != "pointcept"
-        defaults = (SuperpointsConfig(), 0)
-        if not has_superpoints and (arguments.partition, arguments.level) != defaults:
-            raise ConfigError(
-                "expected --superpoints with --partition or --level, got none; add it."
             )
         if arguments.pages is not None and arguments.layout != "pointcept":
             raise ConfigError(

@@ -225,8 +225,10 @@ def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) 
         )
 
 
-def check_level(level: int, config: SuperpointsConfig) -> None:
-    """Raise if the superpoints have no such level."""
+def check_superpoints(config: SuperpointsConfig, level: int, *, is_on: bool) -> None:
+    """Raise if there are no superpoints for the settings, or they have no such level."""
+    if not is_on and (config, level) != (SuperpointsConfig(), 0):
+        raise ConfigError("expected --superpoints with --partition or --level, got none; add it.")
     if not 0 <= level < config.num_levels:
         max_level = config.num_levels - 1
         raise ConfigError(f"expected --level from 0 to {max_level}, got {level}.")

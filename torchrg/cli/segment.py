@@ -121,18 +121,14 @@ def run(argv: list[str]) -> int:
     arguments = parse(Arguments, argv, prog="torchrg segment")
     if arguments.layout not in (None, "pointcept"):
         arguments = dataclasses.replace(arguments, superpoints=True)
-    if not arguments.superpoints and arguments.partition != SuperpointsConfig():
-        raise ConfigError(
-            "segment: expected --superpoints with --partition settings, got none; add it."
-        )
-    flags.check_level(arguments.level, arguments.partition)
-    if arguments.layout is not None:
-        check_layout(arguments.layout, _DATASET, "clouds")
     if arguments.level and arguments.layout is None:
         raise ConfigError(
             "expected --layout with --level, got none; leave --level out, since other files "
             "contain all levels."
         )
+    flags.check_superpoints(arguments.partition, arguments.level, is_on=arguments.superpoints)
+    if arguments.layout is not None:
+        check_layout(arguments.layout, _DATASET, "clouds")
     flags.limit_threads(arguments.threads)
     flags.limit_in_bytes(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
