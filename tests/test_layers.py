@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 LAYERS = [
     {"axes", "errors", "version", "_parallel", "_synonyms"},
     {"precision"},
-    {"_checks", "_optional", "_values", "scratch", "structures"},
+    {"_checks", "_optional", "scratch", "structures"},
     {"kernels"},
     {"_opaque", "linalg", "mesh", "neighbors", "config", "plane_table"},
     {"robust"},

@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from torchrg._values import convert
 from torchrg.cli import main
 from torchrg.cli.settings import flags_by_section
+from torchrg.config import convert
 
 
 def listed(capsys, *arguments):

@@ -23,8 +23,7 @@ from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from torchrg._synonyms import advice_on, nearest_name
-from torchrg._values import SettingError, convert, kinds_of
-from torchrg.config import settings_of
+from torchrg.config import SettingError, convert, kinds_of, settings_of
 from torchrg.errors import ConfigError
 
 Command = TypeVar("Command")

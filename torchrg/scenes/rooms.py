@@ -8,8 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from torchrg._values import expect
-from torchrg.config import check_values
+from torchrg.config import check_values, expect
 from torchrg.errors import ConfigError
 from torchrg.scenes import parts as draw
 from torchrg.scenes.geometry import Array, Frame, Triple

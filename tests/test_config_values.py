@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg._values import SettingError, convert
+from torchrg.config import SettingError, convert
 from torchrg.errors import ConfigError, add_note
 
 Choice = Literal["one", "two"]
