@@ -109,7 +109,7 @@ def test_an_angle_beyond_a_right_one_is_refused():
             "expected growing.connectivity to be a number or none, got True",
         ),
         ("planes: {up: w}", "planes.up to be one of x, y, z, -x, -y, -z or none, got 'w'"),
-        ("growing: 5", "expected growing to be a mapping, got 5"),
+        ("growing: 5", "expected growing to be a GrowingConfig or a mapping, got 5"),
         ("angle_deg: [5]", r"expected angle_deg to be a number, got \[5\]"),
         ("angle_deg: 91", r"expected angle_deg in \[0, 90\], got 91"),
         ("angle: 5", "unknown setting 'angle'; the nearest is angle_deg, as in {'angle_deg': 5}"),
@@ -123,7 +123,7 @@ def test_an_angle_beyond_a_right_one_is_refused():
         ("base: 3", "got 3"),
         ("base: [consensus]", "got "),
         ("base: ../mine", "expected base"),
-        ("base: consensus\ngrowing: 3", "expected growing to be a mapping"),
+        ("base: consensus\ngrowing: 3", "expected growing to be a GrowingConfig or a mapping"),
         ("base: consensus\ngrow: {}", "unknown setting 'grow'; PipelineConfig has"),
     ],
 )

@@ -640,7 +640,7 @@ def _override(config: Settings, values: object, where: str, prefix: str = "") ->
             config = typing.cast(Any, config).with_angle(direct.pop("angle_deg"))
         for key, value in direct.items():
             current = getattr(config, key)
-            if dataclasses.is_dataclass(current) and not dataclasses.is_dataclass(value):
+            if dataclasses.is_dataclass(current) and isinstance(value, Mapping):
                 direct[key] = _override(current, value, where, f"{prefix}{key}.")
         changed = dataclasses.replace(config, **direct)  # type: ignore[type-var]
     except SettingError as error:
@@ -745,20 +745,13 @@ def _convert_to(kind: Any, value: Any) -> Any:  # noqa: ANN401
             return tuple(convert(part, items[0], "") for part in parts)
     if kind is Path and isinstance(value, str | Path):
         return Path(value)
-    if kind is str and is_word:
-        return value
-    if dataclasses.is_dataclass(kind) and type(value) is kind:
+    if (kind is str and is_word) or (dataclasses.is_dataclass(kind) and type(value) is kind):
         return value
     raise ValueError
 
 
 def kinds_of(hint: Any) -> list[Any]:  # noqa: ANN401
-    """Return the alternatives of an annotated type.
-
-    Example:
-        >>> kinds_of(int | None)
-        [<class 'int'>, <class 'NoneType'>]
-    """
+    """Return the alternatives of an annotated type."""
     is_union = typing.get_origin(hint) in (types.UnionType, typing.Union)
     return [*typing.get_args(hint)] if is_union else [hint]
 

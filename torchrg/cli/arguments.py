@@ -230,9 +230,7 @@ def _build(kind: type[Command], flags: Sequence[Flag], words: Mapping[str, Any])
         if dataclasses.is_dataclass(hint):
             start = f"{field.name}."
             changes = {
-                path.removeprefix(start): word
-                for path, word in words.items()
-                if path.startswith(start)
+                path.removeprefix(start): words[path] for path in words if path.startswith(start)
             }
             try:
                 base = argument.base(values) if argument.base else None
@@ -240,7 +238,7 @@ def _build(kind: type[Command], flags: Sequence[Flag], words: Mapping[str, Any])
             except SettingError as error:
                 if error.where:  # A file.
                     raise
-                name = names.get(f"{start}{error.name}") or names[error.name]
+                name = names.get(f"{start}{error.name}") or names.get(error.name, error.name)
                 raise SettingError("", name, error.problem) from None
     return kind(**values)
 
