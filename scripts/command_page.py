@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from torchrg.cli import COMMANDS, convert
 from torchrg.cli.arguments import REQUIRED, Flag, describe, example_lines, group_flags, list_flags
 from torchrg.cli.settings import flags_by_section
+from torchrg.config import load_config
 
 PROGS: dict[str, type] = {
     f"torchrg {name}": importlib.import_module(f"torchrg.cli.{name}").Arguments
@@ -20,8 +21,9 @@ def command_page() -> str:
     """Return a section for each command: description, examples, options; then the settings."""
     blocks = [line for prog, kind in PROGS.items() for line in _section(prog, kind)]
     blocks.append("## Settings")
-    for section, flags in flags_by_section().items():
-        blocks += [f"### {section}", *map(_option, flags)]
+    for section, flags in flags_by_section(load_config()).items():
+        program = f"```{{program}} torchrg settings {section}\n```"
+        blocks += [f"### {section}", program, *map(_option, flags)]
     return "\n\n".join(blocks)
 
 

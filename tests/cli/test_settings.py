@@ -4,9 +4,12 @@ import re
 
 import pytest
 
-from torchrg.cli import main
+from torchrg.cli import main, segment
+from torchrg.cli.arguments import list_flags
 from torchrg.cli.settings import flags_by_section
-from torchrg.config import convert
+from torchrg.config import convert, load_config
+
+SECTIONS = flags_by_section(load_config())
 
 
 def listed(capsys, *arguments):
@@ -16,7 +19,7 @@ def listed(capsys, *arguments):
 
 def test_each_setting_is_listed_once_in_sentences(capsys):
     text = listed(capsys)
-    for section, flags in flags_by_section().items():
+    for section, flags in SECTIONS.items():
         part = text.partition(f"{section}:\n")[2].partition("\n\n")[0]
         assert flags
         for flag in flags:
@@ -37,14 +40,22 @@ def test_a_section_has_the_values_of_the_preset_and_of_other_words(capsys, tmp_p
     assert "plane they lie. Default: false." in " ".join(text.split())
 
 
+def test_each_setting_of_a_configuration_is_in_a_section():
+    listed_names = {flag.path for flag in SECTIONS["selection"]}
+    listed_names |= {f"{name}.{flag.path}" for name, flags in SECTIONS.items() for flag in flags}
+    paths = {flag.path for flag in list_flags(segment.Arguments) if "." in flag.path}
+    assert len(paths) > 35
+    assert {path.removeprefix("settings.") for path in paths} <= listed_names
+
+
 def test_an_unknown_section_is_refused(capsys):
     assert main(["settings", "planez"]) == 2
-    assert "expected SECTION to be one of normals, growing" in capsys.readouterr().err
+    assert "expected SECTION to be one of selection, normals, growing" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("section", flags_by_section())
+@pytest.mark.parametrize("section", SECTIONS)
 def test_defaults_are_shown_as_words_that_are_accepted(section):
-    for flag in flags_by_section()[section]:
+    for flag in SECTIONS[section]:
         for word in re.findall(r"Default: (\S+)\.$", flag.text):
             shown = convert(word, flag.hint, flag.name)
             assert convert(str(shown).strip("()"), flag.hint, flag.name) == shown

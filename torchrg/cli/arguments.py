@@ -260,7 +260,7 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str, complete: bool 
         entries = [format_flag(flag) if complete else _short_entry(flag) for flag in members]
         blocks.append("\n".join([f"{title}:", *entries]))
     if sections := dict.fromkeys(f"--{flag.section}.NAME" for flag in flags if flag.section):
-        blocks.append(_wrap(f"torchrg settings lists the settings {', '.join(sections)}."))
+        blocks.append(_wrap(f"torchrg settings lists more settings: {', '.join(sections)}."))
     if len(common) < len(options):
         blocks.append(f"{prog} --help-all explains these and {len(options) - len(common)} more.")
     if examples := example_lines(kind):

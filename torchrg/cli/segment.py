@@ -70,11 +70,12 @@ IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 class Arguments(flags.PlaneSettings):
     """Segment point clouds into planes: plane label, normal, curvature, plane table.
 
-    Settings come from the preset (or the --config file) and are overridden by the flags below.
-    Points that lie on no plane get the label -1.
+    Settings come from the preset (or the --config file), and arguments such as --normals.k 30
+    override them. Points that lie on no plane get the label -1.
 
     Examples:
         torchrg segment scan.pcd --out planes.npz
+        torchrg segment scan.ply --out planes.npz --normals.k 30 --growing.min-size 200
         torchrg segment scan.laz --out planes.laz --table planes.csv --picture planes.png
         torchrg segment *.ply --out results --picture pictures --pages
         torchrg segment part1.e57 part2.e57 --merge --out hall.npz --voxel 0.02

@@ -5,9 +5,9 @@ from typing import Annotated, Any, Literal
 
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, Flag, format_flag, list_flags, parse
-from torchrg.config import DepthConfig, PipelineConfig, SuperpointsConfig, load_config
+from torchrg.config import DepthConfig, PipelineConfig, SuperpointsConfig
 
-Section = Literal["normals", "growing", "planes", "partition", "depth"]
+Section = Literal["selection", "normals", "growing", "planes", "partition", "depth"]
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,9 @@ class Arguments(flags.PlaneSettings):
 
     A setting is --growing.min-size 50 for a command, growing.min_size: 50 in a --config file, and
     segment_planes(points, {"growing.min_size": 50}) in Python. Values are numbers, words, true,
-    false or none; commas separate several. torchrg depth and torchrg convert rgbd have the section
-    depth, --superpoints has partition, and other commands have the remaining sections.
+    false or none; commas separate several. Names of the section selection have no section. torchrg
+    depth and torchrg convert rgbd have the section depth, --superpoints has partition, and other
+    commands have the remaining sections.
 
     Examples:
         torchrg settings growing
@@ -28,17 +29,16 @@ class Arguments(flags.PlaneSettings):
     """Section to list. Default: all sections."""
 
 
-def flags_by_section(settings: PipelineConfig | None = None) -> dict[str, list[Flag]]:
+def flags_by_section(settings: PipelineConfig) -> dict[str, list[Flag]]:
     """Return the settings of each section, with ``settings`` as their defaults."""
-    settings = settings or load_config()
     sections: dict[str, Any] = {
         **{name: getattr(settings, name) for name in ("normals", "growing", "planes")},
         "partition": SuperpointsConfig(),
         "depth": DepthConfig(),
     }
-    return {
-        name: [*list_flags(type(values), values, section=name)] for name, values in sections.items()
-    }
+    members = {name: [*list_flags(type(v), v, section=name)] for name, v in sections.items()}
+    whole = [flag for flag in list_flags(PipelineConfig, settings) if "." not in flag.path]
+    return {"selection": whole, **members}
 
 
 def run(argv: list[str]) -> int:
