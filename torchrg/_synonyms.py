@@ -48,7 +48,7 @@ _ADVICE = {
     "results are deterministic; leave it out": f"seed {_SEED}",
     "the numbers of superpoints are counts": "n",
     "batches with an offset are supported by torchrg.transforms": "offset",
-    "torchrg.write_cloud writes a result": f"out {_OUTPUT}",
+    "commands name OUT or --out, and torchrg.write_cloud writes a result": f"out {_OUTPUT}",
     "pass the preset as the first argument, config, or as the key base": "preset",
     "neighborhoods have k points; max_distance bounds their radius": "radius",
     "leave it out: the default adapts to the data; up sets the up axis": "laser rgbd s3dis scannet",
