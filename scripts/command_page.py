@@ -1,13 +1,13 @@
 """Reference page of the commands, generated from their parsers; see ``guides/commands.md``."""
 
-import dataclasses
 import importlib
 import re
 from collections.abc import Iterator
 
 from torchrg.cli import COMMANDS, convert
 from torchrg.cli.arguments import REQUIRED, Flag, describe, example_lines, group_flags, list_flags
-from torchrg.cli.flags import PlaneSettings
+from torchrg.cli.settings import flags_by_section
+from torchrg.config import load_config
 
 PROGS: dict[str, type] = {
     f"torchrg {name}": importlib.import_module(f"torchrg.cli.{name}").Arguments
@@ -18,16 +18,18 @@ PROGS: dict[str, type] = {
 
 
 def command_page() -> str:
-    """Return a section for each command: description, examples, and arguments."""
-    return "\n\n".join(line for prog, kind in PROGS.items() for line in _section(prog, kind))
+    """Return a section for each command: description, examples, options; then the settings."""
+    blocks = [line for prog, kind in PROGS.items() for line in _section(prog, kind)]
+    blocks.append("## Settings")
+    for section, flags in flags_by_section(load_config()).items():
+        program = f"```{{program}} torchrg settings {section}\n```"
+        blocks += [f"### {section}", program, *map(_option, flags)]
+    return "\n\n".join(blocks)
 
 
 def flags_of(kind: type) -> list[Flag]:
-    """Return the arguments of a command; defaults of settings come from the preset."""
-    start = None
-    if "settings" in {field.name for field in dataclasses.fields(kind)}:
-        start = {"settings": PlaneSettings.from_arguments([])}
-    return list(list_flags(kind, start))
+    """Return the options of a command, without settings."""
+    return [flag for flag in list_flags(kind) if not flag.section]
 
 
 def _section(prog: str, kind: type) -> Iterator[str]:
@@ -41,8 +43,12 @@ def _section(prog: str, kind: type) -> Iterator[str]:
     yield f"```{{program}} {prog}\n```"
     for title, flags in groups.items():
         yield f"```{{rubric}} {title[0].upper()}{title[1:]}\n```"
-        for flag in flags:
-            yield f"```{{option}} {flag.spelling}\n\n{_escaped(flag.text)}\n```"
+        yield from map(_option, flags)
+
+
+def _option(flag: Flag) -> str:
+    """Return an option or setting with its text."""
+    return f"```{{option}} {flag.spelling}\n\n{_escaped(flag.text)}\n```"
 
 
 def _escaped(text: str) -> str:

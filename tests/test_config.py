@@ -3,19 +3,26 @@
 import dataclasses
 import math
 import types
+from operator import attrgetter
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import yaml
 
+from torchrg.cli import segment
+from torchrg.cli.arguments import list_flags, parse
 from torchrg.config import (
     DepthConfig,
     GrowingConfig,
     NormalsConfig,
     PipelineConfig,
+    PlanesConfig,
     SuperpointsConfig,
     load_config,
     preset_names,
+    settings_of,
 )
 from torchrg.errors import ConfigError
 from torchrg.normals import estimate_normals
@@ -90,30 +97,34 @@ def test_an_angle_beyond_a_right_one_is_refused():
     [
         (
             "growing: {max_angle: 5}",
-            "growing: unknown setting 'max_angle'; the nearest is max_angle_",
+            "unknown setting 'growing.max_angle'; the nearest is growing.max_angle_deg, as in ",
         ),
-        ("k: 5", "unknown setting 'k'; it is normals.k, as in "),
-        ("normals: {k: 2}", "normals: NormalsConfig: expected k >= 3, got 2"),
-        ("normals: {k: 3.5}", "normals: k: expected int, got 3.5"),
-        ("normals: {k: true}", "normals: k: expected int, got True"),
-        ("normals: {method: ransac}", "expected one of pca, jet"),
-        ("growing: {connectivity: yes}", "expected float or null, got True"),
-        ("planes: {up: w}", "up: expected one of x, y, z, -x, -y, -z or null, got 'w'"),
-        ("growing: 5", "growing: expected a mapping of settings, got 5"),
-        ("angle_deg: [5]", r"angle_deg: expected float, got \[5\]"),
+        ("k: 5", "unknown setting 'k'; the nearest is normals.k, as in {'normals.k': 5}"),
+        ("normals: {k: 2}", "yaml: expected normals.k >= 3, got 2"),
+        ("normals: {k: 3.5}", "expected normals.k to be an integer, got 3.5"),
+        ("normals: {k: true}", "expected normals.k to be an integer, got True"),
+        ("normals: {method: ransac}", "expected normals.method to be one of pca, jet"),
+        (
+            "growing: {connectivity: yes}",
+            "expected growing.connectivity to be a number or none, got True",
+        ),
+        ("planes: {up: w}", "planes.up to be one of x, y, z, -x, -y, -z or none, got 'w'"),
+        ("growing: 5", "expected growing to be a GrowingConfig or a mapping, got 5"),
+        ("angle_deg: [5]", r"expected angle_deg to be a number, got \[5\]"),
         ("angle_deg: 91", r"expected angle_deg in \[0, 90\], got 91"),
-        ("angles: 5", "unknown setting 'angles'; the nearest is planes"),
+        ("angle: 5", "unknown setting 'angle'; the nearest is angle_deg, as in {'angle_deg': 5}"),
+        ("angles: 5", "unknown setting 'angles'; PipelineConfig has"),
         ("shade: 5", "unknown setting 'shade'; PipelineConfig has .*, angle_deg"),
         ("growing: [", "expected YAML"),
         pytest.param("[" * 900, "expected YAML, got maximum recursion", id="brackets"),
         pytest.param("chunk_size: " + "9" * 5000, "expected YAML, got Exceeds", id="digits"),
-        ("- 1", "expected a mapping"),
+        ("- 1", "expected settings to be a mapping"),
         ("base: clasic", r"expected base to be one of .*classic, .* got 'clasic'"),
         ("base: 3", "got 3"),
         ("base: [consensus]", "got "),
         ("base: ../mine", "expected base"),
-        ("base: consensus\ngrowing: 3", "growing: expected a mapping"),
-        ("base: consensus\ngrow: {}", "unknown setting 'grow'; the nearest is growing"),
+        ("base: consensus\ngrowing: 3", "expected growing to be a GrowingConfig or a mapping"),
+        ("base: consensus\ngrow: {}", "unknown setting 'grow'; PipelineConfig has"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, text, message):
@@ -156,7 +167,7 @@ def test_missing_file_is_named(tmp_path):
         (DepthConfig, {"noise": (0.0, 0.0)}, "DepthConfig: expected noise two numbers >= 0"),
         (DepthConfig, {"noise": (-1.0, 0.1)}, "noise two numbers >= 0, not both 0, or none"),
         (DepthConfig, {"noise": (math.inf, 0.1)}, "noise in "),
-        (DepthConfig, {"noise": (0.1,)}, "noise two numbers"),
+        (DepthConfig, {"noise": (0.1,)}, "expected noise to be 2 numbers or none, got \\(0.1,\\)"),
         (DepthConfig, {"max_depth": 0.0}, "DepthConfig: expected max_depth > 0 or none"),
         (DepthConfig, {"max_angle_deg": 91.0}, r"DepthConfig: expected max_angle_deg in \[0, 90\]"),
         (DepthConfig, {"max_step": -1.0}, "max_step >= 0"),
@@ -166,6 +177,98 @@ def test_missing_file_is_named(tmp_path):
 def test_values_out_of_range_are_refused(kind, values, message):
     with pytest.raises(ConfigError, match=message):
         kind(**values)
+
+
+SETTINGS = [
+    (kind, name)
+    for kind in (NormalsConfig, GrowingConfig, PlanesConfig, PipelineConfig, DepthConfig)
+    for name in vars(kind())
+]
+"""Every setting of planes, by its class and name."""
+
+
+def doors(kind, name, folder):
+    """Return functions that make settings from one value, and return that of the settings."""
+    own = attrgetter(name)
+    yield lambda given: own(kind(**{name: given}))
+    yield lambda given: own(settings_of("f", kind, {name: given}))
+    if kind is DepthConfig:
+        return
+    sections = {NormalsConfig: "normals.", GrowingConfig: "growing.", PlanesConfig: "planes."}
+    dotted = f"{sections.get(kind, '')}{name}"
+    whole = attrgetter(dotted)
+    yield lambda given: whole(load_config(**{dotted: given}))
+    yield lambda given: whole(SegmentPlanes({dotted: given}).config)
+
+    def from_file(given):
+        path = folder / "mine.yaml"
+        path.write_text(yaml.safe_dump({dotted: given}))
+        return whole(load_config(path))
+
+    def from_command(given):
+        flags = {flag.path: flag.name for flag in list_flags(segment.Arguments)}
+        flag = flags.get(f"settings.{dotted}", f"--{dotted}")
+        line = ["a.ply", "--out", "b.npz", f"{flag}={given}"]
+        return whole(parse(segment.Arguments, line, prog="torchrg segment").settings)
+
+    if not dataclasses.is_dataclass(own(kind())):
+        yield from_file
+        yield from_command
+
+
+@pytest.mark.parametrize(("kind", "name"), SETTINGS)
+def test_every_setting_takes_its_value_in_words_and_refuses_others_at_every_door(
+    kind, name, tmp_path
+):
+    value = getattr(kind(), name)
+    for ask in doors(kind, name, tmp_path):
+        if not dataclasses.is_dataclass(value):
+            assert ask(str(value)) == value
+            assert type(ask(str(value))) is type(value)
+        for wrong in ("no such value", math.nan, [[value], [value]], b"no"):
+            shown = name.replace("_", "[_-]")
+            with pytest.raises(ConfigError, match=f"expected .*{shown} to be"):
+                ask(wrong)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "given", "value"),
+    [
+        (GrowingConfig, "absorb", "no", False),
+        (GrowingConfig, "cut_bridges", np.False_, False),
+        (GrowingConfig, "faceted", "off", False),
+        (GrowingConfig, "min_size", np.int64(50), 50),
+        (GrowingConfig, "min_size", torch.tensor(50), 50),
+        (GrowingConfig, "max_angle_deg", np.float32(8), 8.0),
+        (GrowingConfig, "max_angle_deg", 8, 8.0),
+        (GrowingConfig, "plane_reach", "1e-3", 1e-3),
+        (GrowingConfig, "plane_reach", "null", None),
+        (SuperpointsConfig, "counts", 100, (100,)),
+        (SuperpointsConfig, "counts", "300, 100", (300, 100)),
+        (SuperpointsConfig, "strengths", np.array([1, 2.5]), (1.0, 2.5)),
+        (SuperpointsConfig, "strengths", torch.tensor([1, 2.5]), (1.0, 2.5)),
+        (PipelineConfig, "kinds", ["wall", "floor"], ("wall", "floor")),
+        (PipelineConfig, "kinds", "wall,floor", ("wall", "floor")),
+        (PipelineConfig, "kinds", np.str_("wall"), ("wall",)),
+        (PipelineConfig, "normals", {"k": 30}, NormalsConfig(k=30)),
+    ],
+)
+def test_values_become_those_of_their_type_in_constructors_and_dictionaries(
+    kind, name, given, value
+):
+    for made in (kind(**{name: given}), settings_of("f", kind, {name: given})):
+        assert getattr(made, name) == value
+        assert type(getattr(made, name)) is type(value)
+
+
+@pytest.mark.parametrize("value", [1, 0, "1", 1.0, None, "maybe", ["no"]])
+def test_a_switch_is_on_or_off_and_nothing_between(value):
+    with pytest.raises(ConfigError, match="GrowingConfig: expected absorb to be true or false"):
+        GrowingConfig(absorb=value)
+    with pytest.raises(
+        ConfigError, match=r"load_config: expected growing\.absorb to be true or fal"
+    ):
+        load_config({"growing.absorb": value})
 
 
 def changes(settings, base):
@@ -284,14 +387,17 @@ def test_sections_and_other_settings_come_by_dictionary_too():
     [
         (
             lambda: load_config(k=3),
-            r"^load_config: unknown .* normals.k, as in \*\*{'normals.k': 3}",
+            r"^load_config: unknown .* normals.k, as in {'normals.k': 3}\.$",
         ),
-        (lambda: SegmentPlanes("classic", min_size=3), "it is growing.min_size, as in"),
+        (lambda: SegmentPlanes("classic", min_size=3), "the nearest is growing.min_size, as in"),
         (
             lambda: SegmentPlanes(**{"normal.k": 3}),
-            "unknown setting 'normal'; the nearest is normals",
+            "unknown setting 'normal.k'; the nearest is normals.k",
         ),
-        (lambda: SegmentPlanes(**{"normals.k": "3"}), "SegmentPlanes: normals: k: expected int"),
+        (
+            lambda: SegmentPlanes({"normals.k": "3.5"}),
+            "SegmentPlanes: expected normals.k to be an integer, got '3.5'",
+        ),
         (lambda: segment_planes(torch.zeros(3, 3), preset="classic"), "as the first argument"),
         (
             lambda: estimate_normals(torch.zeros(3, 3), radius=0.1),
@@ -299,8 +405,11 @@ def test_sections_and_other_settings_come_by_dictionary_too():
         ),
         (lambda: make_superpoints(torch.zeros(3, 3), n=10), "numbers of superpoints are counts"),
         (lambda: MakeSuperpoints("classic"), "a SuperpointsConfig or a dictionary, got str"),
-        (lambda: MakeSuperpoints(counts="100"), "counts: expected numbers or null, got '100'"),
-        (lambda: SegmentDepth(noise=[0.1]), "noise: expected numbers or null"),
+        (
+            lambda: MakeSuperpoints(counts="1;2"),
+            "expected counts to be integers or none, got '1;2'",
+        ),
+        (lambda: SegmentDepth(noise=[0.1]), "expected noise to be 2 numbers or none, got"),
         (lambda: load_config(["classic"]), "a dictionary, or a preset, one of .*, got list"),
     ],
 )

@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 LAYERS = [
-    {"axes", "errors", "version", "_parallel"},
+    {"axes", "errors", "version", "_parallel", "_synonyms"},
     {"precision"},
     {"_checks", "_optional", "scratch", "structures"},
     {"kernels"},

@@ -1,6 +1,7 @@
 """README: length, examples, commands and links."""
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -40,6 +41,25 @@ def test_examples_run(tmp_path, monkeypatch, capsys):
     assert {"plane", "normal", "curvature", "offset"} <= set(shared["batch"])
     assert (shared["sample"]["plane"] == 0).all()
     assert "planes;" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_examples_have_no_errors_of_types(tmp_path):
+    """The idioms shown, and results of modules, pass mypy --strict."""
+    pytest.importorskip("mypy", reason="needs the extra dev")
+    uses = """
+def covariance(patches: torch.Tensor) -> torch.Tensor:
+    return DetMCD()(patches).covariance
+
+torchrg.segment_planes(cloud, {"normals.k": 30}, kinds=["wall"], min_area=0.5)
+SegmentPlanes({"base": "classic", "normals": {"k": 30}})
+torchrg.load_config({"growing.absorb": "no"})
+"""
+    (tmp_path / "blocks.py").write_text("\n".join([*blocks_of("python"), uses]), encoding="utf-8")
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "blocks.py"]
+    environment = {**os.environ, "MYPYPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("method", ["spawn", "forkserver"])

@@ -149,7 +149,7 @@ def describe_multipliers(settings: PipelineConfig, partition: object = None) -> 
 
     Example:
         >>> from torchrg.config import load_config
-        >>> describe_multipliers(load_config(**{"normals.k": 600}))
+        >>> describe_multipliers(load_config({"normals.k": 600}))
         ' with --normals.k 600'
     """
     normals, default, flags = settings.normals, NormalsConfig.k, []

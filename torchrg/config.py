@@ -4,21 +4,23 @@ Files and flags hold only differences.
 """
 
 import dataclasses
-import difflib
 import itertools
 import math
 import numbers
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar
 
 import torch
 
 from torchrg._parallel import CHUNK_SIZE
+from torchrg._synonyms import advice_on, nearest_name
 from torchrg.errors import ConfigError
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
@@ -49,10 +51,8 @@ Auto = Literal["auto"]
 """Value of a setting that is determined from the data; see :meth:`PipelineConfig.with_sampling`."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """Up axis of the coordinates."""
-NO_FLAG = {"is_flag": False}
-"""Metadata of a setting available in files and Python, but not as a flag."""
-SHORT_FLAG = {"has_part": False}
-"""Metadata of a setting whose flag omits the name of its section."""
+SHORT_FLAG = {"is_short": True}
+"""Metadata of a setting that is an option of commands, without the name of its section."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class NormalsConfig:
     inlier_quantile: float = 0.975
     """Chi-square quantile of the squared distance below which a neighbor counts as an inlier of a
     robust fit."""
-    irls_decay: float = field(default=1.05, metadata=NO_FLAG)
+    irls_decay: float = 1.05
     """Factor, above 1, by which irls shrinks its scale in each step. The authors use 1.01, which
     takes five times as long as 1.05."""
     adaptive_k: int | None = None
@@ -94,13 +94,13 @@ class NormalsConfig:
 
     def __post_init__(self) -> None:
         check_values(self)
-        _require(self, "k", ">= 3", self.k >= 3)
+        expect(self, "k", ">= 3", self.k >= 3)
         limit = self.adaptive_k
-        _require(self, "adaptive_k", ">= k or none", limit is None or limit >= self.k)
-        _require(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
-        _require(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
-        _require(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
-        _require(self, "irls_decay", "> 1", self.irls_decay > 1)
+        expect(self, "adaptive_k", ">= k or none", limit is None or limit >= self.k)
+        expect(self, "sharp_angle_deg", "in [0, 90]", 0 <= self.sharp_angle_deg <= 90)
+        expect(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
+        expect(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
+        expect(self, "irls_decay", "> 1", self.irls_decay > 1)
 
     def with_sampling(self, sampling: Sampling) -> "NormalsConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
@@ -142,7 +142,7 @@ class GrowingConfig:
     neighborhood (eq. 11)."""
     coplanarity_scope: Literal["all", "connected"] = "all"
     """Neighbors used for that median and Qn: all, or connected ones (Algorithm 2)."""
-    coplanarity_floor: float = field(default=0.005, metadata=NO_FLAG)
+    coplanarity_floor: float = 0.005
     """Lower bound of Qn in the coplanarity test, as a fraction of the distance to the farthest
     neighbor. On exact and quantized surfaces most residuals are equal, so Qn is 0."""
     plane_reach: float | None = 4.0
@@ -164,7 +164,7 @@ class GrowingConfig:
     mesh facets and warped reconstructions. auto: 1/240 of the cloud height (11 mm in a room) if
     deviations grow with scale, less than half of that (5 mm) if the noise is white. None disables
     merging."""
-    faceted: bool | Auto = field(default="auto", metadata=NO_FLAG)
+    faceted: bool | Auto = "auto"
     """Whether flat surfaces deviate from planes by shape (mesh facets, warped reconstructions)
     rather than by noise. If true, points instead of normals decide whether a region is flat;
     requires facet_tolerance. auto: measured."""
@@ -174,10 +174,10 @@ class GrowingConfig:
     absorb: bool = True
     """Assign unlabeled points (and regions below min_size) to an adjacent flat region on whose
     plane they lie."""
-    absorb_reach: float = field(default=3.0, metadata=NO_FLAG)
+    absorb_reach: float = 3.0
     """Maximum distance between an absorbed point and the plane of its region, in thicknesses of the
     region."""
-    absorb_angle_deg: float = field(default=45.0, metadata=NO_FLAG)
+    absorb_angle_deg: float = 45.0
     """Maximum angle between the normals of an absorbed point and the plane, in degrees."""
     refine_borders: bool = True
     """Reassign boundary points to the region that explains them best, using the line of
@@ -185,30 +185,30 @@ class GrowingConfig:
     merge_coplanar: bool = True
     """Merge adjacent coplanar regions, and regions within the noise of a larger one (from the
     residuals of the normals)."""
-    merge_tolerance: float = field(default=1.2, metadata=NO_FLAG)
+    merge_tolerance: float = 1.2
     """Maximum thickness of a region about the merged plane, in multiples of its thickness about its
     own plane. Used by merge_coplanar."""
 
     def __post_init__(self) -> None:
         check_values(self)
-        _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
-        _require(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
+        expect(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
+        expect(self, "curvature_quantile", "in [0, 1]", 0 <= self.curvature_quantile <= 1)
         within = self.connectivity is None or 0 <= self.connectivity <= 1
-        _require(self, "connectivity", "in [0, 1] or none", within)
-        _require(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
+        expect(self, "connectivity", "in [0, 1] or none", within)
+        expect(self, "coplanarity_floor", ">= 0", self.coplanarity_floor >= 0)
         for name in ("max_distance", "plane_reach"):
             value = getattr(self, name)
-            _require(self, name, ">= 0 or none", value is None or value >= 0)
+            expect(self, name, ">= 0 or none", value is None or value >= 0)
         facets = self.facet_tolerance
         is_open = facets is None or facets == "auto"
-        _require(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets or 0) > 0)
+        expect(self, "facet_tolerance", "> 0, auto or none", is_open or float(facets or 0) > 0)
         size = self.min_size
-        _require(self, "min_size", ">= 1 or auto", size == "auto" or int(size) >= 1)
+        expect(self, "min_size", ">= 1 or auto", size == "auto" or int(size) >= 1)
         residual = self.max_plane_residual
-        _require(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
-        _require(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
-        _require(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
-        _require(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
+        expect(self, "max_plane_residual", "> 0 or none", residual is None or residual > 0)
+        expect(self, "absorb_reach", ">= 0", self.absorb_reach >= 0)
+        expect(self, "absorb_angle_deg", "in [0, 90]", 0 <= self.absorb_angle_deg <= 90)
+        expect(self, "merge_tolerance", ">= 1", self.merge_tolerance >= 1)
 
     def with_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
@@ -278,6 +278,9 @@ class PlanesConfig:
     outline: bool = False
     """Trace the polygon of each plane (needs shapely)."""
 
+    def __post_init__(self) -> None:
+        check_values(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionConfig:
@@ -294,11 +297,8 @@ class SelectionConfig:
 
     def __post_init__(self) -> None:
         check_values(self)
-        _require(self, "min_area", ">= 0", self.min_area >= 0)
-        kinds: Any = self.kinds
-        is_list = isinstance(kinds, tuple) and len(kinds) > 0 and set(kinds) <= set(PLANE_KINDS)
-        words = f"to be some of {', '.join(PLANE_KINDS)}, or none"
-        _require(self, "kinds", words, kinds is None or is_list)
+        expect(self, "min_area", ">= 0", self.min_area >= 0)
+        expect(self, "kinds", f"to be some of {', '.join(PLANE_KINDS)} or none", self.kinds != ())
 
     @property
     def max_neighbors(self) -> int:
@@ -324,7 +324,7 @@ class PipelineConfig(SelectionConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self, "chunk_size", ">= 1", self.chunk_size >= 1)
+        expect(self, "chunk_size", ">= 1", self.chunk_size >= 1)
 
     @property
     def max_neighbors(self) -> int:
@@ -356,9 +356,11 @@ class PipelineConfig(SelectionConfig):
         Example:
             >>> config = load_config("paper").with_angle(8)
             >>> config.normals.sharp_angle_deg, config.growing.max_angle_deg
-            (8, 8)
+            (8.0, 8.0)
         """
-        _check_angle("PipelineConfig", angle_deg)
+        angle_deg = convert(angle_deg, float, "angle_deg", "PipelineConfig")
+        if not 0 <= angle_deg <= 90:
+            raise SettingError("PipelineConfig", "angle_deg", f"in [0, 90], got {angle_deg!r}")
         parts = {
             section: dataclasses.replace(getattr(self, section), **{name: angle_deg})
             for section, name in _ANGLES.items()
@@ -439,13 +441,13 @@ class SuperpointsConfig:
     def __post_init__(self) -> None:
         check_values(self)
         is_list = len(self.strengths) > 0 and _ascends(0.0, *self.strengths)
-        _require(self, "strengths", "one or more numbers > 0, ascending", is_list)
+        expect(self, "strengths", "one or more numbers > 0, ascending", is_list)
         counts = self.counts
         is_list = counts is None or (len(counts) > 0 and _ascends(0, *reversed(counts)))
-        _require(self, "counts", "one or more integers > 0, descending, or none", is_list)
-        _require(self, "min_size", ">= 1", self.min_size >= 1)
+        expect(self, "counts", "one or more integers > 0, descending, or none", is_list)
+        expect(self, "min_size", ">= 1", self.min_size >= 1)
         extent = self.max_extent
-        _require(self, "max_extent", "> 0 or none", extent is None or extent > 0)
+        expect(self, "max_extent", "> 0 or none", extent is None or extent > 0)
 
     @property
     def num_levels(self) -> int:
@@ -484,14 +486,14 @@ class DepthConfig(SelectionConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         parts: tuple[float, ...] = (1.0, 0.0) if self.noise is None else self.noise
-        is_noise = len(parts) == 2 and min(parts) >= 0 and max(parts) > 0
-        _require(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
-        _require(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
-        _require(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
-        _require(self, "max_step", ">= 0", self.max_step >= 0)
+        is_noise = min(parts) >= 0 and max(parts) > 0
+        expect(self, "noise", "two numbers >= 0, not both 0, or none", is_noise)
+        expect(self, "max_depth", "> 0 or none", self.max_depth is None or self.max_depth > 0)
+        expect(self, "max_angle_deg", "in [0, 90]", 0 <= self.max_angle_deg <= 90)
+        expect(self, "max_step", ">= 0", self.max_step >= 0)
         needs_up = self.kinds is not None and self.up is None
-        _require(self, "up", "with kinds, as -y for a level camera", not needs_up)
-        _require(self, "min_size", ">= 1", self.min_size >= 1)
+        expect(self, "up", "with kinds, as -y for a level camera", not needs_up)
+        expect(self, "min_size", ">= 1", self.min_size >= 1)
 
 
 def preset_names() -> list[str]:
@@ -507,9 +509,11 @@ def preset_names() -> list[str]:
 def load_config(config: AnyConfig = DEFAULT_PRESET, **changes: Any) -> PipelineConfig:  # noqa: ANN401
     """Load settings from a preset, YAML file or dictionary, and override individual values.
 
-    Values omitted by a file or dictionary come from ``consensus``, or from the preset in ``base``.
+    Values omitted by a file or dictionary come from ``consensus``, or from ``base``: a preset, or
+    in Python also settings.
     Keys are sections, or dotted settings such as ``normals.k``. A top-level ``angle_deg`` sets both
-    angles: see :meth:`PipelineConfig.with_angle`.
+    angles: see :meth:`PipelineConfig.with_angle`. Values can be words, as on the command line:
+    ``"50"``, ``"no"``, ``"none"``, ``"wall,floor"``.
 
     Args:
         config: A name from :func:`preset_names`, the path of a ``.yaml`` file, a dictionary, or
@@ -524,7 +528,7 @@ def load_config(config: AnyConfig = DEFAULT_PRESET, **changes: Any) -> PipelineC
             invalid.
 
     Example:
-        >>> load_config("classic", **{"normals.k": 30}).normals.k
+        >>> load_config({"base": "classic", "normals.k": 30}).normals.k
         30
         >>> load_config({"base": "classic", "growing": {"min_size": 20}}).growing.min_size
         20
@@ -595,160 +599,174 @@ def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
 
 def _apply_to_base(values: object, where: str) -> PipelineConfig:
     """Apply the values of a file or dictionary to its base."""
-    base = PipelineConfig()
+    base: object = PipelineConfig()
     if isinstance(values, Mapping) and "base" in values:
-        expected = f"{where}: expected base to be one of"
-        base = _read_config(_preset_file(values["base"], expected=expected), where)
+        base = values["base"]
         values = {key: value for key, value in values.items() if key != "base"}
+    if not isinstance(base, PipelineConfig):
+        expected = f"{where}: expected base to be one of"
+        base = _read_config(_preset_file(base, expected=expected), where)
     return _override(base, values, where)
-
-
-_REMOVED_PRESETS = ("s3dis", "scannet", "laser", "rgbd")
-"""Presets of earlier versions, one per kind of data; replaced by measurement."""
 
 
 def _preset_file(name: object, *, expected: str) -> Path:
     """Return the file of a preset; raise if it does not exist."""
-    if name in _REMOVED_PRESETS:
-        raise ConfigError(
-            f"{expected} {', '.join(preset_names())}, got {name!r}; leave it out: the default "
-            "adapts to the data. Set the up axis with up."
-        )
     if name not in preset_names():
-        raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}.")
+        advice = advice_on(str(name)) and f"; {advice_on(str(name))}"
+        raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}{advice}.")
     return _preset_folder() / f"{name}.yaml"
 
 
-def _override(config: Settings, values: object, where: str) -> Settings:
-    """Override settings; raise for unknown keys and wrong types.
+def _override(config: Settings, values: object, where: str, prefix: str = "") -> Settings:
+    """Override settings; raise for unknown keys and wrong values.
 
-    ``where`` is the file and section, or the caller, for messages.
+    ``where`` is the file or the caller, and ``prefix`` the section with a dot, for messages.
     """
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where}: expected a mapping of settings, got {values!r}.")
-    kind, settings = type(config), dict[str, Any]()
-    hints, dotted = typing.get_type_hints(kind), dict[str, dict[str, Any]]()
+        name = prefix.removesuffix(".") or "settings"
+        raise SettingError(where, name, f"to be a mapping, got {values!r}")
+    kind, direct, dotted = type(config), dict[str, Any](), dict[str, dict[str, Any]]()
     for key, value in values.items():
         section, dot, name = str(key).partition(".")
+        if section not in vars(config) and (key, kind) != ("angle_deg", PipelineConfig):
+            fix = _fix_for(str(key), value, config, prefix)
+            raise ConfigError(f"{where}: unknown setting {f'{prefix}{key}'!r}; {fix}.")
         if dot:
             dotted.setdefault(section, {})[name] = value
         else:
-            settings[section] = value
-    if isinstance(config, PipelineConfig) and "angle_deg" in settings:
-        angle = _convert(settings.pop("angle_deg"), float, f"{where}: angle_deg")
-        _check_angle(where, angle)
-        # Explicit values of the two angles take precedence.
-        config = typing.cast(Settings, config.with_angle(angle))
-    for key, value in settings.items():
-        if key not in hints:
-            raise ConfigError(f"{where}: unknown setting {key!r}; {_fix_for(key, value, kind)}.")
-        current = getattr(config, key)
-        at = f"{where}: {key}"
-        is_section = dataclasses.is_dataclass(current) and not dataclasses.is_dataclass(value)
-        settings[key] = (
-            _override(current, value, at) if is_section else _convert(value, hints[key], at)
-        )
+            direct[section] = value
     try:
-        changed = dataclasses.replace(config, **settings)  # type: ignore[type-var]
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    return _override(changed, dotted, where) if dotted else changed
+        if "angle_deg" in direct:  # Explicit values of the two angles take precedence.
+            config = typing.cast(Any, config).with_angle(direct.pop("angle_deg"))
+        for key, value in direct.items():
+            current = getattr(config, key)
+            if dataclasses.is_dataclass(current) and isinstance(value, Mapping):
+                direct[key] = _override(current, value, where, f"{prefix}{key}.")
+        changed = dataclasses.replace(config, **direct)  # type: ignore[type-var]
+    except SettingError as error:
+        if error.where == where:  # Of a section.
+            raise
+        raise SettingError(where, f"{prefix}{error.name}", error.problem) from None
+    return _override(changed, dotted, where, prefix) if dotted else changed
 
 
-_FIXES = {
-    "preset": "pass the preset as the first argument, config",
-    "radius": "neighborhoods have k points; max_distance bounds their radius",
-    "offset": "batches with an offset are supported by torchrg.transforms",
-    "n": "the numbers of superpoints are counts",
-}
-"""Fixes for setting names of other libraries."""
-
-
-def _fix_for(key: str, value: object, kind: type) -> str:
+def _fix_for(key: str, value: object, config: object, prefix: str) -> str:
     """Return the fix for an unknown key."""
-    names = valid_names = [*typing.get_type_hints(kind), *["angle_deg"] * (kind is PipelineConfig)]
-    for section, section_kind in _SECTIONS.items() if kind is PipelineConfig else ():
-        names = [*names, *(f"{section}.{name}" for name in typing.get_type_hints(section_kind))]
-    tails = {name.rpartition(".")[2]: name for name in reversed(names)}
-    if key in tails:
-        return f"it is {tails[key]}, as in **{{{tails[key]!r}: {value!r}}}"
-    if key in _FIXES:
-        return _FIXES[key]
-    if near := difflib.get_close_matches(key, [*tails, *names], 1):
-        return f"the nearest is {tails.get(near[0], near[0])}"
-    return f"{kind.__name__} has {', '.join(valid_names)}"
-
-
-def _convert(value: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
-    """Convert a value to its annotated type, or raise."""
-    unions = (types.UnionType, typing.Union)
-    choices = typing.get_args(hint) if typing.get_origin(hint) in unions else (hint,)
-    for choice in choices:
-        if typing.get_origin(choice) is Literal:
-            if value in typing.get_args(choice):
-                return value
-        elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value) if abs(value) <= FARTHEST else value  # The range check raises.
-        elif typing.get_origin(choice) is tuple and isinstance(value, str) and _is_words(choice):
-            return _convert(tuple(value.replace(" ", "").split(",")), choice, where)
-        elif typing.get_origin(choice) is tuple and not isinstance(value, str | Mapping | None):
-            kind, *others = typing.get_args(choice)
-            parts = tuple(value) if isinstance(value, Iterable) else (value,)
-            if others == [...] or len(parts) == len(others) + 1:
-                return tuple(_convert(item, kind, where) for item in parts)
-        elif type(value) is choice:
-            return value
-    allowed = [_type_name(choice) for choice in choices]
-    raise ConfigError(f"{where}: expected {' or '.join(allowed)}, got {value!r}.")
-
-
-def _is_words(choice: Any) -> bool:  # noqa: ANN401
-    """Return whether a tuple consists of choices, which are separated by commas."""
-    return typing.get_origin(typing.get_args(choice)[0]) is Literal
-
-
-def _type_name(choice: Any) -> str:  # noqa: ANN401
-    """Return the name of a type for messages."""
-    if typing.get_origin(choice) is Literal:
-        return "one of " + ", ".join(map(str, typing.get_args(choice)))
-    names = {type(None): "null", tuple: "numbers"}
-    return names.get(typing.get_origin(choice) or choice, getattr(choice, "__name__", ""))
-
-
-def _check_angle(where: str, angle_deg: float) -> None:
-    """Raise if the angle is out of range."""
-    if not 0 <= angle_deg <= 90:
-        raise ConfigError(f"{where}: expected angle_deg in [0, 90], got {angle_deg!r}.")
+    names = [*vars(config), *["angle_deg"] * isinstance(config, PipelineConfig)]
+    if name := nearest_name(key, [*names, *(name for name, _ in _flat_values(config))]):
+        return f"the nearest is {prefix}{name}, as in {{{f'{prefix}{name}'!r}: {value!r}}}"
+    return advice_on(key) or f"{type(config).__name__} has {', '.join(names)}"
 
 
 def check_values(config: Any) -> None:  # noqa: ANN401
-    """Raise unless choices are valid, and numbers of their type and at most 1e12."""
-    for name, hint in typing.get_type_hints(type(config)).items():
-        value, kinds = getattr(config, name), _kinds_of(hint)
-        if typing.get_origin(hint) is Literal:
-            names = ", ".join(typing.get_args(hint))
-            _require(config, name, f"to be one of {names}", value in typing.get_args(hint))
-        kind = numbers.Real if float in kinds else numbers.Integral
-        words = "a number" if float in kinds else "an integer"
-        is_open = kinds.isdisjoint({int, float}) or value is None or value == "auto"
-        for number in () if is_open else value if isinstance(value, tuple | list) else (value,):
-            is_number = isinstance(number, kind) and not isinstance(number, bool)
-            _require(config, name, f"to be {words}", is_number and number == number)
-            bounds = f"in [-{FARTHEST:g}, {FARTHEST:g}]"
-            _require(config, name, bounds, abs(number) <= FARTHEST)
-
-
-def _kinds_of(hint: Any) -> set[Any]:  # noqa: ANN401
-    """Return the types in an annotation."""
-    parts = typing.get_args(hint)
-    return set().union(*map(_kinds_of, parts)) if parts else {hint}
-
-
-def _require(config: Any, name: str, requirement: str, holds: bool) -> None:  # noqa: ANN401
-    """Raise if a setting is invalid."""
-    if not holds:
+    """Convert settings to their annotated types, or raise; numbers are at most 1e12."""
+    kind = type(config)
+    for name, hint in typing.get_type_hints(kind).items():
         value = getattr(config, name)
-        raise ConfigError(f"{type(config).__name__}: expected {name} {requirement}, got {value!r}.")
+        if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+            value = _override(typing.cast(Any, hint)(), value, kind.__name__, f"{name}.")
+        vars(config)[name] = value = convert(value, hint, name, kind.__name__)
+        for number in value if isinstance(value, tuple) else (value,):
+            is_far = isinstance(number, int | float) and abs(number) > FARTHEST
+            expect(config, name, f"in [-{FARTHEST:g}, {FARTHEST:g}]", not is_far)
+
+
+_BOOLS = dict.fromkeys(("true", "on", "yes"), True) | dict.fromkeys(("false", "off", "no"), False)
+"""Words for booleans, as in YAML."""
+_TYPE_NAMES = {
+    NoneType: "none",
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "text",
+    Path: "a path",
+}
+
+
+class SettingError(ConfigError):
+    """A wrong value: caller or file ("" for a command), name, and a problem as ``>= 3, got 2``."""
+
+    def __init__(self, where: str, name: str = "", problem: str = "") -> None:
+        # Unpickling passes the message.
+        message = f"{where}{': ' if where else ''}expected {name} {problem}." if name else where
+        super().__init__(message)
+        self.where, self.name, self.problem = where, name, problem
+
+
+def expect(config: object, name: str, requirement: str, holds: bool) -> None:
+    """Raise if a setting does not meet a requirement."""
+    if not holds:
+        problem = f"{requirement}, got {getattr(config, name)!r}"
+        raise SettingError(type(config).__name__, name, problem)
+
+
+def convert(value: Any, hint: Any, name: str, where: str = "") -> Any:  # noqa: ANN401
+    """Convert a value, or the words for it, to its annotated type.
+
+    This is the only check of types: constructors, keywords, dictionaries, files and commands accept
+    the same values. Words are numbers, choices, true, false and none; commas separate them.
+
+    Raises:
+        SettingError: If the value is none of the type; ``where`` and ``name`` begin the message.
+
+    Example:
+        >>> convert("0.3,3", tuple[float, ...] | None, "strengths")
+        (0.3, 3.0)
+        >>> convert("no", bool, "absorb"), convert("none", float | None, "max_distance")
+        (False, None)
+    """
+    plain = value.item() if getattr(value, "ndim", None) == 0 else value
+    kinds = kinds_of(hint)
+    for kind in sorted(kinds, key=lambda kind: kind is not NoneType):
+        with suppress(ValueError, OverflowError):
+            return _convert_to(kind, plain)
+    expected = " or ".join(map(_type_name, kinds))
+    raise SettingError(where, name, f"to be {expected}, got {value!r}")
+
+
+def _convert_to(kind: Any, value: Any) -> Any:  # noqa: ANN401
+    """Convert a value to a type without alternatives, or raise ValueError."""
+    word = value.strip().lower() if isinstance(value, str) else value
+    is_word, items = isinstance(value, str), typing.get_args(kind)
+    if kind is NoneType and (value is None or (is_word and word in ("none", "null"))):
+        return None
+    if kind is bool and (isinstance(value, bool) or (is_word and word in _BOOLS)):
+        return _BOOLS.get(word, value)
+    if kind in (int, float) and not isinstance(value, bool):
+        allowed = numbers.Integral if kind is int else numbers.Real
+        if (is_word or isinstance(value, allowed)) and (number := kind(value)) == number:
+            return number
+    if typing.get_origin(kind) is Literal and is_word:
+        return items[items.index(value)]
+    if typing.get_origin(kind) is tuple and not isinstance(value, Mapping | bytes | None):
+        parts = value.replace(" ", "").split(",") if is_word else value
+        parts = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+        if ... in items or len(parts) == len(items):
+            return tuple(convert(part, items[0], "") for part in parts)
+    if kind is Path and isinstance(value, str | Path):
+        return Path(value)
+    if (kind is str and is_word) or (dataclasses.is_dataclass(kind) and type(value) is kind):
+        return value
+    raise ValueError
+
+
+def kinds_of(hint: Any) -> list[Any]:  # noqa: ANN401
+    """Return the alternatives of an annotated type."""
+    is_union = typing.get_origin(hint) in (types.UnionType, typing.Union)
+    return [*typing.get_args(hint)] if is_union else [hint]
+
+
+def _type_name(kind: Any) -> str:  # noqa: ANN401
+    """Return the name of a type for messages."""
+    items = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        return f"one of {', '.join(items)}" if len(items) > 1 else f"{items[0]}"
+    if typing.get_origin(kind) is tuple:
+        if typing.get_origin(items[0]) is Literal:
+            return _type_name(items[0]).replace("one of", "some of")
+        noun = {int: "integers", float: "numbers"}.get(items[0], "values")
+        return noun if ... in items else f"{len(items)} {noun}"
+    return _TYPE_NAMES.get(kind) or f"a {kind.__name__} or a mapping"
 
 
 def _preset_folder() -> Path:
@@ -761,7 +779,7 @@ def _raise_immutable(config: object, name: str, value: object) -> NoReturn:
     """Raise an error that shows how to copy settings with a change."""
     kind = type(config)
     section = next((key for key, type_ in _SECTIONS.items() if type_ is kind), "")
-    whole = f"load_config(config, **{{'{section}.{name}': {value!r}}})"
+    whole = f"load_config({{'base': config, '{section}.{name}': {value!r}}})"
     raise dataclasses.FrozenInstanceError(
         f"{kind.__name__} is immutable; use "
         f"{whole if section else f'dataclasses.replace(config, {name}={value!r})'}."
@@ -796,7 +814,7 @@ def _format_call(config: Any) -> str:  # noqa: ANN401
         for name, preset in _values_of_presets().items()
     }
     preset, differing = min(others.items(), key=lambda item: len(item[1]))
-    return f"load_config({preset!r}{f', **{differing}' if differing else ''})"
+    return f"load_config({ {'base': preset, **differing} if differing else preset!r})"
 
 
 _KINDS: list[Any] = [

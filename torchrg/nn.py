@@ -20,7 +20,7 @@ normals need planes.
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -63,10 +63,16 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+Result = TypeVar("Result")
+
 
 @dataclass(eq=False, repr=False)
-class _Function(nn.Module):
+class _Function(nn.Module, Generic[Result]):
     """A function with its settings as fields."""
+
+    if TYPE_CHECKING:  # A call of nn.Module returns Any.
+
+        def __call__(self, *tensors: object, **options: object) -> Result: ...
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -78,7 +84,7 @@ class _Function(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in asdict(self).items())
 
 
-class Covariance(_Function):
+class Covariance(_Function[Tensor]):
     """Covariance of patches; see :func:`torchrg.linalg.covariance`, which also returns the mean.
 
     Example:
@@ -99,7 +105,7 @@ class Eigen(NamedTuple):
 
 
 @dataclass(eq=False, repr=False)
-class Eigh(_Function):
+class Eigh(_Function[Eigen]):
     """Ascending eigenvalues and eigenvectors of symmetric matrices or robust fits.
 
     Example:
@@ -125,7 +131,7 @@ class Eigh(_Function):
         return Eigen(*(eigh3(tensor) if self.method == "jacobi" else torch.linalg.eigh(tensor)))
 
 
-class Normal(_Function):
+class Normal(_Function[Tensor]):
     """Unit normal of the plane of each patch: the eigenvector of the smallest eigenvalue.
 
     Example:
@@ -142,7 +148,7 @@ class Normal(_Function):
 
 
 @dataclass(eq=False, repr=False)
-class Qn(_Function):
+class Qn(_Function[Tensor]):
     """Robust scale of rows; the fields are settings of :func:`torchrg.robust.qn`.
 
     The constant is 2.2219, that of the publication. With ``finite_sample`` it is 2.21914 times a
@@ -168,7 +174,7 @@ class Qn(_Function):
 
 
 @dataclass(eq=False, repr=False)
-class DetMCD(_Function):
+class DetMCD(_Function[RobustFit]):
     """Deterministic MCD of patches; the fields are settings of :func:`torchrg.robust.fit_detmcd`.
 
     Example:
@@ -192,7 +198,7 @@ class DetMCD(_Function):
 
 
 @dataclass(eq=False, repr=False)
-class FastMCD(_Function):
+class FastMCD(_Function[RobustFit]):
     """MCD of patches with random starts, with the settings of :func:`torchrg.robust.fit_fastmcd`.
 
     Example:
@@ -219,7 +225,7 @@ class FastMCD(_Function):
 
 
 @dataclass(eq=False, repr=False)
-class MVE(_Function):
+class MVE(_Function[RobustFit]):
     """Minimum volume ellipsoid of patches, with the settings of :func:`torchrg.robust.fit_mve`.
 
     It is for points of 3 coordinates; use :class:`DetMCD` for more.
@@ -248,7 +254,7 @@ class MVE(_Function):
 
 
 @dataclass(eq=False, repr=False)
-class DetS(_Function):
+class DetS(_Function[RobustFit]):
     """Deterministic S-estimator of patches, with settings of :func:`torchrg.robust.fit_dets`.
 
     Gradients are those of the last step, with fixed weights of the points.
@@ -270,7 +276,7 @@ class DetS(_Function):
 
 
 @dataclass(eq=False, repr=False)
-class DetMM(_Function):
+class DetMM(_Function[RobustFit]):
     """Deterministic MM-estimator of patches, with settings of :func:`torchrg.robust.fit_detmm`.
 
     Gradients are those of the last step, with fixed weights of the points.

@@ -108,8 +108,8 @@ def segment_planes(
         points: Points, shape ``(N, 3)``, float32 or float64, a cloud, or the path of a file.
             Planes of a cloud or a file are relative to :attr:`torchrg.Cloud.origin`, like its
             points. Use float64 for tensors far from the origin, or shift them first.
-        config: Configuration, dictionary, preset name, or file. Default: see
-            :func:`torchrg.load_config`.
+        config: Configuration, dictionary as ``{"normals.k": 30}``, preset name, or file. Default:
+            see :func:`torchrg.load_config`.
         orient: Normal orientation, as in :func:`torchrg.normals.orient_normals`. Default: the front
             of the surface if the cloud has it, else the interior of rooms.
         viewpoint: Scanner position for ``orient="viewpoint"``, as in ``orient_normals``.
@@ -124,7 +124,7 @@ def segment_planes(
         keep_neighbors: Whether to return the neighbors, at 4 bytes per neighbor, so
             :func:`make_superpoints` need not search them again. Default: False.
         on_stage: Callback that receives the name of each stage at its start, and ``"done"``.
-        **changes: Individual settings, as in ``**{"normals.k": 30}``.
+        **changes: Individual settings, as in ``min_area=0.5``.
 
     Returns:
         Labels, normals, curvature and masks in the order of the points, and the plane table. Points

@@ -116,8 +116,8 @@ def test_bad_points_stay_in_place(tmp_path, normals):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--method", "best"], "consensus, got 'best'"),
-        (["--normals.k", "2"], "expected k >= 3, got 2"),
+        (["--method", "best"], "expected --method to be one of pca, jet"),
+        (["--normals.k", "2"], "expected --normals.k >= 3, got 2"),
         (
             ["--orient", "viewpoint"],
             "got none; pass the viewpoint (--viewpoint X Y Z), or use interior",

@@ -81,7 +81,7 @@ def test_superpoints_are_drawn(folder, tmp_path, run):
     ("flags", "message"),
     [
         (["--superpoints", "--partition.strengths", "3", "1"], "strengths"),
-        (["--superpoints", "40,300"], "expected counts"),
+        (["--superpoints", "40,300"], "expected --partition.counts one or more integers"),
         (["--partition.min-size", "3"], "expected --superpoints"),
     ],
 )

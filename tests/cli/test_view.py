@@ -19,7 +19,8 @@ def test_view_draws_a_picture(room_file, tmp_path, run):
     assert out.read_bytes().startswith(b"\x89PNG")
     for flags, message in (
         (["--color", "curvature"], "missing curvature, required by --color curvature"),
-        (["--azimuth-deg", "nan"], "expected azimuth_deg to be finite, got nan"),
+        (["--azimuth-deg", "inf"], "expected azimuth_deg to be finite, got inf"),
+        (["--azimuth-deg", "nan"], "expected --azimuth-deg to be a number or none, got 'nan'"),
         (["--out", "room.jpg"], "room.jpg: expected a file ending in .png or .html"),
     ):
         assert message in run("view", room_file, "--out", out, *flags).error

@@ -12,7 +12,6 @@ from torchrg.batch.records import reason_to_convert
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.cli.arguments import parse
 from torchrg.cli.convert import FolderArguments, RGBDArguments
-from torchrg.cli.flags import PlaneSettings
 from torchrg.config import DepthConfig, PipelineConfig, SelectionConfig
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
@@ -162,8 +161,8 @@ def test_conversions_select_alike(points, chosen, tmp_path):
     (tmp_path / "in").mkdir()
     write_cloud(tmp_path / "in" / "room.npz", Cloud(points.numpy()))
     flags = (str(tmp_path / "in"), str(tmp_path / "out"), *FLAGS)
-    start = {"settings": PlaneSettings.from_arguments(["--preset", "classic"])}
-    arguments = parse(FolderArguments, flags, prog="torchrg convert folder", default=start)
+    command = (*flags, "--preset", "classic")
+    arguments = parse(FolderArguments, command, prog="torchrg convert folder")
     source = arguments.source(tmp_path / "in")
     job = Job(source, source.list_scans(tmp_path / "out")[0], tmp_path / "out")
     assert convert_scan(job).status == "converted"
@@ -225,9 +224,9 @@ def test_depth_images_select_alike(run, tmp_path):
 def test_selections_that_cannot_be_are_refused(whole, run, tmp_path):
     for wrong, message in (
         ({"min_area": -1.0}, "expected min_area >= 0, got -1.0"),
-        ({"kinds": "wal"}, "kinds: expected one of other, floor"),
+        ({"kinds": "wal"}, "expected kinds to be some of other, floor"),
         ({"kinds": ()}, "expected kinds to be some of other, floor"),
-        ({"sort": "size"}, "sort: expected one of points, area"),
+        ({"sort": "size"}, "expected sort to be one of points, area"),
     ):
         with pytest.raises(ConfigError, match=f"^select_planes: .*{message}"):
             torchrg.select_planes(whole, **wrong)

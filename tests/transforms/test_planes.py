@@ -122,10 +122,10 @@ def test_presets_are_taken_by_name_wherever_a_configuration_is(preset):
     [
         (
             lambda: EstimateNormals(method="svd"),
-            "EstimateNormals: method: expected one of pca",
+            "EstimateNormals: expected method to be one of pca",
         ),
         (lambda: EstimateNormals(methd="pca"), "unknown setting 'methd'; the nearest is method"),
-        (lambda: EstimateNormals(k=2.5), "EstimateNormals: k: expected int, got 2.5"),
+        (lambda: EstimateNormals(k=2.5), "EstimateNormals: expected k to be an integer, got 2.5"),
         (lambda: EstimateNormals("clasic"), "a preset, one of .*classic, .* got 'clasic'"),
         (
             lambda: EstimateNormals(GrowingConfig()),
@@ -135,7 +135,7 @@ def test_presets_are_taken_by_name_wherever_a_configuration_is(preset):
             lambda: GrowRegions(max_angle=5),
             "GrowRegions: unknown setting 'max_angle'; the nearest is max_angle_deg",
         ),
-        (lambda: GrowRegions(min_size=0), "GrowingConfig: expected min_size >= 1 or auto, got 0"),
+        (lambda: GrowRegions(min_size=0), "GrowRegions: expected min_size >= 1 or auto, got 0"),
         (
             lambda: SegmentPlanes(7),
             "expected config to be a PipelineConfig or a dict.*, or a preset, .* got int",
@@ -159,8 +159,8 @@ def test_wrong_settings_are_refused_at_once_and_in_one_line(make, message):
     [
         (SegmentPlanes(), "SegmentPlanes(load_config('consensus'))"),
         (
-            SegmentPlanes("paper", orient="none", **{"normals.k": 30}),
-            "SegmentPlanes(load_config('paper', **{'normals.k': 30}), orient='none')",
+            SegmentPlanes({"base": "paper", "normals.k": 30}, orient="none"),
+            "SegmentPlanes(load_config({'base': 'paper', 'normals.k': 30}), orient='none')",
         ),
         (EstimateNormals(k=9), "EstimateNormals(NormalsConfig(k=9))"),
         (GrowRegions(max_angle_deg=7.0), "GrowRegions(GrowingConfig(max_angle_deg=7.0))"),

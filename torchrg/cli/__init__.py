@@ -1,12 +1,12 @@
 """Command line: ``torchrg COMMAND ...``."""
 
-import difflib
 import gc
 import importlib
 import sys
 import warnings
 from collections.abc import Sequence
 
+from torchrg._synonyms import nearest_name
 from torchrg.cli.ending import (
     INTERRUPTED,
     INTERRUPTED_LINE,
@@ -33,6 +33,7 @@ COMMANDS = {
     "sample": "generate a synthetic room with ground truth",
     "view": "render a cloud or a result",
     "info": "print a summary of a point cloud file",
+    "settings": "list all settings with their defaults",
 }
 """Purpose of each command by name; each command is a module with the same name."""
 _OVERVIEW = """usage: torchrg COMMAND ...
@@ -93,8 +94,8 @@ def _run(arguments: list[str]) -> int:
         print(f"torchrg {__version__}")
         return 0
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f" Did you mean {near[0]}?" if near else ""
+        near = nearest_name(name, COMMANDS)
+        hint = f" Did you mean {near}?" if near else ""
         raise ConfigError(f"expected a command ({', '.join(COMMANDS)}), got {name!r}.{hint}")
     command = importlib.import_module(f"torchrg.cli.{name}")
     if not gc.isenabled():  # See torchrg.__main__: loaded modules are no garbage.

@@ -25,7 +25,7 @@ from torchrg.structures import Segmentation
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(flags.PlaneSettings):
     """Make scans upright, with walls along x and y.
 
     The lowest floor is moved to z = 0 and the center to x = y = 0. Floors and walls are detected
@@ -46,13 +46,11 @@ class Arguments:
     """Also write labels, normals, curvature and the plane table, as torchrg segment does."""
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
-    settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, align each input and write it."""
-    start = {"settings": flags.PlaneSettings.from_arguments(argv)}
-    arguments = parse(Arguments, argv, prog="torchrg align", default=start)
+    arguments = parse(Arguments, argv, prog="torchrg align")
     flags.limit_threads(arguments.threads)
     flags.check_columns(arguments.columns, arguments.inputs)
     outputs = output_paths(arguments.inputs, arguments.out)
@@ -82,7 +80,7 @@ def _align_file(arguments: Arguments, source: Path, target: Path) -> None:
     for note in check_finite(cloud):
         warn(f"{source}: {note}.")
     check_output(target, dataclasses.replace(cloud, header={}))
-    settings = arguments.settings.resolved
+    settings = arguments.settings
     with stage_bar(source.name, STAGES) as advance:
         seg = segment_planes(cloud.points, settings, on_stage=advance)
     try:

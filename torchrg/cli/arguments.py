@@ -1,14 +1,12 @@
 """Command-line parser and help texts generated from dataclasses.
 
-Each field is a flag, unless its metadata is ``torchrg.config.NO_FLAG``; its docstring is the help
-text. The fields of a nested dataclass become ``--part.field`` flags. ``--help`` lists required and
-common flags; ``--help-all`` lists all flags by group.
+Each field is an option; its docstring is the help text. A field that holds settings stands for
+words ``--section.name VALUE``, passed unparsed to :mod:`torchrg.config`, and for options without a
+section. ``--help`` lists common options, ``--help-all`` all options, ``torchrg settings`` settings.
 """
 
-import argparse
 import ast
 import dataclasses
-import difflib
 import functools
 import inspect
 import itertools
@@ -17,37 +15,36 @@ import re
 import shutil
 import textwrap
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, NamedTuple, NoReturn, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
+from torchrg._synonyms import advice_on, nearest_name
+from torchrg.config import SettingError, convert, kinds_of, settings_of
 from torchrg.errors import ConfigError
 
 Command = TypeVar("Command")
 
-COMMON = (
-    *("--normals.method", "--normals.k"),
-    *("--growing.max-angle-deg", "--growing.min-size", "--growing.max-distance", "--up"),
-    *("--depth.noise", "--depth.max-depth", "--depth.min-size"),
-)
-"""Common flags of nested parts; the others appear only in ``--help-all``."""
 ADVANCED = (
     *("--pages", "--level", "--layout", "--columns", "--viewpoint", "--within", "--merge"),
     *("--config", "--angle-deg", "--sort", "--chunk-size", "--engine", "--ray-address"),
-    *("--growing.max-distance", "--ignore", "--boundary-distance", "--azimuth-deg"),
+    *("--ignore", "--boundary-distance", "--azimuth-deg"),
 )
 """Command flags that appear only in ``--help-all``."""
 RESOURCES = (
     *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
 )
 """Flags that set where and how fast a command runs, and do not change its result."""
+_STARTS = ("--preset", "--config", "--angle-deg")
+"""Flags that set several settings."""
 ALIASES = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
 """Alternative spellings of flags, accepted but not listed."""
 REQUIRED = "required"
 """Title of the required arguments."""
+_SETTINGS = "settings"
 _PERFORMANCE = "performance (does not change the result)"
 _EXAMPLES = "\n\nExamples:\n"
 _MAX_WIDTH = 100
@@ -55,10 +52,9 @@ _COLUMN = 28
 """Terminal column at which the texts of the short help start."""
 _MAX_LENGTH = 40
 """Maximum length of a default listed in the short help, in characters."""
-_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
-_NUMBERS = {int: "an integer", float: "a number"}
-_NONE = "None"
-"""Spelling of a None value."""
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", bool: "{true,false}"}
+_NUMBER = re.compile(r"-?\d*\.?\d+(e-?\d+)?")
+_COUNTS = re.compile(r"\d+(,\d+)*")
 _ROLE = re.compile(r":\w+:`~?([^`]+)`")
 
 
@@ -70,46 +66,47 @@ class Argument:
         metavar: Placeholder for the value.
         text: Help text, for types that several commands share.
         is_positional: Whether the argument has no flag.
-        is_inline: Whether the fields of a dataclass become flags without the name of the part.
+        numbers: Path of the setting for numbers after a switch.
+        base: Function that returns the settings that words override, from the options by field;
+            the words are then without the name of the field.
     """
 
     metavar: str | None = None
     text: str | None = None
     is_positional: bool = False
-    is_inline: bool = False
+    numbers: str = ""
+    base: Callable[[Mapping[str, Any]], object] | None = None
 
 
 class Flag(NamedTuple):
     """A command-line argument."""
 
     path: str
-    """Dotted path of the field."""
+    """Name of the field; for settings, a dot and their dotted name follow."""
     name: str
-    """Name: ``--part.field``, or a word for a positional argument."""
+    """Name: ``--section.name``, or a word for a positional argument."""
     spelling: str
     """Name with the placeholder for its value, as in the help."""
     text: str
-    part: str
-    """Title of its part, empty for flags of the command itself."""
+    section: str
+    """Section of a setting, as in its name; empty for options."""
     hint: object
     is_required: bool
+    numbers: str = ""
 
     @property
     def is_positional(self) -> bool:
         """Whether the argument has no flag."""
         return not self.name.startswith("-")
 
+    @property
+    def is_switch(self) -> bool:
+        """Whether the option takes no value."""
+        return self.hint is bool and not self.section
 
-def parse(
-    kind: type[Command],
-    arguments: Sequence[str],
-    *,
-    prog: str,
-    default: Mapping[str, object] | None = None,
-) -> Command:
+
+def parse(kind: type[Command], arguments: Sequence[str], *, prog: str) -> Command:
     """Parse arguments into a dataclass; ``--help`` and ``--help-all`` print and exit.
-
-    ``default`` overrides defaults of the dataclass by field name; ``prog`` is the command.
 
     Raises:
         ConfigError: If an argument is invalid, with a one-line message.
@@ -119,194 +116,130 @@ def parse(
         >>> parse(Arguments, ["room.npz", "--noise=0.01"], prog="torchrg sample").noise
         0.01
     """
-    flags = list(list_flags(kind, default))
+    flags = list(list_flags(kind))
     if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
         print(format_help(kind, flags, prog=prog, complete="--help-all" in arguments))
         raise SystemExit(0)
     try:
-        example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
-        values = _read(flags, arguments, prog, example)
-        return typing.cast(Command, _build(kind, default, values))
+        words = _read(flags, arguments)
+        _check_required(flags, words, kind)
+        return _build(kind, flags, words)
     except ConfigError as error:
-        text = _use_flag_name(str(error), flags)
-        raise ConfigError(f"{text} See {prog} --help.") from None
+        raise ConfigError(f"{error} See {prog} --help.") from None
 
 
-def _use_flag_name(message: str, flags: Sequence[Flag]) -> str:
-    """Replace the setting in a message by its flag, if the flag has no part."""
-    named = re.fullmatch(r"\w+Config: expected (\w+) (.*)", message, re.DOTALL)
-    name = f"--{named[1].replace('_', '-')}" if named else ""
-    is_flag = any(flag.name == name for flag in flags)
-    return f"expected {name} {named[2]}" if named and is_flag else message
-
-
-class _Parser(argparse.ArgumentParser):
-    """Parser that raises instead of printing."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise the message, reworded."""
-        for pattern, text in (
-            (r"argument (--[^:/]*).*: expected .*", r"expected a value for \1"),
-            (r"argument (--[^:/]*).*: ignored explicit .*", r"expected no value for \1"),
-        ):
-            message = re.sub(pattern, text, message)
-        raise ConfigError(f"{message}.")
-
-
-def _read(
-    flags: Sequence[Flag], arguments: Sequence[str], prog: str, example: str
-) -> dict[str, object]:
-    """Return the parsed values by field path."""
-    parser = _Parser(prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
-    for flag in flags:
-        nargs = "*" if any(map(_is_list, _kinds(flag.hint))) else None
-        if flag.is_positional:
-            parser.add_argument(flag.path, nargs=nargs or "?", metavar=flag.name)
-            continue
-        switches = zip(_switches(flag.name), (True, False), strict=True)
-        for name, const in switches if flag.hint is bool else [(flag.name, None)]:
-            # Underscores are accepted too.
-            underscored = f"--{name[2:].replace('-', '_')}"
-            spellings = dict.fromkeys((name, underscored, *ALIASES.get(name, ())))
-            takes: dict[str, Any] = {"nargs": nargs}
-            if const is not None:
-                takes = {"action": "store_const", "const": const}
-            parser.add_argument(*spellings, dest=flag.path, **takes)
-    namespace, left = parser.parse_known_args(_join_dashed_values(flags, arguments))
-    if left:
-        raise ConfigError(_describe_unknown(left[0], flags, arguments))
-    values = vars(namespace)
-    missing = [
-        flag.name for flag in flags if flag.is_required and values.get(flag.path) in (None, [])
-    ]
-    if missing:
-        inputs = [values[flag.path] for flag in flags if flag.is_positional and flag.path in values]
-        words = " ".join(" ".join(words) if isinstance(words, list) else words for words in inputs)
-        purpose = f" for {words}" if words else ""
-        raise ConfigError(f"missing required {' and '.join(missing)}{purpose}.{example}")
-    return {flag.path: _to_value(flag, values[flag.path]) for flag in flags if flag.path in values}
-
-
-def _describe_unknown(word: str, flags: Sequence[Flag], arguments: Sequence[str]) -> str:
-    """Return a message about an unknown flag or argument, with a fix."""
-    if os.path.lexists(word):  # A file name that starts like a flag.
-        return f"unrecognized option {word}. Did you mean ./{word}?"
-    if not word.startswith("-"):
-        start = list(arguments).index(word)
-        before = [index for index in range(start) if arguments[index].startswith("-")]
-        if not before:
-            return f"unrecognized argument {word}."
-        words = [*itertools.takewhile(lambda x: x[:1] != "-", arguments[before[-1] + 1 :])]
-        flag_name = arguments[before[-1]]
-        takes_one = any(flag.name == flag_name and flag.hint is not bool for flag in flags)
-        if len(words) == 1 or not takes_one:
-            return f"unrecognized argument {word}."
-        return (
-            f"expected one value for {flag_name}, got {' '.join(words)}; separate values with "
-            f"commas: {flag_name} {','.join(words)}."
-        )
-    unknown = word.partition("=")[0].replace("_", "-")
-    names = {flag.name: flag.name for flag in flags if not flag.is_positional}
-    # The first flag of a tail wins; settings of superpoints, which are rarely changed, come last.
-    ordered = sorted(names, key=lambda name: name.startswith("--partition."))
-    tails = {f"--{name.lstrip('-').rpartition('.')[2]}": name for name in reversed(ordered)}
-    near = difflib.get_close_matches(unknown, [*tails, *names], n=1)
-    tail = f"--{unknown.lstrip('-').rpartition('.')[2]}"
-    name = tails.get(tail) or next((names.get(word) or tails[word] for word in near), "")
-    return f"unrecognized option {unknown}.{f' Did you mean {name}?' if name else ''}"
-
-
-def _join_dashed_values(flags: Sequence[Flag], arguments: Sequence[str]) -> list[str]:
-    """Join each flag with a value that starts with a dash.
-
-    Example:
-        >>> up = Flag("up", "--up", "--up {z,-z}", "", "", Literal["z", "-z"], False)
-        >>> _join_dashed_values([up], ["--up", "-z", "--up", "z"])
-        ['--up=-z', '--up', 'z']
-    """
-    choices = {
-        flag.name: {word for kind in _kinds(flag.hint) for word in typing.get_args(kind)}
-        for flag in flags
-    }
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and argument.startswith("-") and argument in choices.get(joined[-1], ()):
-            joined[-1] += f"={argument}"
+def _read(flags: Sequence[Flag], arguments: Sequence[str]) -> dict[str, Any]:
+    """Return the words of the arguments by path."""
+    named = {name: flag for flag in flags for name in (flag.name, *ALIASES.get(flag.name, ()))}
+    words, inputs, waiting = dict[str, Any](), list[str](), [*reversed(arguments)]
+    while waiting:
+        name, equals, word = (argument := waiting.pop()).partition("=")
+        flag = named.get(name.replace("_", "-")) if name.startswith("-") else None
+        if argument == "--":
+            inputs += reversed(waiting)
+            break
+        if flag is None:
+            if name.startswith("-"):
+                raise ConfigError(_describe_unknown(argument, flags))
+            inputs.append(argument)
+        elif flag.is_switch:
+            words[flag.path] = True
+            if flag.numbers and (equals or (waiting and _COUNTS.fullmatch(waiting[-1]))):
+                words[flag.numbers] = word if equals else waiting.pop()
+            elif equals:
+                raise ConfigError(f"expected no value for {flag.name}.")
+        elif equals or (waiting and not _is_name(waiting[-1])):
+            values = [word if equals else waiting.pop()]
+            while waiting and _continues(values, flag.hint, waiting[-1]):
+                values.append(waiting.pop())
+            words[flag.path] = ",".join(values)
         else:
-            joined.append(argument)
-    return joined
+            example = f", as in {flag.name} true" if flag.hint is bool else ""
+            raise ConfigError(f"expected a value for {flag.name}{example}.")
+    for flag in flags:
+        if flag.is_positional and inputs:
+            is_list = typing.get_origin(flag.hint) is tuple
+            words[flag.path], inputs = (inputs, []) if is_list else (inputs[0], inputs[1:])
+    if inputs:
+        raise ConfigError(_describe_extra(inputs[0], named, arguments))
+    return words
 
 
-def _switches(name: str) -> tuple[str, str]:
-    """Return the flags that turn a setting on and off.
-
-    Example:
-        >>> _switches("--growing.absorb")
-        ('--growing.absorb', '--growing.no-absorb')
-    """
-    section, dot, last = name[2:].rpartition(".")
-    return name, f"--{section}{dot}no-{last}"
+def _is_name(argument: str) -> bool:
+    """Return whether an argument is an option rather than a value, such as -y or -3."""
+    return argument.startswith("--") or argument in itertools.chain(*ALIASES.values())
 
 
-def _kinds(hint: object) -> list[Any]:
-    """Return the types allowed for a value, without None."""
-    kinds = typing.get_args(hint)
-    is_union = typing.get_origin(hint) not in (None, tuple, Literal)
-    return [kind for kind in kinds if kind is not NoneType] if is_union else [hint]
+def _continues(values: Sequence[str], hint: object, argument: str) -> bool:
+    """Return whether an argument is a further value of a list: a number, or a text."""
+    kinds = [kind for kind in kinds_of(hint) if typing.get_origin(kind) is tuple]
+    items = typing.get_args(kinds[0]) if kinds else ()
+    if not items or (... not in items and len(values) == len(items)):
+        return False
+    is_text = items[0] is str and not _is_name(argument)
+    return is_text or (items[0] in (int, float) and _NUMBER.fullmatch(argument) is not None)
 
 
-def _is_list(kind: object) -> bool:
-    """Return whether a value takes several arguments; choices are one, separated by commas."""
-    return typing.get_origin(kind) is tuple and not _choices(kind)
+def _check_required(flags: Sequence[Flag], words: Mapping[str, Any], kind: type) -> None:
+    """Raise if a required argument is missing."""
+    if missing := [flag.name for flag in flags if flag.is_required and flag.path not in words]:
+        inputs = [words[flag.path] for flag in flags if flag.is_positional and flag.path in words]
+        typed = " ".join(" ".join(each) if isinstance(each, list) else each for each in inputs)
+        purpose = f" for {typed}" if typed else ""
+        example = "".join(f" Example: {line}." for line in example_lines(kind)[:1])
+        raise ConfigError(f"missing required {' and '.join(missing)}{purpose}.{example}")
 
 
-def _choices(kind: object) -> tuple[str, ...]:
-    """Return the choices for the items of a tuple; empty for other types."""
-    items = typing.get_args(kind)[:1] if typing.get_origin(kind) is tuple else ()
-    return typing.get_args(items[0]) if items and typing.get_origin(items[0]) is Literal else ()
+def _describe_extra(word: str, named: Mapping[str, Flag], arguments: Sequence[str]) -> str:
+    """Return a message about an argument too many, with a fix if it follows an option."""
+    before = [*itertools.takewhile(lambda argument: argument != word, arguments)]
+    names = [argument.partition("=")[0].replace("_", "-") for argument in before]
+    starts = [index for index, name in enumerate(names) if name in named]
+    name, *values = before[starts[-1] :] if starts else [""]
+    if not values or named[names[starts[-1]]].is_switch:
+        return f"unrecognized argument {word}."
+    return (
+        f"expected one value for {name}, got {' '.join([*values, word])}; separate values with "
+        f"commas: {name} {','.join([*values, word])}."
+    )
 
 
-def _to_value(flag: Flag, typed: bool | str | list[str]) -> object:
-    """Convert the text of a flag to its value."""
-    if isinstance(typed, bool):
-        return typed
-    words = [typed] if isinstance(typed, str) else typed
-    if words == [_NONE] and NoneType in typing.get_args(flag.hint):
-        return None
-    kind, *others = _kinds(flag.hint)
-    if words_of_items := _choices(kind):
-        chosen = tuple(words[0].replace(" ", "").split(","))
-        if not set(chosen) <= set(words_of_items):
-            some = ", ".join(words_of_items)
-            raise ConfigError(f"expected {flag.name} to be some of {some}, got {words[0]!r}.")
-        return chosen
-    parts = typing.get_args(kind)
-    if typing.get_origin(kind) is Literal:
-        choices = [choice for literal in (kind, *others) for choice in typing.get_args(literal)]
-        if words[0] not in choices:
-            raise ConfigError(
-                f"expected {flag.name} to be one of {', '.join(choices)}, got {words[0]!r}."
-            )
-        return words[0]
-    if parts and ... not in parts and len(words) != len(parts):
-        raise ConfigError(f"expected {len(parts)} values for {flag.name}, got {len(words)}.")
-    kind, values = parts[0] if parts else kind, []
-    for word in words:
-        try:
-            values.append(kind(word))
-        except ValueError:
-            raise ConfigError(f"expected {_NUMBERS[kind]} for {flag.name}, got {word!r}.") from None
-    return tuple(values) if parts else values[0]
+def _describe_unknown(word: str, flags: Sequence[Flag]) -> str:
+    """Return a message about an unknown option, with a fix."""
+    if os.path.lexists(word):  # A file name that starts like an option.
+        return f"unrecognized option {word}. Did you mean ./{word}?"
+    unknown = word.partition("=")[0].replace("_", "-")
+    key = unknown.lstrip("-").replace("-", "_")
+    names = {flag.name[2:].replace("-", "_"): flag for flag in flags if not flag.is_positional}
+    if near := names.get(nearest_name(key.replace("no_", ""), names)):
+        value = " false" if near.section and near.hint is bool and "no_" in key else ""
+        return f"unrecognized option {unknown}. Did you mean {near.name}{value}?"
+    advice = advice_on(key)
+    return f"unrecognized option {unknown}{f': {advice}' if advice else ''}."
 
 
-def _build(kind: Any, default: Any, typed: Mapping[str, object], prefix: str = "") -> Any:  # noqa: ANN401
-    """Build a dataclass from the parsed values and the defaults."""
-    values, hints = {}, typing.get_type_hints(kind)
-    for field in dataclasses.fields(kind):
-        value, path = _default_of(field, default), f"{prefix}{field.name}"
-        if any(name.startswith(f"{path}.") for name in typed):
-            value = _build(hints[field.name], value, typed, f"{path}.")
-        values[field.name] = typed.get(path, () if value is dataclasses.MISSING else value)
+def _build(kind: type[Command], flags: Sequence[Flag], words: Mapping[str, Any]) -> Command:
+    """Build a dataclass: convert the options, and load the settings with their words."""
+    values = {
+        flag.path: convert(words[flag.path], flag.hint, flag.name)
+        for flag in flags
+        if flag.path in words and "." not in flag.path
+    }
+    names = {flag.path: flag.name for flag in flags}
+    for field, hint, argument in _fields(kind):
+        if dataclasses.is_dataclass(hint):
+            start = f"{field.name}."
+            changes = {
+                path.removeprefix(start): words[path] for path in words if path.startswith(start)
+            }
+            try:
+                base = argument.base(values) if argument.base else None
+                values[field.name] = settings_of("", typing.cast(type, hint), base, changes)
+            except SettingError as error:
+                if error.where:  # A file.
+                    raise
+                name = names.get(f"{start}{error.name}") or names.get(error.name, error.name)
+                raise SettingError("", name, error.problem) from None
     return kind(**values)
 
 
@@ -316,30 +249,26 @@ def format_help(kind: type, flags: Sequence[Flag], *, prog: str, complete: bool 
     The class docstring is the description; its "Examples" section comes last. The short help shows
     only the first sentence of each common option.
     """
-    common = [flag for flag in flags if complete or _is_common(flag)]
+    options = [flag for flag in flags if not flag.section]
+    common = [flag for flag in options if complete or flag.is_required or flag.name not in ADVANCED]
     groups = group_flags(common)
     needed = (flag.spelling for flag in groups.get(REQUIRED, ()))
     usage = " ".join(["usage:", prog, *needed, "[options]"])
     paragraphs = describe(kind).split("\n\n")
     blocks = [usage, *map(_wrap, paragraphs if complete else paragraphs[:1])]
     for title, members in groups.items():
-        entries = [_long_entry(flag) if complete else _short_entry(flag) for flag in members]
-        blocks.append("\n".join([title if ":" in title else f"{title}:", *entries]))
-    if len(common) < len(flags):
-        blocks.append(f"{prog} --help-all explains these and {len(flags) - len(common)} more.")
+        entries = [format_flag(flag) if complete else _short_entry(flag) for flag in members]
+        blocks.append("\n".join([f"{title}:", *entries]))
+    if sections := dict.fromkeys(f"--{flag.section}.NAME" for flag in flags if flag.section):
+        blocks.append(_wrap(f"torchrg settings lists more settings: {', '.join(sections)}."))
+    if len(common) < len(options):
+        blocks.append(f"{prog} --help-all explains these and {len(options) - len(common)} more.")
     if examples := example_lines(kind):
         blocks.append("\n".join(["examples:", *(f"  {line}" for line in examples)]))
     return "\n\n".join(blocks)
 
 
-def _is_common(flag: Flag) -> bool:
-    """Return whether the short help lists a flag."""
-    return flag.is_required or (
-        flag.name not in ADVANCED and (not flag.part or flag.name in COMMON)
-    )
-
-
-def _long_entry(flag: Flag) -> str:
+def format_flag(flag: Flag) -> str:
     """Format a flag with its complete help text."""
     return f"  {flag.spelling}\n{_wrap(flag.text, indent=6)}"
 
@@ -354,21 +283,12 @@ def _short_entry(flag: Flag) -> str:
 
 
 def group_flags(flags: Sequence[Flag]) -> dict[str, list[Flag]]:
-    """Group arguments by title: required, options, performance, then each part."""
-    groups: dict[str, list[Flag]] = {title: [] for title in (REQUIRED, "options", _PERFORMANCE)}
+    """Group arguments by title: required, options, settings, performance."""
+    groups: dict[str, list[Flag]] = {REQUIRED: [], "options": [], _SETTINGS: [], _PERFORMANCE: []}
     for flag in flags:
-        if flag.is_required:
-            group = REQUIRED
-        elif flag.name in RESOURCES:
-            group = _PERFORMANCE
-        elif not flag.part or flag.name in COMMON:
-            group = "options"
-        else:
-            group = f"advanced: {flag.part}"
-        groups.setdefault(group, []).append(flag)
-    # Positional arguments come first, in their order.
-    groups[REQUIRED].sort(key=lambda flag: not flag.is_positional)
-    groups[_PERFORMANCE].sort(key=lambda flag: RESOURCES.index(flag.name))
+        title = _SETTINGS if "." in flag.path or flag.name in _STARTS else "options"
+        title = _PERFORMANCE if flag.name in RESOURCES else title
+        groups[REQUIRED if flag.is_required else title].append(flag)
     return {title: members for title, members in groups.items() if members}
 
 
@@ -387,46 +307,46 @@ def list_flags(
     kind: Any,  # noqa: ANN401
     default: object = None,
     path: str = "",
-    prefix: str = "--",
-    part: str = "",
+    section: str = "",
 ) -> Iterator[Flag]:
     """Yield the arguments defined by the fields of a dataclass, in order.
 
-    ``default`` is an instance, or a mapping of values by field name, that overrides the class
-    defaults. Nested dataclasses are parts: ``path`` is the path of the part, ``prefix`` the start
-    of its flags, and ``part`` its title.
+    Settings are those of ``default``, at ``path`` with a dot; ``section`` begins their names.
     """
-    texts, hints = _field_docstrings(kind), typing.get_type_hints(kind, include_extras=True)
-    for field in dataclasses.fields(kind):
-        if not field.metadata.get("is_flag", True):
-            continue
-        hint, argument = hints[field.name], Argument()
-        if typing.get_origin(hint) is typing.Annotated:
-            hint, argument = typing.get_args(hint)
-        value, field_path = _default_of(field, default), f"{path}{field.name}"
-        front, subject = prefix, part
-        if not field.metadata.get("has_part", True):
-            front, subject = "--", ""
+    texts = _field_docstrings(kind)
+    for field, hint, argument in _fields(kind):
+        value = field.default if default is None else getattr(default, field.name)
+        if default is None and field.default_factory is not dataclasses.MISSING:
+            value = field.default_factory()
         if dataclasses.is_dataclass(hint):
-            inner = (prefix, part)
-            if not argument.is_inline:
-                inner = (f"{prefix}{field.name}.", _summary(hint))
-            yield from list_flags(hint, value, f"{field_path}.", *inner)
+            inner = "" if argument.base else field.name
+            yield from list_flags(hint, value, f"{path}{field.name}.", inner)
             continue
+        front = "" if field.metadata.get("is_short") else section
         text = plain(argument.text or texts.get(field.name, ""))
         if "Default:" not in text:
-            text = f"{text} {_default_sentence(value, is_setting=front != '--')}".strip()
-        name = f"{front}{field.name}".replace("_", "-")
+            text = f"{text} {_default_sentence(value, is_setting=front != '')}".strip()
+        name = f"--{front}{'.' if front else ''}{field.name}".replace("_", "-")
         if argument.is_positional:
             name = argument.metavar or field.name.upper()
             spelling = name + "..." * (typing.get_origin(hint) is tuple)
-        elif hint is bool:
-            # Only settings can be on by default, and need a flag to turn them off.
-            spelling = ", ".join(_switches(name)) if value or subject else name
+        elif hint is bool and not front:
+            spelling = name
         else:
             spelling = f"{name} {argument.metavar or _metavar(hint)}"
-        needed = argument.is_positional or value is dataclasses.MISSING
-        yield Flag(field_path, name, spelling, text, subject, hint, needed)
+        is_required = value is dataclasses.MISSING
+        dotted = f"{path}{field.name}"
+        yield Flag(dotted, name, spelling, text, front, hint, is_required, argument.numbers)
+
+
+def _fields(kind: Any) -> Iterator[tuple["dataclasses.Field[Any]", object, Argument]]:  # noqa: ANN401
+    """Yield the fields of a dataclass with their types and properties."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        hint, argument = hints[field.name], Argument()
+        if typing.get_origin(hint) is typing.Annotated:
+            hint, argument = typing.get_args(hint)
+        yield field, hint, argument
 
 
 def plain(text: str) -> str:
@@ -453,25 +373,13 @@ def _field_docstrings(kind: type) -> dict[str, str]:
     return texts
 
 
-def _default_of(field: "dataclasses.Field[Any]", default: object) -> object:
-    """Return the value of a field if no flag sets it."""
-    if isinstance(default, Mapping) and field.name in default:
-        return default[field.name]
-    if default is not None and not isinstance(default, Mapping):
-        return getattr(default, field.name)
-    factory = field.default_factory
-    return field.default if factory is dataclasses.MISSING else factory()
-
-
 def _default_sentence(value: object, *, is_setting: bool) -> str:
     """Return the sentence about a default; empty for command flags that are off."""
     is_off = value is None or value is False or value == ()
     if value is dataclasses.MISSING or (is_off and not is_setting):
         return ""
-    if isinstance(value, bool):
-        return f"Default: {'on' if value else 'off'}."
-    words = map(str, value) if isinstance(value, tuple) else (str(value),)
-    return f"Default: {' '.join(words)}."
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return f"Default: {','.join(map(str, value)) if isinstance(value, tuple) else text}."
 
 
 def _metavar(hint: object) -> str:
@@ -480,16 +388,10 @@ def _metavar(hint: object) -> str:
     if typing.get_origin(hint) is Literal:
         return "{" + ",".join(map(str, choices)) + "}"
     if typing.get_origin(hint) is tuple:
-        if words := _choices(hint):
-            return f"{{{','.join(words)}}},..."
+        if typing.get_origin(choices[0]) is Literal:
+            return f"{_metavar(choices[0])},..."
         return f"{_metavar(choices[0])}..." if ... in choices else " ".join(map(_metavar, choices))
     return " or ".join(map(_metavar, choices)) if choices else _METAVARS[typing.cast(type, hint)]
-
-
-def _summary(kind: object) -> str:
-    """Return the first sentence of a docstring, in lower case."""
-    first = re.split(r"[.;] |\.$", plain(inspect.getdoc(kind) or ""))[0].replace("\n", " ")
-    return first[:1].lower() + first[1:]
 
 
 def _wrap(text: str, *, indent: int = 0) -> str:

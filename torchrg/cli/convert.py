@@ -113,13 +113,13 @@ class Arguments:
 
 
 @dataclass(frozen=True)
-class CloudArguments(Arguments):
+class CloudArguments(flags.PlaneSettings, Arguments):
     """Additional arguments of data sets of point clouds."""
 
     pages: Path | None = None
     """Also write an image and an interactive viewer of each finished scan, and an index.html, into
     this directory (pip install 'torchrg[view]'). Default: no pages."""
-    superpoints: bool = False
+    superpoints: flags.SuperpointsFlag = False
     """Also partition all points into superpoints. Optional numbers set how many per level, as in
     --superpoints 1000,300."""
     orient: flags.OrientFlag = "auto"
@@ -135,7 +135,6 @@ class CloudArguments(Arguments):
     replacing ScanNet's; its superpoints do not cross objects. S3DIS supports neither scannet nor
     spformer; ScanNet++ supports no other layout with classes."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
-    settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
     def data(self, root: Path) -> SceneDataset:
         """Open the data set."""
@@ -145,8 +144,7 @@ class CloudArguments(Arguments):
         """Return the clouds of the data set with the settings of their results."""
         names = ("layout", "partition", "level", "orient", "within", "table")
         output: dict[str, Any] = {name: getattr(self, name) for name in names}
-        settings = self.settings.resolved
-        return CloudSource(self.data(root), settings, superpoint=self.superpoints, **output)
+        return CloudSource(self.data(root), self.settings, superpoint=self.superpoints, **output)
 
 
 @dataclass(frozen=True)
@@ -274,13 +272,10 @@ def run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
         raise SystemExit(0 if argv else USAGE_ERROR)
-    kind, *remaining = flags.expand_counts(argv)
+    kind, *remaining = argv
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
-    chosen, start = KINDS[kind], {}
-    if issubclass(chosen, CloudArguments):
-        start["settings"] = flags.PlaneSettings.from_arguments(remaining)
-    arguments = parse(chosen, remaining, prog=f"torchrg convert {kind}", default=start)
+    arguments = parse(KINDS[kind], remaining, prog=f"torchrg convert {kind}")
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()
     listing = tqdm(
@@ -332,17 +327,12 @@ def _check(arguments: Arguments) -> None:
     if _page_folder(arguments) is not None:
         check_library()
     if isinstance(arguments, CloudArguments):
-        flags.check_level(arguments.level, arguments.partition)
+        is_on = arguments.superpoints or arguments.layout != "pointcept"
+        flags.check_superpoints(arguments.partition, arguments.level, is_on=is_on)
         if arguments.orient == "viewpoint" and not isinstance(arguments, FolderArguments):
             raise ConfigError(
                 "expected --orient auto, interior, up or none, got viewpoint; this data set "
                 "stores no scanner positions."
-            )
-        has_superpoints = arguments.superpoints or arguments.layout != "pointcept"
-        defaults = (SuperpointsConfig(), 0)
-        if not has_superpoints and (arguments.partition, arguments.level) != defaults:
-            raise ConfigError(
-                "expected --superpoints with --partition or --level, got none; add it."
             )
         if arguments.pages is not None and arguments.layout != "pointcept":
             raise ConfigError(

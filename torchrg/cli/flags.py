@@ -2,18 +2,16 @@
 
 import dataclasses
 import os
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 
-from torchrg.cli.arguments import ALIASES, Argument
+from torchrg.cli.arguments import Argument
 from torchrg.cli.ending import print_warnings, warn
 from torchrg.config import (
     DEFAULT_PRESET,
@@ -21,7 +19,7 @@ from torchrg.config import (
     PipelineConfig,
     SelectionConfig,
     SuperpointsConfig,
-    load_config,
+    settings_of,
 )
 from torchrg.datasets.camera_files import SUFFIXES, read_camera
 from torchrg.depth.camera import Pinhole
@@ -130,54 +128,39 @@ WithinFlag = Annotated[
         "one more object. Default: no constraint.",
     ),
 ]
+SuperpointsFlag = Annotated[bool, Argument(numbers="partition.counts")]
 Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3d", "nag", "npy"]
 
 
-@dataclass(frozen=True)
+def _base_settings(options: Mapping[str, Any]) -> PipelineConfig:
+    """Return the settings of the preset or file, with the options that concern several settings.
+
+    The up axis is z unless the file sets another. With --table, polygons are traced if shapely is
+    installed.
+    """
+    source = options.get("config") or options.get("preset", DEFAULT_PRESET)
+    changes = {name: options[name] for name in ("angle_deg",) if options.get(name) is not None}
+    config = settings_of("", PipelineConfig, source, changes)
+    outline = bool(options.get("table") and find_spec("shapely")) or config.planes.outline
+    planes = dataclasses.replace(config.planes, up=config.planes.up or "z", outline=outline)
+    return dataclasses.replace(config, planes=planes)
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlaneSettings:
-    """Settings of the plane segmentation: preset or file, overridden by flags."""
+    """Settings of the plane segmentation: preset or file, overridden by words."""
 
     preset: str = DEFAULT_PRESET
     """Preset to start from: consensus (adapts to the data), or classic, classic_increment, detmm,
-    paper, algorithm2 for comparison. Flags override it."""
+    paper, algorithm2 for comparison. Settings override it."""
     config: Path | None = None
     """YAML settings file, instead of a preset. Settings it omits keep their defaults."""
     angle_deg: float | None = None
     """The paper's single threshold, in degrees: sets both --normals.sharp-angle-deg and
     --growing.max-angle-deg, which take precedence."""
-    resolved: Annotated[PipelineConfig, Argument(is_inline=True)] = dataclasses.field(
-        default_factory=PipelineConfig
+    settings: Annotated[PipelineConfig, Argument(base=_base_settings)] = dataclasses.field(
+        default_factory=lambda: _base_settings({})
     )
-
-    @classmethod
-    def from_arguments(cls, argv: list[str]) -> "PlaneSettings":
-        """Return the settings of the preset or file in the arguments, as defaults of the flags.
-
-        The up axis is z unless the file sets another. With --table, polygons are traced if shapely
-        is installed.
-
-        Example:
-            >>> settings = PlaneSettings.from_arguments(["scan.pcd", "--preset=classic"])
-            >>> settings.resolved.normals.method
-            'pca'
-        """
-        values = {"--preset": "", "--config": "", "--angle-deg": ""}
-        for argument, following in pairwise((*argv, "")):
-            name, equals, value = argument.partition("=")
-            name = name.replace("_", "-")
-            if name in values:
-                values[name] = value if equals else following
-        resolved = load_config(values["--config"] or values["--preset"] or DEFAULT_PRESET)
-        planes = dataclasses.replace(resolved.planes, up=resolved.planes.up or "z")
-        if any(argument.partition("=")[0] == "--table" for argument in argv):
-            outline = planes.outline or find_spec("shapely") is not None
-            planes = dataclasses.replace(planes, outline=outline)
-        resolved = dataclasses.replace(resolved, planes=planes)
-        try:
-            angle = float(values["--angle-deg"])
-        except ValueError:  # Missing, or invalid and rejected by the parser.
-            return cls(resolved=resolved)
-        return cls(resolved=resolved.with_angle(angle))
 
 
 def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
@@ -211,10 +194,6 @@ def reason_for_no_plane(settings: SelectionConfig) -> str:
     return "no plane passes --min-area and --kinds" if is_chosen else "no region is large enough"
 
 
-SettingsFlags = Annotated[PlaneSettings, Argument(is_inline=True)]
-"""Argument type with the flags ``--preset``, ``--config``, ``--normals.k`` and so on."""
-
-
 def split_columns(columns: str | None) -> tuple[str, ...] | None:
     """Split the value of ``--columns`` into names.
 
@@ -246,27 +225,10 @@ def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) 
         )
 
 
-def expand_counts(argv: Sequence[str]) -> list[str]:
-    """Move the numbers after ``--superpoints`` into a separate flag.
-
-    Example:
-        >>> expand_counts(["a.ply", "--superpoints", "1000,300", "--merge"])
-        ['a.ply', '--superpoints', '--partition.counts', '1000', '300', '--merge']
-    """
-    spelled: list[str] = []
-    for argument in argv:
-        names = ("--superpoints", *ALIASES["--superpoints"])
-        is_after = spelled[-1:] and spelled[-1] in names
-        name, _, numbers = argument.rpartition("=")
-        if re.fullmatch(r"\d+(,\d+)*", numbers) and (name in names or (is_after and not name)):
-            spelled += [name] * bool(name) + ["--partition.counts", *numbers.split(",")]
-        else:
-            spelled.append(argument)
-    return spelled
-
-
-def check_level(level: int, config: SuperpointsConfig) -> None:
-    """Raise if the superpoints have no such level."""
+def check_superpoints(config: SuperpointsConfig, level: int, *, is_on: bool) -> None:
+    """Raise if there are no superpoints for the settings, or they have no such level."""
+    if not is_on and (config, level) != (SuperpointsConfig(), 0):
+        raise ConfigError("expected --superpoints with --partition or --level, got none; add it.")
     if not 0 <= level < config.num_levels:
         max_level = config.num_levels - 1
         raise ConfigError(f"expected --level from 0 to {max_level}, got {level}.")

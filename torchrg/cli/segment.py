@@ -67,14 +67,15 @@ IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(flags.PlaneSettings):
     """Segment point clouds into planes: plane label, normal, curvature, plane table.
 
-    Settings come from the preset (or the --config file) and are overridden by the flags below.
-    Points that lie on no plane get the label -1.
+    Settings come from the preset (or the --config file), and arguments such as --normals.k 30
+    override them. Points that lie on no plane get the label -1.
 
     Examples:
         torchrg segment scan.pcd --out planes.npz
+        torchrg segment scan.ply --out planes.npz --normals.k 30 --growing.min-size 200
         torchrg segment scan.laz --out planes.laz --table planes.csv --picture planes.png
         torchrg segment *.ply --out results --picture pictures --pages
         torchrg segment part1.e57 part2.e57 --merge --out hall.npz --voxel 0.02
@@ -93,7 +94,7 @@ class Arguments:
     voxel: float | None = None
     """Voxel size, in units of the cloud. Segments one point per voxel and copies the result to all
     points of that voxel. Default: no downsampling."""
-    superpoints: bool = False
+    superpoints: flags.SuperpointsFlag = False
     """Also partition all points into superpoints, stored as "superpoint" (finest), "superpoint_1"
     and so on. Optional numbers set how many per level, as in --superpoints 1000,300. Uses point
     colors if the cloud has them. Images then show superpoints instead of planes."""
@@ -113,29 +114,22 @@ class Arguments:
     limit_memory: float | None = None
     """Memory limit per cloud, in GB. Beyond it, the largest arrays go to disk (about 450 bytes per
     point, next to OUT or in TMPDIR); the result is identical. Default: half of the free memory."""
-    settings: flags.SettingsFlags = dataclasses.field(default_factory=flags.PlaneSettings)
 
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _reject_images(argv)
-    argv = flags.expand_counts(argv)
-    start = {"settings": flags.PlaneSettings.from_arguments(argv)}
-    arguments = parse(Arguments, argv, prog="torchrg segment", default=start)
+    arguments = parse(Arguments, argv, prog="torchrg segment")
     if arguments.layout not in (None, "pointcept"):
         arguments = dataclasses.replace(arguments, superpoints=True)
-    if not arguments.superpoints and arguments.partition != SuperpointsConfig():
-        raise ConfigError(
-            "segment: expected --superpoints with --partition flags, got none; add it."
-        )
-    flags.check_level(arguments.level, arguments.partition)
-    if arguments.layout is not None:
-        check_layout(arguments.layout, _DATASET, "clouds")
     if arguments.level and arguments.layout is None:
         raise ConfigError(
             "expected --layout with --level, got none; leave --level out, since other files "
             "contain all levels."
         )
+    flags.check_superpoints(arguments.partition, arguments.level, is_on=arguments.superpoints)
+    if arguments.layout is not None:
+        check_layout(arguments.layout, _DATASET, "clouds")
     flags.limit_threads(arguments.threads)
     flags.limit_in_bytes(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
@@ -225,7 +219,7 @@ def _segment(
     with stage_bar(sources[0].name, stages) as advance, where:
         seg, superpoints = segment_cloud(
             cloud,
-            arguments.settings.resolved,
+            arguments.settings,
             orient=arguments.orient,
             viewpoint=arguments.viewpoint,
             partition=_memory_settings(arguments)[1],
@@ -250,10 +244,10 @@ def _segment(
         counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)
         print_lines(f"{source}: superpoints of each level: {counts}")
     if seg.sampling is not None:
-        settings = arguments.settings.resolved.measured(seg.sampling)["settings"]
+        settings = arguments.settings.measured(seg.sampling)["settings"]
         print_lines(f"{source}: {flags.describe_sampling(seg.sampling, settings)}")
     destination = f"{target}{dropped_fields_note(target, cloud.fields)}"
-    reason = flags.reason_for_no_plane(arguments.settings.resolved)
+    reason = flags.reason_for_no_plane(arguments.settings)
     _report(source, seg, cloud, destination, reason, time.perf_counter() - begin)
 
 
@@ -270,7 +264,7 @@ def _check_limit(arguments: Arguments, source: str, num_points: int, limit: int)
 
 def _memory_settings(arguments: Arguments) -> tuple[PipelineConfig, SuperpointsConfig | None]:
     """Return the settings that decide on the memory, without a partition if there is none."""
-    return arguments.settings.resolved, arguments.partition if arguments.superpoints else None
+    return arguments.settings, arguments.partition if arguments.superpoints else None
 
 
 def _needed_memory(arguments: Arguments, num_points: int, *, on_disk: bool) -> int:
@@ -289,7 +283,7 @@ def _array_storage(
     if needed <= limit:
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
-    k = min(arguments.settings.resolved.max_neighbors, num_points)
+    k = min(arguments.settings.max_neighbors, num_points)
     check_space(folder, num_points * k * scratch.BYTES_PER_NEIGHBOR, "the work")
     print_lines(
         f"{source}: about {num_points:,} points need {needed / 1e9:.2f} GB of memory, the limit "
@@ -314,7 +308,7 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
 
 def _describe(arguments: Arguments, sources: tuple[Path, ...], seg: Segmentation) -> Record:
     """Return the provenance of a cloud from one or several files."""
-    settings = arguments.settings.resolved
+    settings = arguments.settings
     provenance = describe_run(sources[0], settings) | {"orient": arguments.orient}
     names = ("columns", "viewpoint", "voxel", "within")
     options = {name: getattr(arguments, name) for name in names}

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from torchrg.config import check_values
+from torchrg.config import check_values, expect
 from torchrg.errors import ConfigError
 from torchrg.scenes import parts as draw
 from torchrg.scenes.geometry import Array, Frame, Triple
@@ -88,26 +88,15 @@ class RoomLayout:
 
     def __post_init__(self) -> None:
         check_values(self)
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name.startswith("num_") and not 0 <= value <= _MAX_COUNT:
-                raise ConfigError(
-                    f"RoomLayout: expected {field.name} >= 0 and at most {_MAX_COUNT:,}, got "
-                    f"{value}."
-                )
-        if self.num_small_boxes > self.num_tables:
-            raise ConfigError(
-                f"RoomLayout: expected num_small_boxes <= {self.num_tables}, "
-                f"got {self.num_small_boxes}."
-            )
+        for name in (field.name for field in fields(self) if field.name.startswith("num_")):
+            is_number = 0 <= getattr(self, name) <= _MAX_COUNT
+            expect(self, name, f">= 0 and at most {_MAX_COUNT:,}", is_number)
+        num_tables = self.num_tables
+        expect(self, "num_small_boxes", f"<= {num_tables}", self.num_small_boxes <= num_tables)
         for name in ("plate_thickness", "panel_thickness", "num_viewpoints"):
-            if getattr(self, name) <= 0:
-                raise ConfigError(f"RoomLayout: expected {name} > 0, got {getattr(self, name)}.")
-        if min(self.size[:2]) < 1 or self.size[2] < 2.3 or max(self.size) > _MAX_SIDE:
-            raise ConfigError(
-                f"RoomLayout: expected size of at least 1 x 1 x 2.3 and at most {_MAX_SIDE:,} "
-                f"meters, got {self.size}."
-            )
+            expect(self, name, "> 0", getattr(self, name) > 0)
+        is_size = min(self.size[:2]) >= 1 and self.size[2] >= 2.3 and max(self.size) <= _MAX_SIDE
+        expect(self, "size", f"of at least 1 x 1 x 2.3 and at most {_MAX_SIDE:,} meters", is_size)
 
     def draw_wall(self, number: int, wall: Frame, length: float, holes: Sequence[Hole]) -> Part:
         """Return a wall along the first axis of a frame; a subclass may bend one without holes."""

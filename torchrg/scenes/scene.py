@@ -3,13 +3,14 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._checks import check_choices
 from torchrg.errors import ConfigError
 from torchrg.scenes.geometry import Array, Floats
 from torchrg.scenes.surfaces import Solid, Surface
@@ -144,12 +145,7 @@ def sample_scene(
         raise ConfigError(
             f"sample_scene: expected noise from 0 to {FARTHEST:g} meters, got {noise}."
         )
-    if noise_direction not in get_args(NoiseDirection):
-        options = ", ".join(get_args(NoiseDirection))
-        raise ConfigError(
-            f"sample_scene: expected noise_direction to be one of {options}, got "
-            f"{noise_direction!r}."
-        )
+    check_choices("sample_scene", noise_direction=(noise_direction, NoiseDirection))
     rng = seeded_generator(seed, POSITIONS)
     points, normals, labels = _sample_faces(model, num_points, rng)
     if noise > 0:

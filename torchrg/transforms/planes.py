@@ -2,8 +2,9 @@
 
 ``config`` is a configuration object, a dictionary, a complete configuration, or the name of a
 preset. Default: that of :func:`torchrg.load_config`. ``changes`` override single parameters, as in
-``k=30``, or ``**{"normals.k": 30}`` for a complete configuration. Points with equal coordinates are
-treated as one and get the same result, as in :func:`torchrg.segment_planes`.
+``k=30``; those of a complete configuration are in a dictionary, as in ``{"normals.k": 30}``. Points
+with equal coordinates are treated as one and get the same result, as in
+:func:`torchrg.segment_planes`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -256,15 +257,15 @@ class SegmentPlanes(OrientedTransform):
     ``(N,)``, int64, -1 for none, ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
 
     Args:
-        config: Configuration. Default: the preset ``consensus``.
+        config: Configuration, as in ``{"normals.k": 30}``. Default: the preset ``consensus``.
         orient: Orientation of normals. Default: towards ``front`` if the sample has it, else into
             the free space of rooms.
         viewpoint: Scanner position, for ``orient="viewpoint"``. Default: read from the sample.
-        **changes: Single parameters, as in ``**{"normals.k": 30}``.
+        **changes: Single parameters, as in ``min_area=0.5``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
-        >>> SegmentPlanes("classic", **{"normals.k": 9})({"coord": floor})["plane"].unique()
+        >>> SegmentPlanes({"base": "classic", "normals.k": 9})({"coord": floor})["plane"].unique()
         tensor([0])
     """
 
