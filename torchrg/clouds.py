@@ -22,12 +22,18 @@ from torchrg.errors import (
     PrecisionWarning,
     system_limit,
 )
-from torchrg.io.tables import are_integers
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.precision import describe_placeholders
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
-from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
+from torchrg.structures import (
+    FARTHEST,
+    Cloud,
+    Segmentation,
+    Superpoints,
+    are_integers,
+    bounding_box,
+)
 
 __all__ = [
     "check_finite",

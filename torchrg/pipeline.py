@@ -15,10 +15,9 @@ from torch import Tensor
 from torchrg import scratch
 from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
 from torchrg._parallel import return_freed_memory
+from torchrg.colors import read_colors
 from torchrg.config import AnyConfig, PipelineConfig, SuperpointsConfig, settings_of
 from torchrg.errors import CloudWarning, ConfigError, ShapeError, warn
-from torchrg.io import read_cloud
-from torchrg.io.colors import read_colors
 from torchrg.neighbors import (
     DistinctPoints,
     canonical_order,
@@ -154,6 +153,8 @@ def segment_planes(
         ([200, 200], [5, 6])
     """
     if isinstance(points, str | os.PathLike):
+        from torchrg.io import read_cloud
+
         points = read_cloud(points)
     is_cloud = isinstance(points, Cloud)  # It warns on access to its points.
     points, directions = find_directions(
@@ -394,7 +395,7 @@ def make_superpoints(
             ``consensus``.
         config: Configuration or dictionary.
         colors: Colors, shape ``(N, 3)``, in 0..1, 0..255 or 0..65535, as determined by
-            :func:`torchrg.io.colors.find_white`. Duplicates share the midrange of each channel.
+            :func:`torchrg.colors.find_white`. Duplicates share the midrange of each channel.
             Default: colors are ignored.
         voxel: Voxel size, in the unit of the cloud. One point per voxel is partitioned, and every
             point gets the superpoint of its voxel. Sizes and the numbering then count voxels.

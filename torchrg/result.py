@@ -17,13 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg.colors import narrow_colors, read_colors
 from torchrg.errors import ShapeError
 from torchrg.io import atomic_path, read_cloud
-from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.fields import add_result_fields
 from torchrg.io.files import PARSE_ERRORS, local_path
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
-from torchrg.io.tables import are_integers
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import distinct_rows, search_knn
 from torchrg.plane_table import (
@@ -46,6 +45,7 @@ from torchrg.structures import (
     Planes,
     Segmentation,
     Superpoints,
+    are_integers,
 )
 
 __all__ = ["Result", "read_result", "write_table"]

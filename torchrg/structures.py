@@ -252,6 +252,13 @@ def local_origin(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArr
     return midpoint if half_extent * 4 < reach else np.zeros(3)
 
 
+def are_integers(values: Array) -> bool:
+    """Whether all values are finite integers."""
+    if values.dtype.kind in "iub":
+        return True
+    return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
+
+
 class Neighbors(NamedTuple):
     """Nearest neighbors of each point; see :func:`torchrg.search_knn`.
 

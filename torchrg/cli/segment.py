@@ -53,7 +53,7 @@ from torchrg.io import (
     write_cloud,
 )
 from torchrg.io.files import check_space
-from torchrg.merge import merge_clouds
+from torchrg.io.merge import merge_clouds
 from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, write_entry, write_index, write_planes

@@ -13,9 +13,9 @@ from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
 from torchrg.cli.loop import check_sidecar, is_viewer
+from torchrg.colors import narrow_colors
 from torchrg.config import Up
 from torchrg.errors import ConfigError
-from torchrg.io.colors import narrow_colors
 from torchrg.render import (
     color_curvature,
     color_normals,

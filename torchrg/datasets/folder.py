@@ -12,11 +12,11 @@ import torch
 from torch.utils.data import Dataset, Subset
 
 from torchrg._checks import as_tensor
+from torchrg.colors import read_colors
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
 from torchrg.errors import ConfigError, FormatError, add_note, warn
 from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_cloud, takes_columns
-from torchrg.io.colors import read_colors
 from torchrg.io.files import decode_file, local_path
 from torchrg.io.npy import map_array, map_folder
 from torchrg.structures import Cloud

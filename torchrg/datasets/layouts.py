@@ -22,13 +22,13 @@ import torch
 from numpy.typing import NDArray
 
 from torchrg._optional import require
+from torchrg.colors import narrow_colors
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.nag import encode_nag, make_nag
 from torchrg.datasets.pointcept import write_files, write_pointcept_scene, write_results
 from torchrg.datasets.s3dis import CLASS_ORDERS
 from torchrg.datasets.scannet import NYU_IDS, read_objects
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.colors import narrow_colors
 from torchrg.io.files import normalize_file_name
 from torchrg.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints

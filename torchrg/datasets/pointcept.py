@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
+from torchrg.colors import narrow_colors, read_colors
 from torchrg.datasets.provenance import (
     Record,
     check_owned,
@@ -32,7 +33,6 @@ from torchrg.datasets.provenance import (
 )
 from torchrg.errors import FormatError
 from torchrg.io import atomic_path
-from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.files import create_folder, local_path
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, RECORD, describe_planes

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
+from torchrg.colors import BYTE, WORD, narrow_colors
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.errors import FormatError
-from torchrg.io.colors import BYTE, WORD, narrow_colors
 from torchrg.io.files import (
     PARSE_ERRORS,
     check_available,

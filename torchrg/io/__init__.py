@@ -103,7 +103,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
     Convention:
         Coordinates and fields are returned unchanged, including non-finite points. Field names do
         not depend on the format (see :mod:`torchrg.io.fields`): ``labels`` int64, ``normals``,
-        ``curvature``, ``intensity``, ``color`` uint8 or uint16 (see :mod:`torchrg.io.colors`).
+        ``curvature``, ``intensity``, ``color`` uint8 or uint16 (see :mod:`torchrg.colors`).
         :attr:`torchrg.Cloud.notes` lists assumptions, such as guessed column names, and skipped
         data, such as images. Mesh faces and scan poses give the side from which each point was
         seen, :attr:`torchrg.Cloud.front`.

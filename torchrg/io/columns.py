@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchrg.colors import narrow_colors, read_colors
 from torchrg.errors import FormatError
-from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.fields import MAX_EXACT_INTEGER, SKIPPED, Columns, Values, backup_name
 from torchrg.io.files import atomic_path
 from torchrg.structures import Cloud

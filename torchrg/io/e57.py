@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
+from torchrg.colors import WIDEN, read_colors
 from torchrg.errors import FormatError
-from torchrg.io.colors import WIDEN, read_colors
 from torchrg.io.fields import Values, assemble_cloud
 from torchrg.io.files import PARSE_ERRORS, check_available, wrap_errors
 from torchrg.io.headers import check_grid, distance_outside
-from torchrg.mesh import Fronts
+from torchrg.io.mesh import Fronts
 from torchrg.structures import FARTHEST, Cloud, bounding_box
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg.colors import read_colors
 from torchrg.errors import FormatError
-from torchrg.io.colors import read_colors
-from torchrg.io.tables import are_integers, check_table, guess_column_names, warn_about_counters
-from torchrg.structures import UNLABELED, Cloud
+from torchrg.io.tables import check_table, guess_column_names, warn_about_counters
+from torchrg.structures import UNLABELED, Cloud, are_integers
 
 Values = NDArray[Any]
 """An array of any type."""

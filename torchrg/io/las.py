@@ -18,8 +18,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg._optional import require
+from torchrg.colors import WIDEN
 from torchrg.errors import FormatError
-from torchrg.io.colors import WIDEN
 from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
 from torchrg.io.fields import Columns, Values, assemble_cloud, check_coordinates
 from torchrg.io.files import (
@@ -31,8 +31,7 @@ from torchrg.io.files import (
     wrap_errors,
 )
 from torchrg.io.headers import MAX_INTEGER, check_grid, distance_outside
-from torchrg.io.tables import are_integers
-from torchrg.structures import Cloud, bounding_box
+from torchrg.structures import Cloud, are_integers, bounding_box
 
 _FIELD_NAMES = FieldNames(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True

@@ -25,8 +25,8 @@ from torchrg.io.columns import (
 )
 from torchrg.io.fields import MAX_EXACT_INTEGER, Values, assemble_cloud
 from torchrg.io.files import check_available, check_end, open_lines, split_words
+from torchrg.io.mesh import Fronts, find_fronts
 from torchrg.io.text import read_rows, skip_lines
-from torchrg.mesh import Fronts, find_fronts
 from torchrg.structures import Cloud
 
 _TYPES = {

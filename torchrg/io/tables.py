@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg.colors import BYTE, WORD
 from torchrg.errors import FormatError, warn
-from torchrg.io.colors import BYTE, WORD
+from torchrg.structures import are_integers
 
 Table = NDArray[Any]
 """Numbers of shape ``(N, C)``."""
@@ -155,10 +156,3 @@ def _only_rises(column: Table) -> bool:
     steps = np.diff(column)
     rises = (steps >= 0) & (steps <= (1 if are_integers(column) else np.inf))
     return bool(steps.any() and (rises | (column[1:] == column.min())).all())
-
-
-def are_integers(values: Table) -> bool:
-    """Whether all values are finite integers."""
-    if values.dtype.kind in "iub":
-        return True
-    return bool(np.isfinite(values).all() and (values == np.floor(values)).all())

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.io.colors import read_colors
+from torchrg.colors import read_colors
 from torchrg.io.files import atomic_path
 from torchrg.structures import UNLABELED, Cloud
 

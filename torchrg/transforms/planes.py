@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrg._checks import check_choices
 from torchrg._parallel import CHUNK_SIZE
+from torchrg.colors import find_white
 from torchrg.config import (
     AnyConfig,
     GrowingConfig,
@@ -23,7 +24,6 @@ from torchrg.config import (
     settings_of,
 )
 from torchrg.errors import ConfigError
-from torchrg.io.colors import find_white
 from torchrg.neighbors import distinct_points
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.normals.orient import (

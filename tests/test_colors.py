@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from torchrg.colors import find_white, read_colors
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.colors import find_white, read_colors
 from torchrg.result import Result
 from torchrg.structures import Cloud
 
