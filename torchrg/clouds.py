@@ -177,7 +177,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
 
     Example:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
-        ('2 of 3 points are not finite or beyond 1e+12; they stay unlabeled',)
+        ('2 of 3 points are not finite or beyond 1e+12; they have no normal and no plane',)
     """
     num_bad = len(cloud) - int(np.count_nonzero(cloud.finite))
     if num_bad == len(cloud):
@@ -189,7 +189,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
     if num_bad:
         notes.append(
             f"{num_bad:,} of {len(cloud):,} points are not finite or beyond {FARTHEST:g}; they "
-            "stay unlabeled"
+            "have no normal and no plane"
         )
     finite = cloud.coordinates[cloud.finite] if num_bad else cloud.coordinates
     low, high = bounding_box(finite)

@@ -133,6 +133,13 @@ def search_knn(
     return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
 
 
+def search_distinct(points: Tensor, k: int, *, max_distance: float | None = None) -> Neighbors:
+    """Find up to ``k`` neighbors of distinct points in canonical order; none without points."""
+    if len(points) == 0:
+        return Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
+    return search_knn(points, min(k, len(points)), max_distance=max_distance, canonical=True)
+
+
 def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     """Validate input neighbor lists: one per point, itself first, of rows of the points.
 

@@ -28,6 +28,8 @@ Orientation = Literal[
     "auto", "interior", "viewpoint", "consistent", "up", "+x", "-x", "+y", "-y", "+z", "-z", "none"
 ]
 """Modes of normal orientation; see :func:`orient_normals`."""
+NeighborSearch = Callable[[Tensor, int], Neighbors]
+"""Search of ``k`` neighbors among distinct finite points in canonical order, as transforms use."""
 
 NUM_NEIGHBORS = 20
 """Neighborhood size for orientation, including the point itself."""
@@ -61,7 +63,7 @@ def orient_normals(
     orient: Orientation = "auto",
     viewpoint: Points | Sequence[float] | None = None,
     front: Points | None = None,
-    neighbors: Neighbors | None = None,
+    neighbors: Neighbors | NeighborSearch | None = None,
 ) -> Tensor:
     """Choose the sign of each normal.
 
@@ -93,7 +95,8 @@ def orient_normals(
             ``(N, 3)``, as :attr:`torchrg.Cloud.front`. Points with a zero front follow their
             nearest neighbors; if they are more than 1 % of all points, they are oriented as
             ``"interior"``. Default: that of the cloud.
-        neighbors: Neighbors of all points, which must be finite. Default: searched.
+        neighbors: Neighbors of all points, which must be finite, or a function that searches them.
+            Default: searched among distinct points.
 
     Returns:
         The normals, some of them reversed. Rows of points that are not finite are unchanged.
@@ -118,17 +121,19 @@ def orient_normals(
     vectors = as_tensor("orient_normals", "normals", normals)
     check_shapes("orient_normals", points=(cloud, "N 3"), normals=(vectors, "N 3"))
     check_floating("orient_normals", normals=vectors)
-    if neighbors is not None:
-        check_neighbors("orient_normals", neighbors, cloud)
+    known = None if callable(neighbors) else neighbors
+    if known is not None:
+        check_neighbors("orient_normals", known, cloud)
 
     def turn(side: Orientation) -> Tensor:
-        if neighbors is not None:
-            return turn_faces(cloud, vectors, side, neighbors)
+        if known is not None:
+            return turn_faces(cloud, vectors, side, known)
         upright = _upright(vectors)
         usable = nonzero_rows((upright != 0).any(dim=-1) & cloud.isfinite().all(dim=-1))
         units = upright.detach()[usable]
         distinct = distinct_points(cloud[usable], units.unbind(dim=-1))
-        turned = distinct.restore(turn_faces(distinct.points, units[distinct.rows], side))
+        near = neighbors(distinct.points, NUM_NEIGHBORS) if callable(neighbors) else None
+        turned = distinct.restore(turn_faces(distinct.points, units[distinct.rows], side, near))
         # Duplicates follow the orientation of their representative.
         return turn_towards(upright, upright.detach().index_copy(0, usable, turned))
 

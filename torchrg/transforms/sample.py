@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from torchrg._checks import as_tensor, check_batch, check_shapes, eager_only
 from torchrg.errors import ConfigError
-from torchrg.neighbors import sample_voxels, search_knn
+from torchrg.neighbors import sample_voxels
+from torchrg.neighbors.knn import search_distinct
 from torchrg.structures import UNLABELED, Neighbors
 from torchrg.transforms.rows import (
     LIST_KEY,
@@ -198,8 +199,7 @@ class NeighborSearch:
         k = min(k, len(points))
         neighbors = self.recall(points, k)
         if neighbors is None:
-            none = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
-            neighbors = search_knn(points, k, canonical=True) if k else none
+            neighbors = search_distinct(points, k)
             self.remember(points, neighbors)
         return Neighbors(neighbors.indices[:, : max(k, 1)])
 
