@@ -9,8 +9,8 @@ import torch
 import torchrg
 from torchrg import Cloud, read_cloud, segment_planes, write_cloud
 from torchrg.axes import describe_units
-from torchrg.clouds import check_finite
 from torchrg.errors import UnitWarning
+from torchrg.pipeline.clouds import check_finite
 from torchrg.scenes import make_room
 
 ROOM = make_room(4000, noise=0.003, seed=1).points.double().numpy()

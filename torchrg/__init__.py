@@ -57,7 +57,7 @@ else:
     }
     # Public modules that a star import omits, because names such as io hide other modules.
     _PACKAGES = (
-        "batch", "clouds", "config", "errors", "io", "linalg", "neighbors", "pipeline",
+        "batch", "config", "errors", "io", "linalg", "neighbors", "pipeline",
         "plane_table", "regions", "render", "result", "scratch", "structures",
     )  # fmt: skip
     _MODULES = {name: module for module, names in _NAMES.items() for name in names}

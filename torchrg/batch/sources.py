@@ -14,7 +14,6 @@ from torch import Tensor
 
 from torchrg.batch.scans import Source
 from torchrg.batch.task import Begin, TaskReport, collecting_notes
-from torchrg.clouds import note_on_copies, segment_cloud
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets import layouts
 from torchrg.datasets.folder import SceneDataset, SceneFiles, check_outside
@@ -29,6 +28,7 @@ from torchrg.depth.camera import Pinhole, format_intrinsics, unproject_image
 from torchrg.depth.values import DepthKind
 from torchrg.errors import FormatError
 from torchrg.normals.orient import Orientation
+from torchrg.pipeline.clouds import note_on_copies, segment_cloud
 from torchrg.structures import Segmentation
 
 __all__ = ["CloudSource", "RGBDSource"]
@@ -52,7 +52,7 @@ class CloudSource(Source):
         level: Superpoint level to write.
         orient: Orientation of normals; see :func:`torchrg.normals.orient_normals`.
         within: Array of objects that planes must not cross; see
-            :func:`torchrg.clouds.find_objects`. Default: planes may cross objects.
+            :func:`torchrg.pipeline.clouds.find_objects`. Default: planes may cross objects.
     """
 
     data: SceneDataset

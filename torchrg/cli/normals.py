@@ -21,7 +21,6 @@ from torchrg.cli.loop import (
     run_each,
     stage_bar,
 )
-from torchrg.clouds import check_finite, note_on_copies
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
@@ -30,6 +29,7 @@ from torchrg.io.npy import DISPLAYED_FIELDS
 from torchrg.neighbors import distinct_points
 from torchrg.normals import estimate_normals
 from torchrg.normals.orient import find_directions
+from torchrg.pipeline.clouds import check_finite, note_on_copies
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
 """Per-point output fields."""

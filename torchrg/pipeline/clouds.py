@@ -23,7 +23,8 @@ from torchrg.errors import (
     system_limit,
 )
 from torchrg.normals.orient import Orientation
-from torchrg.pipeline import make_superpoints, segment_planes
+from torchrg.pipeline.planes import segment_planes
+from torchrg.pipeline.superpoints import make_superpoints
 from torchrg.precision import describe_placeholders
 from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
 from torchrg.structures import (
@@ -34,15 +35,6 @@ from torchrg.structures import (
     are_integers,
     bounding_box,
 )
-
-__all__ = [
-    "check_finite",
-    "describe_multipliers",
-    "find_objects",
-    "note_on_copies",
-    "segment_cloud",
-]
-__dir__ = __all__.copy
 
 Returned = TypeVar("Returned")
 

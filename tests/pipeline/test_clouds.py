@@ -5,10 +5,11 @@ import pytest
 import torch
 
 from tests.cli.test_cli import CLASSIC
-from torchrg import clouds, load_config
-from torchrg.clouds import find_objects
+from torchrg import load_config
 from torchrg.config import SuperpointsConfig
 from torchrg.errors import ConfigError
+from torchrg.pipeline import clouds
+from torchrg.pipeline.clouds import find_objects
 from torchrg.structures import Cloud
 
 
