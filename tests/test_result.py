@@ -15,7 +15,7 @@ from torchrg.datasets import write_pointcept_scene
 from torchrg.datasets.pointcept import write_results
 from torchrg.errors import FormatError, ShapeError
 from torchrg.io import FORMATS
-from torchrg.neighbors import finite_rows
+from torchrg.neighbors.order import finite_rows
 from torchrg.render.page import make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room

@@ -19,12 +19,13 @@ from torch import Tensor
 
 from torchrg.colors import narrow_colors, read_colors
 from torchrg.errors import ShapeError
-from torchrg.io import atomic_path, read_cloud
+from torchrg.io import read_cloud
 from torchrg.io.fields import add_result_fields
-from torchrg.io.files import PARSE_ERRORS, local_path
+from torchrg.io.files import PARSE_ERRORS, atomic_path, local_path
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
 from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import distinct_rows, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.order import distinct_rows
 from torchrg.plane_table import (
     Arrays,
     Json,

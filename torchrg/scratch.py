@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 
-__all__ = ["empty", "is_active", "on_disk", "release"]
+__all__ = ["on_disk"]
 __dir__ = __all__.copy
 
 _MIN_BYTES = 2**24

@@ -22,20 +22,15 @@ __all__ = [
     "PLANE_KINDS",
     "UNLABELED",
     "Cloud",
-    "Colors",
-    "FilePath",
-    "Labels",
     "Neighbors",
     "NormalFit",
     "Plane",
     "PlaneAdjacency",
     "PlaneKind",
     "Planes",
-    "Points",
     "Sampling",
     "Segmentation",
     "Superpoints",
-    "Values",
 ]
 __dir__ = __all__.copy
 

@@ -12,7 +12,7 @@ from torchrg.batch.task import TaskReport
 from torchrg.config import PipelineConfig
 from torchrg.datasets import SceneFiles
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
+from torchrg.io.files import atomic_path
 
 
 @dataclass(frozen=True)

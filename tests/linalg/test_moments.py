@@ -10,12 +10,12 @@ from torchrg.linalg.moments import (
     fit_planes_to_each,
     fit_weighted_planes,
     residuals,
-    split_columns,
+    unbind_columns,
 )
 
 
 def test_planes_are_those_of_the_neighbors_with_a_weight():
-    columns = split_columns(torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]]))
+    columns = unbind_columns(torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]]))
     weights = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
     normals, offsets, values = fit_weighted_planes(columns, weights[0])
     assert normals.abs().tolist() == [[0.0, 0.0, 1.0]]

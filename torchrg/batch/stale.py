@@ -21,8 +21,8 @@ from torchrg.datasets.folder import natural_key
 from torchrg.datasets.provenance import (
     Record,
     check_source,
-    output_paths,
     read_record,
+    recorded_paths,
 )
 from torchrg.errors import FormatError
 from torchrg.io.files import (
@@ -190,7 +190,7 @@ def _find_renamed(
 def _describe_stale(out: Path, name: str, scan: str | None, record: Record) -> StaleResult:
     """Return a stale result with the files of its record below ``out``, and its pages."""
     folders = {Path(os.path.normpath(out / str(folder))) for folder in record.get("pages", ())}
-    paths = output_paths(out, out / name, record)
+    paths = recorded_paths(out, out / name, record)
     paths |= {folder / f"{name}{suffix}": None for folder in folders for suffix in PAGE_SUFFIXES}
     return StaleResult(out, name, scan, paths, folders)
 

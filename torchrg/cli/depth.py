@@ -20,7 +20,7 @@ from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import check_distinct, note_input, output_paths, run_each, sidecar_paths
 from torchrg.datasets import RGBDFrame, RGBDFrames
-from torchrg.datasets.rgbd import fit_camera
+from torchrg.datasets.rgbd import scale_camera
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
     num_pixels,
@@ -150,7 +150,7 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
         if camera is None:
             flag, hint = "--intrinsics fx,fy,cx,cy", "or a camera file"
         raise ConfigError(f"{path}: missing {flag}, required for depth images; pass it, {hint}.")
-    matrix, doubt = fit_camera(path, camera)
+    matrix, doubt = scale_camera(path, camera)
     if doubt:
         warn(doubt)
     return RGBDFrame(path, matrix, scale, depth_kind=arguments.depth_kind)

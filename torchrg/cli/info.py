@@ -14,7 +14,8 @@ from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, describe_sampling, file_columns
 from torchrg.config import load_config
 from torchrg.io import read_cloud
-from torchrg.neighbors import distinct_points, measure_sampling, prepare_search
+from torchrg.neighbors import distinct_points, measure_sampling
+from torchrg.neighbors.knn import prepare_search
 from torchrg.structures import Array, Cloud
 
 _DIGITS = {4: 6, 8: 10}

@@ -27,7 +27,7 @@ from torchrg.render import (
     write_png,
 )
 from torchrg.render.channels import COLOR_MODES
-from torchrg.render.page import MAX_POINTS
+from torchrg.render.page import MAX_SHOWN_POINTS
 from torchrg.result import Result, read_result
 from torchrg.structures import Cloud
 
@@ -72,7 +72,7 @@ class Arguments:
     """Second cloud or result, shown in the right half; in a viewer both rotate together."""
     ground_truth: Path | None = None
     """Ground truth for the same points, with labels or normals; shows errors in a viewer."""
-    max_points: int = MAX_POINTS
+    max_points: int = MAX_SHOWN_POINTS
     """Maximum points in the viewer; larger clouds are randomly downsampled, with a note."""
     unit: str | None = None
     """Unit of the coordinates, such as m, for lengths and areas in a viewer. Default: m if the

@@ -32,8 +32,7 @@ from torchrg.datasets.provenance import (
     write_record,
 )
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
-from torchrg.io.files import create_folder, local_path
+from torchrg.io.files import atomic_path, create_folder, local_path
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, RECORD, describe_planes
 from torchrg.structures import Array, Segmentation

@@ -259,7 +259,7 @@ def _find_frames(
                     f"camera of other origin ({origin}); pass --depth-scale (depth_scale), 1000 "
                     "for millimeters."
                 )
-            matrix, doubt = fit_camera(frame.depth, chosen, *files[:1])
+            matrix, doubt = scale_camera(frame.depth, chosen, *files[:1])
             notes[folder] = notes.get(folder) or doubt
             pose, files = frame.pose, tuple(dict.fromkeys((*files, *frame.sources)))
             if pose is not None and not bool((pose.abs() <= FARTHEST).all()):
@@ -280,7 +280,7 @@ def _find_frames(
     return frames
 
 
-def fit_camera(image: Path, camera: Pinhole, file: Path | None = None) -> tuple[Tensor, str]:
+def scale_camera(image: Path, camera: Pinhole, file: Path | None = None) -> tuple[Tensor, str]:
     """Return the camera matrix for a depth image, and a warning if it is implausible.
 
     Args:

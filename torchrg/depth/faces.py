@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels
-from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
 from torchrg.regions.repair import remap_labels
 

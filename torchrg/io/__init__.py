@@ -14,7 +14,7 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import check_field
 from torchrg.io.e57 import count_e57, read_e57
 from torchrg.io.fields import add_result_fields, convert_coordinates
-from torchrg.io.files import ARCHIVE_ERRORS, atomic_path, check_file, check_writable, local_path
+from torchrg.io.files import ARCHIVE_ERRORS, check_file, check_writable, local_path
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
@@ -28,11 +28,7 @@ __all__ = [
     "FOLDER_SUFFIXES",
     "FORMATS",
     "RESULT_FIELDS",
-    "atomic_path",
-    "check_output",
-    "estimate_points",
     "read_cloud",
-    "takes_columns",
     "write_cloud",
 ]
 __dir__ = __all__.copy

@@ -345,7 +345,7 @@ Columns = tuple[Tensor, Tensor, Tensor]
 :mod:`torchrg.robust.lanes` are transposed, since robust fits sort every neighborhood."""
 
 
-def split_columns(patches: Tensor) -> Columns:
+def unbind_columns(patches: Tensor) -> Columns:
     """Split patches ``(n, K, 3)`` into contiguous columns ``(n, K)``."""
     x, y, z = patches.unbind(dim=-1)
     return x.contiguous(), y.contiguous(), z.contiguous()

@@ -15,7 +15,8 @@ from torchrg.metrics.contingency import (
     fraction,
     is_not_ignored,
 )
-from torchrg.neighbors import distinct_rows, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.order import distinct_rows
 from torchrg.structures import UNLABELED
 
 _NUM_NEIGHBORS = 8

@@ -33,14 +33,14 @@ from torchrg._parallel import CHUNK_SIZE, limit_rows
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.linalg.single import to_single
-from torchrg.neighbors import check_neighbors, distinct_points
-from torchrg.neighbors.knn import search_distinct
+from torchrg.neighbors import distinct_points
+from torchrg.neighbors.knn import check_neighbors, search_distinct
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls, fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import (
-    NeighborSearch,
     Orientation,
+    SearchDistinct,
     choose_side,
     find_directions,
     orient_normals,
@@ -115,7 +115,7 @@ def estimate_normals(
     orient: Orientation = "none",
     viewpoint: Points | Sequence[float] | None = None,
     front: Points | None = None,
-    neighbors: Neighbors | NeighborSearch | None = None,
+    neighbors: Neighbors | SearchDistinct | None = None,
     max_distance: float | None = None,
     chunk_size: int = CHUNK_SIZE,
     on_stage: Callable[[str], None] = lambda stage: None,

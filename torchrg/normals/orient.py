@@ -19,7 +19,9 @@ from torchrg._checks import (
 )
 from torchrg._parallel import nonzero_rows
 from torchrg.errors import ConfigError
-from torchrg.neighbors import check_neighbors, distinct_points, distinct_rows, search_knn
+from torchrg.neighbors import distinct_points, search_knn
+from torchrg.neighbors.knn import check_neighbors
+from torchrg.neighbors.order import distinct_rows
 from torchrg.normals.faces import find_faces, find_surfaces
 from torchrg.normals.free_space import cell_width, vote_free_side
 from torchrg.structures import UNLABELED, Cloud, Neighbors, Points
@@ -28,7 +30,7 @@ Orientation = Literal[
     "auto", "interior", "viewpoint", "consistent", "up", "+x", "-x", "+y", "-y", "+z", "-z", "none"
 ]
 """Modes of normal orientation; see :func:`orient_normals`."""
-NeighborSearch = Callable[[Tensor, int], Neighbors]
+SearchDistinct = Callable[[Tensor, int], Neighbors]
 """Search of ``k`` neighbors among distinct finite points in canonical order, as transforms use."""
 
 NUM_NEIGHBORS = 20
@@ -63,7 +65,7 @@ def orient_normals(
     orient: Orientation = "auto",
     viewpoint: Points | Sequence[float] | None = None,
     front: Points | None = None,
-    neighbors: Neighbors | NeighborSearch | None = None,
+    neighbors: Neighbors | SearchDistinct | None = None,
 ) -> Tensor:
     """Choose the sign of each normal.
 

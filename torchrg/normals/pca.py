@@ -10,21 +10,11 @@ from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes, is_concrete
 from torchrg._parallel import CHUNK_SIZE, map_chunks, nonzero_rows
 from torchrg.config import NormalsConfig
-from torchrg.linalg import (
-    coordinate_resolution,
-    covariance,
-    eigh3,
-    rank_tolerance,
-)
-from torchrg.linalg.eigen import (
-    PrincipalFrame,
-    principal_frame,
-    root,
-    smallest_eigenvector3,
-    square_root,
-)
+from torchrg.linalg import covariance, eigh3
+from torchrg.linalg.eigen import PrincipalFrame, principal_frame, smallest_eigenvector3
 from torchrg.linalg.moments import covariance_of_columns, weighted_moments
-from torchrg.neighbors import gather_patches
+from torchrg.linalg.tolerances import coordinate_resolution, rank_tolerance, rounded_sqrt, safe_sqrt
+from torchrg.neighbors.knn import gather_patches
 from torchrg.structures import Neighbors, NormalFit
 
 FitPatches = Callable[..., NormalFit]
@@ -115,7 +105,7 @@ def fit_plane(
         torch.where(valid[..., None], normals, 0.0),
         torch.where(valid, curvature, 0.0),
         valid,
-        residual_rms=torch.where(valid, root(smallest), 0.0),
+        residual_rms=torch.where(valid, safe_sqrt(smallest), 0.0),
     )
     return fit, frame
 
@@ -168,7 +158,7 @@ def _spans_plane(
     """
     if resolution is None:
         resolution = patch_resolution(patches, mask)
-    lengths, widths = (square_root(values[..., axis].clamp(min=0)) for axis in (2, 1))
+    lengths, widths = (rounded_sqrt(values[..., axis].clamp(min=0)) for axis in (2, 1))
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
     narrow = widths < _MIN_RATIO * lengths
     if not is_concrete(patches, mask, values):

@@ -26,7 +26,7 @@ from torchrg.normals.orient import Orientation
 from torchrg.pipeline.planes import segment_planes
 from torchrg.pipeline.superpoints import make_superpoints
 from torchrg.precision import describe_placeholders
-from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
+from torchrg.regions.selection import keep_planes, renumber_planes, selected_rows
 from torchrg.structures import (
     FARTHEST,
     Cloud,
@@ -137,7 +137,7 @@ def segment_cloud(
     begin("superpoints")
     colors = cloud.fields.get("color")
     superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
-    rows = choose_planes(seg.planes, settings)
+    rows = selected_rows(seg.planes, settings)
     plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
     return keep_planes(seg, rows), replace(superpoints, plane=plane)
 

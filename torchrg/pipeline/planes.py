@@ -17,7 +17,6 @@ from torchrg._parallel import return_freed_memory
 from torchrg.config import AnyConfig, PipelineConfig, settings_of
 from torchrg.errors import CloudWarning, ShapeError, warn
 from torchrg.neighbors import (
-    DistinctPoints,
     canonical_order,
     distinct_points,
     expand_to_points,
@@ -25,13 +24,14 @@ from torchrg.neighbors import (
     sample_voxels,
 )
 from torchrg.neighbors.knn import restrict_to_groups, search_distinct
+from torchrg.neighbors.order import DistinctPoints
 from torchrg.normals import run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.precision import warn_about_coordinates
 from torchrg.regions import grow_regions, summarize_planes
 from torchrg.regions.growth import needs_sampling, rank_by_count
 from torchrg.regions.kinds import find_kinds
-from torchrg.regions.selection import choose_planes, keep_planes
+from torchrg.regions.selection import keep_planes, selected_rows
 from torchrg.structures import (
     UNLABELED,
     Cloud,
@@ -165,7 +165,7 @@ def segment_planes(
     side = _Side(orient, directions)
     if settings.min_area > 0 or settings.kinds is not None or settings.sort != "points":
         seg = _segment(points, settings.without_selection(), side, voxel, objects, begin)
-        seg = keep_planes(seg, choose_planes(seg.planes, settings))
+        seg = keep_planes(seg, selected_rows(seg.planes, settings))
     else:
         seg = _segment(points, settings, side, voxel, objects, begin)
     return seg if keep_neighbors else replace(seg, neighbors=None)

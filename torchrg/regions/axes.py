@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchrg._checks import default_device_cpu
 from torchrg.errors import ConfigError, warn
-from torchrg.linalg import eigh3_lapack, unit_direction
+from torchrg.linalg.angles import unit_direction
+from torchrg.linalg.lapack import eigh3_lapack
 from torchrg.linalg.rigid import check_rigid
 from torchrg.regions.fit import canonicalize_sign
 from torchrg.structures import Cloud, Planes, Segmentation

@@ -24,7 +24,9 @@ from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
 from torchrg.linalg.single import is_single, to_single
-from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
+from torchrg.neighbors import canonical_order, measure_sampling
+from torchrg.neighbors.knn import check_neighbors
+from torchrg.neighbors.order import ascending_rows
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrg.config import SelectionConfig, settings_of
 from torchrg.errors import CloudWarning, ConfigError, warn
-from torchrg.linalg import unit_direction
+from torchrg.linalg.angles import unit_direction
 from torchrg.regions.kinds import find_kinds
 from torchrg.structures import (
     PLANE_COLUMNS,
@@ -75,10 +75,10 @@ def select_planes(
             )
         kind = find_kinds(seg.planes, seg.points, seg.labels, direction)
         seg = replace(seg, planes=replace(seg.planes, kind=kind))
-    return keep_planes(seg, choose_planes(seg.planes, settings))
+    return keep_planes(seg, selected_rows(seg.planes, settings))
 
 
-def choose_planes(planes: Planes, settings: SelectionConfig) -> Tensor:
+def selected_rows(planes: Planes, settings: SelectionConfig) -> Tensor:
     """Return the rows of the selected planes in their new order, shape ``(n,)``.
 
     If ``settings`` contain classes, the table must have them.

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, sq_chords, unsigned_angle_deg
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, KnnAdjacency
 from torchrg.regions.edges import GrowingInput, accept_edges, within_angle

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from torchrg.linalg import unit_direction
+from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import finite_rows
+from torchrg.neighbors.order import finite_rows
 from torchrg.plane_table import Json, describe_planes
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.table import summarize_planes

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path, wrap_errors
-from torchrg.linalg import unit_direction
+from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides

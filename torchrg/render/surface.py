@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchrg.linalg import covariance, eigh3
-from torchrg.neighbors import gather_patches, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.knn import gather_patches
 from torchrg.neighbors.order import spread_bits
 
 _BITS = 20

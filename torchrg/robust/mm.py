@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices
-from torchrg.linalg import machine_epsilon, smallest_normal
+from torchrg.linalg.tolerances import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
     covariance_entries,
@@ -22,7 +22,7 @@ from torchrg.robust.lanes import (
     sq_distances,
     take_lanes,
 )
-from torchrg.robust.patches import Estimator, RobustFit, fit_patchwise, patchwise
+from torchrg.robust.patches import LaneEstimator, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
@@ -155,7 +155,7 @@ def _fit_shapes(
     quantile: float,
     min_dimension: int,
     chunk_size: int,
-    estimator: Estimator,
+    estimator: LaneEstimator,
     cutoff_of: Callable[[int], float],
 ) -> RobustFit:
     """Fit patches by an estimator with bisquare weights that vanish at a cutoff for P."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.linalg import at_most
+from torchrg.linalg.angles import at_most
 from torchrg.robust.lanes import (
     covariance_entries,
     fit_ellipsoid,
