@@ -44,7 +44,7 @@ class SceneFiles(NamedTuple):
         dataset: The data set that defines the classes, empty if unknown; None for a plain cloud.
         release_path: Path in the release, which some programs keep. Default: its name.
         num_points: Number of points from headers or file sizes, for ``convert``.
-        item: Extra data for reading; plain, picklable values.
+        item: Extra data for reading; picklable.
     """
 
     name: str
