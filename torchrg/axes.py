@@ -1,7 +1,6 @@
-"""Units of the axes of a cloud, and the axis that is up, checked against the data."""
+"""Units of the axes of a cloud, checked against the data."""
 
 import re
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -31,17 +30,6 @@ _GEO_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 0.3048006}
 """Meters by the code of a unit in GeoTIFF keys."""
 _GEO_MODEL, _GEO_HORIZONTAL, _GEO_VERTICAL = 1024, 3076, 4099
 """GeoTIFF keys of the model (2: degrees), and of the units of x and y, and of z."""
-_MIN_ALONG = 0.966
-"""Minimum cosine of the angle between a plane and the axis that it faces: 15 degrees."""
-_MAX_ACROSS = 0.259
-"""Maximum cosine of the angle between a wall and the axis that is up."""
-_MIN_WALLS = 0.1
-"""Minimum ratio of walls to floor and ceiling: the faces of a single wall have none around them."""
-_END = 0.15
-"""Fraction of the height of a room at its bottom and top that contains floor and ceiling."""
-_MIN_PAIR = 2.0
-"""Minimum ratio of the floor and ceiling of another axis to everything that faces up, and to what
-faces the third axis. The walls of corridors and streets reach 1.5."""
 
 
 def describe_units(points: NDArray[np.floating], header: Mapping[str, Any] | None = None) -> str:
@@ -102,39 +90,4 @@ def _describe_header(header: Mapping[str, Any]) -> str:
     units = units if len(units) == 2 else [unit for unit in codes if unit is not None]
     if len(units) == 2 and abs(units[0] - units[1]) > _SAME_UNIT * units[0]:
         return f"x and y are in units of {units[0]:g} m, z of {units[1]:g} m; convert one of them"
-    return ""
-
-
-def likely_up(
-    normals: NDArray[np.floating],
-    positions: NDArray[np.floating],
-    areas: NDArray[np.floating],
-    up: NDArray[np.floating],
-) -> str:
-    """Return the axis whose floor and ceiling exceed all that faces up or another axis, or "".
-
-    Args:
-        normals: Unit normals of planes or points, shape ``(M, 3)``.
-        positions: Their centers, shape ``(M, 3)``.
-        areas: Their areas, shape ``(M,)``.
-        up: Assumed upward direction, shape ``(3,)``.
-
-    Example:
-        >>> normals, positions = np.eye(3), np.array([[0, 1.0, 1], [2, 0, 1], [2, 1, 0]])
-        >>> both = np.concatenate([positions, [4, 2, 2] - positions])
-        >>> likely_up(np.concatenate([normals] * 2), both, np.array([4, 40, 8] * 2), normals[2])
-        'y'
-    """
-    if len(normals) == 0:
-        return ""
-    low, high = np.quantile(positions, _QUANTILES, axis=0)
-    level = (positions - low) / np.maximum(high - low, sys.float_info.min)
-    faces = np.abs(normals @ np.column_stack([np.eye(3), up])) >= _MIN_ALONG
-    for i, axis in enumerate("xyz"):
-        ends = [faces[:, i] & at for at in (level[:, i] <= _END, level[:, i] >= 1 - _END)]
-        pair = 2 * min(areas[end].sum() for end in ends)
-        others = [areas[faces[:, j]].sum() for j in range(4) if j != i]
-        walls = areas[np.abs(normals[:, i]) <= _MAX_ACROSS].sum()
-        if pair > _MIN_PAIR * max(others) and walls > _MIN_WALLS * pair:
-            return axis
     return ""

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from torchrg import kernels
-from torchrg.axes import likely_up
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, describe_sampling, file_columns
@@ -16,6 +15,7 @@ from torchrg.config import load_config
 from torchrg.io import read_cloud
 from torchrg.neighbors import distinct_points, measure_sampling
 from torchrg.neighbors.knn import prepare_search
+from torchrg.regions.directions import likely_up
 from torchrg.structures import Array, Cloud
 
 _DIGITS = {4: 6, 8: 10}

@@ -29,8 +29,8 @@ from torchrg.normals import run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.precision import warn_about_coordinates
 from torchrg.regions import grow_regions, summarize_planes
+from torchrg.regions.classes import find_kinds
 from torchrg.regions.growth import needs_sampling, rank_by_count
-from torchrg.regions.kinds import find_kinds
 from torchrg.regions.selection import keep_planes, selected_rows
 from torchrg.structures import (
     UNLABELED,

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg.config import SelectionConfig, settings_of
 from torchrg.errors import CloudWarning, ConfigError, warn
 from torchrg.linalg.angles import unit_direction
-from torchrg.regions.kinds import find_kinds
+from torchrg.regions.classes import find_kinds
 from torchrg.structures import (
     PLANE_COLUMNS,
     PLANE_KINDS,

@@ -18,9 +18,9 @@ from torchrg.linalg.moments import Segments, to_column_major
 from torchrg.neighbors.knn import check_neighbors
 from torchrg.neighbors.order import distinct_rows, mark_distinct
 from torchrg.regions.adjacency import find_adjacency
+from torchrg.regions.classes import find_kinds
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
-from torchrg.regions.kinds import find_kinds
 from torchrg.regions.polygons import trace_polygon
 from torchrg.structures import Labels, Neighbors, PlaneAdjacency, Planes, Points, Rows
 

@@ -208,8 +208,8 @@ def render_cloud(
             and ceilings are found. Default: the voxels are segmented.
         view: See above.
         up: Up direction; ignored for ``"sensor"``.
-        azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction along or
-            across the largest wall that is nearest to x, so that clouds of one room share a camera.
+        azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction of
+            most walls nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
         elevation_deg: Elevation of the camera, in degrees. Default: 35, from above 90.
         width: Width in pixels, at most 8,192; with few enough subpixels, about 4,800 at the
