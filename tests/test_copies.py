@@ -16,7 +16,8 @@ from torchrg.metrics import score_labels, score_partition
 from torchrg.normals import ESTIMATORS, estimate_normals, orient_normals
 from torchrg.regions import summarize_planes
 from torchrg.result import Result
-from torchrg.structures import PLANE_COLUMNS, UNLABELED, Cloud
+from torchrg.structures import UNLABELED, Cloud
+from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.transforms import EstimateNormals, GrowRegions, MakeSuperpoints, OrientNormals
 
 COUNT = 1500

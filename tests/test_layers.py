@@ -14,11 +14,11 @@ from torchrg.metrics import score_labels
 from torchrg.scenes import make_room
 
 METHOD = [
-    {"axes", "errors", "version", "_parallel"},
-    {"precision"},
-    {"_checks", "_optional", "scratch", "structures"},
+    {"errors", "version", "_parallel"},
+    {"structures"},
+    {"_checks", "_optional", "scratch"},
     {"kernels"},
-    {"_opaque", "colors", "linalg", "neighbors", "config"},
+    {"_opaque", "linalg", "neighbors", "config"},
     {"robust"},
     {"normals", "regions", "metrics", "scenes"},
     {"pipeline"},
@@ -40,7 +40,7 @@ MODULES = {
 }
 """Every module of the package by its name."""
 UPWARD = {
-    "torchrg.structures": {"torchrg.render.notebook", "torchrg.render.page"},
+    "torchrg.structures.planes": {"torchrg.render.notebook", "torchrg.render.page"},
     "torchrg.pipeline.planes": {"torchrg.io"},
 }
 """The only imports upward, in functions: what a notebook shows, and the path of a cloud."""

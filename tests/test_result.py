@@ -19,7 +19,8 @@ from torchrg.neighbors.order import finite_rows
 from torchrg.render.page import make_page
 from torchrg.result import Result
 from torchrg.scenes import make_room
-from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes
+from torchrg.structures import Cloud, PlaneAdjacency, Planes
+from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.transforms import OrientNormals
 
 CLASSIC = load_config("classic")

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.colors import narrow_colors, read_colors
 from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
 from torchrg.io.fields import add_result_fields
@@ -40,14 +39,14 @@ from torchrg.regions.superpoints import majority_planes
 from torchrg.structures import (
     UNLABELED,
     Cloud,
-    FilePath,
     Neighbors,
     PlaneAdjacency,
     Planes,
     Segmentation,
     Superpoints,
-    are_integers,
 )
+from torchrg.structures.colors import narrow_colors, read_colors
+from torchrg.structures.points import FilePath, are_integers
 
 __all__ = ["Result", "read_result", "write_table"]
 __dir__ = __all__.copy

@@ -20,7 +20,8 @@ from torchrg.errors import ConfigError
 from torchrg.io import write_cloud
 from torchrg.regions.selection import keep_planes
 from torchrg.result import read_result
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Cloud
+from torchrg.structures import PLANE_KINDS, Cloud
+from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.transforms import SegmentDepth, SegmentPlanes
 
 SHELL = ("wall", "floor", "ceiling")

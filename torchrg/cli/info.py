@@ -16,7 +16,8 @@ from torchrg.io import read_cloud
 from torchrg.neighbors import distinct_points, measure_sampling
 from torchrg.neighbors.knn import prepare_search
 from torchrg.regions.directions import likely_up
-from torchrg.structures import Array, Cloud
+from torchrg.structures import Cloud
+from torchrg.structures.points import Array
 
 _DIGITS = {4: 6, 8: 10}
 """Significant digits printed for a coordinate, by its size in bytes. float32 has at most six; ten

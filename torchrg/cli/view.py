@@ -13,7 +13,6 @@ from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
 from torchrg.cli.loop import check_sidecar, is_viewer
-from torchrg.colors import narrow_colors
 from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.render import (
@@ -30,6 +29,7 @@ from torchrg.render.channels import COLOR_MODES
 from torchrg.render.page import MAX_SHOWN_POINTS
 from torchrg.result import Result, read_result
 from torchrg.structures import Cloud
+from torchrg.structures.colors import narrow_colors
 
 ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
 PageColorBy = Literal[ColorBy, "error", "normal-error"]

@@ -12,7 +12,6 @@ import torch
 from torch.utils.data import Dataset, Subset
 
 from torchrg._checks import as_tensor
-from torchrg.colors import read_colors
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
 from torchrg.errors import ConfigError, FormatError, add_note, warn
@@ -20,6 +19,7 @@ from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_clo
 from torchrg.io.files import decode_file, local_path
 from torchrg.io.npy import map_array, map_folder
 from torchrg.structures import Cloud
+from torchrg.structures.colors import read_colors
 from torchrg.transforms.rows import Sample, SampleDict
 
 Transform = Callable[[SampleDict], Sample]

@@ -22,7 +22,6 @@ import torch
 from numpy.typing import NDArray
 
 from torchrg._optional import require
-from torchrg.colors import narrow_colors
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.nag import encode_nag, make_nag
 from torchrg.datasets.pointcept import write_files, write_pointcept_scene, write_results
@@ -32,6 +31,7 @@ from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import normalize_file_name
 from torchrg.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints
+from torchrg.structures.colors import narrow_colors
 
 Files = dict[str, NDArray[Any] | bytes]
 """File contents by path below the output directory: arrays for ``.npy`` files, or bytes."""

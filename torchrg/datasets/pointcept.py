@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
-from torchrg.colors import narrow_colors, read_colors
 from torchrg.datasets.provenance import (
     Record,
     check_owned,
@@ -35,7 +34,9 @@ from torchrg.errors import FormatError
 from torchrg.io.files import atomic_path, create_folder, local_path
 from torchrg.io.npy import check_rows, map_array, map_folder
 from torchrg.result import PLANES_FILE, RECORD, describe_planes
-from torchrg.structures import Array, Segmentation
+from torchrg.structures import Segmentation
+from torchrg.structures.colors import narrow_colors, read_colors
+from torchrg.structures.points import Array
 
 POINT_ARRAYS = (
     "coord", "color", "normal", "strength", "segment", "segment20", "segment200", "instance",

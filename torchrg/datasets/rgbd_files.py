@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
-from torchrg.colors import BYTE, WORD, narrow_colors
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.errors import FormatError
 from torchrg.io.files import (
@@ -26,7 +25,8 @@ from torchrg.io.files import (
     local_path,
     wrap_errors,
 )
-from torchrg.structures import Array
+from torchrg.structures.colors import BYTE, WORD, narrow_colors
+from torchrg.structures.points import Array
 
 Value = TypeVar("Value")
 DEPTH_SUFFIXES = (".png", ".npy", ".pgm")

@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
-from torchrg.colors import find_white, narrow_colors, read_colors
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
 from torchrg.io.files import check_file, local_path
 from torchrg.structures import Cloud
+from torchrg.structures.colors import find_white, narrow_colors, read_colors
 
 CLASS_ORDERS = {
     "pointcept": (

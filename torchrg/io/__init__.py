@@ -22,7 +22,8 @@ from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.text import count_text, read_text, write_text
 from torchrg.io.vg import write_vg
 from torchrg.plane_table import planes_to_arrays
-from torchrg.structures import Cloud, FilePath, Points, Segmentation, Superpoints
+from torchrg.structures import Cloud, Segmentation, Superpoints
+from torchrg.structures.points import FilePath, Points
 
 __all__ = [
     "FOLDER_SUFFIXES",
@@ -99,7 +100,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
     Convention:
         Coordinates and fields are returned unchanged, including non-finite points. Field names do
         not depend on the format (see :mod:`torchrg.io.fields`): ``labels`` int64, ``normals``,
-        ``curvature``, ``intensity``, ``color`` uint8 or uint16 (see :mod:`torchrg.colors`).
+        ``curvature``, ``intensity``, ``color`` uint8 or uint16 (:mod:`torchrg.structures.colors`).
         :attr:`torchrg.Cloud.notes` lists assumptions, such as guessed column names, and skipped
         data, such as images. Mesh faces and scan poses give the side from which each point was
         seen, :attr:`torchrg.Cloud.front`.

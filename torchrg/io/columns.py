@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchrg.colors import narrow_colors, read_colors
 from torchrg.errors import FormatError
 from torchrg.io.fields import MAX_EXACT_INTEGER, SKIPPED, NamedColumns, backup_name
 from torchrg.io.files import atomic_path
-from torchrg.structures import Array, Cloud
+from torchrg.structures import Cloud
+from torchrg.structures.colors import narrow_colors, read_colors
+from torchrg.structures.points import Array
 
 _RECORDS_PER_CHUNK = 1 << 20
 """Number of records converted and written at a time, which bounds the memory."""

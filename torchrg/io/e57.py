@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
-from torchrg.colors import WIDEN, read_colors
 from torchrg.errors import FormatError
 from torchrg.io.fields import assemble_cloud
 from torchrg.io.files import PARSE_ERRORS, check_available, wrap_errors
 from torchrg.io.headers import check_grid, distance_outside
 from torchrg.io.mesh import Fronts
-from torchrg.structures import FARTHEST, Array, Cloud, bounding_box
+from torchrg.structures import FARTHEST, Cloud
+from torchrg.structures.colors import WIDEN, read_colors
+from torchrg.structures.points import Array, bounding_box
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.colors import read_colors
 from torchrg.errors import FormatError
 from torchrg.io.tables import check_table, guess_column_names, warn_about_counters
-from torchrg.structures import UNLABELED, Array, Cloud, are_integers
+from torchrg.structures import UNLABELED, Cloud
+from torchrg.structures.colors import read_colors
+from torchrg.structures.points import Array, are_integers
 
 NamedColumns = Mapping[str, Array]
 """Per-point values by name, each of shape ``(N, ...)``."""

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from torchrg.errors import FormatError, system_limit
-from torchrg.structures import FilePath
+from torchrg.structures.points import FilePath
 
 PARSE_ERRORS = (
     ValueError,

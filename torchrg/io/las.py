@@ -18,7 +18,6 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg._optional import require
-from torchrg.colors import WIDEN
 from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, row_slices
 from torchrg.io.fields import NamedColumns, assemble_cloud, check_coordinates
@@ -31,7 +30,9 @@ from torchrg.io.files import (
     wrap_errors,
 )
 from torchrg.io.headers import MAX_INTEGER, check_grid, distance_outside
-from torchrg.structures import Array, Cloud, are_integers, bounding_box
+from torchrg.structures import Cloud
+from torchrg.structures.colors import WIDEN
+from torchrg.structures.points import Array, are_integers, bounding_box
 
 _FIELD_NAMES = FieldNames(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True

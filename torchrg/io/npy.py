@@ -40,7 +40,8 @@ from torchrg.io.files import (
 )
 from torchrg.io.tables import check_table
 from torchrg.plane_table import planes_to_arrays
-from torchrg.structures import Array, Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
+from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
+from torchrg.structures.points import Array
 
 _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""

@@ -18,7 +18,8 @@ from torchrg.io.columns import FieldNames, flatten_cloud, write_records
 from torchrg.io.fields import NamedColumns, assemble_cloud
 from torchrg.io.files import check_available, check_end, open_lines, split_words
 from torchrg.io.text import read_rows
-from torchrg.structures import FARTHEST, Array, Cloud
+from torchrg.structures import FARTHEST, Cloud
+from torchrg.structures.points import Array
 
 _MAX_HEADER_BYTES = 1 << 16
 """Maximum bytes of a header; a longer one counts as corrupt."""

@@ -27,7 +27,8 @@ from torchrg.io.fields import MAX_EXACT_INTEGER, assemble_cloud
 from torchrg.io.files import check_available, check_end, open_lines, split_words
 from torchrg.io.mesh import Fronts, find_fronts
 from torchrg.io.text import read_rows, skip_lines
-from torchrg.structures import Array, Cloud
+from torchrg.structures import Cloud
+from torchrg.structures.points import Array
 
 _TYPES = {
     "char": "i1",

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.colors import BYTE, WORD
 from torchrg.errors import FormatError, warn
-from torchrg.structures import are_integers
+from torchrg.structures.colors import BYTE, WORD
+from torchrg.structures.points import are_integers
 
 Table = NDArray[Any]
 """Numbers of shape ``(N, C)``."""

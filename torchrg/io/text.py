@@ -25,7 +25,8 @@ from torchrg.io.arrow import parse_numbers
 from torchrg.io.columns import FieldNames, check_exact, flatten_cloud, row_slices
 from torchrg.io.fields import SKIPPED, assemble_table, check_names
 from torchrg.io.files import atomic_path, check_available, find_encoding
-from torchrg.structures import Array, Cloud
+from torchrg.structures import Cloud
+from torchrg.structures.points import Array
 
 LINES_PER_CHUNK = 65_536
 """Lines parsed or formatted together, which bounds the memory."""

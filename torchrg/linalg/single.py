@@ -4,8 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.precision import is_fine_step
-from torchrg.structures import FARTHEST, bounding_box, local_origin
+from torchrg.structures import FARTHEST
+from torchrg.structures.points import bounding_box, local_origin
+from torchrg.structures.precision import is_fine_step
 
 
 def to_single(points: Tensor) -> Tensor:

@@ -27,7 +27,8 @@ from torchrg._parallel import (
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.order import canonical_order, distinct_rows, mark_distinct
-from torchrg.structures import MAX_POINTS, Neighbors, Points, Rows, bounding_box
+from torchrg.structures import MAX_POINTS, Neighbors
+from torchrg.structures.points import Points, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Number of sampled points that estimate the distance of the k-th neighbor."""

@@ -11,7 +11,8 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
-from torchrg.structures import UNLABELED, Points, bounding_box
+from torchrg.structures import UNLABELED
+from torchrg.structures.points import Points, bounding_box
 
 MORTON_BITS = 21
 """Bits per coordinate in a Morton code: three of them fit int64."""

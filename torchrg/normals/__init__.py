@@ -48,9 +48,10 @@ from torchrg.normals.orient import (
 )
 from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
 from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
-from torchrg.precision import warn_about_coordinates
 from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
-from torchrg.structures import Cloud, Neighbors, NormalFit, Points
+from torchrg.structures import Cloud, Neighbors, NormalFit
+from torchrg.structures.points import Points
+from torchrg.structures.precision import warn_about_coordinates
 
 __all__ = [
     "ESTIMATORS",

@@ -24,7 +24,8 @@ from torchrg.neighbors.knn import check_neighbors
 from torchrg.neighbors.order import distinct_rows
 from torchrg.normals.faces import find_faces, find_surfaces
 from torchrg.normals.free_space import cell_width, vote_free_side
-from torchrg.structures import UNLABELED, Cloud, Neighbors, Points
+from torchrg.structures import UNLABELED, Cloud, Neighbors
+from torchrg.structures.points import Points
 
 Orientation = Literal[
     "auto", "interior", "viewpoint", "consistent", "up", "+x", "-x", "+y", "-y", "+z", "-z", "none"

@@ -25,16 +25,10 @@ from torchrg.errors import (
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline.planes import segment_planes
 from torchrg.pipeline.superpoints import make_superpoints
-from torchrg.precision import describe_placeholders
 from torchrg.regions.selection import keep_planes, renumber_planes, selected_rows
-from torchrg.structures import (
-    FARTHEST,
-    Cloud,
-    Segmentation,
-    Superpoints,
-    are_integers,
-    bounding_box,
-)
+from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints
+from torchrg.structures.points import are_integers, bounding_box
+from torchrg.structures.precision import describe_placeholders
 
 Returned = TypeVar("Returned")
 

@@ -27,23 +27,14 @@ from torchrg.neighbors.knn import restrict_to_groups, search_distinct
 from torchrg.neighbors.order import DistinctPoints
 from torchrg.normals import run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
-from torchrg.precision import warn_about_coordinates
 from torchrg.regions import grow_regions, summarize_planes
 from torchrg.regions.classes import find_kinds
 from torchrg.regions.growth import needs_sampling, rank_by_count
 from torchrg.regions.selection import keep_planes, selected_rows
-from torchrg.structures import (
-    UNLABELED,
-    Cloud,
-    DeferredKind,
-    FilePath,
-    Labels,
-    Neighbors,
-    Planes,
-    Points,
-    Rows,
-    Segmentation,
-)
+from torchrg.structures import UNLABELED, Cloud, Neighbors, Planes, Segmentation
+from torchrg.structures.planes import DeferredKind
+from torchrg.structures.points import FilePath, Labels, Points, Rows
+from torchrg.structures.precision import warn_about_coordinates
 
 _MIN_NEIGHBORHOODS = 2
 """Minimum number of points of a cloud, in neighborhoods; fewer points have one plane for all."""

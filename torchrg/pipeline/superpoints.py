@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
-from torchrg.colors import read_colors
 from torchrg.config import AnyConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError, warn
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.pipeline.planes import segment_planes
 from torchrg.regions import partition_points
 from torchrg.regions.superpoints import merge_duplicates
-from torchrg.structures import UNLABELED, Colors, Labels, Points, Segmentation, Superpoints
+from torchrg.structures import UNLABELED, Segmentation, Superpoints
+from torchrg.structures.colors import read_colors
+from torchrg.structures.points import Colors, Labels, Points
 
 _STRENGTH_OF_K = 100.0
 """Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
@@ -54,8 +55,8 @@ def make_superpoints(
             ``consensus``.
         config: Configuration or dictionary.
         colors: Colors, shape ``(N, 3)``, in 0..1, 0..255 or 0..65535, as determined by
-            :func:`torchrg.colors.find_white`. Duplicates share the midrange of each channel.
-            Default: colors are ignored.
+            :func:`torchrg.structures.colors.find_white`. Duplicates share the midrange of each
+            channel. Default: colors are ignored.
         voxel: Voxel size, in the unit of the cloud. One point per voxel is partitioned, and every
             point gets the superpoint of its voxel. Sizes and the numbering then count voxels.
             Default: partition all points.

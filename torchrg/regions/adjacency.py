@@ -21,7 +21,8 @@ from torchrg._parallel import (
     split_rows,
 )
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.structures import Neighbors, PlaneAdjacency, Rows
+from torchrg.structures import Neighbors, PlaneAdjacency
+from torchrg.structures.points import Rows
 
 NUM_CONTACTS = 8
 """Nearest neighbors that count as adjacent; farther neighbors reach across gaps."""

@@ -22,7 +22,8 @@ from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.neighbors.knn import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
-from torchrg.structures import Neighbors, Rows
+from torchrg.structures import Neighbors
+from torchrg.structures.points import Rows
 
 
 class GrowingInput(NamedTuple):

@@ -32,7 +32,8 @@ from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, 
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
-from torchrg.structures import UNLABELED, Colors, Neighbors, Points, Values
+from torchrg.structures import UNLABELED, Neighbors
+from torchrg.structures.points import Colors, Points, Values
 
 _ROOTS_AT_ONCE = 1024
 """Number of roots between two releases of memory-mapped arrays. Each root may map about 200 kB of

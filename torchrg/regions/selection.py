@@ -14,7 +14,6 @@ from torchrg.errors import CloudWarning, ConfigError, warn
 from torchrg.linalg.angles import unit_direction
 from torchrg.regions.classes import find_kinds
 from torchrg.structures import (
-    PLANE_COLUMNS,
     PLANE_KINDS,
     UNLABELED,
     PlaneAdjacency,
@@ -22,6 +21,7 @@ from torchrg.structures import (
     Planes,
     Segmentation,
 )
+from torchrg.structures.planes import PLANE_COLUMNS
 
 _MIN_RATIO = 1e-4
 """Ratio of the minimum area to the area of the smallest plane below which it is probably given in

@@ -22,7 +22,8 @@ from torchrg.regions.classes import find_kinds
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
 from torchrg.regions.polygons import trace_polygon
-from torchrg.structures import Labels, Neighbors, PlaneAdjacency, Planes, Points, Rows
+from torchrg.structures import Neighbors, PlaneAdjacency, Planes
+from torchrg.structures.points import Labels, Points, Rows
 
 _Polygons = tuple[tuple[Tensor, ...], ...]
 

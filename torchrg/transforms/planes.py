@@ -14,7 +14,6 @@ from torch import Tensor
 
 from torchrg._checks import check_choices
 from torchrg._parallel import CHUNK_SIZE
-from torchrg.colors import find_white
 from torchrg.config import (
     AnyConfig,
     GrowingConfig,
@@ -31,6 +30,7 @@ from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.regions.growth import rank_by_count
 from torchrg.structures import UNLABELED
+from torchrg.structures.colors import find_white
 from torchrg.transforms.rows import Sample, cloud_rows
 from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.structures import Array
+from torchrg.structures.points import Array
 
 Sample = Any
 """A sample: a dict of tensors, NumPy arrays and other values, or a PyG ``Data`` or ``Batch``."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.axes import describe_units
 from torchrg.errors import PrecisionWarning, UnitWarning, warn
+from torchrg.structures.units import describe_units
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
 """Rounding steps, in spacings of the points, above which there is a note: for float32, and for the

@@ -13,7 +13,7 @@ from torchrg.batch.sources import CloudSource
 from torchrg.datasets import FolderOfClouds
 from torchrg.errors import PrecisionWarning
 from torchrg.pipeline.clouds import check_finite
-from torchrg.precision import describe_placeholders, describe_steps
+from torchrg.structures.precision import describe_placeholders, describe_steps
 from torchrg.transforms import SegmentPlanes
 
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])
