@@ -29,14 +29,13 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, eager_only
-from torchrg._parallel import CHUNK_SIZE, limit_rows
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
-from torchrg.linalg.single import to_single
 from torchrg.neighbors import distinct_points
 from torchrg.neighbors.knn import check_neighbors, search_distinct
-from torchrg.normals.consensus import estimate_consensus
-from torchrg.normals.irls import estimate_irls, fit_normals_irls
+from torchrg.normals.estimators import ESTIMATORS, WITHOUT_GRADIENT, run_estimator
+from torchrg.normals.irls import fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import (
     Orientation,
@@ -46,9 +45,8 @@ from torchrg.normals.orient import (
     orient_normals,
     turn_faces,
 )
-from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
-from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
-from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
+from torchrg.normals.paper import find_sharp_points, fit_normals_robust
+from torchrg.normals.pca import fit_normals_pca
 from torchrg.structures import Cloud, Neighbors, NormalFit
 from torchrg.structures.points import Points
 from torchrg.structures.precision import warn_about_coordinates
@@ -67,45 +65,6 @@ __all__ = [
     "orient_normals",
 ]
 __dir__ = __all__.copy
-
-_MCD = {"support_fraction": "support_fraction", "quantile": "inlier_quantile"}
-_DETMCD = _MCD | {"scaling": "mcd_scaling", "inliers": "mcd_inliers"}
-
-ESTIMATORS: dict[str, Estimator] = {
-    "pca": lambda points, neighbors, _, chunk_size: fit_points_pca(
-        points, neighbors, chunk_size=chunk_size
-    ),
-    "jet": at_all_points(fit_normals_jet),
-    "irls": estimate_irls,
-    "fastmcd": at_all_points(partial(fit_normals_robust, estimator=fit_fastmcd), **_MCD),
-    "mve": at_all_points(partial(fit_normals_robust, estimator=fit_mve), **_MCD),
-    "detmcd": at_all_points(partial(fit_normals_robust, estimator=fit_detmcd), **_DETMCD),
-    "detmm": at_all_points(
-        partial(fit_normals_robust, estimator=fit_detmm), quantile="inlier_quantile"
-    ),
-    "paper": estimate_paper,
-    "consensus": estimate_consensus,
-}
-"""Estimators by name: points, neighbors, configuration, chunk size -> fit."""
-
-WITHOUT_GRADIENT = {"consensus"}
-"""Estimators without gradients, because they select and smooth planes in several steps."""
-
-
-def run_estimator(
-    points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
-) -> NormalFit:
-    """Fit the neighborhoods of finite points ``(N, 3)``; ``chunk_size`` is for typical ones.
-
-    Float64 points are fitted in float32 if it is fine enough; the fit has the dtype of the points.
-    """
-    width = max(neighbors.indices.shape[1], config.adaptive_k or 0)
-    single, chunk_size = to_single(points), limit_rows(chunk_size, width)
-    fit = ESTIMATORS[config.method](single, neighbors, config, chunk_size)
-    if single.dtype == points.dtype:
-        return fit
-    normals, curvature, rms = (values.to(points) for values in (*fit[:2], fit.residual_rms))
-    return fit._replace(normals=normals, curvature=curvature, residual_rms=rms)
 
 
 @eager_only

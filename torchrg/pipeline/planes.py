@@ -25,7 +25,7 @@ from torchrg.neighbors import (
 )
 from torchrg.neighbors.knn import restrict_to_groups, search_distinct
 from torchrg.neighbors.order import DistinctPoints
-from torchrg.normals import run_estimator
+from torchrg.normals.estimators import run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.regions import grow_regions, summarize_planes
 from torchrg.regions.classes import find_kinds
