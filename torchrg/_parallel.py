@@ -155,10 +155,6 @@ def map_tasks(
     """Return the result of ``work`` for each task; on a CPU, multi-threaded.
 
     Every task writes different rows, so the result does not depend on the number of threads.
-
-    Example:
-        >>> map_tasks(len, ["a", "bc"], torch.device("cpu"))
-        [1, 2]
     """
     if device.type != "cpu":
         return [work(task) for task in tasks]
@@ -207,14 +203,6 @@ def sequential_operations() -> Iterator[None]:
 
     :func:`map_tasks` still uses torch's previous number of threads. Unlike
     :func:`torch.set_num_threads`, this does not change other threads.
-
-    Example:
-        >>> before = torch.get_num_threads()
-        >>> with sequential_operations():
-        ...     print(torch.get_num_threads())
-        1
-        >>> torch.get_num_threads() == before
-        True
     """
     if _THREADS.get() is not None:
         yield

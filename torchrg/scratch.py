@@ -90,13 +90,7 @@ def is_active() -> bool:
 
 
 def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
-    """Return an uninitialized array: ``numpy.empty``, or a map on disk if large and active.
-
-    Example:
-        >>> with on_disk("."):
-        ...     empty((3, 2), np.int32).shape
-        (3, 2)
-    """
+    """Return an uninitialized array: ``numpy.empty``, or a map on disk if large and active."""
     folder, size = _folder.get(), math.prod(shape) * np.dtype(dtype).itemsize
     if folder is None or size < _MIN_BYTES:
         return np.empty(shape, dtype)

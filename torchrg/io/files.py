@@ -78,17 +78,6 @@ def atomic_path(
 
     Raises:
         FormatError: If the folder does not exist, or the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "a.txt"
-        ...     with atomic_path(path) as temporary:
-        ...         _ = temporary.write_text("complete")
-        ...         print(path.exists())
-        ...     print(path.read_text())
-        False
-        complete
     """
     target = Path(os.path.realpath(path))
     end = f".{mark or make_mark()}{secrets.token_hex(4)}{target.suffix}"
@@ -119,15 +108,6 @@ def remove_leftovers(folder: Path, mark: str = "") -> None:
 
     No process may be writing there under the same mark. Default: any mark, for a folder in which
     only this process writes.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     for name in ("a.txt", ".a.0123456789abcdef01234567.txt", ".a.other.txt"):
-        ...         Path(folder, name).touch()
-        ...     remove_leftovers(Path(folder), "0123456789abcdef")
-        ...     sorted(path.name for path in Path(folder).iterdir())
-        ['.a.other.txt', 'a.txt']
     """
     for path in find_leftovers(folder, mark):
         if path.is_dir():

@@ -116,13 +116,6 @@ class Segments:
     device scheduling. ``labels`` ``(N,)`` are 0 to M-1, none missing, or negative. At most
     ``max_points`` points per region are taken, evenly spaced along their rows (default: all).
     Regions have ``sizes`` ``(M,)`` points, of which ``counts`` are taken.
-
-    Example:
-        >>> segments = Segments(torch.tensor([1, 0, -1, 1]))
-        >>> segments.counts.tolist(), segments.rows.tolist()
-        ([1, 2], [1, 0, 3])
-        >>> segments.mean(segments.gather(torch.tensor([1.0, 2.0, 9.0, 3.0]))).tolist()
-        [2.0, 2.0]
     """
 
     def __init__(self, labels: Tensor, *, max_points: int | None = None) -> None:

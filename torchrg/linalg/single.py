@@ -15,12 +15,6 @@ def to_single(points: Tensor) -> Tensor:
     Estimators and region growing depend on differences of coordinates alone. The points are
     therefore relative to :func:`torchrg.structures.local_origin`, as those of a cloud are. Other
     points are unchanged: of another dtype or device, or with gradients.
-
-    Example:
-        >>> points = 5e5 + torch.rand(100, 3, dtype=torch.float64)
-        >>> outlier = points[:1] + 1e9
-        >>> to_single(points).dtype, to_single(torch.cat([points, outlier])).dtype
-        (torch.float32, torch.float64)
     """
     is_plain = points.device.type == "cpu" and not points.requires_grad
     if points.dtype != torch.float64 or not is_plain or len(points) == 0:

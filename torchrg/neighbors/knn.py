@@ -200,16 +200,6 @@ def restrict_to_groups(
         groups: Group of each point, shape ``(N,)``, from 0 if ``position_rows`` are passed.
         chunk_size: Points processed at a time.
         position_rows: Index of each point's position, shape ``(N,)``. Default: the row.
-
-    Example:
-        >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
-        >>> kept = restrict_to_groups(near, torch.tensor([4, 7, 4]), 3)
-        >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
-        ([[0, 2, 0], [1, 1, 1], [2, 0, 2]], [2, 1, 2])
-        >>> groups, index = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 1, 2])
-        >>> kept = restrict_to_groups(near, groups, 4, index)
-        >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
-        ([[0, 1, 0], [1, 0, 1], [2, 3, 2], [3, 2, 3]], [2, 2, 2, 2])
     """
     shape, device = (len(groups), neighbors.indices.shape[1]), groups.device
     indices, valid = (scratch.empty(shape, kind) for kind in (np.int32, np.bool_))
@@ -487,11 +477,6 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
 
     ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. Each
     coordinate is contiguous in memory, so that ``patches.unbind(-1)`` gives fast columns.
-
-    Example:
-        >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])
-        >>> gather_patches(points, torch.tensor([[0, 1]])).tolist()
-        [[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]]
     """
     flat = indices.reshape(-1)
     if points.requires_grad and torch.is_grad_enabled():

@@ -71,12 +71,7 @@ def canonical_order(points: Points, ties: Sequence[Tensor] = ()) -> Tensor:
 
 
 def finite_rows(points: Tensor, ties: Sequence[Tensor] = ()) -> Tensor:
-    """Return the rows of the finite points ``(N, 3)`` in :func:`canonical_order`, int64.
-
-    Example:
-        >>> finite_rows(torch.tensor([[3.0, 0, 0], [torch.nan, 0, 0], [2, 0, 0]])).tolist()
-        [2, 0]
-    """
+    """Return the rows of the finite points ``(N, 3)`` in :func:`canonical_order`, int64."""
     x, y, z = points.isfinite().unbind(dim=-1)
     is_finite = x & y & z
     if bool(is_finite.all()):

@@ -112,15 +112,7 @@ def find_adjacency(
 
 
 class KnnAdjacency:
-    """Adjacency of a point cloud: up to 8 nearest neighbors per point.
-
-    Example:
-        >>> adjacency = KnnAdjacency(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
-        >>> adjacency.neighbor_rows(torch.tensor([2, 0])).tolist()
-        [[1], [1]]
-        >>> adjacency.contacts(torch.tensor([0, 1, 1]))
-        (tensor([[0, 1]]), tensor([2]))
-    """
+    """Adjacency of a point cloud: up to 8 nearest neighbors per point."""
 
     def __init__(self, neighbors: Neighbors) -> None:
         columns, valid = slice(1, NUM_CONTACTS + 1), neighbors.valid

@@ -95,16 +95,6 @@ def transform_planes(planes: Planes, motion: Tensor) -> Planes:
     """Apply a rigid transform ``(4, 4)`` to a plane table.
 
     Normals keep the canonical sign of plane tables.
-
-    Example:
-        >>> from torchrg.regions import summarize_planes
-        >>> floor = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
-        >>> up = torch.tensor([0.0, 0, 1]).expand(16, 3)
-        >>> table = summarize_planes(floor, up, torch.zeros(16, dtype=torch.int64))
-        >>> motion = torch.eye(4, dtype=torch.float64)
-        >>> motion[2, 3] = 5
-        >>> transform_planes(table, motion).offset.tolist()
-        [5.0]
     """
     check_rigid("transform_planes", "motion", motion)
     dtype = planes.normal.dtype
@@ -141,14 +131,6 @@ def transform_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
     """Apply a rigid transform ``(4, 4)`` to the coordinates and normals of a cloud.
 
     Positions in the file header, such as a viewpoint or a coordinate system, are dropped.
-
-    Example:
-        >>> import numpy as np
-        >>> cloud = Cloud(np.array([[1.0, 2, 3]]), {"normals": np.array([[1.0, 0, 0]])})
-        >>> quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        >>> moved = transform_cloud(cloud, quarter.double())
-        >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
-        ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
     """
     check_rigid("transform_cloud", "motion", motion)
     rotation, coordinates, finite = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite

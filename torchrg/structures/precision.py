@@ -52,13 +52,6 @@ def describe_steps(
             rounding step of float64 are ignored.
         scale: Step of the coordinates in their file. Default: none.
         fix: Fix if the type, not the scale, is too coarse.
-
-    Example:
-        >>> points = np.random.default_rng(0).random((1000, 3), dtype=np.float32)
-        >>> describe_steps(points)
-        ''
-        >>> describe_steps(points + np.float32(5_400_000))  # doctest: +ELLIPSIS
-        'coordinates have steps of 0.5 for a spacing of about 0.03; write float64, or subtract ...'
     """
     is_single = points.dtype == np.float32
     if not is_single and scale == 0:

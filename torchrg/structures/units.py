@@ -38,13 +38,6 @@ def describe_units(points: NDArray[np.floating], header: Mapping[str, Any] | Non
     Args:
         points: Coordinates with z up, shape ``(N, 3)``; points that are not finite are ignored.
         header: See ``Cloud.header``; the reference system in it decides.
-
-    Example:
-        >>> room = np.random.default_rng(0).random((1000, 3))
-        >>> describe_units(room * [8, 6, 3])
-        ''
-        >>> describe_units(room * [1e-4, 1e-4, 3])
-        'x and y span 9.8e-05, z spans 2.9: one unit is unlikely; convert degrees or units first'
     """
     if note := _describe_header(header or {}):
         return note
