@@ -25,13 +25,7 @@ from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.order import distinct_rows
-from torchrg.plane_table import (
-    Arrays,
-    Json,
-    described_to_arrays,
-    encode_csv,
-    planes_from_arrays,
-)
+from torchrg.plane_table import Arrays, Json, described_to_arrays, encode_csv, planes_from_arrays
 from torchrg.plane_table import describe_planes as describe_planes
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency

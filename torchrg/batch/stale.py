@@ -18,12 +18,7 @@ from torchrg.batch.records import RECORD
 from torchrg.batch.run import LOCK, read_root
 from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
-from torchrg.datasets.provenance import (
-    Record,
-    check_source,
-    read_record,
-    recorded_paths,
-)
+from torchrg.datasets.provenance import Record, check_source, read_record, recorded_paths
 from torchrg.errors import FormatError
 from torchrg.io.files import (
     OUTPUT_MARK,

@@ -24,12 +24,7 @@ from torchrg.datasets.rgbd_files import (
     refuse_form,
 )
 from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, ListedFrame, find_layout, find_recordings
-from torchrg.depth.camera import (
-    Pinhole,
-    check_camera,
-    describe_improbable_view,
-    unproject_image,
-)
+from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view, unproject_image
 from torchrg.depth.values import DepthKind, check_conversion
 from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError, warn
 from torchrg.io.files import local_path, wrap_errors

@@ -144,7 +144,7 @@ def _list_area(root: Path, area: int) -> list[SceneFiles]:
         missing = f" ({', '.join(bare)}: no {ANNOTATIONS})" if bare else ""
         warn(
             f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{missing}; "
-            "download the missing rooms unless this is intended.",
+            "download the missing rooms unless this is intended."
         )
     return [
         SceneFiles(f"{folder.name}/{room.name}", room, object_files(room), "S3DIS")

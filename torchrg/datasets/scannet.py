@@ -273,7 +273,7 @@ def _warn_missing_scans(lists: Mapping[str, tuple[str, Path]], scans: set[str]) 
     if missing:
         warn(
             f"{lists[missing[0]][1]}: {len(missing):,} of {len(lists):,} listed scans are missing "
-            f"(first: {shortened(missing[0])}); download them, or correct the names.",
+            f"(first: {shortened(missing[0])}); download them, or correct the names."
         )
 
 

@@ -100,11 +100,7 @@ def segment_depth(
 
 
 def _segment(
-    depth: Tensor,
-    intrinsics: Tensor,
-    config: DepthConfig,
-    pose: Tensor | None,
-    orient: Orientation,
+    depth: Tensor, intrinsics: Tensor, config: DepthConfig, pose: Tensor | None, orient: Orientation
 ) -> Segmentation:
     """Implement :func:`segment_depth`."""
     if depth.numel() == 0:

@@ -25,13 +25,7 @@ from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, Segmentation, Superpoints
 from torchrg.structures.points import FilePath, Points
 
-__all__ = [
-    "FOLDER_SUFFIXES",
-    "FORMATS",
-    "RESULT_FIELDS",
-    "read_cloud",
-    "write_cloud",
-]
+__all__ = ["FOLDER_SUFFIXES", "FORMATS", "RESULT_FIELDS", "read_cloud", "write_cloud"]
 __dir__ = __all__.copy
 
 

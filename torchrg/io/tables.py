@@ -147,7 +147,7 @@ def warn_about_counters(path: Path, table: Table, names: Sequence[str]) -> None:
     if 0 < len(wrong) < 3 <= len(others):
         warn(
             f"{path}: values only count up in column {' and '.join(wrong)}, as those of an index "
-            f"or of time; if these are no coordinates, {_NAME_THEM}.",
+            f"or of time; if these are no coordinates, {_NAME_THEM}."
         )
 
 

@@ -368,7 +368,7 @@ def _warn_about_names(path: Path, comment: str, num_columns: int) -> None:
     if any(not any(map(_is_number, row)) for row in readings):
         warn(
             f"{path}: its comment names columns {comment.strip()[:60]!r}, none of them x, y and z: "
-            "the first three are taken; name the columns with --columns.",
+            "the first three are taken; name the columns with --columns."
         )
 
 

@@ -220,7 +220,7 @@ def _library() -> ctypes.CDLL | None:
     if _is_stale(path):
         warn(
             "torchrg runs without its kernels, which are older than their sources; run "
-            "pip install -e . again.",
+            "pip install -e . again."
         )
         return None
     if path.exists():
@@ -233,12 +233,10 @@ def _library() -> ctypes.CDLL | None:
             for name in SIGNATURES:
                 getattr(library, name).restype = ctypes.c_int64
             return library
-        warn(
-            "torchrg runs without its kernels, which are of another version; install it again.",
-        )
+        warn("torchrg runs without its kernels, which are of another version; install it again.")
         return None
     warn(
         "torchrg runs without its kernels, several times slower; install a C++ compiler and "
-        "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install).",
+        "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install)."
     )
     return None

@@ -204,10 +204,7 @@ def _rows_near(
 
 
 def _search_each(
-    points: NDArray[np.floating],
-    rows: NDArray[np.int64],
-    queries: NDArray[np.int64],
-    k: int,
+    points: NDArray[np.floating], rows: NDArray[np.int64], queries: NDArray[np.int64], k: int
 ) -> NDArray[np.int64]:
     """Return the nearest of many candidates for a few points, such as far outliers."""
     positions = points[queries].astype(np.float64)

@@ -246,9 +246,7 @@ def _fit_twice(
     plane = _Plane(start, torch.zeros_like(start), mu, start, mu)
     through = _fit_graduated(points, plane, limit, decay, shift=False)
     restarted = through._replace(
-        mu=torch.maximum(restart, limit),
-        weighed_normal=through.normal,
-        weighed_mu=through.mu,
+        mu=torch.maximum(restart, limit), weighed_normal=through.normal, weighed_mu=through.mu
     )
     near = _fit_graduated(points, restarted, limit, decay, shift=True)
     points = points.relative_to(near.center)

@@ -167,11 +167,7 @@ def _tangent_axes(frame: PrincipalFrame) -> Tensor:
 
 
 def _fit_height(
-    u: Tensor,
-    v: Tensor,
-    w: Tensor,
-    mask: Tensor | None,
-    rounding: Tensor,
+    u: Tensor, v: Tensor, w: Tensor, mask: Tensor | None, rounding: Tensor
 ) -> tuple[list[Tensor], Tensor]:
     """Return height, slopes and second derivatives, shape ``(*)`` each, and the residuals."""
     count = u.shape[-1] if mask is None else mask.sum(dim=-1, keepdim=True)

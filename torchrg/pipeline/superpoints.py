@@ -110,11 +110,7 @@ def make_superpoints(
     return Superpoints(labels, partition.plane, tuple(levels))
 
 
-def _unit_colors(
-    caller: str,
-    points: Tensor,
-    colors: Colors | None,
-) -> Tensor | None:
+def _unit_colors(caller: str, points: Tensor, colors: Colors | None) -> Tensor | None:
     """Return the colors of points in [0, 1], float64.
 
     Warns:

@@ -12,12 +12,7 @@ from torch import Tensor
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics.contingency import check_labels, contingency_table
 from torchrg.metrics.labels import match_regions
-from torchrg.render.colors import (
-    UNLABELED_GRAY,
-    color_curvature,
-    color_normals,
-    color_sharp,
-)
+from torchrg.render.colors import UNLABELED_GRAY, color_curvature, color_normals, color_sharp
 from torchrg.structures import UNLABELED
 
 COLOR_MODES = {

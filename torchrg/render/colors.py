@@ -93,11 +93,7 @@ def _similarity() -> Tensor:
 
 
 def choose_colors(
-    sizes: Tensor,
-    pairs: Tensor,
-    weights: Tensor,
-    *,
-    fixed: Tensor | None = None,
+    sizes: Tensor, pairs: Tensor, weights: Tensor, *, fixed: Tensor | None = None
 ) -> Tensor:
     """Choose a palette row for each plane greedily, the largest plane first.
 
@@ -299,10 +295,7 @@ def color_planes(
 
 
 def palette_of_planes(
-    labels: Tensor,
-    points: Tensor | None,
-    *,
-    reference: Tensor | None = None,
+    labels: Tensor, points: Tensor | None, *, reference: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return each point's palette row ``(N,)``, and the palette ``(M + 1, 3)``, uint8.
 
@@ -322,9 +315,7 @@ def palette_of_planes(
 
 
 def _choose(
-    labels: Tensor,
-    points: Tensor | None,
-    fixed: Tensor | None = None,
+    labels: Tensor, points: Tensor | None, fixed: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return each point's index among the existing labels, and the palette row of each label."""
     rows = number_labels(labels)[1]

@@ -153,9 +153,7 @@ def _discs(
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
     along = torch.where(
-        along.abs() < _MIN_COSINE,
-        torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE),
-        along,
+        along.abs() < _MIN_COSINE, torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE), along
     )
     return Discs(
         pixels,

@@ -20,13 +20,7 @@ from torchrg.robust.lanes import (
 )
 from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import sum_points
-from torchrg.robust.starts import (
-    MCDStarts,
-    draw_seed,
-    elemental_sets,
-    initial_sets,
-    random_subsets,
-)
+from torchrg.robust.starts import MCDStarts, draw_seed, elemental_sets, initial_sets, random_subsets
 from torchrg.robust.weights import (
     Estimate,
     Inliers,

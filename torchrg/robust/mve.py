@@ -107,14 +107,7 @@ def fit_mve(
         )
 
     return fit_patchwise(
-        "fit_mve",
-        patches,
-        mask,
-        support_fraction,
-        quantile,
-        chunk_size,
-        estimator,
-        min_dimension,
+        "fit_mve", patches, mask, support_fraction, quantile, chunk_size, estimator, min_dimension
     )
 
 

@@ -160,7 +160,7 @@ def fit_patchwise(
         repair = "; pass patches.mT if points are columns" * (num_points <= size)
         warn(
             f"{caller}: expected at least {2 * size} points per patch for {size} coordinates, got "
-            f"{num_points}: too few to trust the covariance{repair}.",
+            f"{num_points}: too few to trust the covariance{repair}."
         )
     dense = patches.detach().reshape(batch.numel(), num_points, size)
     counted = torch.isfinite(dense).all(dim=-1)

@@ -8,12 +8,7 @@ from torch import Tensor
 
 from torchrg.errors import ConfigError
 from torchrg.linalg.angles import at_most
-from torchrg.robust.lanes import (
-    covariance_entries,
-    fit_ellipsoid,
-    sorted_points,
-    sq_distances,
-)
+from torchrg.robust.lanes import covariance_entries, fit_ellipsoid, sorted_points, sq_distances
 from torchrg.robust.scale import sum_points
 
 Scaling = Literal["consistency", "quantile"]

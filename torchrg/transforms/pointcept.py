@@ -47,13 +47,7 @@ _FILES = ("plane", "curvature", "superpoint")
 class _ColumnFeatures(SampleTransform):
     """Mixin that adds a second axis to features, as Pointcept's ``Collect`` requires."""
 
-    def replace(
-        self,
-        sample: Sample,
-        values: Entries,
-        *,
-        per_point: Sequence[str] = (),
-    ) -> Sample:
+    def replace(self, sample: Sample, values: Entries, *, per_point: Sequence[str] = ()) -> Sample:
         """Return a new sample of the same type with other values by key."""
         columns = {self.key(sample, name) for name in _FEATURES}
         expanded = {

@@ -136,12 +136,7 @@ def check_lengths(caller: str, entries: Entries, num_points: int) -> None:
 
 
 def select_points(
-    caller: str,
-    sample: Sample,
-    rows: Tensor,
-    num_points: int,
-    *,
-    skip: Collection[str] = (),
+    caller: str, sample: Sample, rows: Tensor, num_points: int, *, skip: Collection[str] = ()
 ) -> SampleDict:
     """Return the entries of a sample that change when only ``rows`` (ascending) are kept.
 

@@ -130,13 +130,7 @@ class SampleTransform(nn.Module):
         # Pointcept stores scalars per point with two axes.
         return tensor.squeeze(-1) if name in TORCHRG_KEYS and tensor.ndim == 2 else tensor
 
-    def replace(
-        self,
-        sample: Sample,
-        values: Entries,
-        *,
-        per_point: Sequence[str] = (),
-    ) -> Sample:
+    def replace(self, sample: Sample, values: Entries, *, per_point: Sequence[str] = ()) -> Sample:
         """Return a new sample of the same type with other values by key.
 
         The keys in ``per_point`` are added to the list of per-point entries.
