@@ -34,7 +34,6 @@ _RELEASE_SECONDS = 0.01
 """Interval for releasing pages, in seconds. Meanwhile about 20 MB of an array are read."""
 _ZEROS = bytes(2**20)
 """Bytes that reserve disk space on systems without posix_fallocate, such as macOS."""
-
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 _folder: ContextVar[Path | None] = ContextVar("scratch", default=None)

@@ -29,7 +29,6 @@ _MAX_NOISE = 3.0
 _MIN_REACH = 2.0
 """Regions meet without a step if their planes intersect within this many pixels of the boundary, or
 within half the width of the strip."""
-
 _STRIDE = 4
 """Row and column stride of the search for hidden contacts."""
 _MIN_LINES = 2

@@ -23,7 +23,6 @@ from torchrg.structures.points import Array, are_integers
 
 NamedColumns = Mapping[str, Array]
 """Per-point values by name, each of shape ``(N, ...)``."""
-
 FIELD_NAMES = {
     "label": "labels",
     "labels": "labels",

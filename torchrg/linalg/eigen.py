@@ -17,14 +17,11 @@ from torchrg.linalg.tolerances import rank_tolerance
 _JACOBI_SWEEPS = 5
 """Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either
 dtype."""
-
 _FIRST_STEPS, _MAX_MORE_STEPS = 4, 36
 """Number of Newton steps for a simple root, and maximum number of further steps for a nearly double
 one, where each step halves the distance until the two roots separate."""
-
 _CONVERGED = 1e-9
 """Maximum last step of a converged root, as a fraction of the trace."""
-
 _NEARLY_EQUAL = 1e-9
 """Fraction of the squared largest eigenvalue below which the adjugate gives no direction."""
 

@@ -20,13 +20,11 @@ from torchrg.linalg.eigen import smallest_eigenvector3
 
 _MIN_POINTS = 2**14
 """Minimum number of points per thread."""
-
 _COORDINATE_KERNELS = {
     torch.float32: "segment_coordinates",
     torch.float64: "segment_coordinates_double",
 }
 """Kernels for the coordinates of vectors, by dtype."""
-
 _SORTED_SIZE = 50
 """Mean number of points per region below which one sort of all values is faster than a selection
 per region."""
@@ -332,7 +330,6 @@ def kth_smallest(values: Tensor, k: int) -> Tensor:
 
 _NUM_LANES = 8
 """Number of parallel accumulators in kernels, ``LANES`` in ``plain.h``."""
-
 Columns = tuple[Tensor, Tensor, Tensor]
 """Coordinates x, y and z of neighborhoods, each ``(n, K)`` and contiguous. The lanes of
 :mod:`torchrg.robust.lanes` are transposed, since robust fits sort every neighborhood."""

@@ -32,20 +32,15 @@ from torchrg.structures.points import Points, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Number of sampled points that estimate the distance of the k-th neighbor."""
-
 SomeNeighbors = Callable[[NDArray[np.integer]], NDArray[np.integer]]
 """Function from rows ``(n,)`` to their neighbors ``(n, k)``, each first its own."""
-
 _MIN_FOR_CELLS = 2000
 """Minimum number of points for which cells are faster than a tree."""
-
 _SIZE_STEP = 1.5
 """Ratio of a cell size to the smallest remaining distance of a k-th neighbor. Cells of one size
 serve points whose k-th neighbor is 1 / 1.75 to 1 size away."""
-
 _MIN_FRACTION = 0.03
 """Minimum fraction of the points for which another cell size is worth its sort."""
-
 _MAX_CELLS_PER_POINT = 8
 """Maximum number of cells per point in the bounding box, including empty ones, 4 bytes each."""
 

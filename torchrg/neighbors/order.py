@@ -16,7 +16,6 @@ from torchrg.structures.points import Points, bounding_box
 
 MORTON_BITS = 21
 """Bits per coordinate in a Morton code: three of them fit int64."""
-
 _SPREADS = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),

@@ -14,7 +14,6 @@ from torchrg.structures.points import Points
 
 _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
-
 _MAX_KEYS = 2**62
 """Maximum number of cells with distinct int64 keys; above the squared number of points."""
 

@@ -34,7 +34,6 @@ ESTIMATORS: dict[str, Estimator] = {
     "consensus": estimate_consensus,
 }
 """Estimators by name: points, neighbors, configuration, chunk size -> fit."""
-
 WITHOUT_GRADIENT = {"consensus"}
 """Estimators without gradients, because they select and smooth planes in several steps."""
 

@@ -21,7 +21,6 @@ from torchrg.structures import NormalFit
 
 _NUM_TERMS = 6
 """Number of terms of a quadratic in two coordinates, and the minimum number of points."""
-
 FLAT_PIVOT = 1e-5
 """Minimum fraction of its squared length that a paraboloid term must retain after the terms before
 it are removed. Normal equations in float32 then give the retained length fraction, the root of

@@ -33,27 +33,20 @@ Orientation = Literal[
 """Modes of normal orientation; see :func:`orient_normals`."""
 SearchDistinct = Callable[[Tensor, int], Neighbors]
 """Search of ``k`` neighbors among distinct finite points in canonical order, as transforms use."""
-
 NUM_NEIGHBORS = 20
 """Neighborhood size for orientation, including the point itself."""
-
 _NUM_VOTES = 256
 """Approximate number of voting points per face."""
-
 _HASH, _HASHES = 2654435761, 2**32
 """Knuth's multiplicative hash of a row; it selects the voting points."""
-
 _THICKNESS = 0.5
 """RMS height of a thin face, as a fraction of the cell width. Two faces farther apart have separate
 smooth patches."""
-
 _CLEARLY_OUTWARDS = 1e-3
 """Fraction of its maximum above which a volume or a mean normal is not a rounding error."""
-
 _FEW = 0.01
 """Maximum fraction of points with unknown front, such as vertices without faces, that follow their
 neighbors. More of them may form a part of the room and are oriented as ``"interior"``."""
-
 _AS_NEAR = 1 + 1e-6
 """Ratio below which two distances differ only by rounding."""
 

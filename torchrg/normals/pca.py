@@ -19,10 +19,8 @@ from torchrg.structures import Neighbors, NormalFit
 
 FitPatches = Callable[..., NormalFit]
 """Patches ``(n, K, 3)``, mask ``(n, K)`` or None, keyword ``resolution`` ``(n,)`` -> fit."""
-
 Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 """Points, neighbors, configuration, chunk size -> fit."""
-
 _MIN_RATIO = 0.03
 """Minimum ratio of width to length of a patch resolved by its covariance; below it is rounding."""
 

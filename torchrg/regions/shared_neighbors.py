@@ -12,7 +12,6 @@ from torchrg.structures import Neighbors
 _BLOCK_SIZE = 64
 """Points per block: smaller blocks repeat more of the surrounding lists, larger ones have larger
 matrix products."""
-
 _MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
 """Maximum number of neighbors for which the kernel is faster: a block of the kernel has at most
 eight times this number of members."""

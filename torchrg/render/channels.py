@@ -26,7 +26,6 @@ COLOR_MODES = {
     "normal-error": ("normal errors", "normals"),
 }
 """Color modes: their name in the viewer, and the required field."""
-
 OUTCOMES = {
     "right": ((214, 224, 214), "in the matching region"),
     "part": ((245, 170, 40), "in a second region of its plane"),
@@ -34,7 +33,6 @@ OUTCOMES = {
     "none": ((50, 95, 190), "unlabeled"),
 }
 """Outcomes of a point against ground truth: color and meaning."""
-
 _OCTAHEDRON_STEPS = 254
 """Steps along the sides of the octahedral map: about one degree. Even, so that the axes are
 exact."""
@@ -46,7 +44,6 @@ _WORST_ANGLE_DEG = 45.0
 """Normal error at the end of the color scale, in degrees."""
 _LEVELS = 255
 """Number of steps of a color scale."""
-
 Legend = list[tuple[list[int], str]]
 
 

@@ -48,7 +48,6 @@ def _to_bytes(colors: Tensor) -> Tensor:
 
 UNLABELED_GRAY = 176
 """Red, green and blue of unlabeled points."""
-
 _CALM = (
     "f0a7bc f1aa9c deb487 bebf86 98c79a 74cbba 66c9db 81c3ef b0b8f0 daaddc "
     "fdd3d4 ffd4bf f0dbab cfe4b4 aeeacd 99ebeb abe5fe cadeff e6d6ff ffcfea"

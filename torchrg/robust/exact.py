@@ -21,13 +21,10 @@ from torchrg.robust.scale import sum_points
 _NUM_SIMPLICES = 128
 """Number of tested simplices of P + 1 points. If 27 of 50 points lie on a plane, all simplices miss
 it once in 25,000."""
-
 _MAX_CANDIDATES = 16
 """Maximum number of candidate flats per patch. On exact planes nearly every simplex gives one."""
-
 _LANES = 1024
 """Number of patches processed at a time, so that their data fits into the cache."""
-
 _MIN_EDGE = 0.01
 """Minimum length of an edge that spans another dimension, as a fraction of the patch extent."""
 

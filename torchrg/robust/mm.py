@@ -29,19 +29,14 @@ from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]
 """Estimate to which the efficiency of 95 % at the normal distribution refers."""
-
 _BREAKDOWN = 0.5
 """Fraction of points that may be arbitrary."""
-
 _EFFICIENCY = 0.95
 """Efficiency of the MM-estimator for normal data."""
-
 _MAX_STEPS = 300
 """Maximum number of reweightings, after which unconverged weights are kept."""
-
 _CONVERGED = {torch.float32: 16, torch.float64: 4096}
 """Relative change of converged weights in one reweighting, in units of the machine epsilon."""
-
 _CHECK_EVERY = 4
 """Number of reweightings between convergence checks."""
 

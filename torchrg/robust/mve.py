@@ -26,7 +26,6 @@ from torchrg.robust.weights import (
 
 _LANES_PER_CHUNK = 1024
 """Number of sets times patches processed at a time, so that their data fits into the cache."""
-
 _MAX_SETS = 2**25
 """Maximum number of sets of an exhaustive search, 32 bytes each for P = 3: 170 points."""
 

@@ -26,10 +26,8 @@ from torchrg.robust.weights import Estimate, subset_size
 
 LaneEstimator = Callable[[list[Tensor], Tensor, int], Estimate]
 """LaneEstimator of lanes in general position: columns ``(K, M)``, minimum variance ``(M,)``, h."""
-
 PATCHES_IN_CACHE = 4096
 """Number of patches processed at a time, so that their data fits into the cache."""
-
 _MIN_PATCHES = 64
 """Minimum number of patches per thread."""
 

@@ -35,17 +35,13 @@ MCDStarts = Literal[Starts, "more"]
 
 _MIN_TAU_VALUES = 1000
 """Number of values from which tau replaces Qn, as in robustbase, because Qn needs all pairs."""
-
 _LANES_PER_CHUNK = 12288
 """Number of starts times axes times lanes processed at a time, so that their data fits into the
 cache."""
-
 _NUM_PLANES = 64
 """Number of candidate planes."""
-
 _NUM_PLANE_STARTS = 4
 """Number of planes used as starts."""
-
 _PLANES_PER_CHUNK = 8
 """Number of planes processed at a time, so that their data fits into the cache."""
 

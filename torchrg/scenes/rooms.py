@@ -27,10 +27,8 @@ from torchrg.scenes.surfaces import Hole, rectangle
 T = TypeVar("T")
 Furniture = Callable[[np.random.Generator, Frame], Part]
 """Function that creates an object at a position on the floor."""
-
 _ROOM = 100
 """Purpose of the random numbers: sizes and positions in a room."""
-
 _FLOOR_CELL = (1.85, 1.35)
 """Size of a floor cell in meters: a table with space to walk around it."""
 _WALL_CELL = 1.75

@@ -14,10 +14,8 @@ UNLABELED = -1
 FARTHEST = 1e12
 """Maximum absolute coordinate of a point; files use 1e20, 1e30 or the largest float32 for missing
 points."""
-
 MAX_POINTS = 2**31 - 1
 """Maximum number of points of a cloud; neighbor lists are int32."""
-
 Array = NDArray[Any]
 """Array of numbers or text of any shape."""
 Rows = slice | Tensor
