@@ -9,9 +9,9 @@ import torchrg
 from tests.test_inputs import CALLS, argument
 from torchrg import depth, metrics, neighbors, nn, transforms
 from torchrg.config import preset_names
+from torchrg.io.result import Result
 from torchrg.normals import find_sharp_points
 from torchrg.regions import summarize_planes
-from torchrg.result import Result
 from torchrg.structures import Cloud
 
 CAMERA = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])

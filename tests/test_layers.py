@@ -26,7 +26,7 @@ METHOD = [
     {"transforms"},
 ]
 """The rows of the method, which knows neither files nor pictures."""
-FILES = [{"plane_table"}, {"io"}, {"result"}, {"datasets"}]
+FILES = [{"io"}, {"datasets"}]
 LAYERS = [*METHOD, *FILES, {"batch", "render"}, {"cli"}, {"__init__", "__main__"}]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 PACKAGE = Path(__file__).parents[1] / "torchrg"

@@ -22,8 +22,8 @@ from torchrg.datasets.s3dis import find_areas
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole
 from torchrg.io import Cloud, estimate_points, write_cloud
+from torchrg.io.result import read_result
 from torchrg.pipeline import make_superpoints, segment_planes
-from torchrg.result import read_result
 
 CLASSIC = load_config("classic")
 

@@ -18,8 +18,8 @@ from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import DepthWarning
 from torchrg.io import read_cloud, write_cloud
+from torchrg.io.result import RECORD
 from torchrg.render import write_png
-from torchrg.result import RECORD
 from torchrg.structures import Cloud
 
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads", "1"]

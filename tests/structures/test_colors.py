@@ -5,7 +5,7 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.result import Result
+from torchrg.io.result import Result
 from torchrg.structures import Cloud
 from torchrg.structures.colors import find_white, read_colors
 

@@ -26,7 +26,7 @@ from torchrg.datasets.provenance import (
     write_record,
 )
 from torchrg.io.files import check_writable, fingerprint, remove_leftovers, sync_folder
-from torchrg.result import PLANES_FILE, RECORD, write_table
+from torchrg.io.result import PLANES_FILE, RECORD, write_table
 
 __all__ = ["Job", "Source", "convert_scan"]
 __dir__ = __all__.copy

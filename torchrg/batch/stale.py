@@ -28,7 +28,7 @@ from torchrg.io.files import (
     remove_leftovers,
     sync_folder,
 )
-from torchrg.result import PAGE_SUFFIXES
+from torchrg.io.result import PAGE_SUFFIXES
 
 __all__ = ["StaleResult", "check_stale", "find_stale", "remove_stale"]
 __dir__ = __all__.copy

@@ -54,10 +54,10 @@ from torchrg.io.files import (
     free_space,
     remove_leftovers,
 )
-from torchrg.plane_table import TABLE_SUFFIXES
+from torchrg.io.plane_table import TABLE_SUFFIXES
+from torchrg.io.result import PLANES_FILE, RECORD, read_result
 from torchrg.render.gallery import INDEX, Entry, check_gallery, write_entry, write_index
 from torchrg.render.page import check_library
-from torchrg.result import PLANES_FILE, RECORD, read_result
 
 _Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
 _MEMORY_FRACTION = 0.8

@@ -31,9 +31,9 @@ from torchrg.depth.camera import Pinhole, format_intrinsics, reprojection_error,
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_writable, create_folder
-from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
+from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
+from torchrg.io.result import PLANES_FILE, write_table
 from torchrg.render import color_planes, write_png
-from torchrg.result import PLANES_FILE, write_table
 from torchrg.structures import Cloud
 
 _COLORING_PIXELS = 200

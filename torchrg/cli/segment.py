@@ -53,16 +53,16 @@ from torchrg.io import (
 )
 from torchrg.io.files import check_space
 from torchrg.io.merge import merge_clouds
+from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
+from torchrg.io.result import Result, write_table
 from torchrg.pipeline.clouds import (
     describe_multipliers,
     find_objects,
     note_on_copies,
     segment_cloud,
 )
-from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, write_entry, write_index, write_planes
-from torchrg.result import Result, write_table
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 _DATASET = "ScanNet"

@@ -15,6 +15,7 @@ from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
 from torchrg.cli.loop import check_sidecar, is_viewer
 from torchrg.config import Up
 from torchrg.errors import ConfigError
+from torchrg.io.result import Result, read_result
 from torchrg.render import (
     color_curvature,
     color_normals,
@@ -27,7 +28,6 @@ from torchrg.render import (
 )
 from torchrg.render.channels import COLOR_MODES
 from torchrg.render.page import MAX_SHOWN_POINTS
-from torchrg.result import Result, read_result
 from torchrg.structures import Cloud
 from torchrg.structures.colors import narrow_colors
 

@@ -29,7 +29,7 @@ from torchrg.datasets.s3dis import CLASS_ORDERS
 from torchrg.datasets.scannet import NYU_IDS, read_objects
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import normalize_file_name
-from torchrg.plane_table import describe_planes
+from torchrg.io.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Cloud, Planes, Segmentation, Superpoints
 from torchrg.structures.colors import narrow_colors
 
@@ -237,7 +237,7 @@ def write_layout(
         out: The output directory.
         scan: The scan.
         planes: Its plane table.
-        origin: Origin of the table's coordinates; see :func:`torchrg.result.describe_planes`.
+        origin: Origin of the table's coordinates; see :func:`torchrg.io.result.describe_planes`.
 
     Returns:
         Paths of the files written, relative to ``folder``.

@@ -18,7 +18,7 @@ import torch
 from torchrg import kernels, version
 from torchrg.errors import FormatError
 from torchrg.io.files import PARSE_ERRORS, atomic_path, first_line, is_unchanged
-from torchrg.result import RECORD
+from torchrg.io.result import RECORD
 
 Record = dict[str, Any]
 """A record, or a part of one, as JSON values."""

@@ -18,10 +18,10 @@ from torchrg.io.files import ARCHIVE_ERRORS, check_file, check_writable, local_p
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
+from torchrg.io.plane_table import planes_to_arrays
 from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.text import count_text, read_text, write_text
 from torchrg.io.vg import write_vg
-from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, Segmentation, Superpoints
 from torchrg.structures.points import FilePath, Points
 
@@ -174,7 +174,7 @@ def write_cloud(
         the cloud already has such a field, that field is kept instead.
         ``.npz`` contains ``points``, the cloud's ``color``, ``labels``, ``normals``, ``curvature``,
         ``sharp``, ``valid``, the plane table in input coordinates (see
-        :func:`torchrg.plane_table.planes_to_arrays`), and ``provenance``. Identical input gives
+        :func:`torchrg.io.plane_table.planes_to_arrays`), and ``provenance``. Identical input gives
         byte-identical files. Superpoints are ``superpoint``, and ``superpoint_1`` and so on for
         the coarser levels; ``.npz`` also contains ``plane_of_superpoint``. ``.vg`` contains
         coordinates, colors, normals and the planes as vertex groups (see :mod:`torchrg.io.vg`); it

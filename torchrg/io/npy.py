@@ -38,8 +38,8 @@ from torchrg.io.files import (
     check_file,
     wrap_errors,
 )
+from torchrg.io.plane_table import planes_to_arrays
 from torchrg.io.tables import check_table
-from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
 from torchrg.structures.points import Array
 

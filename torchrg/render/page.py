@@ -29,9 +29,10 @@ from torchrg._checks import check_choices
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
+from torchrg.io.plane_table import encode_csv
+from torchrg.io.result import Result
 from torchrg.linalg.angles import unit_direction
 from torchrg.neighbors.order import scatter_rows
-from torchrg.plane_table import encode_csv
 from torchrg.render.channels import COLOR_MODES, encode_directions, make_channels
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
@@ -46,7 +47,6 @@ from torchrg.render.content import (
     rounded,
 )
 from torchrg.render.cutaway import MIN_FACING, View, choose_viewpoint
-from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud
 
 if TYPE_CHECKING:

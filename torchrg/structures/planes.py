@@ -203,7 +203,7 @@ class Planes:
         return vars(self) | {"kind": self.kind}
 
     def to_pandas(self) -> Any:  # noqa: ANN401
-        """Convert to a ``pandas.DataFrame`` with :data:`torchrg.plane_table.CSV_COLUMNS`.
+        """Convert to a ``pandas.DataFrame`` with :data:`torchrg.io.plane_table.CSV_COLUMNS`.
 
         Raises:
             MissingDependencyError: If pandas is not installed.
