@@ -12,7 +12,7 @@ from torchrg._checks import (
     is_jit_traced,
     raise_forward_mode,
 )
-from torchrg.linalg.tolerances import rank_tolerance
+from torchrg.linalg.precision import rank_tolerance
 
 _JACOBI_SWEEPS = 5
 """Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either

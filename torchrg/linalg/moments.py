@@ -440,3 +440,15 @@ def dot(vectors: Tensor, others: Tensor) -> Tensor:
     """Return dot products ``(*)`` of vectors ``(*, 3)``, summed in coordinate order."""
     x, y, z = (vectors * others).unbind(dim=-1)
     return x + y + z
+
+
+def eigh3_lapack(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Variant of :func:`eigh3` by LAPACK, faster for fewer than a thousand matrices.
+
+    Non-finite matrices give NaN.
+    """
+    finite = matrices.isfinite().all(dim=(-2, -1))[..., None]
+    values, vectors = torch.linalg.eigh(torch.where(finite[..., None], matrices, 0.0), UPLO="U")
+    return torch.where(finite, values, torch.nan), torch.where(
+        finite[..., None], vectors, torch.nan
+    )

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchrg._parallel import limit_rows
 from torchrg.config import NormalsConfig
-from torchrg.linalg.single import to_single
+from torchrg.linalg.precision import to_single
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls
 from torchrg.normals.jet import fit_normals_jet

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrg._checks import disable_autocast
 from torchrg.linalg.eigen import PrincipalFrame
 from torchrg.linalg.moments import Columns, project, sq_lengths, sum_neighbors
-from torchrg.linalg.tolerances import rank_tolerance, rounded_sqrt, safe_sqrt
+from torchrg.linalg.precision import rank_tolerance, rounded_sqrt, safe_sqrt
 from torchrg.normals.pca import center_on_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 

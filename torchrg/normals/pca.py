@@ -13,7 +13,7 @@ from torchrg.config import NormalsConfig
 from torchrg.linalg import covariance, eigh3
 from torchrg.linalg.eigen import PrincipalFrame, principal_frame, smallest_eigenvector3
 from torchrg.linalg.moments import covariance_of_columns, weighted_moments
-from torchrg.linalg.tolerances import coordinate_resolution, rank_tolerance, rounded_sqrt, safe_sqrt
+from torchrg.linalg.precision import coordinate_resolution, rank_tolerance, rounded_sqrt, safe_sqrt
 from torchrg.neighbors.knn import gather_patches
 from torchrg.structures import Neighbors, NormalFit
 

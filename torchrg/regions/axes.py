@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg._checks import default_device_cpu
 from torchrg.errors import ConfigError, warn
 from torchrg.linalg.angles import unit_direction
-from torchrg.linalg.lapack import eigh3_lapack
+from torchrg.linalg.moments import eigh3_lapack
 from torchrg.linalg.rigid import check_rigid
 from torchrg.regions.directions import (
     MAX_ANGLE,

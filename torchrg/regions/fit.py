@@ -8,9 +8,8 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, split_rows
 from torchrg.config import Auto, GrowingConfig
-from torchrg.linalg.lapack import eigh3_lapack
-from torchrg.linalg.moments import Segments
-from torchrg.linalg.tolerances import coordinate_resolution
+from torchrg.linalg.moments import Segments, eigh3_lapack
+from torchrg.linalg.precision import coordinate_resolution
 from torchrg.regions.edges import GrowingInput, neighborhood_radii
 from torchrg.robust.scale import MAD_FACTOR
 

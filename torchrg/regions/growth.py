@@ -23,7 +23,7 @@ from torchrg._parallel import (
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
-from torchrg.linalg.single import is_single, to_single
+from torchrg.linalg.precision import is_single, to_single
 from torchrg.neighbors import canonical_order, measure_sampling
 from torchrg.neighbors.knn import check_neighbors
 from torchrg.neighbors.order import ascending_rows

@@ -11,8 +11,7 @@ from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_r
 from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
-from torchrg.linalg.lapack import eigh3_lapack
-from torchrg.linalg.moments import Segments
+from torchrg.linalg.moments import Segments, eigh3_lapack
 from torchrg.regions.adjacency import (
     MIN_CONTACTS,
     PARALLEL_DEG,

@@ -15,8 +15,7 @@ from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import SuperpointsConfig
 from torchrg.linalg.angles import sq_chords
-from torchrg.linalg.lapack import eigh3_lapack
-from torchrg.linalg.moments import Segments, reduce_runs
+from torchrg.linalg.moments import Segments, eigh3_lapack, reduce_runs
 from torchrg.neighbors import distinct_points, search_knn
 from torchrg.neighbors.order import DistinctPoints, finite_rows
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency

@@ -13,8 +13,7 @@ from torchrg._parallel import map_tasks, nonzero_rows
 from torchrg.config import Auto
 from torchrg.errors import ShapeError
 from torchrg.linalg.angles import unit_direction
-from torchrg.linalg.lapack import eigh3_lapack
-from torchrg.linalg.moments import Segments, to_column_major
+from torchrg.linalg.moments import Segments, eigh3_lapack, to_column_major
 from torchrg.neighbors.knn import check_neighbors
 from torchrg.neighbors.order import distinct_rows, mark_distinct
 from torchrg.regions.adjacency import find_adjacency

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices
-from torchrg.linalg.tolerances import machine_epsilon, smallest_normal
+from torchrg.linalg.precision import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
     covariance_entries,

@@ -12,7 +12,7 @@ from torchrg._opaque import opaque
 from torchrg._parallel import limit_rows, map_chunks
 from torchrg.errors import ConfigError, warn
 from torchrg.linalg import second_moments
-from torchrg.linalg.tolerances import flatness_tolerance, smallest_normal
+from torchrg.linalg.precision import flatness_tolerance, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     columns_of_points,

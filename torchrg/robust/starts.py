@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
-from torchrg.linalg.tolerances import machine_epsilon
+from torchrg.linalg.precision import machine_epsilon
 from torchrg.robust.lanes import (
     covariance_entries,
     eigenvectors,

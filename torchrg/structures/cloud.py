@@ -12,8 +12,7 @@ from torch import Tensor
 
 from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning, warn
 from torchrg.structures.points import FARTHEST, bounding_box, local_origin
-from torchrg.structures.precision import describe_steps
-from torchrg.structures.units import describe_units
+from torchrg.structures.precision import describe_steps, describe_units
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from torchrg.linalg.moments import (
     sq_lengths,
     sum_neighbors,
 )
-from torchrg.linalg.tolerances import rounded_sqrt
+from torchrg.linalg.precision import rounded_sqrt
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.candidates import candidate_ranks
 

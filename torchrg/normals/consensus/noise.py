@@ -19,7 +19,7 @@ from torchrg.linalg.moments import (
     sum_neighbors,
     unbind_columns,
 )
-from torchrg.linalg.tolerances import coordinate_resolution, rounded_sqrt
+from torchrg.linalg.precision import coordinate_resolution, rounded_sqrt
 from torchrg.neighbors.knn import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
 from torchrg.structures import Neighbors, NormalFit

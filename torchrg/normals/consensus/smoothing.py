@@ -15,7 +15,7 @@ from torchrg.linalg.moments import (
     sq_lengths,
     sum_neighbors,
 )
-from torchrg.linalg.tolerances import rounded_sqrt
+from torchrg.linalg.precision import rounded_sqrt
 from torchrg.neighbors.knn import gather_columns
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from torchrg.linalg.tolerances import flatness_tolerance
+from torchrg.linalg.precision import flatness_tolerance
 
 PACKAGE = Path(__file__).parents[2] / "torchrg"
 # The largest number that a file can hold.
