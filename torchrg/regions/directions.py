@@ -72,11 +72,6 @@ def find_heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor | None:
         normals: Unit normals of planes, shape ``(M, 3)``.
         areas: Their areas, shape ``(M,)``.
         up: Upward unit vector, shape ``(3,)``.
-
-    Example:
-        >>> walls = torch.tensor([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
-        >>> find_heading(walls, torch.ones(3), walls[2]).round(decimals=3).tolist()
-        [0.8, -0.6, 0.0]
     """
     weights = areas * bisquare((normals @ up).abs().clamp(max=1).asin())
     if not bool(weights.sum() > MIN_FRACTION * areas.sum()):
