@@ -70,7 +70,7 @@ def to_single(points: Tensor) -> Tensor:
     """Return finite float64 points ``(N, 3)`` as float32, if its steps are fine for their spacing.
 
     Estimators and region growing depend on differences of coordinates alone. The points are
-    therefore relative to :func:`torchrg.structures.local_origin`, as those of a cloud are. Other
+    therefore relative to the local origin, as those of a cloud are. Other
     points are unchanged: of another dtype or device, or with gradients.
     """
     is_plain = points.device.type == "cpu" and not points.requires_grad
