@@ -20,7 +20,7 @@ from sphinx.ext.apidoc import main as write_reference
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "torchrg"
 BUILD = Path("build")
-PRIVATE = ("__main__.py", "cli", "kernels", "merge.py", "mesh.py", "precision.py", "version.py")
+PRIVATE = ("__main__.py", "cli", "kernels", "version.py")
 """Modules that users do not import, in addition to those with an underscore."""
 
 

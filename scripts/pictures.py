@@ -21,8 +21,8 @@ from PIL import Image, ImageDraw, ImageFont
 import torchrg
 from torchrg.config import PlanesConfig, SuperpointsConfig
 from torchrg.depth import depth_to_points, make_intrinsics, segment_depth
+from torchrg.io.result import Result
 from torchrg.render import color_planes, make_page, render_cloud, write_page
-from torchrg.result import Result
 
 FOLDER = Path(__file__).parent
 CAMERA, DEPTH_SCALE = (520.9, 521.0, 325.1, 249.7), 5000.0

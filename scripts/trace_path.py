@@ -26,7 +26,7 @@ NUM_POINTS = 8_000
 WIDTH = 118
 """Line width in characters."""
 
-MAX_FILES = {"classic": 26, "paper": 34, "consensus": 35}
+MAX_FILES = {"classic": 24, "paper": 34, "consensus": 34}
 """Maximum number of files per preset, enforced by a test."""
 
 

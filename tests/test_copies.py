@@ -12,11 +12,12 @@ from tests.kernels.clouds import definitions
 from torchrg import make_superpoints, segment_planes
 from torchrg.config import preset_names
 from torchrg.datasets import collate_offset
+from torchrg.io.result import Result
 from torchrg.metrics import score_labels, score_partition
 from torchrg.normals import ESTIMATORS, estimate_normals, orient_normals
 from torchrg.regions import summarize_planes
-from torchrg.result import Result
-from torchrg.structures import PLANE_COLUMNS, UNLABELED, Cloud
+from torchrg.structures import UNLABELED, Cloud
+from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.transforms import EstimateNormals, GrowRegions, MakeSuperpoints, OrientNormals
 
 COUNT = 1500

@@ -9,9 +9,10 @@ import torchrg
 from tests.test_inputs import CALLS, argument
 from torchrg import depth, metrics, neighbors, nn, transforms
 from torchrg.config import preset_names
+from torchrg.io.result import Result
+from torchrg.neighbors.knn import search_nearest
 from torchrg.normals import find_sharp_points
 from torchrg.regions import summarize_planes
-from torchrg.result import Result
 from torchrg.structures import Cloud
 
 CAMERA = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -75,7 +76,7 @@ EVERYTHING |= {
     ),
     "voxel": lambda: torchrg.segment_planes(POINTS, "classic", voxel=0.2),
     "sample_voxels": lambda: neighbors.sample_voxels(POINTS, 0.5),
-    "search_nearest": lambda: neighbors.search_nearest(POINTS.numpy(), POINTS[::3].numpy(), 0.5),
+    "search_nearest": lambda: search_nearest(POINTS.numpy(), POINTS[::3].numpy(), 0.5),
     "segment_depth": lambda: depth.segment_depth(IMAGE[0], CAMERA, pose=FRAME["pose"]),
     "make_intrinsics": lambda: depth.make_intrinsics(50, 50, 20, 15),
     "depth_to_points": lambda: depth.depth_to_points(IMAGE, CAMERA[None]),

@@ -24,10 +24,8 @@ NUM_POINTS = 60_000
 SECONDS_UNTIL_HUNG = 120
 MODULES = (depth, linalg, metrics, neighbors, nn, normals, regions, robust, scenes, steps, torchrg)
 WITHOUT_TENSORS = {
-    *("load_config", "read_cloud", "read_result", "write_cloud", "check_neighbors"),
-    *("block", "build_room", "furnish", "label_points", "passage", "rectangle", "room_walls"),
-    *("sample_scene", "scanner_positions", "unit", "make_intrinsics", "unit_direction"),
-    *("deg_to_sq_chord", "machine_epsilon", "rank_tolerance", "smallest_normal"),
+    *("load_config", "read_cloud", "read_result", "write_cloud"),
+    *("build_room", "sample_scene", "make_intrinsics"),
 }
 """Functions of files, settings, rooms and single numbers."""
 GRID = torch.cartesian_prod(torch.arange(300.0), torch.arange(200.0), torch.zeros(1)) / 100
@@ -75,7 +73,7 @@ def calls():
         patches[:1000],
         linalg.covariance(patches)[1],
     )
-    column, wide = points[:, 0].contiguous(), patches.flatten(1)
+    wide = patches.flatten(1)
     noise, partition = torch.full((200,), 0.02), SuperpointsConfig()
     yield "segment_planes", lambda: torchrg.segment_planes(points, CLASSIC)
     yield "segment_mesh", lambda: torchrg.segment_mesh(GRID[::4])
@@ -89,17 +87,10 @@ def calls():
     yield "summarize_planes", lambda: regions.summarize_planes(points, unit, labels)
     yield "grow_regions", lambda: torchrg.grow_regions(points, unit, seg.curvature, near, "classic")
     yield "search_knn", lambda: torchrg.search_knn(points, 5)
-    yield "search_nearest", lambda: neighbors.search_nearest(GRID.numpy(), GRID.numpy(), 1)
-    yield "prepare_search", lambda: neighbors.prepare_search(points.numpy(), 5)(slice(None))
     yield "measure_sampling", lambda: neighbors.measure_sampling(points, near)
     yield "expand_to_points", lambda: neighbors.expand_to_points(voxels.rows, voxels.inverse)
-    yield "gather_columns", lambda: neighbors.gather_columns(points, near.indices)
-    yield "gather_patches", lambda: neighbors.gather_patches(points, near.indices)
-    yield "scatter_rows", lambda: neighbors.scatter_rows(points, torch.arange(len(points)), 90_000)
     yield "sample_voxels", lambda: neighbors.sample_voxels(points, 0.1)
-    yield "ascending_rows", lambda: neighbors.ascending_rows(labels)
-    yield "mark_distinct", lambda: neighbors.mark_distinct(column)
-    for name in ("canonical_order", "distinct_points", "distinct_rows", "finite_rows"):
+    for name in ("canonical_order", "distinct_points"):
         yield name, partial(getattr(neighbors, name), points)
     yield "estimate_normals", lambda: torchrg.estimate_normals(points, method="pca", k=10)
     yield "orient_normals", lambda: normals.orient_normals(points, unit)
@@ -120,16 +111,8 @@ def calls():
     yield "Eigh", lambda: nn.Eigh()(covariances)
     yield "Normal", lambda: nn.Normal()(nn.Eigh()(covariances))
     yield "second_moments", lambda: linalg.second_moments(patches.unbind(dim=-1))
-    for name in ("covariance", "coordinate_resolution"):
-        yield name, partial(getattr(linalg, name), patches)
-    for name in ("eigh3", "eigh3_lapack", "smallest_eigenvector3"):
-        yield name, partial(getattr(linalg, name), covariances)
-    yield "flatness_tolerance", lambda: linalg.flatness_tolerance(patches, wide[:, 0])
-    for name in ("above", "at_most"):
-        yield name, partial(getattr(linalg, name), column, 1.0)
-    yield "signs", lambda: linalg.signs(column)
-    yield "sq_chord_to_deg", lambda: linalg.sq_chord_to_deg(unit[:, 0].square())
-    yield "sq_chords", lambda: linalg.sq_chords(unit.T[..., None], unit.T[..., None])
+    yield "covariance", lambda: linalg.covariance(patches)
+    yield "eigh3", lambda: linalg.eigh3(covariances)
     yield "unsigned_angle_deg", lambda: linalg.unsigned_angle_deg(unit, unit)
     yield "contingency_table", lambda: metrics.contingency_table(labels, room.labels)
     for name in ("adjusted_rand_index", "match_regions", "segmentation_covering"):

@@ -34,6 +34,6 @@ def test_import_is_quiet_and_light():
 def test_modules_load_when_they_are_asked_for():
     assert set(torchrg.__all__) <= set(dir(torchrg))
     assert torchrg.render.__name__ == "torchrg.render"
-    assert torchrg.segment_planes.__module__ == "torchrg.pipeline"
+    assert torchrg.segment_planes.__module__ == "torchrg.pipeline.planes"
     with pytest.raises(AttributeError, match="module 'torchrg' has no attribute 'nothing'"):
         _ = torchrg.nothing

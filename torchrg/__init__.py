@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from torchrg.config import load_config
     from torchrg.errors import TorchrgError
     from torchrg.io import read_cloud, write_cloud
+    from torchrg.io.result import read_result
     from torchrg.neighbors import search_knn
     from torchrg.normals import estimate_normals
     from torchrg.pipeline import make_superpoints, segment_mesh, segment_planes
     from torchrg.regions import align_axes, grow_regions, select_planes
-    from torchrg.result import read_result
     from torchrg.structures import UNLABELED, Cloud, Plane
 else:
     _NAMES = {
@@ -52,13 +52,13 @@ else:
         "normals": ("estimate_normals",),
         "pipeline": ("make_superpoints", "segment_mesh", "segment_planes"),
         "regions": ("align_axes", "grow_regions", "select_planes"),
-        "result": ("read_result",),
+        "io.result": ("read_result",),
         "structures": ("UNLABELED", "Cloud", "Plane"),
     }
     # Public modules that a star import omits, because names such as io hide other modules.
     _PACKAGES = (
-        "batch", "clouds", "config", "errors", "io", "linalg", "neighbors", "pipeline",
-        "plane_table", "regions", "render", "result", "scratch", "structures",
+        "batch", "config", "errors", "io", "linalg", "neighbors", "pipeline",
+        "regions", "render", "scratch", "structures",
     )  # fmt: skip
     _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 

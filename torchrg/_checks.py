@@ -21,10 +21,6 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
 
     Big-endian and read-only arrays are copied. In all checks, ``caller`` is the public function
     that starts the message. Invalid tensors raise ShapeError, invalid settings ConfigError.
-
-    Example:
-        >>> as_tensor("f", "points", np.zeros((2, 3), dtype=np.float32)).dtype
-        torch.float32
     """
     if isinstance(values, Tensor):
         return values
@@ -117,13 +113,6 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
     Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for a length
     that is equal in all patterns, a number for a fixed length, and a leading ``*`` for any leading
     axes, equal in all patterns. None is skipped. A ``mask`` must be bool, too.
-
-    Example:
-        >>> check_shapes("f", patches=(torch.zeros(5, 8, 3), "* K 3"))
-        >>> check_shapes("f", patches=(torch.zeros(5, 8, 2), "* K 3"))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected patches of shape (*, K, 3), got (5, 8, 2).
     """
     bound: dict[str, tuple[int, ...]] = {}
     for name, (tensor, pattern) in arguments.items():

@@ -26,30 +26,23 @@ Returned = TypeVar("Returned")
 
 CACHE_BYTES = 2**22
 """Size of one array processed at a time by a thread, in bytes, so that it stays in the cache."""
-
 ROWS_IN_CACHE = 8192
 """Number of rows of about 50 values processed at a time by a thread, so that they stay in the
 cache."""
-
 CHUNK_SIZE = 16384
 """Default number of points processed at a time by each stage."""
-
 ROWS_AT_ONCE = 65536
 """Number of rows per pass over a cloud: few calls, temporaries of bounded memory."""
-
 TYPICAL_WIDTH = 64
 """Number of values per row, such as neighbors, up to which the numbers above apply."""
-
 CHILD_ENVIRONMENT = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
 ) | {"PYTHONSAFEPATH": "1"}
 """Environment of all child processes, read by Python and its libraries at startup: one thread, and
 no imports from the working directory."""
-
 _MIN_ROWS = 4096
 """Minimum number of rows per thread: at a few tenths of a microsecond each they outweigh its
 start."""
-
 _RETAINED_BYTES = 31 * 2**20
 """Just below 32 MiB, the largest freed block that raises the trim threshold of glibc."""
 
@@ -155,10 +148,6 @@ def map_tasks(
     """Return the result of ``work`` for each task; on a CPU, multi-threaded.
 
     Every task writes different rows, so the result does not depend on the number of threads.
-
-    Example:
-        >>> map_tasks(len, ["a", "bc"], torch.device("cpu"))
-        [1, 2]
     """
     if device.type != "cpu":
         return [work(task) for task in tasks]
@@ -207,14 +196,6 @@ def sequential_operations() -> Iterator[None]:
 
     :func:`map_tasks` still uses torch's previous number of threads. Unlike
     :func:`torch.set_num_threads`, this does not change other threads.
-
-    Example:
-        >>> before = torch.get_num_threads()
-        >>> with sequential_operations():
-        ...     print(torch.get_num_threads())
-        1
-        >>> torch.get_num_threads() == before
-        True
     """
     if _THREADS.get() is not None:
         yield
@@ -233,7 +214,6 @@ def sequential_operations() -> Iterator[None]:
 
 _THREADS: ContextVar[int | None] = ContextVar("threads", default=None)
 """Number of threads for the tasks of this call; None outside of calls."""
-
 _POOL: ContextVar[list[ThreadPoolExecutor]] = ContextVar("pool")
 """The threads of this call, empty until the first of them starts."""
 

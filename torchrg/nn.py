@@ -28,21 +28,8 @@ from torch import Tensor, nn
 from torchrg._checks import check_choices
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import covariance, eigh3
-from torchrg.normals import (
-    fit_normals_irls,
-    fit_normals_jet,
-    fit_normals_pca,
-    fit_normals_robust,
-)
-from torchrg.robust import (
-    RobustFit,
-    fit_detmcd,
-    fit_detmm,
-    fit_dets,
-    fit_fastmcd,
-    fit_mve,
-    qn,
-)
+from torchrg.normals import fit_normals_irls, fit_normals_jet, fit_normals_pca, fit_normals_robust
+from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn
 from torchrg.robust.mm import Target
 from torchrg.robust.starts import MCDStarts, Starts
 from torchrg.robust.weights import Inliers, Scaling
@@ -215,10 +202,7 @@ class FastMCD(_Function[RobustFit]):
     chunk_size: int = 16
 
     def forward(
-        self,
-        patches: Tensor,
-        mask: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        self, patches: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
     ) -> RobustFit:
         """Return the fits; the generator draws the starts."""
         return fit_fastmcd(patches, mask, generator=generator, **asdict(self))
@@ -244,10 +228,7 @@ class MVE(_Function[RobustFit]):
     chunk_size: int = 64
 
     def forward(
-        self,
-        patches: Tensor,
-        mask: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        self, patches: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
     ) -> RobustFit:
         """Return the fits; the generator draws the subsets."""
         return fit_mve(patches, mask, generator=generator, **asdict(self))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
 
-__all__ = ["empty", "is_active", "on_disk", "release"]
+__all__ = ["on_disk"]
 __dir__ = __all__.copy
 
 _MIN_BYTES = 2**24
@@ -34,7 +34,6 @@ _RELEASE_SECONDS = 0.01
 """Interval for releasing pages, in seconds. Meanwhile about 20 MB of an array are read."""
 _ZEROS = bytes(2**20)
 """Bytes that reserve disk space on systems without posix_fallocate, such as macOS."""
-
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 _folder: ContextVar[Path | None] = ContextVar("scratch", default=None)
@@ -90,13 +89,7 @@ def is_active() -> bool:
 
 
 def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
-    """Return an uninitialized array: ``numpy.empty``, or a map on disk if large and active.
-
-    Example:
-        >>> with on_disk("."):
-        ...     empty((3, 2), np.int32).shape
-        (3, 2)
-    """
+    """Return an uninitialized array: ``numpy.empty``, or a map on disk if large and active."""
     folder, size = _folder.get(), math.prod(shape) * np.dtype(dtype).itemsize
     if folder is None or size < _MIN_BYTES:
         return np.empty(shape, dtype)

@@ -21,7 +21,7 @@ from torch import Tensor, empty
 import torchrg
 from benchmarks.harness import Benchmark, Figures
 from torchrg.linalg import covariance, eigh3
-from torchrg.neighbors import gather_patches
+from torchrg.neighbors.knn import gather_patches
 from torchrg.robust import fit_detmcd, fit_detmm, fit_dets, fit_fastmcd, fit_mve, qn, qn_exceeds
 
 K = 50

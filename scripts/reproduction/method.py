@@ -14,7 +14,7 @@ from reproduction.pictures import settings
 from reproduction.records import Block, Record, figure, section, text
 from tests.made import make_shape
 from torchrg import estimate_normals, load_config, search_knn
-from torchrg.neighbors import gather_patches
+from torchrg.neighbors.knn import gather_patches
 from torchrg.regions.edges import coplanarity_limits, patch_radii, plane_residuals
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.structures import Neighbors

@@ -11,7 +11,7 @@ from typing import Any
 import surroundings
 import torch
 
-from torchrg.io import atomic_path
+from torchrg.io.files import atomic_path
 
 Record = dict[str, Any]
 Block = dict[str, Any]

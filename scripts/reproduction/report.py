@@ -21,7 +21,7 @@ from reproduction.records import (
     mark_best,
     verdict,
 )
-from torchrg.io import atomic_path
+from torchrg.io.files import atomic_path
 
 TEMPLATE = Path(__file__).with_name("report.html.jinja")
 RESULTS = Path(__file__).with_name("results.json")

@@ -5,21 +5,25 @@ import os
 import signal
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from torchrg.batch.scans import Job, Source
 from torchrg.batch.task import TaskReport
 from torchrg.config import PipelineConfig
-from torchrg.datasets import SceneFiles
+from torchrg.datasets import SceneDataset, SceneFiles
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
+from torchrg.io.files import atomic_path
+
+
+class Texts(SceneDataset):
+    def __init__(self, root):
+        self.root, self.scenes = root, []
 
 
 @dataclass(frozen=True)
 class FaultySource(Source):
     """Text files, named ``<points>_<anything>``; the text is a behavior and becomes the result."""
 
-    root: Path
+    data: Texts
     settings: PipelineConfig = field(default_factory=PipelineConfig)
     table: str | None = None
     bytes_per_point = 1
@@ -84,5 +88,5 @@ def make_jobs(folder, behaviors):
     (folder / "in").mkdir(parents=True, exist_ok=True)
     for name, behavior in behaviors.items():
         (folder / "in" / f"{name}.txt").write_text(behavior)
-    source = FaultySource(folder / "in")
+    source = FaultySource(Texts(folder / "in"))
     return [Job(source, scan, folder / "out") for scan in source.list_scans(folder / "out")]

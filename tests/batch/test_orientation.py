@@ -17,7 +17,7 @@ from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import DepthConfig, load_config
-from torchrg.datasets import FolderOfClouds, ScanNet, collate_offset
+from torchrg.datasets import FolderOfClouds, RGBDFrames, ScanNet, collate_offset
 from torchrg.depth.camera import Pinhole
 from torchrg.io import read_cloud, write_cloud
 from torchrg.pipeline import segment_planes
@@ -240,15 +240,16 @@ def test_converted_frames_look_at_the_camera_in_the_world(tmp_path):
     write_png(tmp_path / "in" / "seq-01" / "frame-000000.depth.png", depth)
     pose = np.array([[0, 0, 1, 5.0], [-1, 0, 0, 6], [0, -1, 0, 7], [0, 0, 0, 1]])
     np.savetxt(tmp_path / "in" / "seq-01" / "frame-000000.pose.txt", pose)
-    camera = (tmp_path / "in", DepthConfig(), "7-scenes", Pinhole(50.0, 50.0, 19.5, 14.5), 1000.0)
-    (normals,) = convert(RGBDSource(*camera), tmp_path / "out").values()
+    camera = Pinhole(50.0, 50.0, 19.5, 14.5)
+    data = RGBDFrames.from_folder(tmp_path / "in", "7-scenes", intrinsics=camera, depth_scale=1000)
+    (normals,) = convert(RGBDSource(data, DepthConfig()), tmp_path / "out").values()
     points = np.load(next((tmp_path / "out").rglob("coord.npy")))
     known = normals.any(axis=-1)
     assert known.mean() > 0.9
     assert ((normals * (pose[:3, 3] - points)).sum(axis=-1)[known] > 0).all()
     assert normals[..., 2].max() > 0.99
     for orient, least in (("up", 0), ("interior", -0.1)):
-        source = RGBDSource(*camera, orient=orient)
+        source = RGBDSource(data, DepthConfig(), orient=orient)
         (turned,) = convert(source, tmp_path / orient).values()
         np.testing.assert_allclose(abs(turned), abs(normals), atol=1e-6)
         assert (turned[..., 2] >= least).all()

@@ -9,7 +9,7 @@ from torchrg.batch.run import list_jobs, lock_folder
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import load_config
-from torchrg.datasets import FolderOfClouds
+from torchrg.datasets import FolderOfClouds, RGBDFrames
 from torchrg.depth import DepthConfig
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, FormatError
@@ -161,7 +161,7 @@ def test_a_scan_of_another_command_with_the_same_files_is_refused(root, tmp_path
 def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
     (job,) = faults.make_jobs(tmp_path, {"1_a": "plain"})
     scan = job.scan._replace(name=name)
-    source = job.source.__class__(job.source.root)
+    source = job.source.__class__(job.source.data)
     object.__setattr__(source, "list_scans", lambda out: [scan])
     with pytest.raises(FormatError, match="expected a scan name without"):
         list_jobs(source, tmp_path / "out")
@@ -170,9 +170,9 @@ def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
 def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
     for name in ("1.npy", "1.png"):
         (root / name).touch()
-    source = RGBDSource(root, DepthConfig(), "images", Pinhole(5.0, 5.0, 2.0, 1.0), 1000)
+    camera = Pinhole(5.0, 5.0, 2.0, 1.0)
     with pytest.raises(ConfigError, match=r"got '1' twice, for .*1.npy and .*1.png; move or"):
-        list_jobs(source, tmp_path / "out")
+        RGBDFrames.from_folder(root, "images", intrinsics=camera, depth_scale=1000)
 
 
 @pytest.mark.filterwarnings("ignore:.*using the built-in camera")
@@ -182,13 +182,13 @@ def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
         (root / name / "frame-000000.depth.png").touch()
     (root / "loop").symlink_to("seq-01")
     (root / "seq-01" / "self").symlink_to(".")
-    source = RGBDSource(root, DepthConfig(), "7-scenes")
     with pytest.warns(UserWarning, match=f"{root}: skipped loop and 1 more: links to"):
-        jobs = list_jobs(source, tmp_path / "out")
+        data = RGBDFrames.from_folder(root, "7-scenes")
+    jobs = list_jobs(RGBDSource(data, DepthConfig()), tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["seq-01/frame-000000", "seq-02/frame-000000"]
-    inside = RGBDSource(root / "seq-01", DepthConfig(), "7-scenes")
     with pytest.warns(UserWarning, match="skipped self: links to files"):
-        jobs = list_jobs(inside, tmp_path / "out")
+        data = RGBDFrames.from_folder(root / "seq-01", "7-scenes")
+    jobs = list_jobs(RGBDSource(data, DepthConfig()), tmp_path / "out")
     assert [job.scan.name for job in jobs] == ["seq-01/frame-000000"]
 
 

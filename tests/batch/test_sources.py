@@ -3,6 +3,7 @@
 import json
 import resource
 import signal
+from functools import partial
 from typing import get_args, get_type_hints
 
 import numpy as np
@@ -15,14 +16,14 @@ from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config
-from torchrg.datasets import S3DIS, FolderOfClouds
+from torchrg.datasets import S3DIS, FolderOfClouds, RGBDFrames
 from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS
 from torchrg.datasets.s3dis import find_areas
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole
 from torchrg.io import Cloud, estimate_points, write_cloud
+from torchrg.io.result import read_result
 from torchrg.pipeline import make_superpoints, segment_planes
-from torchrg.result import read_result
 
 CLASSIC = load_config("classic")
 
@@ -31,17 +32,20 @@ CLASSIC = load_config("classic")
 def test_the_command_knows_every_kind_and_layout(tmp_path):
     assert {*get_args(get_type_hints(RGBDArguments)["layout"])} == {"auto", *FRAME_LAYOUTS}
     settings, camera = DepthConfig(), Pinhole(5.0, 5.0, 2.0, 1.0)
-    assert RGBDSource(tmp_path, settings, "images", camera, 9.0).describe() == {
+    np.save(tmp_path / "1.npy", np.ones((4, 4), np.float32))
+    frames = partial(RGBDFrames.from_folder, tmp_path, "images", intrinsics=camera, depth_scale=9.0)
+    assert RGBDSource(frames(), settings).describe() == {
         "kind": "rgbd",
         "layout": "images",
         "intrinsics": camera,
         "depth_scale": 9.0,
         "orient": "auto",
     }
-    turned = RGBDSource(tmp_path, settings, "images", camera, 9.0, orient="up")
+    turned = RGBDSource(frames(), settings, orient="up")
     assert turned.describe()["orient"] == "up"
-    rays = RGBDSource(tmp_path, settings, "images", camera, 9.0, "ray")
+    rays = RGBDSource(frames(depth_kind="ray"), settings)
     assert rays.describe()["depth_kind"] == "ray"
+    (tmp_path / "1.npy").unlink()
     options = {"kind": "s3dis", "class_order": "spt", "superpoint": True, "orient": "auto"}
     write_room(tmp_path / "Area_5" / "a", {"floor_1": grid()})
     np.save(tmp_path / "a.npy", grid())
@@ -248,7 +252,8 @@ def test_depth_frames_become_images(tmp_path):
     np.save(tmp_path / "in" / "2.npy", np.zeros_like(depth))
     camera = Pinhole(50.0, 50.0, 20.0, 15.0)
     settings = DepthConfig(noise=(0.001, 0.0))
-    source = RGBDSource(tmp_path / "in", settings, "images", camera, 1000)
+    frames = partial(RGBDFrames.from_folder, tmp_path / "in", intrinsics=camera)
+    source = RGBDSource(frames(depth_scale=1000), settings)
     jobs = list_jobs(source, tmp_path / "out")
     good, bad = (convert_scan(job) for job in jobs)
     assert "expected pixels with depth" in bad.reason
@@ -262,7 +267,7 @@ def test_depth_frames_become_images(tmp_path):
     assert (coord[0] == 0).all()
     assert coord[15, 20].tolist() == [0, 0, 3]
     assert reason_to_convert(jobs[0]) == ""
-    other = RGBDSource(tmp_path / "in", settings, "images", camera, 500)
+    other = RGBDSource(frames(depth_scale=500), settings)
     assert reason_to_convert(list_jobs(other, tmp_path / "out")[0]) == "options changed"
 
 

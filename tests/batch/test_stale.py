@@ -21,7 +21,7 @@ from torchrg.config import load_config
 from torchrg.datasets import ScanNet
 from torchrg.datasets.layouts import LAYOUTS
 from torchrg.io.files import OUTPUT_MARK, remove_leftovers
-from torchrg.result import PAGE_SUFFIXES
+from torchrg.io.result import PAGE_SUFFIXES
 from torchrg.scenes import make_room
 
 FIRST, MOVED, LAST = SCANS = ("scene0001_00", "scene0002_00", "scene0003_00")

@@ -108,5 +108,5 @@ def test_a_floor_alone_is_turned_upright_with_a_warning(tmp_path, align):
     path = tmp_path / "floor.npy"
     x, y = np.random.default_rng(0).uniform(0, 4, (2, 3000))
     np.save(path, np.stack([x, y, 0.1 * x], axis=1))
-    assert "expected upright planes" in align(path, "--out", tmp_path / "out.ply").err
+    assert "expected vertical planes" in align(path, "--out", tmp_path / "out.ply").err
     assert np.ptp(read_cloud(tmp_path / "out.ply").coordinates[:, 2]) < 1e-3

@@ -18,8 +18,8 @@ from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, make_intrinsics
 from torchrg.errors import DepthWarning
 from torchrg.io import read_cloud, write_cloud
+from torchrg.io.result import RECORD
 from torchrg.render import write_png
-from torchrg.result import RECORD
 from torchrg.structures import Cloud
 
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads", "1"]
@@ -294,12 +294,12 @@ def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, 
         assert reported in line
         assert "pass 1000 for millimeters" in line
     camera = parse_intrinsics(CAMERA[1])
-    source = RGBDSource(root, DepthConfig(), "images", camera, float(scale))
+    data = RGBDFrames.from_folder(root, intrinsics=camera, depth_scale=float(scale))
+    source = RGBDSource(data, DepthConfig())
     with pytest.warns(DepthWarning, match="expected a median depth"):
         jobs = list_jobs(source, tmp_path / "out")
     (note,) = convert_scan(jobs[0]).warnings
     assert reported in note
-    data = RGBDFrames.from_folder(root, intrinsics=camera, depth_scale=float(scale))
     with pytest.warns(DepthWarning, match="expected a median depth"):
         _ = data[0]
 

@@ -104,7 +104,7 @@ def test_bad_points_stay_in_place(tmp_path, normals):
     np.save(tmp_path / "points.npy", points)
     out = tmp_path / "normals.npz"
     done = normals(tmp_path / "points.npy", "--out", out, "--method", "pca")
-    assert "1 of 60 points have no normal" in done.err
+    assert "1 of 60 points are not finite or beyond 1e+12; they have no normal" in done.err
     assert done.err.count("\n") == 1
     with np.load(out) as result:
         assert result["valid"].sum() == 59

@@ -10,8 +10,8 @@ import torch
 from torchrg.cli import flags
 from torchrg.config import load_config
 from torchrg.io import read_cloud, write_cloud
+from torchrg.io.result import read_result
 from torchrg.pipeline import segment_planes
-from torchrg.result import read_result
 from torchrg.structures import PLANE_KINDS, Cloud
 
 UTM = np.array([651_234.125, 5_412_345.5, 417.75])

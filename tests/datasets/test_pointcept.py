@@ -12,8 +12,8 @@ from tests.datasets.s3dis_tree import digest
 from torchrg.config import load_config
 from torchrg.datasets import read_pointcept_scene, write_pointcept_scene
 from torchrg.errors import FormatError
+from torchrg.io.result import describe_planes
 from torchrg.pipeline import segment_planes
-from torchrg.result import describe_planes
 from torchrg.scenes import make_room
 
 CLASSIC = load_config("classic")

@@ -15,7 +15,7 @@ from torchrg.datasets.provenance import (
 )
 from torchrg.errors import FormatError
 from torchrg.io.files import fingerprint
-from torchrg.result import RECORD
+from torchrg.io.result import RECORD
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 import warnings
 from pathlib import Path
 
@@ -296,7 +297,7 @@ def test_a_frame_that_is_missing_fails_alone(tum, tmp_path):
     (tum / "depth" / "1.0.png").unlink()
     long = "x" * 300
     (tum / "depth.txt").write_text(f"1.0 depth/1.0.png\n2.0 depth/2.0.png\n3.0 {long}.png\n")
-    source = RGBDSource(tum, DepthConfig(noise=(0.001, 0.0)), "tum")
+    source = RGBDSource(RGBDFrames.from_folder(tum, "tum"), DepthConfig(noise=(0.001, 0.0)))
     out = tmp_path / "out"
     reports = [convert_scan(Job(source, scan, out)) for scan in source.list_scans(out)]
     assert [report.status for report in reports] == ["failed", "converted", "failed"]
@@ -420,9 +421,37 @@ def test_the_record_says_in_which_frame_results_are(tmp_path, posed):
     write_depth(root / "frame-000000.depth.png", 2500, (24, 36))
     if posed:
         write_text(root / "frame-000000.pose.txt", POSE_ROWS)
-    source = RGBDSource(tmp_path, DepthConfig(), "7-scenes", intrinsics=Pinhole(30, 30, 17.5, 11.5))
+    camera = Pinhole(30, 30, 17.5, 11.5)
+    data = RGBDFrames.from_folder(tmp_path, "7-scenes", intrinsics=camera)
+    source = RGBDSource(data, DepthConfig())
     (scan,) = source.list_scans(tmp_path / "out")
     report = convert_scan(Job(source, scan, tmp_path / "out"))
     record = json.loads((tmp_path / "out" / scan.name / "provenance.json").read_text())
     expected = "world" if posed else "camera"
     assert record["measured"]["pose"] == report.measured["pose"] == expected
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_a_frame_is_read_as_a_cloud_as_other_scenes_are(tmp_path, posed):
+    root = tmp_path / "seq-01"
+    write_depth(root / "frame-000000.depth.png", 2500, (24, 36))
+    image = torch.full((24, 36), 2500)
+    image[3, 5] = 0
+    write_png(root / "frame-000000.depth.png", image)
+    if posed:
+        write_text(root / "frame-000000.pose.txt", POSE_ROWS)
+    camera = Pinhole(30, 30, 17.5, 11.5)
+    data = RGBDFrames.from_folder(tmp_path, "7-scenes", intrinsics=camera)
+    cloud, sample = data.read_cloud(0), data[0]
+    pose = sample.get("pose", torch.eye(4).double())
+    pixel = torch.tensor([(35 - 17.5) / 30 * 2.5, (23 - 11.5) / 30 * 2.5, 2.5]).double()
+    assert cloud.grid_shape == (24, 36)
+    np.testing.assert_allclose(cloud.coordinates[-1], pose[:3, :3] @ pixel + pose[:3, 3], atol=1e-6)
+    assert np.flatnonzero(~cloud.finite).tolist() == [3 * 36 + 5]
+    np.testing.assert_allclose(
+        (cloud.coordinates + cloud.front)[cloud.finite], pose[:3, 3].expand(863, 3), atol=1e-6
+    )
+    assert data.count_points(data.scenes[0]) == len(cloud) == 24 * 36
+    copy = pickle.loads(pickle.dumps(data.scenes[0].item))
+    assert torch.equal(copy.intrinsics, data.frames[0].intrinsics)
+    assert (copy.pose is None) == (not posed)

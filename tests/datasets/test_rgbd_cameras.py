@@ -203,15 +203,16 @@ def test_a_camera_without_a_file_is_named_once(scene, tmp_path, run):
 
 @pytest.mark.filterwarnings("ignore:.*using the built-in camera")
 def test_the_record_names_the_camera_and_a_new_file_changes_the_input(scene, tmp_path):
-    source = RGBDSource(scene, DepthConfig(), "7-scenes")
-    (job,) = list_jobs(source, tmp_path / "out")
+    data = RGBDFrames.from_folder(scene, "7-scenes")
+    (job,) = list_jobs(RGBDSource(data, DepthConfig()), tmp_path / "out")
     assert convert_scan(job).status == "converted"
     record = json.loads((job.folder / "provenance.json").read_text())
     # The camera is that of 640 x 480 pixels; the centers of pixels are scaled.
     camera = {"intrinsics": "29.25,29.25,15.525,11.525", "camera": "built in, 7-scenes"}
     assert record["measured"] == {**camera, "depth_scale": 1000.0, "pose": "camera"}
     np.savetxt(scene / "camera-intrinsics.txt", K)
-    jobs = list_jobs(source, tmp_path / "out")
+    data = RGBDFrames.from_folder(scene, "7-scenes")
+    jobs = list_jobs(RGBDSource(data, DepthConfig()), tmp_path / "out")
     assert [*make_plan(jobs).reasons.values()] == ["input changed"]
     assert convert_scan(jobs[0]).status == "converted"
     record = json.loads((job.folder / "provenance.json").read_text())

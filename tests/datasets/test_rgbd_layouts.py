@@ -56,7 +56,8 @@ def test_frames_lie_on_the_walls_that_they_were_taken_of(tmp_path, layout):
 def test_a_capture_in_opengl_axes_has_the_planes_of_its_cloud(tmp_path, suffix, unit):
     given = {} if unit is None else {"depth_unit_scale_factor": unit}
     root = write_nerfstudio(tmp_path / "capture", suffix, 1 / (unit or 0.001), **given)
-    jobs = list_jobs(RGBDSource(root, DepthConfig(), "nerfstudio"), tmp_path / "out")
+    data = RGBDFrames.from_folder(root, "nerfstudio")
+    jobs = list_jobs(RGBDSource(data, DepthConfig()), tmp_path / "out")
     assert [convert_scan(job).status for job in jobs] == ["converted"] * 2
     for number, frame in enumerate(FRAMES):
         cloud = segment_planes(torch.from_numpy(frame.points.reshape(-1, 3)).float(), "classic")

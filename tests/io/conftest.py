@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.structures import PLANE_COLUMNS, Planes, Segmentation
+from torchrg.structures import Planes, Segmentation
+from torchrg.structures.planes import PLANE_COLUMNS
 
 
 @pytest.fixture

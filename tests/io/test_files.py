@@ -15,7 +15,7 @@ from torchrg.datasets import FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
 from torchrg.io.files import atomic_path, check_end
-from torchrg.result import read_result
+from torchrg.io.result import read_result
 from torchrg.structures import Cloud
 
 WRITTEN = [kind for kind, row in FORMATS.items() if row.write]

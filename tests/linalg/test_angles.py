@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.linalg import deg_to_sq_chord, sq_chord_to_deg, sq_chords, unsigned_angle_deg
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chord_to_deg, sq_chords
 
 
 def test_angles_are_those_of_the_arc_cosine():

@@ -7,15 +7,16 @@ import torch
 from torchrg.linalg import covariance, second_moments
 from torchrg.linalg.moments import (
     Segments,
+    eigh3_lapack,
     fit_planes_to_each,
     fit_weighted_planes,
     residuals,
-    split_columns,
+    unbind_columns,
 )
 
 
 def test_planes_are_those_of_the_neighbors_with_a_weight():
-    columns = split_columns(torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]]))
+    columns = unbind_columns(torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 0, 2]]]))
     weights = torch.tensor([[1.0, 1, 1, 0]]), torch.tensor([[1.0, 1, 0, 1]])
     normals, offsets, values = fit_weighted_planes(columns, weights[0])
     assert normals.abs().tolist() == [[0.0, 0.0, 1.0]]
@@ -77,3 +78,13 @@ def test_quantiles_of_small_and_large_regions_are_those_of_sorted_values(size: i
             ascending = values[labels == label].sort().values
             expected.append(ascending[int(fraction * (len(ascending) - 1))])
         assert torch.equal(found, torch.stack(expected))
+
+
+def test_a_matrix_that_is_not_finite_spoils_itself_alone():
+    matrices = torch.diag(torch.tensor([3.0, 1.0, 2.0])).repeat(2, 1, 1)
+    matrices[1, 0, 2] = torch.nan
+    values, vectors = eigh3_lapack(matrices)
+    assert values[0].tolist() == [1.0, 2.0, 3.0]
+    assert vectors[0, :, 0].abs().tolist() == [0.0, 1.0, 0.0]
+    assert values[1].isnan().all()
+    assert vectors[1].isnan().all()

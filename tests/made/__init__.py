@@ -3,7 +3,7 @@
 To add a scene, return a :class:`torchrg.scenes.SceneModel` from a function here: parts (surfaces,
 each a face, and solids that hide what is inside them) and places where a scanner may stand.
 :func:`torchrg.scenes.sample_scene` turns it into a cloud with truth. A new kind of surface has the
-properties and methods of :class:`torchrg.scenes.Surface`, and a function in ``rays`` if it is
+properties and methods of ``scenes.surfaces.Surface``, and a function in ``rays`` if it is
 scanned. A part of the report takes it once it has a key in ``reproduction.clouds``, or in
 ``shapes.SHAPES``.
 """

@@ -10,16 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tests.made.rays import cast_rays
-from torchrg.scenes import (
-    Array,
-    Frame,
-    RoomLayout,
-    Scene,
-    SceneModel,
-    build_room,
-    label_points,
-    unit,
-)
+from torchrg.scenes import RoomLayout, Scene, SceneModel, build_room
+from torchrg.scenes.geometry import Doubles, Frame, unit
+from torchrg.scenes.scene import label_points
 from torchrg.structures import UNLABELED
 
 Sensor = Literal["exact", "kinect", "kinect2"]
@@ -110,7 +103,7 @@ class Camera:
         pose[:3, :3], pose[:3, 3] = self.frame.axes.T, self.frame.origin
         return torch.from_numpy(pose)
 
-    def rays(self) -> Array:
+    def rays(self) -> Doubles:
         """Return what each pixel sees, in camera coordinates with depth 1, ``(H, W, 3)``."""
         rays = np.ones((self.height, self.width, 3))
         rays[..., 0] = (np.arange(self.width) - (self.width - 1) / 2) / self.focal
@@ -204,7 +197,7 @@ def render_depth(
     )
 
 
-def _as_kinect(depth: Array, focal: float, rng: np.random.Generator) -> Array:
+def _as_kinect(depth: Doubles, focal: float, rng: np.random.Generator) -> Doubles:
     """Return depth with the noise and the steps of a Kinect; 0 where out of its range."""
     nearest, furthest = _KINECT_RANGE
     beyond = depth - nearest
@@ -217,7 +210,7 @@ def _as_kinect(depth: Array, focal: float, rng: np.random.Generator) -> Array:
     return np.where(valid, scale / steps, 0)
 
 
-def _as_kinect2(depth: Array, rng: np.random.Generator) -> Array:
+def _as_kinect2(depth: Doubles, rng: np.random.Generator) -> Doubles:
     """Return depth with the noise of a Kinect v2; 0 where out of its range."""
     nearest, furthest = _KINECT2_RANGE
     constant, slope, bend = _KINECT2_NOISE
@@ -307,7 +300,7 @@ def fuse_frames(
 
 def _to_world(
     frame: DepthFrame, pixels: NDArray[np.int64]
-) -> tuple[Array, Array, NDArray[np.int64]]:
+) -> tuple[Doubles, Doubles, NDArray[np.int64]]:
     """Return points, normals and faces of some pixels of a frame, in the world."""
     depth = frame.depth.numpy().reshape(-1, 1)[pixels].astype(np.float64)
     rays = frame.camera.rays().reshape(-1, 3)[pixels]

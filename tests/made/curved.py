@@ -8,18 +8,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrg.scenes import (
-    Array,
-    Frame,
-    Part,
-    RoomLayout,
-    Solid,
-    Surface,
-    unit,
-)
+from torchrg.scenes import RoomLayout
+from torchrg.scenes.geometry import Doubles, Frame, unit
 from torchrg.scenes.parts import TABLE_HEIGHT
 from torchrg.scenes.rooms import Furniture
-from torchrg.scenes.surfaces import Hole, PlaneEquation
+from torchrg.scenes.scene import Part
+from torchrg.scenes.surfaces import Hole, PlaneEquation, Solid, Surface
 
 AngleRange = tuple[float, float]
 """First and last angle, in radians."""
@@ -70,11 +64,11 @@ class Cone(Surface):
         turn = self.sector[1] - self.sector[0]
         return turn * (self.start[0] + self.end[0]) / 2 * self._slant
 
-    def _corners(self) -> Array:
+    def _corners(self) -> Doubles:
         radii, heights = zip(self.start, self.end, strict=True)
         return _around_circles(radii, heights, self.sector)
 
-    def _draw(self, rng: np.random.Generator, count: int) -> Array:
+    def _draw(self, rng: np.random.Generator, count: int) -> Doubles:
         (r0, z0), (r1, z1) = self.start, self.end
         fraction = rng.random(count)
         # The further from the axis, the longer the circle.
@@ -84,7 +78,7 @@ class Cone(Surface):
         sides = (radius * np.cos(angles), radius * np.sin(angles), z0 + step * (z1 - z0))
         return np.stack(sides, axis=1)
 
-    def normals_at(self, points: Array) -> Array:
+    def normals_at(self, points: Doubles) -> Doubles:
         """Return the outward unit normals at points on it, shape ``(N, 3)``."""
         local = self.frame.to_local(points)
         (r0, z0), (r1, z1) = self.start, self.end
@@ -125,12 +119,12 @@ class Ring(Surface):
         profile = self.center * (high - low) + self.radius * float(np.sin(high) - np.sin(low))
         return (self.sector[1] - self.sector[0]) * self.radius * profile
 
-    def _corners(self) -> Array:
+    def _corners(self) -> Doubles:
         angles = _extreme_angles(self.arc)
         radii, heights = self.center + self.radius * np.cos(angles), self.radius * np.sin(angles)
         return _around_circles(radii, heights, self.sector)
 
-    def _draw(self, rng: np.random.Generator, count: int) -> Array:
+    def _draw(self, rng: np.random.Generator, count: int) -> Doubles:
         drawn, missing = [np.zeros(0)], count
         widest = self.center + self.radius
         while missing > 0:
@@ -144,7 +138,7 @@ class Ring(Surface):
         local = [distances * np.cos(around), distances * np.sin(around)]
         return np.stack([*local, self.radius * np.sin(on_arc)], axis=1)
 
-    def normals_at(self, points: Array) -> Array:
+    def normals_at(self, points: Doubles) -> Doubles:
         """Return the outward unit normals at points on it, shape ``(N, 3)``."""
         local = self.frame.to_local(points)
         if self.center:
@@ -153,18 +147,18 @@ class Ring(Surface):
         return self.frame.vectors_to_world(unit(local))
 
 
-def _draw_angles(rng: np.random.Generator, count: int, angles: AngleRange) -> Array:
+def _draw_angles(rng: np.random.Generator, count: int, angles: AngleRange) -> Doubles:
     """Return random angles within a range, shape ``(count,)``."""
     return angles[0] + (angles[1] - angles[0]) * rng.random(count)
 
 
-def _extreme_angles(angles: AngleRange) -> Array:
+def _extreme_angles(angles: AngleRange) -> Doubles:
     """Return both ends of a range and the right angles between them."""
     right = np.arange(-8, 9) * (np.pi / 2)
     return np.concatenate([angles, right[(right > angles[0]) & (right < angles[1])]])
 
 
-def _around_circles(radii: ArrayLike, heights: ArrayLike, sector: AngleRange) -> Array:
+def _around_circles(radii: ArrayLike, heights: ArrayLike, sector: AngleRange) -> Doubles:
     """Return the corners of a box around arcs of radii at heights, shape ``(8, 3)``."""
     distances, angles = np.asarray(radii)[:, None], _extreme_angles(sector)
     sides = (distances * np.cos(angles), distances * np.sin(angles), np.asarray(heights))

@@ -7,7 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.made.curved import Cone, Ring
-from torchrg.scenes import Array, Flat, Scene, SceneModel, Surface, label_points, unit
+from torchrg.scenes import Scene, SceneModel
+from torchrg.scenes.geometry import Doubles, unit
+from torchrg.scenes.scene import label_points
+from torchrg.scenes.surfaces import Flat, Surface
 from torchrg.structures import UNLABELED
 
 _PLACES, _NOISE = range(2)
@@ -37,11 +40,11 @@ class Hits(NamedTuple):
         faces: The faces met, shape ``(H, W)``; ``UNLABELED`` where none.
     """
 
-    distances: Array
+    distances: Doubles
     faces: NDArray[np.int64]
 
 
-def cast_rays(model: SceneModel, origin: Array, directions: Array) -> Hits:
+def cast_rays(model: SceneModel, origin: Doubles, directions: Doubles) -> Hits:
     """Return where rays from one place first meet a scene.
 
     Args:
@@ -74,7 +77,7 @@ def cast_rays(model: SceneModel, origin: Array, directions: Array) -> Hits:
     return Hits(distances[back].reshape(height, width), faces[back].reshape(height, width))
 
 
-def _cones(tiles: NDArray[np.int64], steps: Array) -> tuple[Array, Array]:
+def _cones(tiles: NDArray[np.int64], steps: Doubles) -> tuple[Doubles, Doubles]:
     """Return axis ``(T, 3)`` and half angle ``(T,)`` of a cone around each block of rays."""
     starts = np.flatnonzero(np.diff(tiles, prepend=-1))
     towards = unit(steps)
@@ -85,7 +88,7 @@ def _cones(tiles: NDArray[np.int64], steps: Array) -> tuple[Array, Array]:
     return axes, np.arccos(np.clip(cosines, -1, 1)) + _MARGIN
 
 
-def _may_meet(cones: tuple[Array, Array], bounds: Array) -> NDArray[np.bool_]:
+def _may_meet(cones: tuple[Doubles, Doubles], bounds: Doubles) -> NDArray[np.bool_]:
     """Return which cones touch the ball around a box, given relative to their tip."""
     axes, half_angles = cones
     middle, radius = bounds.mean(axis=0), np.linalg.norm(bounds[1] - bounds[0]) / 2
@@ -124,8 +127,8 @@ def scan_scene(model: SceneModel, num_points: int, *, noise: float = 0.0, seed: 
 
 
 def _scan(
-    model: SceneModel, viewpoint: Array, num_points: int, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.int64]]:
+    model: SceneModel, viewpoint: Doubles, num_points: int, rng: np.random.Generator
+) -> tuple[Doubles, NDArray[np.int64]]:
     """Return exactly ``num_points`` points and faces seen from one place."""
     num_rays = num_points
     while True:
@@ -140,7 +143,7 @@ def _scan(
     return viewpoint + hits.distances.ravel()[kept, None] * steps, hits.faces.ravel()[kept]
 
 
-def _angular_grid(num_rays: int, first_azimuth: float) -> Array:
+def _angular_grid(num_rays: int, first_azimuth: float) -> Doubles:
     """Return at least ``num_rays`` directions in equal steps, shape ``(columns, rows, 3)``."""
     span = _HIGHEST - _LOWEST
     rows = int(np.ceil(np.sqrt(num_rays * span / 360)))
@@ -153,7 +156,7 @@ def _angular_grid(num_rays: int, first_azimuth: float) -> Array:
 
 
 @singledispatch
-def intersect(surface: Surface, origins: Array, directions: Array) -> Array:
+def intersect(surface: Surface, origins: Doubles, directions: Doubles) -> Doubles:
     """Return how far along each ray a surface is first met, shape ``(N,)``; infinite where never.
 
     ``origins`` have shape ``(N, 3)`` or ``(1, 3)``, ``directions`` ``(N, 3)``; distances are in
@@ -163,7 +166,7 @@ def intersect(surface: Surface, origins: Array, directions: Array) -> Array:
 
 
 @intersect.register
-def _meet_flat(surface: Flat, origins: Array, directions: Array) -> Array:
+def _meet_flat(surface: Flat, origins: Doubles, directions: Doubles) -> Doubles:
     start = surface.frame.to_local(origins)
     step = surface.frame.vectors_to_local(directions)
     distance = -start[:, 2] / np.where(step[:, 2] == 0, np.nan, step[:, 2])
@@ -179,7 +182,7 @@ def _meet_flat(surface: Flat, origins: Array, directions: Array) -> Array:
 
 
 @intersect.register
-def _meet_cone(surface: Cone, origins: Array, directions: Array) -> Array:
+def _meet_cone(surface: Cone, origins: Doubles, directions: Doubles) -> Doubles:
     start = surface.frame.to_local(origins)
     step = surface.frame.vectors_to_local(directions)
     (r0, z0), (r1, z1) = surface.start, surface.end
@@ -204,7 +207,7 @@ def _meet_cone(surface: Cone, origins: Array, directions: Array) -> Array:
 
 
 @intersect.register
-def _meet_ring(surface: Ring, origins: Array, directions: Array) -> Array:
+def _meet_ring(surface: Ring, origins: Doubles, directions: Doubles) -> Doubles:
     start = surface.frame.to_local(origins)
     step = surface.frame.vectors_to_local(directions)
     b, c = np.vecdot(start, step), np.vecdot(start, start) - surface.radius**2
@@ -217,7 +220,7 @@ def _meet_ring(surface: Ring, origins: Array, directions: Array) -> Array:
     return nearest
 
 
-def solve_quadratic(a: Array, b: Array, c: Array) -> list[Array]:
+def solve_quadratic(a: Doubles, b: Doubles, c: Doubles) -> list[Doubles]:
     """Return both solutions of ``a t^2 + 2 b t + c = 0``, shape ``(N,)`` each; NaN for none.
 
     Example:
@@ -231,7 +234,7 @@ def solve_quadratic(a: Array, b: Array, c: Array) -> list[Array]:
         return [far / a, c / far]
 
 
-def _is_within(x: Array, y: Array, angles: tuple[float, float]) -> NDArray[np.bool_]:
+def _is_within(x: Doubles, y: Doubles, angles: tuple[float, float]) -> NDArray[np.bool_]:
     """Return which directions are in a range of angles, both ends included."""
     beyond = np.mod(np.arctan2(y, x) - angles[0] + _SLACK, 2 * np.pi)
     return beyond <= angles[1] - angles[0] + 2 * _SLACK

@@ -9,22 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.made.curved import Cone, Ring
-from torchrg.scenes import (
-    Array,
-    Flat,
-    Frame,
-    Part,
-    Scene,
-    SceneModel,
-    Surface,
-    block,
-    rectangle,
-    sample_scene,
-    unit,
-)
-from torchrg.scenes.geometry import box_around
-from torchrg.scenes.scene import NoiseDirection
-from torchrg.scenes.surfaces import PlaneEquation, append_zero
+from torchrg.scenes import Scene, SceneModel, sample_scene
+from torchrg.scenes.geometry import Doubles, Frame, box_around, unit
+from torchrg.scenes.parts import block
+from torchrg.scenes.scene import NoiseDirection, Part
+from torchrg.scenes.surfaces import Flat, PlaneEquation, Surface, append_zero, rectangle
 
 _HERE = Frame.upright(np.zeros(3))
 _QUARTER = np.pi / 2
@@ -62,11 +51,11 @@ class Fan(Flat):
         """Its area."""
         return float((self._cell_areas / 2).sum())
 
-    def _corners(self) -> Array:
+    def _corners(self) -> Doubles:
         corner, first, second = self.cells.swapaxes(0, 1)
         return append_zero(np.concatenate([corner, corner + first, corner + second]))
 
-    def _edge_fractions(self, first: Array, second: Array) -> tuple[Array, Array]:
+    def _edge_fractions(self, first: Doubles, second: Doubles) -> tuple[Doubles, Doubles]:
         beyond = first + second > 1
         return np.where(beyond, 1 - first, first), np.where(beyond, 1 - second, second)
 
@@ -82,25 +71,25 @@ class Outline:
         holes: Each as (x, y, radius); they meet neither each other nor the edge.
     """
 
-    corners: Array
-    radii: Array
+    corners: Doubles
+    radii: Doubles
     holes: Sequence[tuple[float, float, float]] = ()
 
     @cached_property
-    def ways(self) -> tuple[Array, Array]:
+    def ways(self) -> tuple[Doubles, Doubles]:
         """Unit vectors along the edge into and out of each corner, shape ``(M, 2)`` each."""
         edges = np.roll(self.corners, -1, axis=0) - self.corners
         out = edges / np.sqrt((edges * edges).sum(axis=1))[:, None]
         return np.roll(out, 1, axis=0), out
 
     @cached_property
-    def turns(self) -> tuple[Array, Array]:
+    def turns(self) -> tuple[Doubles, Doubles]:
         """Sine, positive to the left, and cosine of the turn at each corner, ``(M,)`` each."""
         into, out = self.ways
         return into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], (into * out).sum(axis=1)
 
     @cached_property
-    def arcs(self) -> tuple[Array, Array, Array]:
+    def arcs(self) -> tuple[Doubles, Doubles, Doubles]:
         """Start ``(M, 2)``, middle ``(M, 2)`` and unsigned angle ``(M,)`` of each rounding."""
         into, (sines, cosines) = self.ways[0], self.turns
         left = np.stack([-into[:, 1], into[:, 0]], axis=1)
@@ -109,10 +98,10 @@ class Outline:
         return starts, middles, np.arctan2(np.abs(sines), cosines)
 
     @cached_property
-    def tangents(self) -> Array:
+    def tangents(self) -> Doubles:
         """Distance from each corner to where its rounding starts, shape ``(M,)``."""
         sines, cosines = self.turns
-        reach: Array = self.radii * np.abs(sines) / (1 + cosines)  # tan(turn / 2)
+        reach: Doubles = self.radii * np.abs(sines) / (1 + cosines)  # tan(turn / 2)
         return reach
 
     @cached_property
@@ -125,7 +114,7 @@ class Outline:
         holes = sum(np.pi * radius**2 for _, _, radius in self.holes)
         return float(whole - (np.sign(self.turns[0]) * cut).sum() - holes)
 
-    def contains(self, x: Array, y: Array) -> NDArray[np.bool_]:
+    def contains(self, x: Doubles, y: Doubles) -> NDArray[np.bool_]:
         """Return which places, of shape ``(N,)``, are inside."""
         inside, places, (_, out) = _in_polygon(x, y, self.corners), np.stack([x, y], 1), self.ways
         starts, middles, _ = self.arcs
@@ -140,7 +129,7 @@ class Outline:
         return inside
 
 
-def _in_polygon(x: Array, y: Array, corners: Array) -> NDArray[np.bool_]:
+def _in_polygon(x: Doubles, y: Doubles, corners: Doubles) -> NDArray[np.bool_]:
     """Return which places are inside a polygon: a line to the right crosses it an odd number."""
     inside = np.zeros(len(x), dtype=bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -166,14 +155,14 @@ class Sheet(Surface):
         """Its area."""
         return self.outline.area
 
-    def normals_at(self, points: Array) -> Array:
+    def normals_at(self, points: Doubles) -> Doubles:
         """Return the outward unit normal at each point, shape ``(N, 3)``."""
         return np.broadcast_to(self.frame.axes[2], points.shape)
 
-    def _corners(self) -> Array:
+    def _corners(self) -> Doubles:
         return append_zero(self.outline.corners)
 
-    def _draw(self, rng: np.random.Generator, count: int) -> Array:
+    def _draw(self, rng: np.random.Generator, count: int) -> Doubles:
         low, high = box_around(self.outline.corners)
         drawn, missing = [np.zeros((0, 2))], count
         while missing > 0:
@@ -228,7 +217,7 @@ def _box(*size: float) -> tuple[Surface, ...]:
     return block("side", _HERE.moved(0, 0, -z / 2), (x, y, z)).surfaces
 
 
-def _convex(corners: Array, directions: Array) -> tuple[Surface, ...]:
+def _convex(corners: Doubles, directions: Doubles) -> tuple[Surface, ...]:
     """Return the faces of a convex body, from its corners and a normal of each face."""
     faces: list[Surface] = []
     for normal in unit(directions):
@@ -244,12 +233,12 @@ def _convex(corners: Array, directions: Array) -> tuple[Surface, ...]:
     return tuple(faces)
 
 
-def _signs(*values: float) -> Array:
+def _signs(*values: float) -> Doubles:
     """Return the vector with all signs of its components, each once."""
     return np.unique(np.array(list(product(*((-value, value) for value in values)))), axis=0)
 
 
-def _cycled(corners: Array) -> Array:
+def _cycled(corners: Doubles) -> Doubles:
     """Return vectors with their components moved on by none, one and two places."""
     return np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
 

@@ -4,21 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchrg.scenes import (
-    Flat,
-    Frame,
-    Part,
-    RoomLayout,
-    Scene,
-    SceneModel,
-    block,
-    furnish,
-    passage,
-    room_walls,
-    sample_scene,
-    scanner_positions,
-)
-from torchrg.scenes.surfaces import Hole
+from torchrg.scenes import RoomLayout, Scene, SceneModel, sample_scene
+from torchrg.scenes.geometry import Frame
+from torchrg.scenes.parts import block, passage, room_walls
+from torchrg.scenes.rooms import furnish, scanner_positions
+from torchrg.scenes.scene import Part
+from torchrg.scenes.surfaces import Flat, Hole
 
 HALL_LAYOUT = RoomLayout(
     size=(24.0, 2.4, 2.7),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.neighbors import finite_rows
 from torchrg.neighbors.blocks import farthest_neighbor, find_boxes, near_boxes, search_block
 from torchrg.neighbors.knn import search_rows
+from torchrg.neighbors.order import finite_rows
 
 
 def lattice(rng):

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors import canonical_order, gather_patches, search_knn
+from torchrg.neighbors import canonical_order, search_knn
 from torchrg.neighbors import knn as knn_module
+from torchrg.neighbors.knn import gather_patches
 
 
 def brute_force(points, k):

@@ -8,13 +8,8 @@ import pytest
 import torch
 
 from torchrg import load_config, search_knn
-from torchrg.neighbors import (
-    canonical_order,
-    distinct_points,
-    measure_sampling,
-    prepare_search,
-    sample_voxels,
-)
+from torchrg.neighbors import canonical_order, distinct_points, measure_sampling, sample_voxels
+from torchrg.neighbors.knn import prepare_search
 from torchrg.structures import Sampling
 
 K = 50

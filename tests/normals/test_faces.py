@@ -8,7 +8,8 @@ import torch
 
 from tests.kernels.clouds import definitions, needs_library
 from torchrg import scratch
-from torchrg.neighbors import finite_rows, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.order import finite_rows
 from torchrg.normals import orient_normals
 from torchrg.normals.faces import _compare, _Components, find_faces, find_surfaces
 from torchrg.normals.orient import turn_faces

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from torchrg.linalg.moments import split_columns
+from torchrg.linalg.moments import unbind_columns
 from torchrg.normals.jet import fit_paraboloids
 
 
@@ -26,7 +26,7 @@ def test_fit_is_that_of_numpy(rng):
     patches = torch.randn(40, 30, 3, generator=rng, dtype=torch.float64)
     patches[:, 0] = 0
     ups = torch.nn.functional.normalize(torch.randn(40, 3, generator=rng).double(), dim=1)
-    found = fit_paraboloids(split_columns(patches), ups, torch.ones(40, 30).double())
+    found = fit_paraboloids(unbind_columns(patches), ups, torch.ones(40, 30).double())
     for row in range(40):
         normal, offset, deviation = literal(patches[row].numpy(), ups[row].numpy())
         assert np.allclose(found[0][row].numpy(), normal, atol=1e-8)
@@ -39,6 +39,6 @@ def test_two_scan_lines_give_their_plane():
     lines = torch.stack([line.repeat(2), torch.tensor([0.0, 0.5]).repeat_interleave(15)], dim=1)
     patch = torch.cat([lines, torch.zeros(30, 1)], dim=1)[None]
     up = torch.tensor([[0.0, 0.0, 1.0]])
-    normals, offsets, deviations = fit_paraboloids(split_columns(patch), up, torch.ones(1, 30))
+    normals, offsets, deviations = fit_paraboloids(unbind_columns(patch), up, torch.ones(1, 30))
     assert torch.allclose(normals, up)
     assert float(offsets.abs() + deviations) < 1e-6

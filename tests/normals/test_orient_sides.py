@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError
+from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals, orient_normals
 from torchrg.structures import Cloud
 
@@ -116,3 +117,31 @@ def test_a_viewpoint_that_is_not_known_is_refused_with_the_repair(scanned):
     )
     with pytest.raises(ConfigError, match="expected orient to be one of auto"):
         orient_normals(cloud, normals, orient="inwards")
+
+
+@pytest.mark.parametrize("orient", ["auto", "interior", "consistent", "up", "-x", "viewpoint"])
+def test_estimated_normals_are_oriented_by_the_same_rule(room, orient):
+    scene = room(3_000, 0.003, 1)
+    points = torch.cat([scene.points, scene.points[:100], torch.full((1, 3), torch.nan)])
+    side = {"orient": orient, "viewpoint": (1.0, 1.0, 1.0) if orient == "viewpoint" else None}
+    stages = []
+    fit = estimate_normals(points, method="pca", k=20, **side, on_stage=stages.append)
+    unoriented = estimate_normals(points, method="pca", k=20)
+    expected = orient_normals(points, unoriented.normals, **side)
+    assert torch.equal(fit.normals, expected)
+    assert torch.equal(fit.curvature, unoriented.curvature)
+    assert stages == ["normals", "orientation"]
+    near = search_knn(scene.points, 20)
+    listed = estimate_normals(scene.points, method="pca", neighbors=near, **side)
+    unoriented = estimate_normals(scene.points, method="pca", neighbors=near)
+    expected = orient_normals(scene.points, unoriented.normals, **side, neighbors=near)
+    assert torch.equal(listed.normals, expected)
+
+
+def test_the_front_of_a_cloud_orients_estimated_normals():
+    floor = np.random.default_rng(0).random((200, 3)) * [1, 1, 0]
+    cloud = Cloud(floor, front=np.tile(np.float32([0, 0, -1]), (200, 1)))
+    fit = estimate_normals(cloud, method="pca", k=10, orient="auto")
+    assert (fit.normals[:, 2] < -0.99).all()
+    with pytest.raises(ConfigError, match="estimate_normals: expected a viewpoint"):
+        estimate_normals(floor, orient="viewpoint")

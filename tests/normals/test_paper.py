@@ -8,7 +8,8 @@ import torch
 from torchrg.config import NormalsConfig
 from torchrg.errors import ShapeError
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.neighbors import gather_patches, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.knn import gather_patches
 from torchrg.normals import (
     estimate_normals,
     fit_normals_pca,

@@ -7,7 +7,9 @@ import torch
 
 from torchrg.config import load_config
 from torchrg.linalg import covariance, eigh3
-from torchrg.neighbors import finite_rows, gather_patches, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.knn import gather_patches
+from torchrg.neighbors.order import finite_rows
 
 
 def papers_growing(**changes):

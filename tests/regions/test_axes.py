@@ -12,7 +12,8 @@ from torchrg import Cloud, align_axes, segment_planes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.regions import summarize_planes
 from torchrg.regions.axes import transform_cloud, transform_planes
-from torchrg.structures import PLANE_COLUMNS, Planes
+from torchrg.structures import Planes
+from torchrg.structures.planes import PLANE_COLUMNS
 
 
 def tilted(rng, most_tilt=5.0):

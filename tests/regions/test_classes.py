@@ -10,10 +10,10 @@ import torch
 
 from tests.made import make_storey
 from torchrg.batch.memory import peak_memory, reset_peak_memory
+from torchrg.io.result import read_result
 from torchrg.regions import classes as module
 from torchrg.regions import summarize_planes
 from torchrg.regions.classes import _find_slabs, classify_planes
-from torchrg.result import read_result
 from torchrg.scenes import RoomLayout, make_room
 from torchrg.structures import PLANE_KINDS
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from torchrg import Cloud, segment_planes, select_planes, write_cloud
-from torchrg.plane_table import describe_planes
-from torchrg.result import read_result
+from torchrg.io.plane_table import describe_planes
+from torchrg.io.result import read_result
 from torchrg.scenes import make_room
 from torchrg.structures import PLANE_KINDS
 

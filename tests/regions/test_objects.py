@@ -7,9 +7,9 @@ import torch
 from tests.kernels.clouds import definitions
 from torchrg import scratch, segment_planes
 from torchrg.errors import ShapeError
+from torchrg.io.result import describe_planes
 from torchrg.neighbors import sample_voxels, search_knn
 from torchrg.neighbors.knn import restrict_to_groups
-from torchrg.result import describe_planes
 from torchrg.structures import UNLABELED, Neighbors
 
 PRESETS = ("consensus", "classic", "paper")

@@ -17,9 +17,10 @@ from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import write_cloud
+from torchrg.io.result import read_result
 from torchrg.regions.selection import keep_planes
-from torchrg.result import read_result
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Cloud
+from torchrg.structures import PLANE_KINDS, Cloud
+from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.transforms import SegmentDepth, SegmentPlanes
 
 SHELL = ("wall", "floor", "ceiling")

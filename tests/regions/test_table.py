@@ -9,7 +9,8 @@ import torch
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import summarize_planes
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS
+from torchrg.structures import PLANE_KINDS
+from torchrg.structures.planes import PLANE_COLUMNS
 
 
 def rotation(rng):

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from tests.render.test_page import described, places, room, unpacked
+from torchrg.io.result import Result
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
 from torchrg.render.channels import decode_directions, encode_directions
 from torchrg.render.page import make_page
-from torchrg.result import Result
 
 
 @pytest.mark.parametrize("mode", ["plane", "superpoint", "normal", "curvature", "sharp"])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tests.render.test_page import described, places, room, unpacked
+from torchrg.io.result import Result
 from torchrg.render.content import NUM_STRATA
 from torchrg.render.page import make_page
-from torchrg.result import Result
 from torchrg.structures import Cloud
 
 

@@ -13,9 +13,9 @@ import torch
 pytest.importorskip("pydeck", reason="needs the extra view")
 
 from torchrg.errors import ConfigError, MissingDependencyError
+from torchrg.io.result import Result
 from torchrg.render.channels import decode_directions
 from torchrg.render.page import Page, make_page
-from torchrg.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from torchrg.result import Result
+from torchrg.io.result import Result
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 

@@ -9,7 +9,7 @@ from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.datasets.provenance import Record, describe_versions, read_record
 from torchrg.errors import FormatError
 from torchrg.io.files import fingerprint, hash_file
-from torchrg.result import RECORD as RECORD
+from torchrg.io.result import RECORD as RECORD
 
 _RESULTS = {"points": int, "regions": int, "repairs": list, "warnings": list}
 """Types of the record entries that reports repeat."""

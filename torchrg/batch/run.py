@@ -19,8 +19,13 @@ from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.provenance import Record, describe_versions, read_record
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io import atomic_path
-from torchrg.io.files import OUTPUT_MARK, PARSE_ERRORS, check_space, normalize_file_name
+from torchrg.io.files import (
+    OUTPUT_MARK,
+    PARSE_ERRORS,
+    atomic_path,
+    check_space,
+    normalize_file_name,
+)
 
 __all__ = [
     "BatchReport",

@@ -1,6 +1,7 @@
 """Sources, jobs, and the conversion of a single scan."""
 
 import contextlib
+import copy
 import json
 import os
 from collections.abc import Collection, Sequence
@@ -12,7 +13,7 @@ from typing import ClassVar
 from torchrg.batch.memory import scan_memory
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
-from torchrg.datasets.folder import SceneFiles
+from torchrg.datasets.folder import SceneDataset, SceneFiles
 from torchrg.datasets.provenance import (
     Record,
     check_owned,
@@ -25,7 +26,7 @@ from torchrg.datasets.provenance import (
     write_record,
 )
 from torchrg.io.files import check_writable, fingerprint, remove_leftovers, sync_folder
-from torchrg.result import PLANES_FILE, RECORD, write_table
+from torchrg.io.result import PLANES_FILE, RECORD, write_table
 
 __all__ = ["Job", "Source", "convert_scan"]
 __dir__ = __all__.copy
@@ -37,18 +38,29 @@ class Source:
     Sources are sent to other processes, so they hold settings and paths but no open files.
 
     Attributes:
-        root: The directory of the data set.
+        data: The data set.
         settings: Segmentation configuration.
         table: Name of an additional plane table in the folder of each scan. Default: none.
     """
 
-    root: Path
+    data: SceneDataset
     settings: PipelineConfig | DepthConfig
     table: str | None
     num_levels = 0
     """Number of levels of superpoints into which conversion also partitions clouds."""
     bytes_per_point: ClassVar[int]
     """Disk space of the results per point, to check the free space in advance."""
+
+    @property
+    def root(self) -> Path:
+        """The directory of the data set."""
+        return self.data.root
+
+    def __getstate__(self) -> Record:
+        """Return the state for other processes, without scenes: each job has its own."""
+        data = copy.copy(self.data)
+        data.scenes = []
+        return vars(self) | {"data": data}
 
     def describe(self) -> Record:
         """Return the type of the source and its options that affect results, for JSON."""

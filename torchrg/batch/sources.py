@@ -1,34 +1,31 @@
 """Sources of batch conversion: clouds and depth frames."""
 
-import copy
 import dataclasses
 import json
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchrg.batch.scans import Source
 from torchrg.batch.task import Begin, TaskReport, collecting_notes
-from torchrg.clouds import note_on_copies, segment_cloud
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets import layouts
-from torchrg.datasets.folder import SceneDataset, SceneFiles, check_outside
+from torchrg.datasets.folder import SceneDataset, SceneFiles
 from torchrg.datasets.layouts import check_layout, check_stems, note_on_origin, write_scan
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.pointcept import SOURCE_ARRAYS, write_results
 from torchrg.datasets.provenance import Record
 from torchrg.datasets.rgbd import RGBDFrame, RGBDFrames
-from torchrg.datasets.rgbd_files import num_pixels
 from torchrg.depth import DepthConfig, segment_depth
-from torchrg.depth.camera import Pinhole, format_intrinsics, unproject_image
-from torchrg.depth.values import DepthKind
+from torchrg.depth.camera import format_intrinsics, unproject_image
 from torchrg.errors import FormatError
 from torchrg.normals.orient import Orientation
+from torchrg.pipeline.clouds import note_on_copies, segment_cloud
 from torchrg.structures import Segmentation
 
 __all__ = ["CloudSource", "RGBDSource"]
@@ -52,7 +49,7 @@ class CloudSource(Source):
         level: Superpoint level to write.
         orient: Orientation of normals; see :func:`torchrg.normals.orient_normals`.
         within: Array of objects that planes must not cross; see
-            :func:`torchrg.clouds.find_objects`. Default: planes may cross objects.
+            :func:`torchrg.pipeline.clouds.find_objects`. Default: planes may cross objects.
     """
 
     data: SceneDataset
@@ -67,11 +64,6 @@ class CloudSource(Source):
     table: str | None = None
     bytes_per_point: ClassVar[int] = 104
     """Disk space per point in the largest layout."""
-
-    @property
-    def root(self) -> Path:  # type: ignore[override]
-        """The directory of the data set."""
-        return self.data.root
 
     @property
     def num_levels(self) -> int:  # type: ignore[override]
@@ -133,12 +125,6 @@ class CloudSource(Source):
             scan.name, "converted", *counts, tuple(files), cloud.repairs, tuple(notes), measured
         )
 
-    def __getstate__(self) -> Record:
-        """Return the state for other processes, without scenes: each job has its own."""
-        data = copy.copy(self.data)
-        data.scenes = []
-        return vars(self) | {"data": data}
-
     def describe(self) -> Record:
         """Return the type of the source, and the settings that differ from their defaults."""
         kind = self.data.kind
@@ -177,58 +163,38 @@ class RGBDSource(Source):
     zero, with plane -1.
 
     Args:
-        layout: Layout of the folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
-        intrinsics: The camera. Default: from a camera file, or the layout's.
-        depth_scale: Depth units per meter. Default: from a camera file, or the layout's.
-        depth_kind: Meaning of the stored values; see :func:`torchrg.depth.values.convert_depth`.
+        data: The frames of a folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
         orient: Orientation of normals; see :func:`torchrg.depth.segment_depth`.
     """
 
-    root: Path
+    data: RGBDFrames
     settings: DepthConfig
-    layout: str
-    intrinsics: Pinhole | None = None
-    depth_scale: float | None = None
-    depth_kind: DepthKind = "z"
+    _: KW_ONLY
     orient: Orientation = "auto"
     table: str | None = None
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
 
     def describe(self) -> Record:
         """Return the type of the source and its options that affect results."""
-        return {
-            "kind": "rgbd",
-            "layout": self.layout,
-            "intrinsics": self.intrinsics,
-            "depth_scale": self.depth_scale,
-            "orient": self.orient,
-            **({} if self.depth_kind == "z" else {"depth_kind": self.depth_kind}),
-        }
+        return {"kind": self.data.kind, "orient": self.orient} | self.data.describe()
 
     def list_scans(self, out: Path) -> list[SceneFiles]:
         """Return the frames in natural order."""
-        check_outside(self.root, out)
-        names = ("layout", "intrinsics", "depth_scale", "depth_kind")
-        options: dict[str, Any] = {name: getattr(self, name) for name in names}
-        data = RGBDFrames.from_folder(self.root, **options)
+        self.data.check_output("", out)
         # A wrong scale affects all frames, so warn before the work.
         with suppress(FormatError, OSError):
-            data.read_sample(0)
+            self.data.read_sample(0)
         return [
-            SceneFiles(
-                frame.name,
-                frame.depth,
-                (frame.depth, *frame.sources),
-                num_points=num_pixels(frame.depth),
-                item=_to_plain(frame),
+            scene._replace(
+                files=(scene.path, *scene.item.sources), num_points=self.data.count_points(scene)
             )
-            for frame in data.frames
+            for scene in self.data.scenes
         ]
 
     def convert(self, scan: SceneFiles, folder: Path, begin: Begin) -> TaskReport:
         """Read a frame, segment it, and write its results, each file atomically."""
         begin("read")
-        frame = _from_plain(scan.item)
+        frame: RGBDFrame = scan.item
         with collecting_notes() as notes:
             depth = frame.read_depth()
         if not bool((depth > 0).any()):
@@ -244,19 +210,15 @@ class RGBDSource(Source):
         files = tuple(write_frame(folder, depth, points, seg))
         num_planes = len(seg.planes)
         notes += [] if num_planes else ["no plane found"]
+        measured = {
+            "intrinsics": format_intrinsics(frame.intrinsics),
+            "camera": frame.origin,
+            "depth_scale": frame.depth_scale,
+            "pose": "camera" if frame.pose is None else "world",
+        }
+        counts = (depth.numel(), num_planes)
         return TaskReport(
-            scan.name,
-            "converted",
-            depth.numel(),
-            num_planes,
-            files,
-            warnings=tuple(notes),
-            measured={
-                "intrinsics": format_intrinsics(frame.intrinsics),
-                "camera": frame.origin,
-                "depth_scale": frame.depth_scale,
-                "pose": "camera" if frame.pose is None else "world",
-            },
+            scan.name, "converted", *counts, files, warnings=tuple(notes), measured=measured
         )
 
 
@@ -267,18 +229,3 @@ def write_frame(folder: Path, depth: Tensor, points: Tensor, seg: Segmentation) 
     """
     coord = torch.where(depth[..., None] > 0, points, 0.0).float().numpy()
     return write_results(folder, coord, seg)
-
-
-def _to_plain(frame: RGBDFrame) -> Record:
-    """Convert a frame to plain values."""
-    pose = None if frame.pose is None else frame.pose.tolist()
-    return vars(frame) | {"intrinsics": frame.intrinsics.tolist(), "pose": pose}
-
-
-def _from_plain(values: Record) -> RGBDFrame:
-    """Convert plain values to a frame."""
-    matrices = {
-        name: None if values[name] is None else torch.tensor(values[name], dtype=torch.float64)
-        for name in ("intrinsics", "pose")
-    }
-    return RGBDFrame(**(values | matrices))

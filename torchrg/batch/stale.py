@@ -18,12 +18,7 @@ from torchrg.batch.records import RECORD
 from torchrg.batch.run import LOCK, read_root
 from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
-from torchrg.datasets.provenance import (
-    Record,
-    check_source,
-    output_paths,
-    read_record,
-)
+from torchrg.datasets.provenance import Record, check_source, read_record, recorded_paths
 from torchrg.errors import FormatError
 from torchrg.io.files import (
     OUTPUT_MARK,
@@ -33,7 +28,7 @@ from torchrg.io.files import (
     remove_leftovers,
     sync_folder,
 )
-from torchrg.result import PAGE_SUFFIXES
+from torchrg.io.result import PAGE_SUFFIXES
 
 __all__ = ["StaleResult", "check_stale", "find_stale", "remove_stale"]
 __dir__ = __all__.copy
@@ -190,7 +185,7 @@ def _find_renamed(
 def _describe_stale(out: Path, name: str, scan: str | None, record: Record) -> StaleResult:
     """Return a stale result with the files of its record below ``out``, and its pages."""
     folders = {Path(os.path.normpath(out / str(folder))) for folder in record.get("pages", ())}
-    paths = output_paths(out, out / name, record)
+    paths = recorded_paths(out, out / name, record)
     paths |= {folder / f"{name}{suffix}": None for folder in folders for suffix in PAGE_SUFFIXES}
     return StaleResult(out, name, scan, paths, folders)
 

@@ -15,11 +15,11 @@ from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import STAGES, check_distinct, note_input, output_paths, run_each, stage_bar
-from torchrg.clouds import check_finite
 from torchrg.errors import ConfigError
-from torchrg.io import RESULT_FIELDS, atomic_path, check_output, read_cloud, write_cloud
-from torchrg.io.files import check_writable
+from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
+from torchrg.io.files import atomic_path, check_writable
 from torchrg.pipeline import segment_planes
+from torchrg.pipeline.clouds import check_finite
 from torchrg.regions.axes import align_axes, transform_cloud, transform_planes
 from torchrg.structures import Segmentation
 

@@ -41,10 +41,9 @@ from torchrg.cli.ending import (
 from torchrg.cli.loop import Progress, print_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig
-from torchrg.datasets import S3DIS, FolderOfClouds, ScanNet
+from torchrg.datasets import S3DIS, FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.datasets.folder import SceneDataset
 from torchrg.datasets.provenance import read_record
-from torchrg.datasets.rgbd_layouts import find_layout
 from torchrg.datasets.s3dis import find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
@@ -55,10 +54,10 @@ from torchrg.io.files import (
     free_space,
     remove_leftovers,
 )
-from torchrg.plane_table import TABLE_SUFFIXES
+from torchrg.io.plane_table import TABLE_SUFFIXES
+from torchrg.io.result import PLANES_FILE, RECORD, read_result
 from torchrg.render.gallery import INDEX, Entry, check_gallery, write_entry, write_index
 from torchrg.render.page import check_library
-from torchrg.result import PLANES_FILE, RECORD, read_result
 
 _Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
 _MEMORY_FRACTION = 0.8
@@ -240,9 +239,10 @@ class RGBDArguments(Arguments):
     def source(self, root: Path) -> Source:
         """Open the frames."""
         camera = flags.parse_intrinsics(self.intrinsics)
-        layout = find_layout(root) if self.layout == "auto" else self.layout
-        options = (layout, camera, self.depth_scale, self.depth_kind, self.orient)
-        return RGBDSource(root, self.depth, *options, table=self.table)
+        names = ("layout", "depth_scale", "depth_kind")
+        options: dict[str, Any] = {name: getattr(self, name) for name in names}
+        data = RGBDFrames.from_folder(root, intrinsics=camera, **options)
+        return RGBDSource(data, self.depth, orient=self.orient, table=self.table)
 
 
 KINDS: dict[str, type[Arguments]] = {

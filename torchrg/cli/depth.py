@@ -20,7 +20,7 @@ from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import check_distinct, note_input, output_paths, run_each, sidecar_paths
 from torchrg.datasets import RGBDFrame, RGBDFrames
-from torchrg.datasets.rgbd import fit_camera
+from torchrg.datasets.rgbd import scale_camera
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
     num_pixels,
@@ -31,9 +31,9 @@ from torchrg.depth.camera import Pinhole, format_intrinsics, reprojection_error,
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import check_writable, create_folder
-from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
+from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
+from torchrg.io.result import PLANES_FILE, write_table
 from torchrg.render import color_planes, write_png
-from torchrg.result import PLANES_FILE, write_table
 from torchrg.structures import Cloud
 
 _COLORING_PIXELS = 200
@@ -150,7 +150,7 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
         if camera is None:
             flag, hint = "--intrinsics fx,fy,cx,cy", "or a camera file"
         raise ConfigError(f"{path}: missing {flag}, required for depth images; pass it, {hint}.")
-    matrix, doubt = fit_camera(path, camera)
+    matrix, doubt = scale_camera(path, camera)
     if doubt:
         warn(doubt)
     return RGBDFrame(path, matrix, scale, depth_kind=arguments.depth_kind)

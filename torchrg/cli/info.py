@@ -8,14 +8,16 @@ import numpy as np
 import torch
 
 from torchrg import kernels
-from torchrg.axes import likely_up
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, describe_sampling, file_columns
 from torchrg.config import load_config
 from torchrg.io import read_cloud
-from torchrg.neighbors import distinct_points, measure_sampling, prepare_search
-from torchrg.structures import Array, Cloud
+from torchrg.neighbors import distinct_points, measure_sampling
+from torchrg.neighbors.knn import prepare_search
+from torchrg.regions.directions import likely_up
+from torchrg.structures import Cloud
+from torchrg.structures.points import Array
 
 _DIGITS = {4: 6, 8: 10}
 """Significant digits printed for a coordinate, by its size in bytes. float32 has at most six; ten

@@ -4,6 +4,7 @@ import dataclasses
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,15 +21,15 @@ from torchrg.cli.loop import (
     run_each,
     stage_bar,
 )
-from torchrg.clouds import check_finite, note_on_copies
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.fields import add_result_fields
 from torchrg.io.npy import DISPLAYED_FIELDS
-from torchrg.neighbors import distinct_points, search_knn
-from torchrg.normals import estimate_normals, orient_normals
+from torchrg.neighbors import distinct_points
+from torchrg.normals import estimate_normals
 from torchrg.normals.orient import find_directions
+from torchrg.pipeline.clouds import check_finite, note_on_copies
 
 RESULTS = ("normals", "curvature", "sharp", "valid")
 """Per-point output fields."""
@@ -80,39 +81,31 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     begin = time.perf_counter()
     cloud = read_cloud(source, columns=flags.file_columns(source, arguments.columns))
     note_input(f"{source}", cloud, target, RESULTS)
-    check_finite(cloud)
-    for note in filter(None, (cloud.unit_note, cloud.precision_note)):
+    for note in check_finite(cloud):
         warn(f"{source}: {note}.")
+    side: dict[str, Any] = {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
     # Fail before the computation.
-    find_directions("normals", cloud, arguments.orient, viewpoint=arguments.viewpoint)
+    find_directions("normals", cloud, **side)
     check_output(target, cloud)
     with stage_bar(source.name, ("normals", "orientation")) as advance:
-        advance("normals")
-        distinct, settings = distinct_points(cloud.points), arguments.normals
-        near = search_knn(distinct.points, min(settings.k, len(distinct.points)), canonical=True)
-        fit = estimate_normals(
-            distinct.points, settings, neighbors=near, chunk_size=arguments.chunk_size
-        ).map(distinct.restore)
-        advance("orientation")
-        turned = orient_normals(
-            cloud, fit.normals, orient=arguments.orient, viewpoint=arguments.viewpoint
-        )
-    for note in note_on_copies(distinct.num_copies, len(cloud)):
+        side |= {"chunk_size": arguments.chunk_size, "on_stage": advance}
+        fit = estimate_normals(cloud, arguments.normals, **side)
+    for note in note_on_copies(distinct_points(cloud.points).num_copies, len(cloud)):
         print_lines(f"{source}: {note}")
     provenance = describe_run(source, arguments.normals)
     names = ("orient", "viewpoint", *["columns"] * (arguments.columns is not None))
     provenance |= {name: getattr(arguments, name) for name in names}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
-    results = zip(RESULTS, (turned, fit.curvature, sharp, fit.valid), strict=True)
+    results = zip(RESULTS, (fit.normals, fit.curvature, sharp, fit.valid), strict=True)
     keeps_fields = not is_archive(target)
     fields = {
         name: v for name, v in cloud.fields.items() if keeps_fields or name in DISPLAYED_FIELDS
     }
     fields = add_result_fields(fields, {name: values.numpy() for name, values in results})
     write_cloud(target, replace(cloud, fields=fields), provenance=provenance)
-    num_bad = len(cloud) - int(fit.valid.sum())
-    if num_bad:
-        warn(f"{source}: {num_bad:,} of {len(cloud):,} points have no normal.")
+    num_lost = int((~fit.valid.numpy() & cloud.finite).sum())
+    if num_lost:
+        warn(f"{source}: {num_lost:,} of {len(cloud):,} finite points have no normal.")
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
     destination = f"{target}{dropped_fields_note(target, cloud.fields)}"

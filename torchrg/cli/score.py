@@ -15,6 +15,7 @@ from torchrg.cli.ending import print_warnings, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
+from torchrg.io.result import read_result
 from torchrg.metrics import (
     METRICS,
     Index,
@@ -24,7 +25,6 @@ from torchrg.metrics import (
     score_normals,
     score_partition,
 )
-from torchrg.result import read_result
 from torchrg.structures import UNLABELED, Cloud
 
 Scores: TypeAlias = dict[str, dict[str, float | None]]

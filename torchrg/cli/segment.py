@@ -31,7 +31,6 @@ from torchrg.cli.loop import (
     sidecar_paths,
     stage_bar,
 )
-from torchrg.clouds import describe_multipliers, find_objects, note_on_copies, segment_cloud
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.layouts import (
@@ -53,11 +52,17 @@ from torchrg.io import (
     write_cloud,
 )
 from torchrg.io.files import check_space
-from torchrg.merge import merge_clouds
-from torchrg.plane_table import TABLE_SUFFIXES, describe_planes
+from torchrg.io.merge import merge_clouds
+from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
+from torchrg.io.result import Result, write_table
+from torchrg.pipeline.clouds import (
+    describe_multipliers,
+    find_objects,
+    note_on_copies,
+    segment_cloud,
+)
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, write_entry, write_index, write_planes
-from torchrg.result import Result, write_table
 from torchrg.structures import Cloud, Segmentation, Superpoints
 
 _DATASET = "ScanNet"

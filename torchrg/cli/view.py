@@ -15,7 +15,7 @@ from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
 from torchrg.cli.loop import check_sidecar, is_viewer
 from torchrg.config import Up
 from torchrg.errors import ConfigError
-from torchrg.io.colors import narrow_colors
+from torchrg.io.result import Result, read_result
 from torchrg.render import (
     color_curvature,
     color_normals,
@@ -27,9 +27,9 @@ from torchrg.render import (
     write_png,
 )
 from torchrg.render.channels import COLOR_MODES
-from torchrg.render.page import MAX_POINTS
-from torchrg.result import Result, read_result
+from torchrg.render.page import MAX_SHOWN_POINTS
 from torchrg.structures import Cloud
+from torchrg.structures.colors import narrow_colors
 
 ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
 PageColorBy = Literal[ColorBy, "error", "normal-error"]
@@ -72,7 +72,7 @@ class Arguments:
     """Second cloud or result, shown in the right half; in a viewer both rotate together."""
     ground_truth: Path | None = None
     """Ground truth for the same points, with labels or normals; shows errors in a viewer."""
-    max_points: int = MAX_POINTS
+    max_points: int = MAX_SHOWN_POINTS
     """Maximum points in the viewer; larger clouds are randomly downsampled, with a note."""
     unit: str | None = None
     """Unit of the coordinates, such as m, for lengths and areas in a viewer. Default: m if the

@@ -21,7 +21,7 @@ from torchrg.errors import DepthWarning, FormatError, TorchrgError, warn
 from torchrg.io.files import PARSE_ERRORS, decode_file, wrap_errors
 from torchrg.structures import FARTHEST
 
-Record = Mapping[str, Any]
+Entries = Mapping[str, Any]
 SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".npy", ".pincam", ".k")
 """Suffixes of files that may be camera files by their name."""
 _SECTIONS = ("intrinsic", "intrinsics", "camera", "cam", "depth", "depth_intrinsics")
@@ -99,7 +99,7 @@ def read_camera(path: Path) -> Pinhole:
         DepthWarning: If the lens distorts images, which torchrg does not correct, or a focal length
             is negative.
     """
-    record = read_record(path)
+    record = read_entries(path)
     if isinstance(record.get("frames"), list) and "fl_x" not in record:
         raise FormatError(
             f"{path}: expected one camera, got one per frame, or none; pass the folder of the file "
@@ -108,7 +108,7 @@ def read_camera(path: Path) -> Pinhole:
     return parse_camera(path, record)
 
 
-def read_record(path: Path) -> Record:
+def read_entries(path: Path) -> Entries:
     """Return the names and values of a camera file in any format."""
     if path.suffix.lower() == ".npy":
         return _name_numbers(path, read_array(path).astype(np.float64).ravel().tolist())
@@ -126,13 +126,13 @@ def read_record(path: Path) -> Record:
         return _colmap_camera(path, rows)
     content = read_mapping(path, repair="; correct it, or pass --intrinsics fx,fy,cx,cy")
     # ORB-SLAM's names have a prefix.
-    record: Record = {re.sub(r"^Camera1?\.", "", f"{name}"): content[name] for name in content}
+    record: Entries = {re.sub(r"^Camera1?\.", "", f"{name}"): content[name] for name in content}
     for section in _SECTIONS:
         record = {**record, **record[section]} if isinstance(record.get(section), dict) else record
     return record
 
 
-def _name_numbers(path: Path, numbers: list[float]) -> Record:
+def _name_numbers(path: Path, numbers: list[float]) -> Entries:
     """Return unnamed numbers as a record; their count determines the names.
 
     If several names fit, the optical axis nearest to the center of the image decides.
@@ -149,7 +149,7 @@ def _name_numbers(path: Path, numbers: list[float]) -> Record:
     return {"intrinsic": numbers}
 
 
-def _colmap_camera(path: Path, rows: list[str]) -> Record:
+def _colmap_camera(path: Path, rows: list[str]) -> Entries:
     """Return the camera in COLMAP's ``cameras.txt``, with nerfstudio's names."""
     if len(rows) > 1:
         raise FormatError(
@@ -199,7 +199,7 @@ def read_info(path: Path) -> dict[str, Any]:
     return record
 
 
-def parse_camera(path: Path, record: Record) -> Pinhole:
+def parse_camera(path: Path, record: Entries) -> Pinhole:
     """Return the camera in a record with any of the known names."""
     size = _image_size(path, record)
     values = ((name, record.get(name)) for name in _MODELS)
@@ -227,7 +227,7 @@ def parse_camera(path: Path, record: Record) -> Pinhole:
     return Pinhole(fx, fy, cx, cy, size, 1 / scale if scale and 0 < scale < 1 else scale)
 
 
-def _read_pinhole(path: Path, record: Record) -> tuple[float, float, float, float]:
+def _read_pinhole(path: Path, record: Entries) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy of a record, with pixel (0, 0) centered at 0."""
     matches = [names for names in _PINHOLE_NAMES if names[0] in record]
     if matches:
@@ -250,7 +250,7 @@ def _read_pinhole(path: Path, record: Record) -> tuple[float, float, float, floa
     )
 
 
-def _distortions(record: Record) -> list[str]:
+def _distortions(record: Entries) -> list[str]:
     """Return the names of nonzero distortion coefficients; none if the images are rectified."""
     names = [] if record.keys() & {*_RECTIFIED} else [name for name in _LENS if name in record]
     values = {name: record[name] for name in names}
@@ -258,7 +258,7 @@ def _distortions(record: Record) -> list[str]:
     return [n for n, value in values.items() if (any(value) if isinstance(value, list) else value)]
 
 
-def parse_matrix(path: Path, record: Record, key: str, columns: int = 3) -> Tensor:
+def parse_matrix(path: Path, record: Entries, key: str, columns: int = 3) -> Tensor:
     """Return a matrix of 3 or 4 rows and at least ``columns`` columns, stored nested or flat."""
     value = record.get(key)
     with suppress(TypeError, ValueError, OverflowError):
@@ -270,7 +270,7 @@ def parse_matrix(path: Path, record: Record, key: str, columns: int = 3) -> Tens
     raise FormatError(f"{path}: expected {key} to be a matrix, got {shortened(value)}; correct it.")
 
 
-def parse_number(path: Path, record: Record, key: str) -> float:
+def parse_number(path: Path, record: Entries, key: str) -> float:
     """Return a finite number of a record, within FARTHEST."""
     value = record.get(key)
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
@@ -279,7 +279,7 @@ def parse_number(path: Path, record: Record, key: str) -> float:
     return float(value)
 
 
-def _image_size(path: Path, record: Record) -> tuple[int, int] | None:
+def _image_size(path: Path, record: Entries) -> tuple[int, int] | None:
     """Return image width and height of a record, or None."""
     for names in _SIDES:
         if names[0] in record:

@@ -16,10 +16,10 @@ from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
 from torchrg.errors import ConfigError, FormatError, add_note, warn
 from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_cloud, takes_columns
-from torchrg.io.colors import read_colors
 from torchrg.io.files import decode_file, local_path
 from torchrg.io.npy import map_array, map_folder
 from torchrg.structures import Cloud
+from torchrg.structures.colors import read_colors
 from torchrg.transforms.rows import Sample, SampleDict
 
 Transform = Callable[[SampleDict], Sample]
@@ -42,7 +42,7 @@ class SceneFiles(NamedTuple):
         dataset: The data set that defines the classes, empty if unknown; None for a plain cloud.
         release_path: Path in the release, which some programs keep. Default: its name.
         num_points: Number of points from headers or file sizes, for ``convert``.
-        item: Extra data for reading; plain, picklable values.
+        item: Extra data for reading; picklable.
     """
 
     name: str

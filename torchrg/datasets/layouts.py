@@ -28,10 +28,10 @@ from torchrg.datasets.pointcept import write_files, write_pointcept_scene, write
 from torchrg.datasets.s3dis import CLASS_ORDERS
 from torchrg.datasets.scannet import NYU_IDS, read_objects
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.colors import narrow_colors
 from torchrg.io.files import normalize_file_name
-from torchrg.plane_table import describe_planes
+from torchrg.io.plane_table import describe_planes
 from torchrg.structures import UNLABELED, Cloud, Segmentation, Superpoints
+from torchrg.structures.colors import narrow_colors
 
 Files = dict[str, NDArray[Any] | bytes]
 """File contents by path below the output directory: arrays for ``.npy`` files, or bytes."""

@@ -17,8 +17,7 @@ from torchrg.datasets.layouts import SPLIT_NAMES
 from torchrg.datasets.s3dis import CLASS_ORDERS, ROOMS_PER_AREA
 from torchrg.datasets.scannet import CLASSES, NYU_IDS
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
-from torchrg.io.files import OUTPUT_MARK, create_folder, remove_leftovers, wrap_errors
+from torchrg.io.files import OUTPUT_MARK, atomic_path, create_folder, remove_leftovers, wrap_errors
 
 ListEntry = dict[str, Any]
 """List entry of a scan, by key."""

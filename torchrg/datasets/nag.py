@@ -13,7 +13,8 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_shapes
 from torchrg._optional import require
 from torchrg.errors import MissingDependencyError, ShapeError
-from torchrg.structures import Array, Superpoints
+from torchrg.structures import Superpoints
+from torchrg.structures.points import Array
 
 
 class Cluster(NamedTuple):

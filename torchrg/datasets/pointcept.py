@@ -31,13 +31,13 @@ from torchrg.datasets.provenance import (
     write_record,
 )
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
-from torchrg.io.colors import narrow_colors, read_colors
 from torchrg.io.columns import narrow_integers
-from torchrg.io.files import create_folder, local_path
+from torchrg.io.files import atomic_path, create_folder, local_path
 from torchrg.io.npy import check_rows, map_array, map_folder
-from torchrg.result import PLANES_FILE, RECORD, describe_planes
-from torchrg.structures import Array, Segmentation
+from torchrg.io.result import PLANES_FILE, RECORD, describe_planes
+from torchrg.structures import Segmentation
+from torchrg.structures.colors import narrow_colors, read_colors
+from torchrg.structures.points import Array
 
 POINT_ARRAYS = (
     "coord", "color", "normal", "strength", "segment", "segment20", "segment200", "instance",
@@ -102,9 +102,8 @@ def write_pointcept_scene(
             ``normal``: the normals of the segmentation.
         segmentation: Result of :func:`torchrg.segment_planes` for ``coord``.
         superpoint: Superpoint of each point, shape ``(N,)``. Default: not written.
-        origin: Origin of ``coord``, for the plane table; see
-            :func:`torchrg.result.describe_planes`. Default: ``coord`` is in the coordinates of the
-            data set.
+        origin: Origin of ``coord``, for the plane table. Default: ``coord`` is in the coordinates
+            of the data set.
 
     Returns:
         Names of the files written.

@@ -17,9 +17,8 @@ import torch
 
 from torchrg import kernels, version
 from torchrg.errors import FormatError
-from torchrg.io import atomic_path
-from torchrg.io.files import PARSE_ERRORS, first_line, is_unchanged
-from torchrg.result import RECORD
+from torchrg.io.files import PARSE_ERRORS, atomic_path, first_line, is_unchanged
+from torchrg.io.result import RECORD
 
 Record = dict[str, Any]
 """A record, or a part of one, as JSON values."""
@@ -117,7 +116,7 @@ def _layout(source: Record) -> object:
     return source.get("layout") if "version" in source else "pointcept"
 
 
-def output_paths(out: Path, folder: Path, record: Record | None) -> dict[Path, Record | None]:
+def recorded_paths(out: Path, folder: Path, record: Record | None) -> dict[Path, Record | None]:
     """Return the files of a record in a folder by path, without files outside ``out``."""
     files = owned_files(record).items()
     paths = {Path(os.path.normpath(folder / name)): stored for name, stored in files}
@@ -133,7 +132,7 @@ def remove_unwritten(
     """
     paths = {Path(os.path.normpath(folder / name)) for name in written}
     changed = []
-    for path, stored in sorted(output_paths(out, folder, record).items()):
+    for path, stored in sorted(recorded_paths(out, folder, record).items()):
         if path not in paths and os.path.lexists(path):
             if is_unchanged(path, stored):
                 path.unlink()

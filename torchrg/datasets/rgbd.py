@@ -2,9 +2,11 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,17 +18,18 @@ from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
     MAX_PIXELS,
     image_size,
+    num_pixels,
     read_color,
     read_depth,
     refuse_form,
 )
 from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, ListedFrame, find_layout, find_recordings
-from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view
+from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view, unproject_image
 from torchrg.depth.values import DepthKind, check_conversion
 from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError, warn
 from torchrg.io.files import local_path, wrap_errors
 from torchrg.linalg.rigid import check_rigid
-from torchrg.structures import FARTHEST
+from torchrg.structures import FARTHEST, Cloud
 from torchrg.transforms.rows import SampleDict
 
 
@@ -67,6 +70,14 @@ class RGBDFrame:
         check_rigid("RGBDFrame", "pose", self.pose)
         check_conversion("RGBDFrame", self.depth_scale, self.depth_kind)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return plain values, because other processes would share the memory of tensors."""
+        return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(self).items()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        matrices = {k: torch.tensor(v).double() for k, v in state.items() if isinstance(v, list)}
+        vars(self).update(state | matrices)
+
     @property
     def files(self) -> tuple[Path, ...]:
         """All input files: depth, color if present, and the files of intrinsics and pose."""
@@ -96,8 +107,7 @@ class RGBDFrames(SceneDataset):
         transform: Applied to each sample, for example :class:`torchrg.transforms.SegmentDepth`.
 
     Attributes:
-        frames: The frames.
-        scenes: Name, depth image and all input files of each frame.
+        scenes: Name, depth image and all input files of each frame, which is its ``item``.
 
     Raises:
         ConfigError: If two frames have the same name, or ``frames`` is a folder.
@@ -113,6 +123,10 @@ class RGBDFrames(SceneDataset):
         (torch.Size([1, 4, 6]), 1.5, ['depth', 'intrinsics', 'name'])
     """
 
+    kind = "rgbd"
+    options: Mapping[str, Any] = MappingProxyType({})
+    """Arguments of :meth:`from_folder` that affect the samples."""
+
     def __init__(self, frames: Sequence[RGBDFrame], *, transform: Transform | None = None) -> None:
         is_path = isinstance(frames, os.PathLike)
         if is_path or not all(isinstance(frame, RGBDFrame) for frame in frames):
@@ -120,8 +134,8 @@ class RGBDFrames(SceneDataset):
                 f"RGBDFrames: expected a list of RGBDFrame, got {frames!r:.60}; use "
                 "RGBDFrames.from_folder for a folder."
             )
-        self.frames, self.transform = tuple(frames), transform
-        self.scenes = [SceneFiles(frame.name, frame.depth, frame.files) for frame in self.frames]
+        self.transform = transform
+        self.scenes = [SceneFiles(f.name, f.depth, f.files, item=f) for f in frames]
         first: dict[str, Path] = {}
         for number, (name, path, *_) in enumerate(self.scenes):
             first.setdefault(name, path)
@@ -188,7 +202,40 @@ class RGBDFrames(SceneDataset):
         if not frames:
             suffixes = " ".join(DEPTH_SUFFIXES)
             raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
-        return cls(frames, transform=transform)
+        data = cls(frames, transform=transform)
+        data.root = folder
+        data.options = {"layout": name, "intrinsics": camera, "depth_scale": depth_scale} | (
+            {} if depth_kind == "z" else {"depth_kind": depth_kind}
+        )
+        return data
+
+    @property
+    def frames(self) -> tuple[RGBDFrame, ...]:
+        """The frames."""
+        return tuple(scene.item for scene in self.scenes)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the JSON-serializable parameters that affect the samples."""
+        return dict(self.options)
+
+    def count_points(self, scene: SceneFiles) -> int:
+        """Return the number of pixels of a frame."""
+        return num_pixels(scene.path)
+
+    def read_scene(self, scene: SceneFiles) -> Cloud:
+        """Return the pixels of a frame as an organized cloud, with its front towards the camera.
+
+        Coordinates are in the world if the pose is known. Pixels without depth are NaN.
+        """
+        frame: RGBDFrame = scene.item
+        depth = frame.read_depth()
+        points = unproject_image(depth, frame.intrinsics, frame.pose)
+        center = points.new_zeros(3) if frame.pose is None else frame.pose[:3, 3].to(points)
+        points = torch.where(depth[..., None] > 0, points, torch.nan).view(-1, 3)
+        front = (center - points).nan_to_num(0.0).float().numpy()
+        height, width = depth.shape
+        shape = (height, width)
+        return Cloud(points.numpy(), grid_shape=shape, source=f"{frame.depth}", front=front)
 
     def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a frame.
@@ -196,7 +243,7 @@ class RGBDFrames(SceneDataset):
         Raises:
             FormatError: If a file is missing, corrupt, or not a depth image.
         """
-        frame = self.frames[index]
+        frame: RGBDFrame = self.scenes[index].item
         sample: SampleDict = {
             "depth": frame.read_depth()[None],
             "intrinsics": frame.intrinsics.to(torch.float64),
@@ -259,7 +306,7 @@ def _find_frames(
                     f"camera of other origin ({origin}); pass --depth-scale (depth_scale), 1000 "
                     "for millimeters."
                 )
-            matrix, doubt = fit_camera(frame.depth, chosen, *files[:1])
+            matrix, doubt = scale_camera(frame.depth, chosen, *files[:1])
             notes[folder] = notes.get(folder) or doubt
             pose, files = frame.pose, tuple(dict.fromkeys((*files, *frame.sources)))
             if pose is not None and not bool((pose.abs() <= FARTHEST).all()):
@@ -280,7 +327,7 @@ def _find_frames(
     return frames
 
 
-def fit_camera(image: Path, camera: Pinhole, file: Path | None = None) -> tuple[Tensor, str]:
+def scale_camera(image: Path, camera: Pinhole, file: Path | None = None) -> tuple[Tensor, str]:
     """Return the camera matrix for a depth image, and a warning if it is implausible.
 
     Args:

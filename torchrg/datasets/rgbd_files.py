@@ -17,7 +17,6 @@ from torch import Tensor
 from torchrg._checks import as_tensor
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.errors import FormatError
-from torchrg.io.colors import BYTE, WORD, narrow_colors
 from torchrg.io.files import (
     PARSE_ERRORS,
     check_available,
@@ -26,7 +25,8 @@ from torchrg.io.files import (
     local_path,
     wrap_errors,
 )
-from torchrg.structures import Array
+from torchrg.structures.colors import BYTE, WORD, narrow_colors
+from torchrg.structures.points import Array
 
 Value = TypeVar("Value")
 DEPTH_SUFFIXES = (".png", ".npy", ".pgm")

@@ -17,8 +17,8 @@ from torchrg.datasets.camera_files import (
     parse_matrix,
     parse_number,
     read_camera,
+    read_entries,
     read_mapping,
-    read_record,
 )
 from torchrg.datasets.folder import check_folder, find_files, list_dir, natural_key, warn_skipped
 from torchrg.datasets.rgbd_files import (
@@ -254,7 +254,7 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     """
     locations = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
     calibration = next((path for path in locations if path.is_file()), locations[0])
-    record = read_record(calibration)
+    record = read_entries(calibration)
     scale = parse_number(calibration, record, "scale")
     camera = parse_camera(calibration, {**record, "depth_scale": scale})
     track = folder / "traj.txt"

@@ -24,9 +24,9 @@ from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_f
 from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
-from torchrg.io.colors import find_white, narrow_colors, read_colors
 from torchrg.io.files import check_file, local_path
 from torchrg.structures import Cloud
+from torchrg.structures.colors import find_white, narrow_colors, read_colors
 
 CLASS_ORDERS = {
     "pointcept": (
@@ -142,7 +142,7 @@ def _list_area(root: Path, area: int) -> list[SceneFiles]:
         missing = f" ({', '.join(bare)}: no {ANNOTATIONS})" if bare else ""
         warn(
             f"{folder}: expected {ROOMS_PER_AREA[area]} rooms, got {len(rooms)}{missing}; "
-            "download the missing rooms unless this is intended.",
+            "download the missing rooms unless this is intended."
         )
     return [
         SceneFiles(f"{folder.name}/{room.name}", room, object_files(room), "S3DIS")

@@ -22,8 +22,8 @@ from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_f
 from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import read_cloud
 from torchrg.io.files import PARSE_ERRORS, decode_file, local_path, wrap_errors
+from torchrg.io.plane_table import Arrays
 from torchrg.linalg.rigid import check_rigid
-from torchrg.plane_table import Arrays
 from torchrg.structures import UNLABELED, Cloud
 from torchrg.transforms.rows import SampleDict
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels
-from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
 from torchrg.regions.repair import remap_labels
 
@@ -29,7 +29,6 @@ _MAX_NOISE = 3.0
 _MIN_REACH = 2.0
 """Regions meet without a step if their planes intersect within this many pixels of the boundary, or
 within half the width of the strip."""
-
 _STRIDE = 4
 """Row and column stride of the search for hidden contacts."""
 _MIN_LINES = 2

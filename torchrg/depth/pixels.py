@@ -10,7 +10,7 @@ from torchrg.config import DepthConfig
 from torchrg.depth.normals import FLAT, PixelPlanes
 from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import Image, Windows
-from torchrg.linalg import deg_to_sq_chord, sq_chords
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 
 _WIDE_ANGLE_FACTOR = 1.75
 """Factor of the maximum angle between the normals of two windows that both contain both pixels. On

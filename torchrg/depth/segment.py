@@ -16,13 +16,13 @@ from torchrg.depth.normals import fit_pixels
 from torchrg.depth.pixels import Pixels, describe_pixels
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.depth.windows import Image
-from torchrg.linalg import unit_direction
+from torchrg.linalg.angles import unit_direction
 from torchrg.linalg.moments import Segments, kth_smallest
 from torchrg.linalg.rigid import check_rigid
 from torchrg.normals import Orientation, orient_normals
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.fit import fit_planes
-from torchrg.regions.selection import choose_planes, keep_planes
+from torchrg.regions.selection import keep_planes, selected_rows
 from torchrg.regions.table import measure_planes
 from torchrg.structures import Segmentation
 
@@ -96,15 +96,11 @@ def segment_depth(
     settings = settings_of("segment_depth", DepthConfig, config, changes)
     depth = convert_depth("segment_depth", depth, intrinsics, depth_scale, depth_kind)
     seg = _segment(depth, intrinsics, settings, pose, orient)
-    return keep_planes(seg, choose_planes(seg.planes, settings))
+    return keep_planes(seg, selected_rows(seg.planes, settings))
 
 
 def _segment(
-    depth: Tensor,
-    intrinsics: Tensor,
-    config: DepthConfig,
-    pose: Tensor | None,
-    orient: Orientation,
+    depth: Tensor, intrinsics: Tensor, config: DepthConfig, pose: Tensor | None, orient: Orientation
 ) -> Segmentation:
     """Implement :func:`segment_depth`."""
     if depth.numel() == 0:

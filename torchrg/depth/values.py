@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrg._checks import check_choices, check_floating
 from torchrg.errors import ConfigError, DepthWarning, warn
-from torchrg.structures import Array
+from torchrg.structures.points import Array
 
 Image = TypeVar("Image", Tensor, Array)
 DepthKind = Literal["z", "ray"]

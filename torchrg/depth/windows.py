@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels, pass_over_rows
-from torchrg.linalg import machine_epsilon
 from torchrg.linalg.moments import kth_smallest
+from torchrg.linalg.precision import machine_epsilon
 
 CELL_SIZES = (8, 4, 2, 1)
 """Cell widths in pixels, largest first."""

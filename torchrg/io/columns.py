@@ -8,10 +8,11 @@ import numpy as np
 
 from torchrg._parallel import split_rows
 from torchrg.errors import FormatError
-from torchrg.io.colors import narrow_colors, read_colors
-from torchrg.io.fields import MAX_EXACT_INTEGER, SKIPPED, Columns, Values, backup_name
+from torchrg.io.fields import MAX_EXACT_INTEGER, SKIPPED, NamedColumns, backup_name
 from torchrg.io.files import atomic_path
 from torchrg.structures import Cloud
+from torchrg.structures.colors import narrow_colors, read_colors
+from torchrg.structures.points import Array
 
 _RECORDS_PER_CHUNK = 1 << 20
 """Number of records converted and written at a time, which bounds the memory."""
@@ -39,14 +40,14 @@ class FieldNames(NamedTuple):
     blanks: bool = False
 
 
-def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str, Values]:
+def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str, Array]:
     """Convert a cloud to named columns: ``x y z`` first, then its fields.
 
     Labels become int32 if they fit, colors uint8 (or uint16 if the format supports it), booleans
     uint8, and half precision float32. A multi-column field is split into ``name_0``, ``name_1`` and
     so on, unless the format has ``vectors``.
     """
-    columns: dict[str, Values] = {axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")}
+    columns: dict[str, Array] = {axis: cloud.coordinates[:, i] for i, axis in enumerate("xyz")}
     for name, values in cloud.fields.items():
         if name == SKIPPED:
             raise FormatError(f"{path}: a field cannot be named {name!r}; rename it.")
@@ -62,7 +63,7 @@ def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str
     return columns
 
 
-def check_field(path: Path, name: str, values: Values, num_points: int) -> None:
+def check_field(path: Path, name: str, values: Array, num_points: int) -> None:
     """Check that a field has a name that files can store, and one row per point."""
     if "\0" in name or len(name) > _MAX_NAME:
         raise FormatError(
@@ -76,7 +77,7 @@ def check_field(path: Path, name: str, values: Values, num_points: int) -> None:
         )
 
 
-def _to_storable(path: Path, name: str, values: Values, field_names: FieldNames) -> Values:
+def _to_storable(path: Path, name: str, values: Array, field_names: FieldNames) -> Array:
     """Convert a field to real numbers of a dtype that files can store."""
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
         raise FormatError(
@@ -100,7 +101,7 @@ def _to_storable(path: Path, name: str, values: Values, field_names: FieldNames)
     return values.astype(np.float32) if values.dtype == np.float16 else values
 
 
-def _split_field(name: str, values: Values, field_names: FieldNames) -> dict[str, Values]:
+def _split_field(name: str, values: Array, field_names: FieldNames) -> dict[str, Array]:
     """Split a field into named columns."""
     word = (name if field_names.blanks else "_".join(name.split())) or "field"
     if values.shape[1:] in ((), (1,)):
@@ -114,7 +115,7 @@ def _split_field(name: str, values: Values, field_names: FieldNames) -> dict[str
     return {f"{word}_{i}": column for i, column in enumerate(values.T)}
 
 
-def check_exact(path: Path, columns: Columns) -> None:
+def check_exact(path: Path, columns: NamedColumns) -> None:
     """Check that float64, and thus text, represents all 64-bit integers exactly."""
     for name, column in columns.items():
         is_integer = column.dtype.kind in "iu"
@@ -125,7 +126,7 @@ def check_exact(path: Path, columns: Columns) -> None:
             )
 
 
-def narrow_integers(values: Values, codes: Collection[str]) -> Values:
+def narrow_integers(values: Array, codes: Collection[str]) -> Array:
     """Convert 64-bit integers to the first type of ``codes`` that holds them all.
 
     Values that fit none of these types, and values of other dtypes, are unchanged.
@@ -140,7 +141,7 @@ def narrow_integers(values: Values, codes: Collection[str]) -> Values:
     return values
 
 
-def to_records(columns: Columns, rows: slice = slice(None)) -> Values:
+def to_records(columns: NamedColumns, rows: slice = slice(None)) -> Array:
     """Return rows of columns as one little-endian structured array, shape ``(n,)``."""
     parts = {name: column[rows] for name, column in columns.items()}
     types = [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in parts.items()]
@@ -150,7 +151,7 @@ def to_records(columns: Columns, rows: slice = slice(None)) -> Values:
     return records
 
 
-def write_records(path: Path, header: Sequence[str], columns: Columns) -> None:
+def write_records(path: Path, header: Sequence[str], columns: NamedColumns) -> None:
     """Write header lines and columns as binary records."""
     num_rows = len(next(iter(columns.values())))
     with atomic_path(path) as temporary, temporary.open("wb") as stream:

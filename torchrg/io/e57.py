@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 
 from torchrg._optional import require
 from torchrg.errors import FormatError
-from torchrg.io.colors import WIDEN, read_colors
-from torchrg.io.fields import Values, assemble_cloud
+from torchrg.io.fields import assemble_cloud
 from torchrg.io.files import PARSE_ERRORS, check_available, wrap_errors
 from torchrg.io.headers import check_grid, distance_outside
-from torchrg.mesh import Fronts
-from torchrg.structures import FARTHEST, Cloud, bounding_box
+from torchrg.io.mesh import Fronts
+from torchrg.structures import FARTHEST, Cloud
+from torchrg.structures.colors import WIDEN, read_colors
+from torchrg.structures.points import Array, bounding_box
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -53,7 +54,7 @@ _VALUE_BYTES = 8
 """Maximum bytes of a value in memory."""
 _BYTES_PER_POINT = 12
 """Assumed bytes per point when estimating the count from the file size: three float32."""
-_Block = dict[str, Values]
+_Block = dict[str, Array]
 """Columns of a scan, by name."""
 
 
@@ -193,7 +194,7 @@ def _unify_colors(
     if all(each is None for each in limits):
         return ()
     channels, notes = [*_CHANNELS.values()], dict[str, None]()
-    colors = dict[int, Values]()
+    colors = dict[int, Array]()
     for i, (block, stated) in enumerate(zip(blocks, limits, strict=True)):
         if all(channel in block for channel in channels):
             color = np.stack([block[channel] for channel in channels], axis=1)
@@ -308,7 +309,7 @@ def _read_numbers(node: Any, prefix: str, names: Iterable[str]) -> tuple[float, 
     return tuple(float(node[each].value()) for each in paths)
 
 
-def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple[Values, _Block]:  # noqa: ANN401
+def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple[Array, _Block]:  # noqa: ANN401
     """Read the coordinates of a scan, shape ``(n, 3)``, and its fields by the standard's names.
 
     Text fields are skipped.
@@ -358,7 +359,7 @@ def _type_code(libe57: Any, node: Any) -> str:  # noqa: ANN401
     return "f" if single else "d"
 
 
-def _to_world(points: Values, block: _Block, scan: ScanPose) -> _Block:
+def _to_world(points: Array, block: _Block, scan: ScanPose) -> _Block:
     """Apply the pose to points and normals of a scan, and rename its fields to column names."""
     if scan.is_moved and all(name in block for name in _NORMALS):
         normals = np.stack([block[name] for name in _NORMALS], axis=1)

@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError
-from torchrg.io.colors import read_colors
-from torchrg.io.tables import are_integers, check_table, guess_column_names, warn_about_counters
+from torchrg.io.tables import check_table, guess_column_names, warn_about_counters
 from torchrg.structures import UNLABELED, Cloud
+from torchrg.structures.colors import read_colors
+from torchrg.structures.points import Array, are_integers
 
-Values = NDArray[Any]
-"""An array of any type."""
-Columns = Mapping[str, Values]
+NamedColumns = Mapping[str, Array]
 """Per-point values by name, each of shape ``(N, ...)``."""
-
 FIELD_NAMES = {
     "label": "labels",
     "labels": "labels",
@@ -59,7 +57,7 @@ rounded integer."""
 
 def assemble_cloud(
     path: Path,
-    columns: Columns,
+    columns: NamedColumns,
     *,
     coordinates: str | None = None,
     grid_shape: tuple[int, int] | None = None,
@@ -112,7 +110,7 @@ def assemble_cloud(
 
 def assemble_table(
     path: Path,
-    table: Values,
+    table: Array,
     names: Sequence[str] | None,
     notes: tuple[str, ...] = (),
     integers: Collection[int] = (),
@@ -137,7 +135,7 @@ def assemble_table(
     return assemble_cloud(path, columns, notes=notes, integers=[names[i] for i in integers])
 
 
-def convert_coordinates(path: Path, coordinates: Values) -> NDArray[np.floating]:
+def convert_coordinates(path: Path, coordinates: Array) -> NDArray[np.floating]:
     """Return coordinates as float32 or float64 in native byte order.
 
     Integers of at most 16 bits and half precision become float32, which is exact; other numbers
@@ -172,8 +170,8 @@ def backup_name(name: str) -> str:
 
 
 def add_result_fields(
-    fields: Mapping[str, Values], results: Mapping[str, Values]
-) -> dict[str, Values]:
+    fields: Mapping[str, Array], results: Mapping[str, Array]
+) -> dict[str, Array]:
     """Return the fields of a cloud together with the fields of a result.
 
     A field with the name of a result is renamed as :func:`backup_name` returns. If that name is
@@ -212,7 +210,7 @@ def check_names(path: Path, names: Sequence[str], num_columns: int) -> None:
     raise FormatError(f"{path}: expected {wrong}; use {SKIPPED} to skip a column.")
 
 
-def _field_columns(columns: Columns) -> dict[str, list[str]]:
+def _field_columns(columns: NamedColumns) -> dict[str, list[str]]:
     """Return the columns of each field; the first of two equal names wins.
 
     Triples and numbered columns are joined, the others renamed, by shape and type only.
@@ -234,7 +232,7 @@ def _field_columns(columns: Columns) -> dict[str, list[str]]:
     return fields
 
 
-def _unique_field_name(name: str, values: Values, existing: Collection[str]) -> str:
+def _unique_field_name(name: str, values: Array, existing: Collection[str]) -> str:
     """Return the field name of a column if its shape fits, changed if the name is taken."""
     target = FIELD_NAMES.get(_normalize_name(name), name.removeprefix("scalar_") or name)
     shapes = {"normals": (3,), "color": (3,), "labels": ()}
@@ -250,7 +248,7 @@ def _normalize_name(name: str) -> str:
     return name.lower().removeprefix("scalar_")
 
 
-def _find_numbered(columns: Columns) -> dict[str, list[str]]:
+def _find_numbered(columns: NamedColumns) -> dict[str, list[str]]:
     """Find consecutive ``name_0``, ``name_1``, ... of single columns of one type."""
     numbers: dict[str, dict[int, str]] = {}
     for name, values in columns.items():
@@ -266,7 +264,7 @@ def _find_numbered(columns: Columns) -> dict[str, list[str]]:
     }
 
 
-def _stack(path: Path, columns: list[Values]) -> Values:
+def _stack(path: Path, columns: list[Array]) -> Array:
     """Stack single columns, or return one column as it is, in native byte order."""
     if len(columns) == 1:
         return np.ascontiguousarray(columns[0], dtype=columns[0].dtype.newbyteorder("="))
@@ -284,7 +282,7 @@ def _stack(path: Path, columns: list[Values]) -> Values:
     return stacked
 
 
-def _convert_labels(path: Path, labels: Values) -> NDArray[np.int64]:
+def _convert_labels(path: Path, labels: Array) -> NDArray[np.int64]:
     """Convert labels to int64, shape ``(N,)``; NaN means unlabeled, as in CloudCompare."""
     flat = labels.reshape(-1) if labels.shape[1:] == (1,) else labels
     if flat.ndim != 1 or flat.dtype.kind not in "biuf":
@@ -308,7 +306,7 @@ def _convert_labels(path: Path, labels: Values) -> NDArray[np.int64]:
     return flat.astype(np.int64)
 
 
-def _convert_normals(path: Path, normals: Values) -> NDArray[np.floating]:
+def _convert_normals(path: Path, normals: Array) -> NDArray[np.floating]:
     """Convert normals to float32 or float64, shape ``(N, 3)``."""
     if normals.shape[1:] != (3,) or normals.dtype.kind not in "fiu":
         raise FormatError(
@@ -318,6 +316,6 @@ def _convert_normals(path: Path, normals: Values) -> NDArray[np.floating]:
     return normals.astype(np.float64 if normals.dtype.itemsize > 4 else np.float32, copy=False)
 
 
-def _row_shape(values: Values) -> str:
+def _row_shape(values: Array) -> str:
     """Format the shape of a field for a message, with N for the number of points."""
     return f"({', '.join(['N', *map(str, values.shape[1:])])})"

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from torchrg.errors import FormatError, system_limit
-from torchrg.structures import FilePath
+from torchrg.structures.points import FilePath
 
 PARSE_ERRORS = (
     ValueError,
@@ -80,17 +80,6 @@ def atomic_path(
 
     Raises:
         FormatError: If the folder does not exist, or the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "a.txt"
-        ...     with atomic_path(path) as temporary:
-        ...         _ = temporary.write_text("complete")
-        ...         print(path.exists())
-        ...     print(path.read_text())
-        False
-        complete
     """
     target = Path(os.path.realpath(path))
     end = f".{mark or secrets.token_hex(8)}{secrets.token_hex(4)}{target.suffix}"
@@ -116,15 +105,6 @@ def remove_leftovers(folder: Path, mark: str = "") -> None:
 
     No process may be writing there under the same mark. Default: any mark, for a folder in which
     only this process writes.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     for name in ("a.txt", ".a.0123456789abcdef01234567.txt", ".a.other.txt"):
-        ...         Path(folder, name).touch()
-        ...     remove_leftovers(Path(folder), "0123456789abcdef")
-        ...     sorted(path.name for path in Path(folder).iterdir())
-        ['.a.other.txt', 'a.txt']
     """
     for path in find_leftovers(folder, mark):
         if path.is_dir():

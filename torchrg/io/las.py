@@ -19,9 +19,8 @@ import numpy as np
 from torchrg._optional import require
 from torchrg._parallel import split_rows
 from torchrg.errors import FormatError
-from torchrg.io.colors import WIDEN
 from torchrg.io.columns import FieldNames, flatten_cloud
-from torchrg.io.fields import Columns, Values, assemble_cloud, check_coordinates
+from torchrg.io.fields import NamedColumns, assemble_cloud, check_coordinates
 from torchrg.io.files import (
     PARSE_ERRORS,
     atomic_path,
@@ -31,8 +30,9 @@ from torchrg.io.files import (
     wrap_errors,
 )
 from torchrg.io.headers import MAX_INTEGER, check_grid, distance_outside
-from torchrg.io.tables import are_integers
-from torchrg.structures import Cloud, bounding_box
+from torchrg.structures import Cloud
+from torchrg.structures.colors import WIDEN
+from torchrg.structures.points import Array, are_integers, bounding_box
 
 _FIELD_NAMES = FieldNames(
     normals=("NormalX", "NormalY", "NormalZ"), curvature="Curvature", color_bits=16, blanks=True
@@ -110,7 +110,7 @@ def read_las(path: Path, size: int) -> Cloud:
     return assemble_cloud(path, columns, header={"las": header}, notes=notes)
 
 
-def _header_notes(header: Any, columns: Columns, size: int) -> tuple[str, ...]:  # noqa: ANN401
+def _header_notes(header: Any, columns: NamedColumns, size: int) -> tuple[str, ...]:  # noqa: ANN401
     """Return notes on contradictions between a header and its points."""
     notes = list[str]()
     low, high = ([end(columns[axis]) for axis in "xyz"] for end in (np.min, np.max))
@@ -237,14 +237,14 @@ def _add_dimensions(
     laspy: ModuleType,
     header: Any,  # noqa: ANN401
     cloud: Cloud,
-    columns: Columns,
-) -> dict[str, Values]:
+    columns: NamedColumns,
+) -> dict[str, Array]:
     """Add the extra dimensions that the columns need to a header, and return dimensions by name.
 
     Input dimensions keep type, scale and description if these represent the values exactly. A
     column that does not fit the standard dimension of its name becomes an extra dimension.
     """
-    dimensions, params = dict[str, Values](), list[Any]()
+    dimensions, params = dict[str, Array](), list[Any]()
     for extra in _input_dimensions(cloud.header.get("las"), columns):
         if extra.holds(columns):
             d = extra.dimension
@@ -281,13 +281,13 @@ class _InputDimension(NamedTuple):
 
     Attributes:
         dimension: laspy's description, with the name to write.
-        columns: Columns of the cloud that are its elements.
+        columns: NamedColumns of the cloud that are its elements.
     """
 
     dimension: Any
     columns: tuple[str, ...]
 
-    def holds(self, columns: Columns) -> bool:
+    def holds(self, columns: NamedColumns) -> bool:
         """Whether the type and scale of the dimension represent its columns exactly."""
         values, dimension = self.join(columns), self.dimension
         dtype = dimension.dtype.base
@@ -299,13 +299,13 @@ class _InputDimension(NamedTuple):
             return _fits(steps, dtype) and bool((back == values).all())
         return _fits(values, dtype)
 
-    def join(self, columns: Columns) -> Values:
+    def join(self, columns: NamedColumns) -> Array:
         """Return the values of the dimension, shape ``(N,)`` or ``(N, K)``."""
         parts = [columns[name] for name in self.columns]
         return parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
 
 
-def _input_dimensions(header: Any, columns: Columns) -> list[_InputDimension]:  # noqa: ANN401
+def _input_dimensions(header: Any, columns: NamedColumns) -> list[_InputDimension]:  # noqa: ANN401
     """Return the extra dimensions of the input whose columns the cloud still has.
 
     A renamed field that a result replaces keeps its dimension, under the new name.
@@ -470,7 +470,7 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
         )
 
 
-def _chunk_columns(block: Any) -> dict[str, Values]:  # noqa: ANN401
+def _chunk_columns(block: Any) -> dict[str, Array]:  # noqa: ANN401
     """Return the columns of a chunk of points."""
     columns = {axis: np.asarray(block[axis]) for axis in "xyz"}
     for dimension in block.point_format.dimensions:
@@ -482,14 +482,14 @@ def _chunk_columns(block: Any) -> dict[str, Values]:  # noqa: ANN401
     return columns
 
 
-def _dimension_holds(dimension: Any, column: Values) -> bool:  # noqa: ANN401
+def _dimension_holds(dimension: Any, column: Array) -> bool:  # noqa: ANN401
     """Whether a standard dimension represents all values of a column exactly."""
     if dimension.dtype is not None:
         return _fits(column, dimension.dtype)
     return _fits(column, np.dtype(np.uint8)) and bool(column.max() <= dimension.max)
 
 
-def _fits(values: Values, dtype: np.dtype[Any]) -> bool:
+def _fits(values: Array, dtype: np.dtype[Any]) -> bool:
     """Whether a type represents all values exactly."""
     if dtype.kind == "f":
         with np.errstate(over="ignore"):

@@ -24,7 +24,6 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, to_records
 from torchrg.io.fields import (
     FIELD_NAMES,
-    Values,
     assemble_cloud,
     assemble_table,
     backup_name,
@@ -40,9 +39,10 @@ from torchrg.io.files import (
     check_file,
     wrap_errors,
 )
+from torchrg.io.plane_table import planes_to_arrays
 from torchrg.io.tables import check_table
-from torchrg.plane_table import planes_to_arrays
 from torchrg.structures import Cloud, PlaneAdjacency, Planes, Segmentation, Superpoints
+from torchrg.structures.points import Array
 
 _Layout = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of an array."""
@@ -166,7 +166,7 @@ def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str |
     )
 
 
-def read_result_arrays(path: Path) -> dict[str, Values]:
+def read_result_arrays(path: Path) -> dict[str, Array]:
     """Read the arrays of a ``.npz`` file that are not per point: plane table, provenance."""
     size = check_file(path)
     with _open_archive(path) as archive:
@@ -185,7 +185,7 @@ def write_npz(
 
     Identical arrays give byte-identical files.
     """
-    arrays: dict[str, Values] = {"points": cloud.coordinates}
+    arrays: dict[str, Array] = {"points": cloud.coordinates}
     if segmentation is None:
         for name, values in cloud.fields.items():
             if name in _COORDINATES or name in _NOT_PER_POINT:
@@ -218,12 +218,12 @@ def write_npz(
                 _write_array(file, values)
 
 
-def _write_array(file: IO[bytes], values: Values) -> None:
+def _write_array(file: IO[bytes], values: Array) -> None:
     """Write an array in NumPy's format, in C order."""
     npy_format.write_array(file, np.asarray(values, order="C"), allow_pickle=False)
 
 
-def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Values]:
+def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Array]:
     """Memory-map the arrays of a folder that exist; ``coord`` is required.
 
     Its shape is ``(N, 3)`` or that of an image; the others have one row per point.
@@ -242,7 +242,7 @@ def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Values]:
     return arrays
 
 
-def check_rows(path: Path, values: Values, shape: tuple[int, ...]) -> None:
+def check_rows(path: Path, values: Array, shape: tuple[int, ...]) -> None:
     """Check that an array has one row per point, or per pixel of an image."""
     if values.shape[: len(shape)] != shape:
         rows = " x ".join(map(str, shape))
@@ -251,7 +251,7 @@ def check_rows(path: Path, values: Values, shape: tuple[int, ...]) -> None:
         )
 
 
-def map_array(path: Path) -> Values:
+def map_array(path: Path) -> Array:
     """Map a ``.npy`` file into memory, copy-on-write: changes never reach the file."""
     shape, _ = _check_npy(path, check_file(path))
     # Mapping an empty array fails.
@@ -311,10 +311,10 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
     return layouts
 
 
-def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Values:
+def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
     """Read an archive member to its end."""
     with _open_member(path, archive, archive.getinfo(f"{name}.npy")) as stream:
-        values: Values = npy_format.read_array(stream, allow_pickle=False)
+        values: Array = npy_format.read_array(stream, allow_pickle=False)
         _drain(stream)
         return values
 

@@ -15,10 +15,11 @@ import numpy as np
 
 from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, write_records
-from torchrg.io.fields import Columns, Values, assemble_cloud
+from torchrg.io.fields import NamedColumns, assemble_cloud
 from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
 from torchrg.io.text import read_rows
 from torchrg.structures import FARTHEST, Cloud
+from torchrg.structures.points import Array
 
 _MAX_RECORD_BYTES = 1 << 20
 """Maximum bytes of a point; a larger one counts as corrupt."""
@@ -46,7 +47,7 @@ def read_pcd(path: Path, size: int) -> Cloud:
         if header.encoding != "binary_compressed" and header.num_points:
             is_binary = header.encoding == "binary"
             notes = check_end(path, stream, header.dtype.itemsize if is_binary else 0)
-    columns: dict[str, Values] = {}
+    columns: dict[str, Array] = {}
     for name in header.field_names:
         columns |= _unpack_color(name, stored[name])
     grid_shape = (header.height, header.width) if header.height > 1 else None
@@ -220,7 +221,7 @@ def _record_type(entries: _HeaderLines) -> np.dtype[np.void]:
     return np.dtype(parts)
 
 
-def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
+def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Array:
     """Read the points of an ASCII file."""
     # Padding has no type in ASCII: it is COUNT words to skip.
     fields = header.field_names
@@ -232,7 +233,7 @@ def _read_text(path: Path, stream: BinaryIO, header: _Header, size: int) -> Valu
     return read_rows(path, stream, dtype, header.num_points, "points", line_number=number)
 
 
-def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Values:
+def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Array:
     """Read the points of a binary file."""
     num_bytes, content = header.num_points * header.dtype.itemsize, f"{header.num_points:,} points"
     start = stream.tell()
@@ -240,7 +241,7 @@ def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Va
     return np.fromfile(stream, header.dtype, count=header.num_points)
 
 
-def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -> dict[str, Values]:
+def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -> dict[str, Array]:
     """Read a compressed file: one LZF block that stores one field after the other."""
     import lzf
 
@@ -279,7 +280,7 @@ def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -
     return fields
 
 
-def _unpack_color(name: str, values: Values) -> dict[str, Values]:
+def _unpack_color(name: str, values: Array) -> dict[str, Array]:
     """Split a packed color into channels; return any other field unchanged."""
     if name.lower() not in ("rgb", "rgba") or values.ndim != 1 or values.dtype.itemsize != 4:
         return {name: values}
@@ -290,9 +291,9 @@ def _unpack_color(name: str, values: Values) -> dict[str, Values]:
     return unpacked | ({"alpha": quadruples[:, 3].copy()} if name.lower() == "rgba" else {})
 
 
-def _pack_columns(columns: Columns) -> dict[str, Values]:
+def _pack_columns(columns: NamedColumns) -> dict[str, Array]:
     """Pack color channels as in PCL, and convert normals to the type of the coordinates."""
-    packed: dict[str, Values] = {}
+    packed: dict[str, Array] = {}
     has_color = all(name in columns for name in _FIELD_NAMES.color)
     for name, column in columns.items():
         if has_color and name == _FIELD_NAMES.color[0]:

@@ -23,11 +23,12 @@ from torchrg.io.columns import (
     narrow_integers,
     write_records,
 )
-from torchrg.io.fields import MAX_EXACT_INTEGER, Values, assemble_cloud
+from torchrg.io.fields import MAX_EXACT_INTEGER, assemble_cloud
 from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
+from torchrg.io.mesh import Fronts, find_fronts
 from torchrg.io.text import read_rows, skip_lines
-from torchrg.mesh import Fronts, find_fronts
 from torchrg.structures import Cloud
+from torchrg.structures.points import Array
 
 _TYPES = {
     "char": "i1",
@@ -226,20 +227,20 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
 
 def _read_vertices(
     path: Path, stream: BinaryIO, header: _Header, index: int, size: int
-) -> tuple[dict[str, Values], list[str]]:
+) -> tuple[dict[str, Array], list[str]]:
     """Return the vertex properties, and the names of lists that cannot be columns."""
     vertex, order = header.elements[index], header.byte_order
     line_number = _seek_element(path, stream, header, index, size)
     count = vertex.num_records
     if not vertex.has_lists:
         dtype = np.dtype([(prop.name, order + prop.code) for prop in vertex.properties])
-        rows: Values
+        rows: Array
         if order:
             rows = np.fromfile(stream, dtype, count)
         else:
             rows = read_rows(path, stream, dtype, count, "vertices", line_number=line_number)
         return {name: rows[name] for name in dtype.names or ()}, []
-    parts: dict[str, list[Values]] = {prop.name: [] for prop in vertex.properties}
+    parts: dict[str, list[Array]] = {prop.name: [] for prop in vertex.properties}
     for records in _read_records(path, stream, vertex, order, size, line_number):
         for prop in vertex.properties:
             if prop.name in parts:
@@ -297,7 +298,7 @@ class _Records(NamedTuple):
     lengths: dict[str, NDArray[np.int64]]
     ends: NDArray[np.int64]
 
-    def values(self, path: Path, prop: _Property) -> list[Values]:
+    def values(self, path: Path, prop: _Property) -> list[Array]:
         """Return the values of a property, shape ``(n,)``.
 
         A list has shape ``(n, length)``, one array per length, ascending.
@@ -314,26 +315,26 @@ class _Records(NamedTuple):
         return arrays if self.order else [_convert_words(path, prop, values) for values in arrays]
 
 
-def _gather(numbers: Values, starts: NDArray[np.int64], length: int) -> Values:
+def _gather(numbers: Array, starts: NDArray[np.int64], length: int) -> Array:
     """Gather ``length`` numbers from each start, shape ``(n, length)``."""
     steps = np.diff(starts)
     if (steps == steps[:1]).all():
         step = int(steps[0]) if len(steps) else 0
         shape, strides = (len(starts), length), (step, numbers.itemsize)
         return np.lib.stride_tricks.as_strided(numbers[starts[0] :], shape, strides)
-    gathered: Values = numbers[starts[:, None] + np.arange(length) * numbers.itemsize]
+    gathered: Array = numbers[starts[:, None] + np.arange(length) * numbers.itemsize]
     return gathered
 
 
-def _numbers_at_bytes(content: NDArray[np.uint8], order: str, code: str) -> Values:
+def _numbers_at_bytes(content: NDArray[np.uint8], order: str, code: str) -> Array:
     """Return a view with the number that begins at each byte."""
     dtype = np.dtype(order + code if order else np.float64)
     return np.ndarray(len(content) - dtype.itemsize + 1, dtype, content, strides=(1,))
 
 
-def _convert_words(path: Path, prop: _Property, values: NDArray[np.float64]) -> Values:
+def _convert_words(path: Path, prop: _Property, values: NDArray[np.float64]) -> Array:
     """Convert the words of an ASCII file to the type of their property."""
-    converted: Values = values.astype(prop.code)
+    converted: Array = values.astype(prop.code)
     if converted.dtype.kind != "f":
         wrong = values[(converted != values) | (np.abs(values) >= MAX_EXACT_INTEGER)]
         if wrong.size:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError, warn
-from torchrg.io.colors import BYTE, WORD
+from torchrg.structures.colors import BYTE, WORD
+from torchrg.structures.points import are_integers
 
 Table = NDArray[Any]
 """Numbers of shape ``(N, C)``."""
@@ -145,7 +146,7 @@ def warn_about_counters(path: Path, table: Table, names: Sequence[str]) -> None:
     if 0 < len(wrong) < 3 <= len(others):
         warn(
             f"{path}: values only count up in column {' and '.join(wrong)}, as those of an index "
-            f"or of time; if these are no coordinates, {_NAME_THEM}.",
+            f"or of time; if these are no coordinates, {_NAME_THEM}."
         )
 
 
@@ -154,10 +155,3 @@ def _only_rises(column: Table) -> bool:
     steps = np.diff(column)
     rises = (steps >= 0) & (steps <= (1 if are_integers(column) else np.inf))
     return bool(steps.any() and (rises | (column[1:] == column.min())).all())
-
-
-def are_integers(values: Table) -> bool:
-    """Whether all values are finite integers."""
-    if values.dtype.kind in "iub":
-        return True
-    return bool(np.isfinite(values).all() and (values == np.floor(values)).all())

@@ -24,9 +24,10 @@ from torchrg._parallel import split_rows
 from torchrg.errors import FormatError, warn
 from torchrg.io.arrow import parse_numbers
 from torchrg.io.columns import FieldNames, check_exact, flatten_cloud
-from torchrg.io.fields import SKIPPED, Values, assemble_table, check_names
+from torchrg.io.fields import SKIPPED, assemble_table, check_names
 from torchrg.io.files import atomic_path, check_available, find_encoding, parse_count
 from torchrg.structures import Cloud
+from torchrg.structures.points import Array
 
 LINES_PER_CHUNK = 65_536
 """Lines parsed or formatted together, which bounds the memory."""
@@ -117,7 +118,7 @@ def read_rows(
     content: str,
     *,
     line_number: int,
-) -> Values:
+) -> Array:
     """Read rows of a structured type from an ASCII file, starting at ``line_number``.
 
     ``content`` names the rows in messages. Blank lines are ignored, and no more lines are read than
@@ -157,7 +158,7 @@ def skip_lines(stream: BinaryIO, count: int) -> int:
     return passed
 
 
-def _parse_blocks(path: Path, stream: TextIO, preamble: "_Preamble") -> Iterator[Values]:
+def _parse_blocks(path: Path, stream: TextIO, preamble: "_Preamble") -> Iterator[Array]:
     """Yield tables of the first point and of the lines that follow it in a stream."""
     dtype = np.dtype([("row", "f8", (preamble.num_columns,))])
     line, number = preamble.line, preamble.line_number
@@ -183,7 +184,7 @@ def _parse(
     line_number: int,
     dialect: _Dialect | None = None,
     skipped: Collection[int] = (),
-) -> Values:
+) -> Array:
     """Parse a block of lines; an error names the first wrong line.
 
     Without a dialect, white space separates numbers and there are no comments. Skipped columns may
@@ -193,7 +194,7 @@ def _parse(
     converters: dict[int | str, Callable[[str], float]] | None
     converters = dict.fromkeys(skipped, lambda word: np.nan) or None
 
-    def parse(lines: list[str]) -> Values:
+    def parse(lines: list[str]) -> Array:
         if decimal != ".":
             lines = [line.replace(decimal, ".") for line in lines]
         # NumPy before 2.3 truncates numbers to integers, with a deprecation warning.
@@ -353,7 +354,7 @@ def _warn_about_names(path: Path, comment: str, num_columns: int) -> None:
     if any(not any(map(_is_number, row)) for row in readings):
         warn(
             f"{path}: its comment names columns {comment.strip()[:60]!r}, none of them x, y and z: "
-            "the first three are taken; name the columns with --columns.",
+            "the first three are taken; name the columns with --columns."
         )
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.io.colors import read_colors
 from torchrg.io.files import atomic_path
 from torchrg.structures import UNLABELED, Cloud
+from torchrg.structures.colors import read_colors
 
 
 def write_vg(path: Path, cloud: Cloud, planes: NDArray[np.floating] | None = None) -> None:

@@ -24,7 +24,6 @@ from torchrg.errors import warn
 MAX_NEIGHBORS = 512
 """Maximum number of values per row, ``MAX_WIDTH`` in ``plain.h``. Longer rows use the torch
 definitions."""
-
 SIGNATURES = {
     "majority_differences": "f[nk] -> f[n]",
     "fit_normals_pca": "f[N3] i[nk] b[nk]? f[n] x x -> f[n3] f[n] f[n] b[n] b[n]",
@@ -76,7 +75,6 @@ integer scalar), and one letter per axis; equal letters mean equal lengths. A qu
 optional argument, a capital letter an argument that the kernel writes to. In C the lengths come
 first, in the order of their letters.
 """
-
 _DTYPES = {
     "f": torch.float32,
     "d": torch.float64,
@@ -220,7 +218,7 @@ def _library() -> ctypes.CDLL | None:
     if _is_stale(path):
         warn(
             "torchrg runs without its kernels, which are older than their sources; run "
-            "pip install -e . again.",
+            "pip install -e . again."
         )
         return None
     if path.exists():
@@ -233,12 +231,10 @@ def _library() -> ctypes.CDLL | None:
             for name in SIGNATURES:
                 getattr(library, name).restype = ctypes.c_int64
             return library
-        warn(
-            "torchrg runs without its kernels, which are of another version; install it again.",
-        )
+        warn("torchrg runs without its kernels, which are of another version; install it again.")
         return None
     warn(
         "torchrg runs without its kernels, several times slower; install a C++ compiler and "
-        "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install).",
+        "reinstall torchrg, or set TORCHRG_KERNELS (see the guide Install)."
     )
     return None

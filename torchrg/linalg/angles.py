@@ -64,10 +64,6 @@ def sq_chord_to_deg(sq_chord: Tensor) -> Tensor:
     """Convert squared chords of the unit sphere, in [0, 2], to angles.
 
     In [0, 90] degrees, accurate to 1e-7 (float32) or 1e-8 degrees (float64).
-
-    Example:
-        >>> sq_chord_to_deg(torch.tensor([0.0, 1.0, 2.0]))
-        tensor([ 0.0000, 60.0000, 90.0000])
     """
     # asin(x) / x as a polynomial of x^2 on [0, 1/2], where x is half the chord.
     sq_half = (sq_chord / 4).clamp(max=0.5)
@@ -129,12 +125,7 @@ _ASIN_SERIES = _asin_series(_ASIN_DEGREE)
 
 
 def above(values: Tensor, bounds: Tensor | float) -> Tensor:
-    """Return 1 where values exceed their bounds, else 0, in their dtype, without gradient.
-
-    Example:
-        >>> above(torch.tensor([1.0, 2.0, 3.0]), 2.0)
-        tensor([0., 0., 1.])
-    """
+    """Return 1 where values exceed their bounds, else 0, in their dtype, without gradient."""
     return torch.gt(values.detach(), bounds, out=torch.empty_like(values, requires_grad=False))
 
 
@@ -149,10 +140,5 @@ def at_most(values: Tensor, bounds: Tensor | float) -> Tensor:
 
 
 def signs(values: Tensor) -> Tensor:
-    """Return 1 or -1, by the sign of the values; either for zero.
-
-    Example:
-        >>> signs(torch.tensor([-0.5, 2.0]))
-        tensor([-1.,  1.])
-    """
+    """Return 1 or -1, by the sign of the values; either for zero."""
     return torch.copysign(values.new_ones(()), values.detach())

@@ -1,8 +1,4 @@
-"""Eigenvectors of many symmetric 3x3 matrices, and numerical tolerances.
-
-All tolerances that follow from the precision of a dtype are functions of this module; other modules
-use multiples of them.
-"""
+"""Eigenvectors of many symmetric 3x3 matrices in closed form."""
 
 from typing import Any, NamedTuple
 
@@ -16,61 +12,18 @@ from torchrg._checks import (
     is_jit_traced,
     raise_forward_mode,
 )
+from torchrg.linalg.precision import rank_tolerance
 
 _JACOBI_SWEEPS = 5
 """Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either
 dtype."""
-
 _FIRST_STEPS, _MAX_MORE_STEPS = 4, 36
 """Number of Newton steps for a simple root, and maximum number of further steps for a nearly double
 one, where each step halves the distance until the two roots separate."""
-
 _CONVERGED = 1e-9
 """Maximum last step of a converged root, as a fraction of the trace."""
-
 _NEARLY_EQUAL = 1e-9
 """Fraction of the squared largest eigenvalue below which the adjugate gives no direction."""
-
-_ROUNDED_STEPS = 8
-"""Number of accumulated rounding errors in a distance to a plane, relative to the patch extent."""
-
-
-def machine_epsilon(dtype: torch.dtype) -> float:
-    """Return the spacing of numbers at 1: twice the relative rounding error of a dtype."""
-    return torch.finfo(dtype).eps
-
-
-def smallest_normal(dtype: torch.dtype) -> float:
-    """Return the smallest positive normal number of a dtype."""
-    return torch.finfo(dtype).tiny
-
-
-def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
-    """Return ``max(num_values, 3) * eps``, the rank tolerance for ``num_values`` points.
-
-    It is the ratio to the largest singular value below which a direction counts as flat.
-    """
-    return max(num_values, 3) * machine_epsilon(dtype)
-
-
-def coordinate_resolution(points: Tensor) -> Tensor:
-    """Return the rounding error of differences of coordinates ``(*, P)`` per point, shape ``(*)``.
-
-    Example:
-        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
-        tensor([True])
-    """
-    return points.abs().amax(dim=-1) * (4 * machine_epsilon(points.dtype))
-
-
-def flatness_tolerance(patches: Tensor, extent: Tensor) -> Tensor:
-    """Return how far from its plane rounding alone can move a point, shape ``(B,)``.
-
-    The points ``(B, K, P)`` are input coordinates, whose rounding depends on their distance from
-    the origin. ``extent`` is the largest coordinate relative to the center of the patch.
-    """
-    coordinates = 2 * patches.abs().amax(dim=(1, 2))
-    return machine_epsilon(patches.dtype) * (coordinates + _ROUNDED_STEPS * extent)
 
 
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -166,18 +119,6 @@ def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
     values, order = values.sort(dim=-1)
     vectors = vectors.gather(-1, order[..., None, :].expand_as(vectors))
     return values * safe.squeeze(-1), vectors
-
-
-def eigh3_lapack(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Variant of :func:`eigh3` by LAPACK, faster for fewer than a thousand matrices.
-
-    Non-finite matrices give NaN.
-    """
-    finite = matrices.isfinite().all(dim=(-2, -1))[..., None]
-    values, vectors = torch.linalg.eigh(torch.where(finite[..., None], matrices, 0.0), UPLO="U")
-    return torch.where(finite, values, torch.nan), torch.where(
-        finite[..., None], vectors, torch.nan
-    )
 
 
 def smallest_eigenvector3(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -327,17 +268,3 @@ def principal_frame(matrices: Tensor) -> PrincipalFrame:
     values, vectors = eigh3(matrices)
     smallest = values[..., 0].clamp(min=0)
     return PrincipalFrame(vectors[..., 0], smallest, values.detach(), vectors.detach())
-
-
-def square_root(values: Tensor) -> Tensor:
-    """Return square roots of float32 with correct IEEE 754 rounding, as in kernels.
-
-    torch uses a vector library, in which every fifth result is an adjacent float.
-    """
-    return values.double().sqrt().to(values.dtype)
-
-
-def root(squares: Tensor) -> Tensor:
-    """Return square roots with zero gradient at zero."""
-    positive = squares > 0
-    return square_root(torch.where(positive, squares, 1.0)) * positive

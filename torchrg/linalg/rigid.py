@@ -17,12 +17,6 @@ def check_rigid(caller: str, name: str, motions: Tensor | None) -> None:
 
     A rigid motion turns and shifts: ``R @ R.T`` is the identity, the determinant of ``R`` is
     positive, and the last row is 0 0 0 1.
-
-    Example:
-        >>> check_rigid("f", "pose", torch.diag(torch.tensor([5.0, 5, 5, 1])))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ShapeError: f: expected pose to be rigid, got a rotation scaled by 5; ...
     """
     if motions is not None and is_concrete(motions):
         for matrix in motions.detach().reshape(-1, 4, 4).double().cpu():

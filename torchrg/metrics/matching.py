@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.neighbors import search_nearest
+from torchrg.neighbors.knn import search_nearest
 from torchrg.structures import Cloud
 
 

@@ -9,13 +9,9 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import (
-    check_labels,
-    contingency_table,
-    fraction,
-    is_not_ignored,
-)
-from torchrg.neighbors import distinct_rows, search_knn
+from torchrg.metrics.contingency import check_labels, contingency_table, fraction, is_not_ignored
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.order import distinct_rows
 from torchrg.structures import UNLABELED
 
 _NUM_NEIGHBORS = 8

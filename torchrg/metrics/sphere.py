@@ -14,7 +14,6 @@ from torchrg.neighbors import canonical_order
 
 _MAX_PAIRS = 2**17
 """Number of distances computed at a time; about the size of a cache."""
-
 _ROUNDING = 1e-12
 """Maximum relative error by which an angle may be too large."""
 

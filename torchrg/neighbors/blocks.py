@@ -22,16 +22,13 @@ _MIN_CANDIDATES = 65536
 _NUM_BLOCKS = 2
 """Maximum number of rows searched at a time: those of two blocks, but at least ``_MIN_CANDIDATES``,
 so that a small block is not fragmented."""
-
 SearchRows = Callable[[NDArray[np.floating], slice, int], NDArray[np.int32]]
 """Points in canonical order, query rows, and k -> their neighbors, ``(n, k)``."""
 POINTS_PER_BOX = 256
 """Points per box, a surface patch about two neighborhoods of 50 wide. Few rows are read in vain,
 and boxes take a hundredth of the memory of the points."""
-
 _ROUNDING = 1 + 1e-9
 """Factor by which distances are enlarged, so that rounding excludes no point."""
-
 _BOXES_AT_ONCE = 64
 """Consecutive boxes whose common bounding box leaves few candidates to compare with each."""
 
@@ -204,10 +201,7 @@ def _rows_near(
 
 
 def _search_each(
-    points: NDArray[np.floating],
-    rows: NDArray[np.int64],
-    queries: NDArray[np.int64],
-    k: int,
+    points: NDArray[np.floating], rows: NDArray[np.int64], queries: NDArray[np.int64], k: int
 ) -> NDArray[np.int64]:
     """Return the nearest of many candidates for a few points, such as far outliers."""
     positions = points[queries].astype(np.float64)

@@ -27,24 +27,20 @@ from torchrg._parallel import (
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.order import canonical_order, distinct_rows, mark_distinct
-from torchrg.structures import MAX_POINTS, Neighbors, Points, Rows, bounding_box
+from torchrg.structures import MAX_POINTS, Neighbors
+from torchrg.structures.points import Points, Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Number of sampled points that estimate the distance of the k-th neighbor."""
-
 SomeNeighbors = Callable[[NDArray[np.integer]], NDArray[np.integer]]
 """Function from rows ``(n,)`` to their neighbors ``(n, k)``, each first its own."""
-
 _MIN_FOR_CELLS = 2000
 """Minimum number of points for which cells are faster than a tree."""
-
 _SIZE_STEP = 1.5
 """Ratio of a cell size to the smallest remaining distance of a k-th neighbor. Cells of one size
 serve points whose k-th neighbor is 1 / 1.75 to 1 size away."""
-
 _MIN_FRACTION = 0.03
 """Minimum fraction of the points for which another cell size is worth its sort."""
-
 _MAX_CELLS_PER_POINT = 8
 """Maximum number of cells per point in the bounding box, including empty ones, 4 bytes each."""
 
@@ -133,6 +129,13 @@ def search_knn(
     return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
 
 
+def search_distinct(points: Tensor, k: int, *, max_distance: float | None = None) -> Neighbors:
+    """Find up to ``k`` neighbors of distinct points in canonical order; none without points."""
+    if len(points) == 0:
+        return Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
+    return search_knn(points, min(k, len(points)), max_distance=max_distance, canonical=True)
+
+
 def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
     """Validate input neighbor lists: one per point, itself first, of rows of the points.
 
@@ -192,16 +195,6 @@ def restrict_to_groups(
         groups: Group of each point, shape ``(N,)``, from 0 if ``position_rows`` are passed.
         chunk_size: Points processed at a time.
         position_rows: Index of each point's position, shape ``(N,)``. Default: the row.
-
-    Example:
-        >>> near = Neighbors(torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 0]]))
-        >>> kept = restrict_to_groups(near, torch.tensor([4, 7, 4]), 3)
-        >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
-        ([[0, 2, 0], [1, 1, 1], [2, 0, 2]], [2, 1, 2])
-        >>> groups, index = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 1, 2])
-        >>> kept = restrict_to_groups(near, groups, 4, index)
-        >>> kept.indices.tolist(), kept.valid.sum(dim=1).tolist()
-        ([[0, 1, 0], [1, 0, 1], [2, 3, 2], [3, 2, 3]], [2, 2, 2, 2])
     """
     shape, device = (len(groups), neighbors.indices.shape[1]), groups.device
     indices, valid = (scratch.empty(shape, kind) for kind in (np.int32, np.bool_))
@@ -479,11 +472,6 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
 
     ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. Each
     coordinate is contiguous in memory, so that ``patches.unbind(-1)`` gives fast columns.
-
-    Example:
-        >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])
-        >>> gather_patches(points, torch.tensor([[0, 1]])).tolist()
-        [[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]]
     """
     flat = indices.reshape(-1)
     if points.requires_grad and torch.is_grad_enabled():

@@ -11,11 +11,11 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
-from torchrg.structures import UNLABELED, Points, bounding_box
+from torchrg.structures import UNLABELED
+from torchrg.structures.points import Points, bounding_box
 
 MORTON_BITS = 21
 """Bits per coordinate in a Morton code: three of them fit int64."""
-
 _SPREADS = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -70,12 +70,7 @@ def canonical_order(points: Points, ties: Sequence[Tensor] = ()) -> Tensor:
 
 
 def finite_rows(points: Tensor, ties: Sequence[Tensor] = ()) -> Tensor:
-    """Return the rows of the finite points ``(N, 3)`` in :func:`canonical_order`, int64.
-
-    Example:
-        >>> finite_rows(torch.tensor([[3.0, 0, 0], [torch.nan, 0, 0], [2, 0, 0]])).tolist()
-        [2, 0]
-    """
+    """Return the rows of the finite points ``(N, 3)`` in :func:`canonical_order`, int64."""
     x, y, z = points.isfinite().unbind(dim=-1)
     is_finite = x & y & z
     if bool(is_finite.all()):

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.structures import UNLABELED, Points
+from torchrg.structures import UNLABELED
+from torchrg.structures.points import Points
 
 _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
-
 _MAX_KEYS = 2**62
 """Maximum number of cells with distinct int64 keys; above the squared number of points."""
 

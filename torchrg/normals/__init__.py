@@ -15,33 +15,41 @@ name                  estimator                                      purpose
 ``consensus``         ``pca``, then planes that neighbors support    the default: edges, noise
 ====================  =============================================  =============================
 
-Signs are arbitrary until :func:`orient_normals` chooses them. The ``fit_*`` functions take patches
-of shape ``(*, K, 3)``; the estimators are built on them.
+Signs are arbitrary unless ``orient`` or :func:`orient_normals` chooses them. The ``fit_*``
+functions take patches of shape ``(*, K, 3)``; the estimators are built on them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_points, eager_only
-from torchrg._parallel import CHUNK_SIZE, limit_rows
+from torchrg._checks import as_tensor, eager_only
+from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
-from torchrg.linalg.single import to_single
-from torchrg.neighbors import check_neighbors, distinct_points, search_knn
-from torchrg.normals.consensus import estimate_consensus
-from torchrg.normals.irls import estimate_irls, fit_normals_irls
+from torchrg.neighbors import distinct_points
+from torchrg.neighbors.knn import check_neighbors, search_distinct
+from torchrg.normals.estimators import ESTIMATORS, WITHOUT_GRADIENT, run_estimator
+from torchrg.normals.irls import fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
-from torchrg.normals.orient import Orientation, orient_normals
-from torchrg.normals.paper import estimate_paper, find_sharp_points, fit_normals_robust
-from torchrg.normals.pca import Estimator, at_all_points, fit_normals_pca, fit_points_pca
-from torchrg.precision import warn_about_coordinates
-from torchrg.robust import fit_detmcd, fit_detmm, fit_fastmcd, fit_mve
-from torchrg.structures import Neighbors, NormalFit, Points
+from torchrg.normals.orient import (
+    Orientation,
+    SearchDistinct,
+    choose_side,
+    find_directions,
+    orient_normals,
+    turn_faces,
+)
+from torchrg.normals.paper import find_sharp_points, fit_normals_robust
+from torchrg.normals.pca import fit_normals_pca
+from torchrg.structures import Cloud, Neighbors, NormalFit
+from torchrg.structures.points import Points
+from torchrg.structures.precision import warn_about_coordinates
 
 __all__ = [
     "ESTIMATORS",
@@ -58,54 +66,19 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-_MCD = {"support_fraction": "support_fraction", "quantile": "inlier_quantile"}
-_DETMCD = _MCD | {"scaling": "mcd_scaling", "inliers": "mcd_inliers"}
-
-ESTIMATORS: dict[str, Estimator] = {
-    "pca": lambda points, neighbors, _, chunk_size: fit_points_pca(
-        points, neighbors, chunk_size=chunk_size
-    ),
-    "jet": at_all_points(fit_normals_jet),
-    "irls": estimate_irls,
-    "fastmcd": at_all_points(partial(fit_normals_robust, estimator=fit_fastmcd), **_MCD),
-    "mve": at_all_points(partial(fit_normals_robust, estimator=fit_mve), **_MCD),
-    "detmcd": at_all_points(partial(fit_normals_robust, estimator=fit_detmcd), **_DETMCD),
-    "detmm": at_all_points(
-        partial(fit_normals_robust, estimator=fit_detmm), quantile="inlier_quantile"
-    ),
-    "paper": estimate_paper,
-    "consensus": estimate_consensus,
-}
-"""Estimators by name: points, neighbors, configuration, chunk size -> fit."""
-
-WITHOUT_GRADIENT = {"consensus"}
-"""Estimators without gradients, because they select and smooth planes in several steps."""
-
-
-def run_estimator(
-    points: Tensor, neighbors: Neighbors, config: NormalsConfig, chunk_size: int
-) -> NormalFit:
-    """Fit the neighborhoods of finite points ``(N, 3)``; ``chunk_size`` is for typical ones.
-
-    Float64 points are fitted in float32 if it is fine enough; the fit has the dtype of the points.
-    """
-    width = max(neighbors.indices.shape[1], config.adaptive_k or 0)
-    single, chunk_size = to_single(points), limit_rows(chunk_size, width)
-    fit = ESTIMATORS[config.method](single, neighbors, config, chunk_size)
-    if single.dtype == points.dtype:
-        return fit
-    normals, curvature, rms = (values.to(points) for values in (*fit[:2], fit.residual_rms))
-    return fit._replace(normals=normals, curvature=curvature, residual_rms=rms)
-
 
 @eager_only
 def estimate_normals(
-    points: Points,
+    points: Points | Cloud,
     config: NormalsConfig | AnyConfig | None = None,
     *,
-    neighbors: Neighbors | None = None,
+    orient: Orientation = "none",
+    viewpoint: Points | Sequence[float] | None = None,
+    front: Points | None = None,
+    neighbors: Neighbors | SearchDistinct | None = None,
     max_distance: float | None = None,
     chunk_size: int = CHUNK_SIZE,
+    on_stage: Callable[[str], None] = lambda stage: None,
     **changes: Any,  # noqa: ANN401
 ) -> NormalFit:
     """Estimate the normal and curvature of every point of a cloud.
@@ -122,13 +95,19 @@ def estimate_normals(
         duplicates, gradients flow to the first.
 
     Args:
-        points: Points, shape ``(N, 3)``. Points with NaN or Inf are skipped and not ``valid``.
+        points: Points, shape ``(N, 3)``, or a cloud. Points with NaN or Inf are skipped and not
+            ``valid``.
         config: A normals configuration, a dictionary, a complete configuration, or a preset name.
             Default: that of :func:`torchrg.load_config`.
-        neighbors: Precomputed neighbors of finite points, the point itself first. Default: searched
-            among distinct points; duplicates share a result.
+        orient: Normal orientation, as in :func:`orient_normals`, with the same neighbors. Default:
+            signs are arbitrary.
+        viewpoint: Scanner position, as in :func:`orient_normals`.
+        front: Direction to the side from which each point was seen, as in :func:`orient_normals`.
+        neighbors: Neighbors of finite points, the point itself first, or a function that searches
+            them. Default: searched among distinct points; duplicates share a result.
         max_distance: See :func:`torchrg.search_knn`.
         chunk_size: Points processed at a time; bounds memory, does not change the result.
+        on_stage: Callback that receives ``"normals"`` and ``"orientation"`` when these start.
         **changes: Individual parameters, as in ``method="pca", k=20``: see
             :class:`torchrg.config.NormalsConfig`.
 
@@ -136,8 +115,8 @@ def estimate_normals(
         The fit in the order of the points.
 
     Raises:
-        ConfigError: If ``method`` is unknown, a parameter is out of range, or the points require
-            gradients that the method does not support.
+        ConfigError: If ``method`` or ``orient`` is unknown, a parameter is out of range, or the
+            points require gradients that the method does not support.
         ShapeError: If a shape or dtype is not as above.
 
     Warns:
@@ -149,9 +128,13 @@ def estimate_normals(
         >>> estimate_normals(floor, method="pca", k=20).normals.abs()[0]
         tensor([0., 0., 1.])
     """
-    tensor = as_tensor("estimate_normals", "points", points)
-    check_points("estimate_normals", tensor)
-    warn_about_coordinates("estimate_normals", tensor)
+    is_cloud = isinstance(points, Cloud)  # It warns on access to its points.
+    positions, directions = find_directions(
+        "estimate_normals", points, orient, viewpoint=viewpoint, front=front
+    )
+    tensor = positions if is_cloud else as_tensor("estimate_normals", "points", points)
+    if not is_cloud:
+        warn_about_coordinates("estimate_normals", tensor)
     settings = settings_of("estimate_normals", NormalsConfig, config, changes)
     if settings.method in WITHOUT_GRADIENT and tensor.requires_grad and torch.is_grad_enabled():
         names = ", ".join(sorted(ESTIMATORS.keys() - WITHOUT_GRADIENT))
@@ -159,13 +142,24 @@ def estimate_normals(
             f"estimate_normals: expected a method with gradients ({names}) for points that require "
             f"them, got {settings.method!r}; choose one, or pass points.detach()."
         )
-    if neighbors is not None:
+    on_stage("normals")
+    if neighbors is not None and not callable(neighbors):
         check_neighbors("estimate_normals", neighbors, tensor)
-        return run_estimator(tensor, neighbors, settings, chunk_size)
-    distinct = distinct_points(tensor)
-    size = min(settings.k, len(distinct.points))
-    if size == 0:
-        neighbors = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=tensor.device))
+        sites, near, restore = tensor, neighbors, _unchanged
     else:
-        neighbors = search_knn(distinct.points, size, max_distance=max_distance, canonical=True)
-    return run_estimator(distinct.points, neighbors, settings, chunk_size).map(distinct.restore)
+        distinct = distinct_points(tensor)
+        search = neighbors or partial(search_distinct, max_distance=max_distance)
+        sites, restore = distinct.points, distinct.restore
+        near = search(sites, settings.k)
+    fit = run_estimator(sites, near, settings, chunk_size)
+
+    def turn(side: Orientation) -> Tensor:
+        return restore(turn_faces(sites, fit.normals, side, near))
+
+    on_stage("orientation")
+    found = fit.map(restore)
+    return found._replace(normals=choose_side(positions, found.normals, orient, directions, turn))
+
+
+def _unchanged(values: Tensor) -> Tensor:
+    return values

@@ -17,29 +17,22 @@ from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
 """Neighbor ranks over which faces spread. Noise tilts the links to nearer ones."""
-
 _MIN_BEND, _MAX_BEND, _BEND_FACTOR = 0.01, 0.05, 4.0
 """Maximum bend within a smooth patch: a multiple of the median bend, clamped to the bends of
 normals 8 and 18 degrees apart."""
-
 _TRUST_POWER = 4
 """Power of ``1 - bend / 2`` that weights a link: 1 on a plane, 1/16 over a right-angled edge, 0
 through a plate."""
-
 _MIN_FACE_POINTS = 10
 """A face of fewer points joins its neighbor. Noise tilts its normals, or an edge bends them."""
-
 _MIN_AGREEMENT = 0.5
 """Minimum agreement per point at which a face joins its neighbor. The median is 0.5 to 1 for
 patches of one surface split by noise, and 0.05 for faces that meet at an edge of a room."""
-
 _MIN_TWO_SIDED = 0.73
 """Minimum ratio of squared mean height to mean squared height, about the middle, of a plate among
 thin faces. One side with noise has 0.70, a filled slab 0.75, and a plate 0.8 to 1."""
-
 _MAX_HEIGHT_FACTOR = 2.0
 """Multiple of the mean height at which heights are clamped, to limit stray points."""
-
 _MIN_COSINE = 0.5
 """Minimum cosine between a normal and its plane, 60 degrees; other points are on an edge."""
 

@@ -16,25 +16,19 @@ from torchrg.normals.faces import gather_lists
 _SPACINGS_PER_CELL = 1.5
 _SPACING_QUANTILE = 0.9
 """Quantile of the point spacing that defines the cell width, so that sparse walls are closed."""
-
 _MAX_CELLS = 2**19
 """Maximum number of cells along an axis; a line index and a cell index then fit into int64."""
-
 _NUM_OBSTACLES = 12
 """Nearest neighbors that can be an obstacle."""
-
 _MIN_PARALLEL_COSINE, _MIN_ELEVATION_SINE = 0.99, 0.5
 """Minimum cosine (8 degrees) between parallel normals, and minimum sine (30 degrees) of the
 elevation of such a neighbor on another face. On one smooth surface the elevation is at most half
 the angle between the normals."""
-
 _OPEN_WEIGHT = 0.5
 """Weight of a free path that leaves the bounding box of the cloud."""
-
 _HALF_PATH = 8
 """Free cells at which a path gets half of the maximum weight. A gap thus counts less than a room,
 and a hall no more than a room."""
-
 _HALF_DIRECTIONS = [steps for steps in product((-1, 0, 1), repeat=3) if steps > (0, 0, 0)]
 """Thirteen of the 26 directions to neighboring cells, without their opposites."""
 

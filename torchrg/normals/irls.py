@@ -25,22 +25,16 @@ from torchrg.structures import Neighbors, NormalFit
 
 _MIN_HEAVY_WEIGHT = 0.25
 """Weight above which a point belongs to the plane."""
-
 _MIN_STEPS = 5
 """Minimum number of steps, even if the start is close to the limit."""
-
 _UNTURNED_COSINE = 0.996
 """Cosine of 5 degrees. A normal within this angle of the PCA normal has no nearby edge."""
-
 _SAME_COSINE = 0.95
 """Cosine of 18 degrees. Two solutions with normals within this angle are one."""
-
 _SECOND_START = 0.35
 """Quantile of the squared distances at which the second solution starts."""
-
 _MIN_FRACTION = 0.1
 """Minimum fraction of the points explained by a solution; otherwise the other one wins."""
-
 _MIN_NOISE = 1e-4
 """Fraction of the distance to the farthest point. Exact planes have no noise, and without a minimum
 the steps would never end. All constants above are those of the authors' program."""
@@ -246,9 +240,7 @@ def _fit_twice(
     plane = _Plane(start, torch.zeros_like(start), mu, start, mu)
     through = _fit_graduated(points, plane, limit, decay, shift=False)
     restarted = through._replace(
-        mu=torch.maximum(restart, limit),
-        weighed_normal=through.normal,
-        weighed_mu=through.mu,
+        mu=torch.maximum(restart, limit), weighed_normal=through.normal, weighed_mu=through.mu
     )
     near = _fit_graduated(points, restarted, limit, decay, shift=True)
     points = points.relative_to(near.center)

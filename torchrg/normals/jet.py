@@ -13,15 +13,14 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import disable_autocast
-from torchrg.linalg import rank_tolerance
-from torchrg.linalg.eigen import PrincipalFrame, root, square_root
+from torchrg.linalg.eigen import PrincipalFrame
 from torchrg.linalg.moments import Columns, project, sq_lengths, sum_neighbors
+from torchrg.linalg.precision import rank_tolerance, rounded_sqrt, safe_sqrt
 from torchrg.normals.pca import center_on_first, check_patches, fit_plane, patch_resolution
 from torchrg.structures import NormalFit
 
 _NUM_TERMS = 6
 """Number of terms of a quadratic in two coordinates, and the minimum number of points."""
-
 FLAT_PIVOT = 1e-5
 """Minimum fraction of its squared length that a paraboloid term must retain after the terms before
 it are removed. Normal equations in float32 then give the retained length fraction, the root of
@@ -118,7 +117,7 @@ def fit_jet(
         torch.where(valid[..., None, None], directions @ axes.mT, 0.0),
         plane.curvature,
         valid,
-        torch.where(valid, root((residual * residual).sum(dim=-1) / count), 0.0),
+        torch.where(valid, safe_sqrt((residual * residual).sum(dim=-1) / count), 0.0),
     )
 
 
@@ -135,7 +134,7 @@ def fit_paraboloids(
     Returns unit normals ``(n, 3)``, offsets ``(n,)`` of the tangent planes ``normal . q = offset``,
     and standard deviations of the residuals ``(n,)``, with six degrees of freedom less.
     """
-    radius = square_root(sq_lengths(columns).mul_(counted).amax(dim=1))
+    radius = rounded_sqrt(sq_lengths(columns).mul_(counted).amax(dim=1))
     scale = torch.where(radius > 0, 1 / radius, 0.0)[:, None] * counted
     first, second = _tangents(normals)
     u, v, height = (project(columns, axis) * scale for axis in (first, second, normals))
@@ -148,9 +147,9 @@ def fit_paraboloids(
     for coefficient, term in zip(solution, terms, strict=True):
         height.sub_(term * coefficient[:, None])
     freedom = (counted.sum(dim=1) - _NUM_TERMS).clamp_(min=1)
-    deviations = square_root(sum_neighbors(height.square_()) / freedom) * radius
+    deviations = rounded_sqrt(sum_neighbors(height.square_()) / freedom) * radius
     a, b, c = solution[:3]
-    length = square_root(1 + b * b + c * c)
+    length = rounded_sqrt(1 + b * b + c * c)
     tilted = normals - b[:, None] * first - c[:, None] * second
     return tilted / length[:, None], a * radius / length, deviations
 
@@ -167,11 +166,7 @@ def _tangent_axes(frame: PrincipalFrame) -> Tensor:
 
 
 def _fit_height(
-    u: Tensor,
-    v: Tensor,
-    w: Tensor,
-    mask: Tensor | None,
-    rounding: Tensor,
+    u: Tensor, v: Tensor, w: Tensor, mask: Tensor | None, rounding: Tensor
 ) -> tuple[list[Tensor], Tensor]:
     """Return height, slopes and second derivatives, shape ``(*)`` each, and the residuals."""
     count = u.shape[-1] if mask is None else mask.sum(dim=-1, keepdim=True)
@@ -265,13 +260,13 @@ def _principal_curvatures(
     ab = au * (bu * uu + bv * uv) / gradient
     bb = (bu * bu * uu + 2 * bu * bv * uv + bv * bv * vv) / gradient
     middle, half = (aa + bb) / 2, (aa - bb) / 2
-    radius = root(half * half + ab * ab)
+    radius = safe_sqrt(half * half + ab * ab)
     values = torch.stack([middle + radius, middle - radius], dim=-1)
     with torch.no_grad():
         # The longer of the two rows of (S - k1) is orthogonal to the first direction.
         a = torch.where(half >= 0, half + radius, ab)
         b = torch.where(half >= 0, ab, radius - half)
-        size = root(a * a + b * b)
+        size = safe_sqrt(a * a + b * b)
         umbilic = size == 0
         a = torch.where(umbilic, 1.0, a / torch.where(umbilic, 1.0, size))
         b = torch.where(umbilic, 0.0, b / torch.where(umbilic, 1.0, size))

@@ -19,36 +19,34 @@ from torchrg._checks import (
 )
 from torchrg._parallel import nonzero_rows
 from torchrg.errors import ConfigError
-from torchrg.neighbors import check_neighbors, distinct_points, distinct_rows, search_knn
+from torchrg.neighbors import distinct_points, search_knn
+from torchrg.neighbors.knn import check_neighbors
+from torchrg.neighbors.order import distinct_rows
 from torchrg.normals.faces import find_faces, find_surfaces
 from torchrg.normals.free_space import cell_width, vote_free_side
-from torchrg.structures import UNLABELED, Cloud, Neighbors, Points
+from torchrg.structures import UNLABELED, Cloud, Neighbors
+from torchrg.structures.points import Points
 
 Orientation = Literal[
     "auto", "interior", "viewpoint", "consistent", "up", "+x", "-x", "+y", "-y", "+z", "-z", "none"
 ]
 """Modes of normal orientation; see :func:`orient_normals`."""
-
+SearchDistinct = Callable[[Tensor, int], Neighbors]
+"""Search of ``k`` neighbors among distinct finite points in canonical order, as transforms use."""
 NUM_NEIGHBORS = 20
 """Neighborhood size for orientation, including the point itself."""
-
 _NUM_VOTES = 256
 """Approximate number of voting points per face."""
-
 _HASH, _HASHES = 2654435761, 2**32
 """Knuth's multiplicative hash of a row; it selects the voting points."""
-
 _THICKNESS = 0.5
 """RMS height of a thin face, as a fraction of the cell width. Two faces farther apart have separate
 smooth patches."""
-
 _CLEARLY_OUTWARDS = 1e-3
 """Fraction of its maximum above which a volume or a mean normal is not a rounding error."""
-
 _FEW = 0.01
 """Maximum fraction of points with unknown front, such as vertices without faces, that follow their
 neighbors. More of them may form a part of the room and are oriented as ``"interior"``."""
-
 _AS_NEAR = 1 + 1e-6
 """Ratio below which two distances differ only by rounding."""
 
@@ -61,7 +59,7 @@ def orient_normals(
     orient: Orientation = "auto",
     viewpoint: Points | Sequence[float] | None = None,
     front: Points | None = None,
-    neighbors: Neighbors | None = None,
+    neighbors: Neighbors | SearchDistinct | None = None,
 ) -> Tensor:
     """Choose the sign of each normal.
 
@@ -93,7 +91,8 @@ def orient_normals(
             ``(N, 3)``, as :attr:`torchrg.Cloud.front`. Points with a zero front follow their
             nearest neighbors; if they are more than 1 % of all points, they are oriented as
             ``"interior"``. Default: that of the cloud.
-        neighbors: Neighbors of all points, which must be finite. Default: searched.
+        neighbors: Neighbors of all points, which must be finite, or a function that searches them.
+            Default: searched among distinct points.
 
     Returns:
         The normals, some of them reversed. Rows of points that are not finite are unchanged.
@@ -118,17 +117,19 @@ def orient_normals(
     vectors = as_tensor("orient_normals", "normals", normals)
     check_shapes("orient_normals", points=(cloud, "N 3"), normals=(vectors, "N 3"))
     check_floating("orient_normals", normals=vectors)
-    if neighbors is not None:
-        check_neighbors("orient_normals", neighbors, cloud)
+    known = None if callable(neighbors) else neighbors
+    if known is not None:
+        check_neighbors("orient_normals", known, cloud)
 
     def turn(side: Orientation) -> Tensor:
-        if neighbors is not None:
-            return turn_faces(cloud, vectors, side, neighbors)
+        if known is not None:
+            return turn_faces(cloud, vectors, side, known)
         upright = _upright(vectors)
         usable = nonzero_rows((upright != 0).any(dim=-1) & cloud.isfinite().all(dim=-1))
         units = upright.detach()[usable]
         distinct = distinct_points(cloud[usable], units.unbind(dim=-1))
-        turned = distinct.restore(turn_faces(distinct.points, units[distinct.rows], side))
+        near = neighbors(distinct.points, NUM_NEIGHBORS) if callable(neighbors) else None
+        turned = distinct.restore(turn_faces(distinct.points, units[distinct.rows], side, near))
         # Duplicates follow the orientation of their representative.
         return turn_towards(upright, upright.detach().index_copy(0, usable, turned))
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
-from torchrg.linalg import at_most, deg_to_sq_chord, sq_chord_to_deg, sq_chords
+from torchrg.linalg.angles import at_most, deg_to_sq_chord, sq_chord_to_deg, sq_chords
 from torchrg.normals.pca import (
     check_patches,
     fit_normals_pca,

@@ -10,29 +10,17 @@ from torchrg import kernels
 from torchrg._checks import check_floating, check_shapes, is_concrete
 from torchrg._parallel import CHUNK_SIZE, map_chunks, nonzero_rows
 from torchrg.config import NormalsConfig
-from torchrg.linalg import (
-    coordinate_resolution,
-    covariance,
-    eigh3,
-    rank_tolerance,
-)
-from torchrg.linalg.eigen import (
-    PrincipalFrame,
-    principal_frame,
-    root,
-    smallest_eigenvector3,
-    square_root,
-)
+from torchrg.linalg import covariance, eigh3
+from torchrg.linalg.eigen import PrincipalFrame, principal_frame, smallest_eigenvector3
 from torchrg.linalg.moments import covariance_of_columns, weighted_moments
-from torchrg.neighbors import gather_patches
+from torchrg.linalg.precision import coordinate_resolution, rank_tolerance, rounded_sqrt, safe_sqrt
+from torchrg.neighbors.knn import gather_patches
 from torchrg.structures import Neighbors, NormalFit
 
 FitPatches = Callable[..., NormalFit]
 """Patches ``(n, K, 3)``, mask ``(n, K)`` or None, keyword ``resolution`` ``(n,)`` -> fit."""
-
 Estimator = Callable[[Tensor, Neighbors, NormalsConfig, int], NormalFit]
 """Points, neighbors, configuration, chunk size -> fit."""
-
 _MIN_RATIO = 0.03
 """Minimum ratio of width to length of a patch resolved by its covariance; below it is rounding."""
 
@@ -115,7 +103,7 @@ def fit_plane(
         torch.where(valid[..., None], normals, 0.0),
         torch.where(valid, curvature, 0.0),
         valid,
-        residual_rms=torch.where(valid, root(smallest), 0.0),
+        residual_rms=torch.where(valid, safe_sqrt(smallest), 0.0),
     )
     return fit, frame
 
@@ -168,7 +156,7 @@ def _spans_plane(
     """
     if resolution is None:
         resolution = patch_resolution(patches, mask)
-    lengths, widths = (square_root(values[..., axis].clamp(min=0)) for axis in (2, 1))
+    lengths, widths = (rounded_sqrt(values[..., axis].clamp(min=0)) for axis in (2, 1))
     flat = torch.maximum(rank_tolerance(patches.shape[-2], patches.dtype) * lengths, resolution)
     narrow = widths < _MIN_RATIO * lengths
     if not is_concrete(patches, mask, values):

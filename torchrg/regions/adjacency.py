@@ -21,27 +21,22 @@ from torchrg._parallel import (
     split_rows,
 )
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.structures import Neighbors, PlaneAdjacency, Rows
+from torchrg.structures import Neighbors, PlaneAdjacency
+from torchrg.structures.points import Rows
 
 NUM_CONTACTS = 8
 """Nearest neighbors that count as adjacent; farther neighbors reach across gaps."""
-
 MIN_CONTACTS = 3
 """Minimum number of edges between two regions that meet or are merged: a single edge may be an
 outlier's."""
-
 PARALLEL_DEG = 15.0
 """Below this angle the intersection line of two planes may lie far from where the regions end."""
-
 _CHUNKS_AT_ONCE = 16
 """Chunks of edges per parallel batch, few enough that their results need little memory."""
-
 _MAX_CELL = 2.0**53
 """Largest cell index on a line. float64 cannot distinguish cells beyond it."""
-
 _REACH = 4.0
 """Maximum out-of-plane component of an edge within the noise, in thicknesses of the planes."""
-
 _MAX_STEEPNESS = 0.25
 """An edge follows the surface if its out-of-plane component is at most this fraction of the
 distance to the 8th neighbor. Beyond this and the noise it leads to a parallel surface."""
@@ -111,15 +106,7 @@ def find_adjacency(
 
 
 class KnnAdjacency:
-    """Adjacency of a point cloud: up to 8 nearest neighbors per point.
-
-    Example:
-        >>> adjacency = KnnAdjacency(Neighbors(torch.tensor([[0, 1], [1, 0], [2, 1]])))
-        >>> adjacency.neighbor_rows(torch.tensor([2, 0])).tolist()
-        [[1], [1]]
-        >>> adjacency.contacts(torch.tensor([0, 1, 1]))
-        (tensor([[0, 1]]), tensor([2]))
-    """
+    """Adjacency of a point cloud: up to 8 nearest neighbors per point."""
 
     def __init__(self, neighbors: Neighbors) -> None:
         columns, valid = slice(1, NUM_CONTACTS + 1), neighbors.valid

@@ -11,20 +11,25 @@ from torch import Tensor
 
 from torchrg._checks import default_device_cpu
 from torchrg.errors import ConfigError, warn
-from torchrg.linalg import eigh3_lapack, unit_direction
+from torchrg.linalg.angles import unit_direction
+from torchrg.linalg.moments import eigh3_lapack
 from torchrg.linalg.rigid import check_rigid
+from torchrg.regions.directions import (
+    MAX_ANGLE,
+    MIN_FRACTION,
+    NUM_FITS,
+    are_horizontal,
+    are_vertical,
+    bisquare,
+    find_heading,
+    horizontal_toward,
+    unit_axis,
+)
 from torchrg.regions.fit import canonicalize_sign
 from torchrg.structures import Cloud, Planes, Segmentation
 
-_MAX_TILT_DEG = 30.0
-"""Maximum tilt of a room: a larger one could mistake a wall for the floor."""
-_MAX_ANGLE_DEG = 3.0
-"""Maximum angle between planes of one direction: walls are built to within one degree and scanned
-to within two."""
-_NUM_FITS = 5
-"""Reweighted fits until a direction has converged."""
-_MIN_FRACTION = 0.02
-"""Minimum fraction of the plane area per direction: smaller ones are furniture, not a room."""
+_MAX_TILT = math.radians(30.0)
+"""Maximum tilt of a room, in radians: a larger one could mistake a wall for the floor."""
 
 
 @default_device_cpu()
@@ -34,16 +39,16 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
     Up is the unit vector :math:`u` that minimizes, over planes of area :math:`a` and unit normal
     :math:`n`,
 
-    .. math:: \sum_{\mathrm{level}} a w \|n \times u\|^2 +
-        \sum_{\mathrm{upright}} a w (n \cdot u)^2,
+    .. math:: \sum_{\mathrm{horizontal}} a w \|n \times u\|^2 +
+        \sum_{\mathrm{vertical}} a w (n \cdot u)^2,
 
     where the weights (Tukey's bisquare) fall to 0 at 3 degrees, which excludes sloped ceilings and
     leaning shelves. The initial direction is the normal within 30 degrees of ``up`` that most area
-    agrees with. The x axis follows the walls: it is the direction of upright planes, modulo 90
+    agrees with. The x axis follows the walls: it is the direction of vertical planes, modulo 90
     degrees, with most area, fitted in the same way. Among the four possible rotations, the smallest
-    about up is used. The lowest level plane (the floor) is at z = 0; the center of the bounding box
-    of axis-aligned planes is at x = y = 0. If the origin is far from the cloud, transform the
-    points in float64.
+    about up is used. The lowest horizontal plane (the floor) is at z = 0; the center of the
+    bounding box of axis-aligned planes is at x = y = 0. If the origin is far from the cloud,
+    transform the points in float64.
 
     Args:
         seg: A segmentation or its plane table.
@@ -53,7 +58,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
         A rigid transform, shape ``(4, 4)``, float64: ``points @ motion[:3, :3].T + motion[:3, 3]``.
 
     Raises:
-        ConfigError: If ``up`` is not a direction, or no plane is level or upright.
+        ConfigError: If ``up`` is not a direction, or no plane is horizontal or vertical.
 
     Warns:
         UserWarning: If there are no walls to define x and y.
@@ -72,13 +77,13 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
     normals = planes.normal.cpu().double()
     areas = torch.where(planes.curved.cpu(), 0.0, planes.area.cpu().double())
     axis = _find_up(normals, areas, upwards)
-    heading = _find_heading(normals, areas, axis)
+    heading = find_heading(normals, areas, axis)
     if heading is None:
         warn(
-            "align_axes: expected upright planes (walls) to define x and y, got none large "
+            "align_axes: expected vertical planes (walls) to define x and y, got none large "
             "enough. Only the up axis is aligned.",
         )
-        heading = _horizontal(torch.eye(3, dtype=torch.float64)[upwards.abs().argmin()], axis)
+        heading = horizontal_toward(unit_axis(upwards), axis)
     rotation = torch.stack([heading, torch.linalg.cross(axis, heading), axis])
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = rotation
@@ -90,16 +95,6 @@ def transform_planes(planes: Planes, motion: Tensor) -> Planes:
     """Apply a rigid transform ``(4, 4)`` to a plane table.
 
     Normals keep the canonical sign of plane tables.
-
-    Example:
-        >>> from torchrg.regions import summarize_planes
-        >>> floor = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
-        >>> up = torch.tensor([0.0, 0, 1]).expand(16, 3)
-        >>> table = summarize_planes(floor, up, torch.zeros(16, dtype=torch.int64))
-        >>> motion = torch.eye(4, dtype=torch.float64)
-        >>> motion[2, 3] = 5
-        >>> transform_planes(table, motion).offset.tolist()
-        [5.0]
     """
     check_rigid("transform_planes", "motion", motion)
     dtype = planes.normal.dtype
@@ -136,14 +131,6 @@ def transform_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
     """Apply a rigid transform ``(4, 4)`` to the coordinates and normals of a cloud.
 
     Positions in the file header, such as a viewpoint or a coordinate system, are dropped.
-
-    Example:
-        >>> import numpy as np
-        >>> cloud = Cloud(np.array([[1.0, 2, 3]]), {"normals": np.array([[1.0, 0, 0]])})
-        >>> quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        >>> moved = transform_cloud(cloud, quarter.double())
-        >>> moved.coordinates.tolist(), moved.fields["normals"].tolist()
-        ([[3.0, 1.0, 3.0]], [[0.0, 1.0, 0.0]])
     """
     check_rigid("transform_cloud", "motion", motion)
     rotation, coordinates, finite = motion[:3, :3].numpy(), cloud.coordinates.copy(), cloud.finite
@@ -159,25 +146,25 @@ def transform_cloud(cloud: Cloud, motion: Tensor) -> Cloud:
 
 
 def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
-    """Return the direction to which most area is level or upright; see :func:`align_axes`."""
-    level = (normals @ upwards).abs() >= math.cos(math.radians(_MAX_TILT_DEG))
-    candidates = normals[level & (areas > 0)]
+    """Return the direction to which most area is horizontal or vertical; see :func:`align_axes`."""
+    candidates = normals[are_horizontal(normals, upwards, _MAX_TILT) & (areas > 0)]
     if not len(candidates):
-        # Without level planes, up is perpendicular to the wall normals.
-        upright = (normals @ upwards).abs() <= math.sin(math.radians(_MAX_TILT_DEG))
-        spread = (areas * upright)[:, None, None] * normals[:, :, None] * normals[:, None, :]
+        # Without a floor or ceiling, up is perpendicular to the wall normals.
+        weights = areas * are_vertical(normals, upwards, _MAX_TILT)
+        spread = weights[:, None, None] * normals[:, :, None] * normals[:, None, :]
         values, vectors = eigh3_lapack(spread.sum(dim=0))
-        if not bool(values[1] > _MIN_FRACTION * values[2]) or values[2] == 0:
+        if not bool(values[1] > MIN_FRACTION * values[2]) or values[2] == 0:
             raise ConfigError(
                 "align_axes: expected a floor, a ceiling, or walls in two directions, got none "
-                f"within {_MAX_TILT_DEG:g} degrees of up. Segment the cloud first, or pass up."
+                f"within {math.degrees(_MAX_TILT):g} degrees of up. Segment the cloud first, or "
+                "pass up."
             )
         candidates = vectors[:, 0][None]
     agreeing = [_agreeing_area(normals, areas, axis) for axis in candidates]
     axis = candidates[int(torch.stack(agreeing).argmax())]
-    for _ in range(_NUM_FITS):
+    for _ in range(NUM_FITS):
         lengths = (normals @ axis).abs().clamp(max=1)
-        flat, across = areas * _bisquare(lengths.acos()), areas * _bisquare(lengths.asin())
+        flat, across = areas * bisquare(lengths.acos()), areas * bisquare(lengths.asin())
         spread = normals[:, :, None] * normals[:, None, :]
         matrix = ((across - flat)[:, None, None] * spread).sum(dim=0)
         axis = eigh3_lapack(matrix)[1][:, 0]
@@ -186,48 +173,9 @@ def _find_up(normals: Tensor, areas: Tensor, upwards: Tensor) -> Tensor:
 
 
 def _agreeing_area(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor:
-    """Return the area of planes that are level or upright if this direction is up."""
+    """Return the area of planes that are horizontal or vertical if this direction is up."""
     lengths = (normals @ axis).abs().clamp(max=1)
-    return (areas * (_bisquare(lengths.acos()) + _bisquare(lengths.asin()))).sum()
-
-
-def _bisquare(angles: Tensor) -> Tensor:
-    """Return Tukey weights of angles in radians, 0 beyond the same-direction limit."""
-    return (1 - (angles / math.radians(_MAX_ANGLE_DEG)) ** 2).clamp(min=0) ** 2
-
-
-def _find_heading(normals: Tensor, areas: Tensor, axis: Tensor) -> Tensor | None:
-    """Return the main horizontal wall direction closest to x, or None without walls."""
-    across = areas * _bisquare((normals @ axis).abs().clamp(max=1).asin())
-    if not bool(across.sum() > _MIN_FRACTION * areas.sum()):
-        return None
-    first = _horizontal(torch.eye(3, dtype=torch.float64)[0], axis)
-    second = torch.linalg.cross(axis, first)
-    angles = torch.atan2(normals @ second, normals @ first)
-    candidates = angles[across > 0]
-    agreeing = [(across * _bisquare(_modulo_90(angles - angle))).sum() for angle in candidates]
-    angle = candidates[int(torch.stack(agreeing).argmax())]
-    for _ in range(_NUM_FITS):
-        off = _modulo_90(angles - angle)
-        weights = across * _bisquare(off)
-        angle = angle + (weights * off).sum() / weights.sum()
-    angle = _modulo_90(angle)
-    heading: Tensor = angle.cos() * first + angle.sin() * second
-    return heading
-
-
-def _modulo_90(angles: Tensor) -> Tensor:
-    """Return angles in radians modulo 90 degrees, within 45 degrees of 0."""
-    return angles - (angles / (math.pi / 2)).round() * (math.pi / 2)
-
-
-def _horizontal(direction: Tensor, axis: Tensor) -> Tensor:
-    """Return the unit vector perpendicular to an axis that is closest to a direction."""
-    across = direction - (direction @ axis) * axis
-    if bool(across.norm() < math.sin(math.radians(_MAX_ANGLE_DEG))):
-        across = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[axis.abs().argmin()])
-    unit: Tensor = across / across.norm()
-    return unit
+    return (areas * (bisquare(lengths.acos()) + bisquare(lengths.asin()))).sum()
 
 
 def _origin(planes: Planes, rotation: Tensor) -> Tensor:
@@ -236,12 +184,12 @@ def _origin(planes: Planes, rotation: Tensor) -> Tensor:
     half_extent = (planes.extent.cpu().double()[:, :, None] * axes).abs().sum(dim=1) / 2
     center = planes.center.cpu().double() @ rotation.T
     # The bounding box of a diagonal rectangle exceeds its content.
-    axis_aligned = (axes.abs().amax(dim=2) > math.cos(math.radians(_MAX_ANGLE_DEG))).all(dim=1)
+    axis_aligned = (axes.abs().amax(dim=2) > math.cos(MAX_ANGLE)).all(dim=1)
     used = axis_aligned if bool(axis_aligned.any()) else torch.ones_like(axis_aligned)
     low, high = (center - half_extent)[used].amin(dim=0), (center + half_extent)[used].amax(dim=0)
-    upright = (planes.normal.cpu().double() @ rotation[2]).abs().clamp(max=1)
     area = planes.area.cpu().double()
-    level = (upright.acos() < math.radians(_MAX_ANGLE_DEG)) & (area > _MIN_FRACTION * area.sum())
-    if bool(level.any()):
-        low[2] = center[level, 2].amin()
+    floors = are_horizontal(planes.normal.cpu(), rotation[2], MAX_ANGLE)
+    floors &= area > MIN_FRACTION * area.sum()
+    if bool(floors.any()):
+        low[2] = center[floors, 2].amin()
     return torch.stack([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])

@@ -18,11 +18,12 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import map_chunks
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, sq_chords
-from torchrg.neighbors import gather_patches
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
+from torchrg.neighbors.knn import gather_patches
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
-from torchrg.structures import Neighbors, Rows
+from torchrg.structures import Neighbors
+from torchrg.structures.points import Rows
 
 
 class GrowingInput(NamedTuple):

@@ -14,26 +14,19 @@ from torchrg.linalg.moments import Segments, reduce_runs
 
 _REL_TOL = 1e-9
 """Relative area difference below which rectangles count as equal (rounding)."""
-
 _COMPASS = np.array([[1.0, 0], [1, 1], [0, 1], [-1, 1]])
 """Four directions, counterclockwise; the opposite four are implied."""
-
 _ROUNDING = 1e-12
 """Relative margin by which a discarded point must be inside the octagon (rounding)."""
-
 _SIDE_TURNS = np.array([[1.5], [2.0], [2.5]])
 """Angles, in units of pi, from an edge to the front, opposite and back edges of its rectangle: 0.5,
 1 and 1.5, plus 1 because angles start at -pi."""
-
 _POINTS_PER_CELL = 9.0
 """Mean number of points per cell; one cell in 8,000 is then empty by chance."""
-
 _NUM_DOUBLINGS = 4
 """Maximum number of times the cell width is doubled."""
-
 _MAX_AREA_GROWTH = 1.05
 """Cells are wide enough if doubling their width gives less than this times the area."""
-
 _CELL_ANGLE = math.radians(28.0)
 """Angle between cell grid and rectangle: a parallel edge would cut all its cells equally."""
 

@@ -8,48 +8,37 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, split_rows
 from torchrg.config import Auto, GrowingConfig
-from torchrg.linalg import coordinate_resolution, eigh3_lapack
-from torchrg.linalg.moments import Segments
+from torchrg.linalg.moments import Segments, eigh3_lapack
+from torchrg.linalg.precision import coordinate_resolution
 from torchrg.regions.edges import GrowingInput, neighborhood_radii
 from torchrg.robust.scale import MAD_FACTOR
 
 POINTS_AT_ONCE = 2**18
 """Points of regions that are fitted or measured together: about 400 bytes each."""
-
 BISQUARE_CUT = 4.685
 """Residuals beyond this many standard deviations have weight 0: 95 % efficiency for normal data."""
-
 _NUM_FITS = 4
 """Reweighted fits until the plane has converged."""
-
 _FLAT_RATIO = 4.0
 """Minimum ratio of consecutive variances; below it noise determines their directions."""
-
 _SAME_MAGNITUDE = 1e-6
 """Relative difference below which components of a normal count as equal (rounding)."""
-
 _CURVED_SPREAD_DEG = 8.0
 """Minimum RMS angle of the normals of a curved region to their mean direction. A smooth bend by
 three to four times this angle has this spread, a full column 45 degrees."""
-
 MAX_FITTED = 4096
 """Maximum number of points for plane fits while regions change: more points move the plane by less
 than a fiftieth of their noise."""
-
 MIN_FITTED = 10
 """Minimum number of points of a plane that assigns boundary points: any three are coplanar."""
-
 _BENT_FRACTION = 0.5
 """A region is bent if its thickness exceeds this fraction of the median reach of its points. Reach
 is four residuals, so this is twice the noise."""
-
 _FACET_THICKNESS = 2 / 3
 """Minimum thickness of mesh surfaces, in facet tolerances: points next to a surface are on facets
 no closer to its plane than the points in it."""
-
 _MAX_FACET_RMS = 1.5
 """Maximum RMS distance, in facet tolerances, of a planar faceted region with any normals."""
-
 _MIN_HEIGHT = 0.2
 """An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. A region
 thinner than 0.2 a w is a plane with noisy normals."""
@@ -59,7 +48,6 @@ _MAX_RMS, _MAX_RMS_OF_FEW = 0.2, 0.1
 """Maximum RMS distance of flat regions to their plane, as a fraction of their length: a cube has
 0.29, clutter in rooms up to 0.19, a slab a third as thick as long 0.1. The second limit is for
 clouds of fewer than two neighborhoods, whose normals are equal, whatever their shape."""
-
 _SQ_WIDTH = 12.0
 """Squared width of a uniformly covered strip, in units of the variance across it."""
 

@@ -23,14 +23,17 @@ from torchrg._parallel import (
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
-from torchrg.linalg.single import is_single, to_single
-from torchrg.neighbors import ascending_rows, canonical_order, check_neighbors, measure_sampling
+from torchrg.linalg.precision import is_single, to_single
+from torchrg.neighbors import canonical_order, measure_sampling
+from torchrg.neighbors.knn import check_neighbors
+from torchrg.neighbors.order import ascending_rows
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
-from torchrg.structures import UNLABELED, Colors, Neighbors, Points, Values
+from torchrg.structures import UNLABELED, Neighbors
+from torchrg.structures.points import Colors, Points, Values
 
 _ROOTS_AT_ONCE = 1024
 """Number of roots between two releases of memory-mapped arrays. Each root may map about 200 kB of

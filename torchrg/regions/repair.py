@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, eigh3_lapack, sq_chords, unsigned_angle_deg
-from torchrg.linalg.moments import Segments
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
+from torchrg.linalg.moments import Segments, eigh3_lapack
 from torchrg.regions.adjacency import (
     MIN_CONTACTS,
     PARALLEL_DEG,

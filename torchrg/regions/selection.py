@@ -11,10 +11,9 @@ from torch import Tensor
 
 from torchrg.config import SelectionConfig, settings_of
 from torchrg.errors import CloudWarning, ConfigError, warn
-from torchrg.linalg import unit_direction
-from torchrg.regions.kinds import find_kinds
+from torchrg.linalg.angles import unit_direction
+from torchrg.regions.classes import find_kinds
 from torchrg.structures import (
-    PLANE_COLUMNS,
     PLANE_KINDS,
     UNLABELED,
     PlaneAdjacency,
@@ -22,6 +21,7 @@ from torchrg.structures import (
     Planes,
     Segmentation,
 )
+from torchrg.structures.planes import PLANE_COLUMNS
 
 _MIN_RATIO = 1e-4
 """Ratio of the minimum area to the area of the smallest plane below which it is probably given in
@@ -75,10 +75,10 @@ def select_planes(
             )
         kind = find_kinds(seg.planes, seg.points, seg.labels, direction)
         seg = replace(seg, planes=replace(seg.planes, kind=kind))
-    return keep_planes(seg, choose_planes(seg.planes, settings))
+    return keep_planes(seg, selected_rows(seg.planes, settings))
 
 
-def choose_planes(planes: Planes, settings: SelectionConfig) -> Tensor:
+def selected_rows(planes: Planes, settings: SelectionConfig) -> Tensor:
     """Return the rows of the selected planes in their new order, shape ``(n,)``.
 
     If ``settings`` contain classes, the table must have them.

@@ -12,7 +12,6 @@ from torchrg.structures import Neighbors
 _BLOCK_SIZE = 64
 """Points per block: smaller blocks repeat more of the surrounding lists, larger ones have larger
 matrix products."""
-
 _MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
 """Maximum number of neighbors for which the kernel is faster: a block of the kernel has at most
 eight times this number of members."""
@@ -35,12 +34,6 @@ class SharedNeighbors:
     block lose only members that are in no list of the block, so the counts are exact. Points should
     be in canonical order: a block is then a surface patch with few members. Each point is in its
     own list.
-
-    Example:
-        >>> lists = torch.tensor([[0, 1, 2], [1, 0, 2], [2, 1, 3], [3, 2, 1]])
-        >>> shared = SharedNeighbors(Neighbors(lists), 3)
-        >>> shared.connected(slice(0, 1), torch.ones(1, 3, dtype=torch.bool))
-        tensor([[ True,  True, False]])
     """
 
     def __init__(self, neighbors: Neighbors, min_shared: int) -> None:

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import GrowingConfig
-from torchrg.linalg import deg_to_sq_chord, sq_chords, unsigned_angle_deg
+from torchrg.linalg import unsigned_angle_deg
+from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, KnnAdjacency
 from torchrg.regions.edges import GrowingInput, accept_edges, within_angle
@@ -25,74 +26,54 @@ from torchrg.structures import UNLABELED, Neighbors
 
 _CORE_FRACTION = 0.5
 """Fraction of the angle and distance limits within which the core of a surface is connected."""
-
 _SMOOTH_FRACTION = 0.3
 """A surface is smooth where neighboring normals differ by less than this fraction of the maximum
 angle."""
-
 _MIN_SMOOTH_RATIO = 0.7
 """Cores grow only through points whose fraction of smooth neighbors is at least 0.7 of the region's
 median. At other points noise may hide an edge."""
-
 _MAX_OFF_PLANE_FRACTION = 0.1
 """Maximum fraction of a region's points off its plane for which the plane is one surface."""
-
 _EXACT_REACH = 4.0
 """Maximum distance of the points of an exact surface to its plane, in minimum thicknesses."""
-
 _MIN_FLAT_FRACTION = 0.5
 """Minimum fraction of points in flat cores of a piecewise planar region: a noisy column breaks into
 few, curved cores."""
-
 _MIN_FACE_FRACTION = 0.05
 """Minimum fraction of the region's points in a flat core next to curved ones, such as a panel
 framed by a molding. Smaller ones belong to the bend."""
-
 _MIN_OPEN_FRACTION = 0.1
 """Minimum fraction of edges between two cores of one surface that pass the criteria; few do across
 a bridge."""
-
 _MAX_MISFIT = 2.0
 """Two cores are coplanar if their misfit is below this many thicknesses, as for parts of a surface
 bent by noise."""
-
 _MAX_DIHEDRAL_DEG = 30.0
 """Maximum angle between the planes of joined cores, in degrees. ``_MAX_MISFIT`` alone would join
 narrow strips on both sides of an edge."""
-
 _NUM_AVERAGED = 16
 """Nearest neighbors whose residuals are averaged, which reduces white noise to a quarter."""
-
 _MIN_SIZE_FACTOR = 3
 """Minimum size of a region that may contain two surfaces, in multiples of ``min_size``."""
-
 _NOISE_QUANTILE, _NOISE_FACTOR = 0.33, 2.345
 """Quantile of the absolute residuals, and the factor that converts it to a standard deviation of
 normal noise. The lower third belongs to the main level even if a second one has nearly half of the
 points."""
-
 _SEED_NOISE_FACTOR = 1.5
 """Minimum averaged residual of a candidate, in standard deviations; six of the average itself."""
-
 _STEP_NOISE_FACTOR = 2.0
 """Minimum step between two levels, in standard deviations of the residuals."""
-
 _MAX_THICKNESS = 0.6
 """Maximum thickness of a second level, as a fraction of its step: a thicker one is a slope."""
-
 _MAX_VALLEY = 0.8
 """Maximum ratio of points halfway to the second level to points on it. A step has a valley between
 its levels; a bend and the edge of a region have none."""
-
 _VALLEY_WIDTH = 1 / 6
 """Half-width of each counted band of residuals, as a fraction of the step."""
-
 _NUM_RINGS = 4
 """Rings of nearest neighbors around a level that are counted with it: they cross the step."""
-
 _MAX_LEVELS = 2
 """Maximum number of searches per region: a board may contain another level."""
-
 _BINS, _WINDOW, _PEAK_WIDTH = 64, (1, 2, 3, 2, 1), 1.5
 """Number of half-standard-deviation bins of the main-level histogram, its smoothing weights, and
 the half-width of the averaged peak in standard deviations."""

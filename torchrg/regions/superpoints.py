@@ -14,51 +14,41 @@ from torch.nn import functional
 from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import SuperpointsConfig
-from torchrg.linalg import sq_chords
-from torchrg.linalg.eigen import eigh3_lapack
-from torchrg.linalg.moments import Segments, reduce_runs
-from torchrg.neighbors import DistinctPoints, distinct_points, finite_rows, search_knn
+from torchrg.linalg.angles import sq_chords
+from torchrg.linalg.moments import Segments, eigh3_lapack, reduce_runs
+from torchrg.neighbors import distinct_points, search_knn
+from torchrg.neighbors.order import DistinctPoints, finite_rows
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
 from torchrg.regions.growth import rank_by_count
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
 _NUM_NEIGHBORS = 1 + NUM_CONTACTS
 """The point itself and its adjacent neighbors."""
-
 _RADIUS_SPACINGS = 1.6
 """Radius, in spacings, of a circle around 8 points that are one spacing apart."""
-
 _COLOR_WEIGHT = 3.0
 """Weight of a squared color difference, channels in [0, 1], relative to unit normals. Colors a
 third of the range apart in each channel weigh the same as a squared normal difference of 1."""
-
 _PLANE_FRACTION, _MAX_SPREAD_DEG = 0.5, 20.0
 """Fraction by which a point normal is turned to the mean normal of its plane, and the maximum RMS
 angle of the normals of such a plane. Noise and edges perturb normals, but not a plane's mean. In a
 column, the RMS angle is 45 degrees."""
-
 _POSITION_SPACINGS = 150.0
 """Length, in spacings, that scales positions to features. It separates boards, pictures and doors
 that are flush with a wall."""
-
 _STEP_WEIGHT = 0.25
 """Weight of the squared sine of the angle between a contact and the surface. A perpendicular
 contact, as at a step, weighs the same as normals that differ by 29 degrees."""
-
 _PLANE_WEIGHT = 0.25
 """Weight of a contact between points of different planes, equal to normals that differ by 29
 degrees."""
-
 _MIN_DIFFERENCE = 0.01
 """Squared normal difference, equal to 6 degrees, added even between regions of one surface."""
-
 _MAX_EDGES = 64
 """Maximum number of listed edges per vertex, which bounds the memory; reconstructions have 6."""
-
 _MERGE_DIVISOR = 8
 """When merging to a number of superpoints, the cheapest 1/8 of the boundaries are eligible per
 round."""
-
 _MIN_SIZE_RATIO = 16
 """Minimum size ratio at which a region merges, in one round, with all smaller ones that prefer it:
 they hardly change it. Otherwise a floor would take one speck per round."""

@@ -12,15 +12,17 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import map_tasks, nonzero_rows
 from torchrg.config import Auto
 from torchrg.errors import ShapeError
-from torchrg.linalg import eigh3_lapack, unit_direction
-from torchrg.linalg.moments import Segments, to_column_major
-from torchrg.neighbors import check_neighbors, distinct_rows, mark_distinct
+from torchrg.linalg.angles import unit_direction
+from torchrg.linalg.moments import Segments, eigh3_lapack, to_column_major
+from torchrg.neighbors.knn import check_neighbors
+from torchrg.neighbors.order import distinct_rows, mark_distinct
 from torchrg.regions.adjacency import find_adjacency
+from torchrg.regions.classes import find_kinds
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
-from torchrg.regions.kinds import find_kinds
 from torchrg.regions.polygons import trace_polygon
-from torchrg.structures import Labels, Neighbors, PlaneAdjacency, Planes, Points, Rows
+from torchrg.structures import Neighbors, PlaneAdjacency, Planes
+from torchrg.structures.points import Labels, Points, Rows
 
 _Polygons = tuple[tuple[Tensor, ...], ...]
 

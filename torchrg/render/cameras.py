@@ -56,10 +56,6 @@ def view_axes(toward: Tensor, up: Tensor) -> Tensor:
 
     Returns:
         Unit vectors as rows, shape ``(3, 3)``, float64.
-
-    Example:
-        >>> view_axes(torch.tensor([0.0, -1, 0]), torch.tensor([0.0, 0, 1])).abs().tolist()
-        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
     """
     forward = -torch.nn.functional.normalize(toward.double(), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)

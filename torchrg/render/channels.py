@@ -12,12 +12,7 @@ from torch import Tensor
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics.contingency import check_labels, contingency_table
 from torchrg.metrics.labels import match_regions
-from torchrg.render.colors import (
-    UNLABELED_GRAY,
-    color_curvature,
-    color_normals,
-    color_sharp,
-)
+from torchrg.render.colors import UNLABELED_GRAY, color_curvature, color_normals, color_sharp
 from torchrg.structures import UNLABELED
 
 COLOR_MODES = {
@@ -31,7 +26,6 @@ COLOR_MODES = {
     "normal-error": ("normal errors", "normals"),
 }
 """Color modes: their name in the viewer, and the required field."""
-
 OUTCOMES = {
     "right": ((214, 224, 214), "in the matching region"),
     "part": ((245, 170, 40), "in a second region of its plane"),
@@ -39,7 +33,6 @@ OUTCOMES = {
     "none": ((50, 95, 190), "unlabeled"),
 }
 """Outcomes of a point against ground truth: color and meaning."""
-
 _OCTAHEDRON_STEPS = 254
 """Steps along the sides of the octahedral map: about one degree. Even, so that the axes are
 exact."""
@@ -51,7 +44,6 @@ _WORST_ANGLE_DEG = 45.0
 """Normal error at the end of the color scale, in degrees."""
 _LEVELS = 255
 """Number of steps of a color scale."""
-
 Legend = list[tuple[list[int], str]]
 
 
@@ -222,12 +214,7 @@ def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
 
 
 def decode_directions(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Decode the unit vectors ``(n, 3)`` of :func:`encode_directions`.
-
-    Example:
-        >>> decode_directions(np.array([[254, 127]], dtype=np.uint8)).tolist()
-        [[1.0, 0.0, 0.0]]
-    """
+    """Decode the unit vectors ``(n, 3)`` of :func:`encode_directions`."""
     x, y = (codes.astype(np.float32) / _OCTAHEDRON_STEPS * 2 - 1).T
     z = 1 - np.abs(x) - np.abs(y)
     fold = np.maximum(-z, 0)

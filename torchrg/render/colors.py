@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.linalg import unit_direction
+from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import check_labels, contingency_table, number_labels
 from torchrg.metrics.labels import match_regions
 from torchrg.neighbors import search_knn
@@ -48,7 +48,6 @@ def _to_bytes(colors: Tensor) -> Tensor:
 
 UNLABELED_GRAY = 176
 """Red, green and blue of unlabeled points."""
-
 _CALM = (
     "f0a7bc f1aa9c deb487 bebf86 98c79a 74cbba 66c9db 81c3ef b0b8f0 daaddc "
     "fdd3d4 ffd4bf f0dbab cfe4b4 aeeacd 99ebeb abe5fe cadeff e6d6ff ffcfea"
@@ -93,11 +92,7 @@ def _similarity() -> Tensor:
 
 
 def choose_colors(
-    sizes: Tensor,
-    pairs: Tensor,
-    weights: Tensor,
-    *,
-    fixed: Tensor | None = None,
+    sizes: Tensor, pairs: Tensor, weights: Tensor, *, fixed: Tensor | None = None
 ) -> Tensor:
     """Choose a palette row for each plane greedily, the largest plane first.
 
@@ -299,10 +294,7 @@ def color_planes(
 
 
 def palette_of_planes(
-    labels: Tensor,
-    points: Tensor | None,
-    *,
-    reference: Tensor | None = None,
+    labels: Tensor, points: Tensor | None, *, reference: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return each point's palette row ``(N,)``, and the palette ``(M + 1, 3)``, uint8.
 
@@ -322,9 +314,7 @@ def palette_of_planes(
 
 
 def _choose(
-    labels: Tensor,
-    points: Tensor | None,
-    fixed: Tensor | None = None,
+    labels: Tensor, points: Tensor | None, fixed: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return each point's index among the existing labels, and the palette row of each label."""
     rows = number_labels(labels)[1]

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from torchrg.linalg import unit_direction
+from torchrg.io.plane_table import Json, describe_planes
+from torchrg.io.result import Result
+from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import finite_rows
-from torchrg.plane_table import Json, describe_planes
+from torchrg.neighbors.order import finite_rows
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.table import summarize_planes
 from torchrg.render.channels import COLOR_MODES
 from torchrg.render.cutaway import Sides, find_sides
 from torchrg.render.surface import VisibleSurface, sample_surface
-from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
 
 NUM_STRATA = 8
@@ -139,8 +139,8 @@ def encode_radii(shown: PointSample) -> Tensor:
 def page_planes(result: Result, shown: PointSample, frame: PageFrame) -> list[dict[str, object]]:
     """Return the plane entries of a viewer, by viewer label.
 
-    Entries have the columns of :func:`torchrg.result.describe_planes` that are not drawn, ``rings``
-    in viewer axes, and ``meets``: adjacent planes with angle and boundary length. Planes without
+    Entries have the columns of :func:`describe_planes` that are not drawn, ``rings`` in viewer
+    axes, and ``meets``: adjacent planes with angle and boundary length. Planes without
     classes are classified by the up axis of the viewer.
     """
     planes, origin, table = result.planes, result.cloud.origin, displayed_table(result, frame)

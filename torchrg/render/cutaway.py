@@ -10,13 +10,13 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from torchrg.config import load_config
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import number_labels
 from torchrg.pipeline import segment_planes
 from torchrg.regions.classes import classify_planes
+from torchrg.regions.directions import find_heading, horizontal_toward, unit_axis
 from torchrg.regions.table import summarize_planes
 from torchrg.render.surface import VisibleSurface
 from torchrg.structures import PLANE_KINDS, UNLABELED, Planes
@@ -90,7 +90,7 @@ def find_sides(surface: VisibleSurface, labels: Tensor | None, up: Tensor) -> Si
     centers = surface.centers
     if len(centers) == 0:
         nothing = torch.zeros(0, dtype=torch.uint8, device=centers.device)
-        return Sides(centers, nothing, nothing, _heading(centers, nothing, up))
+        return Sides(centers, nothing, nothing, horizontal_toward(unit_axis(up), up))
     if labels is None:
         config = load_config("classic").with_angle(_ANGLE_DEG)
         # Otherwise a few voxels at a corner join two walls to a region that is no wall.
@@ -114,7 +114,8 @@ def find_sides(surface: VisibleSurface, labels: Tensor | None, up: Tensor) -> Si
     of_planes = ((2 * inside > counts[:, None]) * powers).sum(dim=1)
     voxels = torch.where(of_voxels < 0, bits_by_position, of_planes[of_voxels])
     points = torch.where(of_points < 0, bits_by_position[surface.voxel_of], of_planes[of_points])
-    heading = _heading(planes.normal[walls], planes.area[walls], up)
+    heading = find_heading(planes.normal[walls], planes.area[walls], up)
+    heading = horizontal_toward(unit_axis(up), up) if heading is None else heading
     return Sides(directions, voxels.to(torch.uint8), points.to(torch.uint8), heading)
 
 
@@ -154,20 +155,6 @@ def _find_outer_sides(
     return torch.stack([up.new_zeros(3), *directions])[1:], covered
 
 
-def _heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor:
-    """Return the horizontal direction, along or across the largest wall, nearest to an axis."""
-    east = torch.zeros_like(up)
-    east[up.abs().argmin()] = 1
-    east = functional.normalize(east - (east @ up) * up, dim=0)
-    if len(normals) == 0:
-        return east
-    wall = normals[areas.argmax()]
-    wall = functional.normalize(wall - (wall @ up) * up, dim=0)
-    across = torch.linalg.cross(up, wall)
-    sides = torch.stack([wall, across, -wall, -across])
-    return sides[(sides @ east).argmax()]
-
-
 class Viewpoint(NamedTuple):
     """Direction of a camera.
 
@@ -193,10 +180,9 @@ def choose_viewpoint(
 ) -> Viewpoint:
     """Choose the direction from which most surface is visible.
 
-    The azimuth is measured about ``up``, from the direction along or across the largest wall that
-    is nearest to x. Default: the best of eight, ties broken by angle; from above, the longer side
-    of the cloud is horizontal. The elevation is the angle above the horizon. Default: 35, from
-    above 90.
+    The azimuth is measured about ``up``, from the direction of most walls nearest to x. Default:
+    the best of eight, ties broken by angle; from above, the longer side of the cloud is horizontal.
+    The elevation is the angle above the horizon. Default: 35, from above 90.
     """
     for name, angle in (("azimuth_deg", azimuth_deg), ("elevation_deg", elevation_deg)):
         if angle is not None and not math.isfinite(angle):

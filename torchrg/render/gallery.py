@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from torchrg.errors import FormatError
 from torchrg.io.files import atomic_path, check_writable
+from torchrg.io.result import PAGE_SUFFIXES, Result
 from torchrg.render.colors import color_planes
 from torchrg.render.page import check_library, load_template, make_page, write_page
 from torchrg.render.pictures import render_cloud, write_png
-from torchrg.result import PAGE_SUFFIXES, Result
 
 INDEX = "index.html"
 """File name of the index."""

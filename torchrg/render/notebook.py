@@ -7,10 +7,10 @@ from typing import Any
 
 from torchrg._optional import require
 from torchrg.errors import ConfigError
-from torchrg.plane_table import describe_planes, tabulate_planes
+from torchrg.io.plane_table import describe_planes, tabulate_planes
+from torchrg.io.result import Result
 from torchrg.render.gallery import write_planes
 from torchrg.render.page import Page, make_page
-from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud, Planes, Segmentation
 
 MAX_ROWS = 12

@@ -29,9 +29,10 @@ from torchrg._checks import check_choices
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
-from torchrg.linalg import unit_direction
+from torchrg.io.plane_table import encode_csv
+from torchrg.io.result import Result
+from torchrg.linalg.angles import unit_direction
 from torchrg.neighbors.order import scatter_rows
-from torchrg.plane_table import encode_csv
 from torchrg.render.channels import COLOR_MODES, encode_directions, make_channels
 from torchrg.render.colors import palette_of_planes
 from torchrg.render.content import (
@@ -46,13 +47,12 @@ from torchrg.render.content import (
     rounded,
 )
 from torchrg.render.cutaway import MIN_FACING, View, choose_viewpoint
-from torchrg.result import Result
 from torchrg.structures import PLANE_KINDS, Cloud
 
 if TYPE_CHECKING:
     from jinja2 import Template
 
-MAX_POINTS = 1_000_000
+MAX_SHOWN_POINTS = 1_000_000
 """Default maximum number of points in a viewer; laptops display this many smoothly."""
 _ROOM_HEIGHTS = 2.0, 6.0
 """Range of heights of rooms and halls, in meters."""
@@ -90,7 +90,7 @@ def make_page(
     view: View = "cutaway",
     up: tuple[float, float, float] | None = None,
     azimuth_deg: float | None = None,
-    max_points: int = MAX_POINTS,
+    max_points: int = MAX_SHOWN_POINTS,
     unit: str | None = None,
 ) -> Page:
     """Create a viewer of a result, or of two results with a shared camera.

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_choices, check_floating, check_shapes
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path, wrap_errors
-from torchrg.linalg import unit_direction
+from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides
@@ -153,9 +153,7 @@ def _discs(
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
     along = torch.where(
-        along.abs() < _MIN_COSINE,
-        torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE),
-        along,
+        along.abs() < _MIN_COSINE, torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE), along
     )
     return Discs(
         pixels,
@@ -208,8 +206,8 @@ def render_cloud(
             and ceilings are found. Default: the voxels are segmented.
         view: See above.
         up: Up direction; ignored for ``"sensor"``.
-        azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction along or
-            across the largest wall that is nearest to x, so that clouds of one room share a camera.
+        azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction of
+            most walls nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
         elevation_deg: Elevation of the camera, in degrees. Default: 35, from above 90.
         width: Width in pixels, at most 8,192; with few enough subpixels, about 4,800 at the

@@ -300,11 +300,6 @@ def light_colors(colors: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
     """Shade colors by the angle between surface and light.
 
     Normals (of arbitrary sign, zero if unknown) and positions are in camera axes.
-
-    Example:
-        >>> wall = torch.tensor([[0.0, 0, 1], [0, 0, -1]])
-        >>> light_colors(torch.full((2, 3), 100, dtype=torch.uint8), wall, torch.ones(2, 3))[:, 0]
-        tensor([91, 91], dtype=torch.uint8)
     """
     light = functional.normalize(normals.new_tensor(_LIGHT), dim=0)
     away = (normals * positions).sum(dim=-1) > 0
@@ -322,11 +317,6 @@ def shade_hollows(inverse_depth: Tensor, *, focal: float, radius: float) -> Tens
 
     References:
         [1] C. Boucheny, A. Ribes. Eye-dome lighting: a non-photorealistic shading technique. 2011.
-
-    Example:
-        >>> step = torch.tensor([[1.0, 1.0, 2.0, 2.0]]).repeat(4, 1)
-        >>> shade_hollows(step, focal=100.0, radius=1.0)[1] < 1
-        tensor([ True,  True, False, False])
     """
     height, width = inverse_depth.shape
     drawn = inverse_depth > 0

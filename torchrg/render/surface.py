@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchrg.linalg import covariance, eigh3
-from torchrg.neighbors import gather_patches, search_knn
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.knn import gather_patches
 from torchrg.neighbors.order import spread_bits
 
 _BITS = 20
@@ -87,11 +88,6 @@ def sample_surface(points: Tensor) -> VisibleSurface:
 
     The result does not depend on the order of the points: means are computed from integer steps,
     which add up exactly.
-
-    Example:
-        >>> surface = sample_surface(torch.tensor([[8.0, 0, 0], [torch.nan, 0, 0], [4, 1, 0]]))
-        >>> surface.rows.tolist(), surface.origin.tolist(), surface.centers[:, 0].round().tolist()
-        ([2, 0], [4.0, 0.0, 0.0], [0.0, 4.0])
     """
     rows = points.isfinite().all(dim=-1).nonzero().squeeze(-1)
     finite = points[rows].detach()

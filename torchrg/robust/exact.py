@@ -9,19 +9,22 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import split_rows
-from torchrg.robust.lanes import covariance_entries, dot, eigenvectors, sum_squares, take_lanes
+from torchrg.robust.lanes import (
+    covariance_entries,
+    eigenvectors,
+    sum_products,
+    sum_squares,
+    take_lanes,
+)
 from torchrg.robust.scale import sum_points
 
 _NUM_SIMPLICES = 128
 """Number of tested simplices of P + 1 points. If 27 of 50 points lie on a plane, all simplices miss
 it once in 25,000."""
-
 _MAX_CANDIDATES = 16
 """Maximum number of candidate flats per patch. On exact planes nearly every simplex gives one."""
-
 _LANES = 1024
 """Number of patches processed at a time, so that their data fits into the cache."""
-
 _MIN_EDGE = 0.01
 """Minimum length of an edge that spans another dimension, as a fraction of the patch extent."""
 
@@ -119,14 +122,14 @@ def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimens
     vectors = eigenvectors(covariance_entries(columns, means, weights, count))
     centered = [column - mean for column, mean in zip(columns, means, strict=True)]
     normals = vectors[..., : len(columns) - dimension].unbind(dim=2)
-    across = sum_squares([dot(centered, normal.unbind(dim=1)) for normal in normals])
+    across = sum_squares([sum_products(centered, normal.unbind(dim=1)) for normal in normals])
     return across <= tolerance.double() ** 2
 
 
 def _reject(vectors: list[Tensor], directions: list[list[Tensor]]) -> list[Tensor]:
     """Component of vectors orthogonal to the given orthonormal directions."""
     for direction in directions:
-        along = dot(vectors, direction)
+        along = sum_products(vectors, direction)
         vectors = [
             component - along * axis for component, axis in zip(vectors, direction, strict=True)
         ]

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.linalg import at_most, eigh3, second_moments
+from torchrg.linalg import eigh3, second_moments
+from torchrg.linalg.angles import at_most
 from torchrg.robust.scale import median_of_sorted, sort_rows, sum_points
 
 
@@ -57,7 +58,7 @@ def smallest_points(distances: Tensor, size: int) -> Tensor:
     return marked
 
 
-def dot(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:
+def sum_products(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:
     """Sum of the products of P tensors and P matching tensors."""
     total = parts[0] * factors[0]
     for column, factor in zip(parts[1:], factors[1:], strict=True):
@@ -67,7 +68,7 @@ def dot(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:
 
 def sum_squares(parts: Sequence[Tensor]) -> Tensor:
     """Sum of the squares of P tensors of one shape: squared lengths from coordinates."""
-    return dot(parts, parts)
+    return sum_products(parts, parts)
 
 
 def eigenvectors(matrices: Tensor) -> Tensor:

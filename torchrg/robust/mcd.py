@@ -20,13 +20,7 @@ from torchrg.robust.lanes import (
 )
 from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import sum_points
-from torchrg.robust.starts import (
-    MCDStarts,
-    draw_seed,
-    elemental_sets,
-    initial_sets,
-    random_subsets,
-)
+from torchrg.robust.starts import MCDStarts, draw_seed, elemental_sets, initial_sets, random_subsets
 from torchrg.robust.weights import (
     Estimate,
     Inliers,
@@ -42,23 +36,17 @@ from torchrg.robust.weights import (
 
 _MAX_STEPS = 100
 """Maximum number of concentration steps, after which alternating sets of tied points are kept."""
-
 _NUM_BEST = 10
 """Number of random starts that are concentrated to convergence, as published."""
-
 _NUM_MORE, _NUM_BEST_MORE = 24, 4
 """The same for ``starts="more"``: random starts, and those concentrated to convergence."""
-
 _NUM_RESAMPLED, _NUM_SUBSETS = 2, 4
 """Number of best sets from which ``starts="more"`` draws further starts, and of draws from each."""
-
 _LANES_IN_CACHE = 8192
 """Number of random starts processed at a time, so that their data fits into the cache."""
-
 _MAX_COMPARED_STARTS = 16
 """Maximum number of starts per patch for which duplicate sets are detected; with more, comparing
 costs more than it saves."""
-
 _DIGITS = 24
 """Number of points encoded exactly in one number, one binary digit each."""
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices
-from torchrg.linalg import machine_epsilon, smallest_normal
+from torchrg.linalg.precision import machine_epsilon, smallest_normal
 from torchrg.robust.lanes import (
     Ellipsoid,
     covariance_entries,
@@ -22,26 +22,21 @@ from torchrg.robust.lanes import (
     sq_distances,
     take_lanes,
 )
-from torchrg.robust.patches import Estimator, RobustFit, fit_patchwise, patchwise
+from torchrg.robust.patches import LaneEstimator, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
 
 Target = Literal["shape", "location"]
 """Estimate to which the efficiency of 95 % at the normal distribution refers."""
-
 _BREAKDOWN = 0.5
 """Fraction of points that may be arbitrary."""
-
 _EFFICIENCY = 0.95
 """Efficiency of the MM-estimator for normal data."""
-
 _MAX_STEPS = 300
 """Maximum number of reweightings, after which unconverged weights are kept."""
-
 _CONVERGED = {torch.float32: 16, torch.float64: 4096}
 """Relative change of converged weights in one reweighting, in units of the machine epsilon."""
-
 _CHECK_EVERY = 4
 """Number of reweightings between convergence checks."""
 
@@ -155,7 +150,7 @@ def _fit_shapes(
     quantile: float,
     min_dimension: int,
     chunk_size: int,
-    estimator: Estimator,
+    estimator: LaneEstimator,
     cutoff_of: Callable[[int], float],
 ) -> RobustFit:
     """Fit patches by an estimator with bisquare weights that vanish at a cutoff for P."""

@@ -26,7 +26,6 @@ from torchrg.robust.weights import (
 
 _LANES_PER_CHUNK = 1024
 """Number of sets times patches processed at a time, so that their data fits into the cache."""
-
 _MAX_SETS = 2**25
 """Maximum number of sets of an exhaustive search, 32 bytes each for P = 3: 170 points."""
 
@@ -107,14 +106,7 @@ def fit_mve(
         )
 
     return fit_patchwise(
-        "fit_mve",
-        patches,
-        mask,
-        support_fraction,
-        quantile,
-        chunk_size,
-        estimator,
-        min_dimension,
+        "fit_mve", patches, mask, support_fraction, quantile, chunk_size, estimator, min_dimension
     )
 
 

@@ -11,7 +11,8 @@ from torchrg._checks import Arguments, as_tensor, check_floating, check_shapes
 from torchrg._opaque import opaque
 from torchrg._parallel import limit_rows, map_chunks
 from torchrg.errors import ConfigError, warn
-from torchrg.linalg import flatness_tolerance, second_moments, smallest_normal
+from torchrg.linalg import second_moments
+from torchrg.linalg.precision import flatness_tolerance, smallest_normal
 from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     columns_of_points,
@@ -23,12 +24,10 @@ from torchrg.robust.lanes import (
 from torchrg.robust.scale import sum_points
 from torchrg.robust.weights import Estimate, subset_size
 
-Estimator = Callable[[list[Tensor], Tensor, int], Estimate]
-"""Estimator of lanes in general position: columns ``(K, M)``, minimum variance ``(M,)``, h."""
-
+LaneEstimator = Callable[[list[Tensor], Tensor, int], Estimate]
+"""LaneEstimator of lanes in general position: columns ``(K, M)``, minimum variance ``(M,)``, h."""
 PATCHES_IN_CACHE = 4096
 """Number of patches processed at a time, so that their data fits into the cache."""
-
 _MIN_PATCHES = 64
 """Minimum number of patches per thread."""
 
@@ -126,7 +125,7 @@ def fit_patchwise(
     support_fraction: float,
     quantile: float,
     chunk_size: int,
-    estimator: Estimator,
+    estimator: LaneEstimator,
     min_dimension: int,
     majority: Callable[[int], int] | None = None,
     weigh: Callable[[RobustFit, Tensor], Tensor] = lambda fit, points: fit.support,
@@ -159,7 +158,7 @@ def fit_patchwise(
         repair = "; pass patches.mT if points are columns" * (num_points <= size)
         warn(
             f"{caller}: expected at least {2 * size} points per patch for {size} coordinates, got "
-            f"{num_points}: too few to trust the covariance{repair}.",
+            f"{num_points}: too few to trust the covariance{repair}."
         )
     dense = patches.detach().reshape(batch.numel(), num_points, size)
     counted = torch.isfinite(dense).all(dim=-1)
@@ -252,7 +251,7 @@ def _store(out: RobustFit, rows: Tensor, fit: RobustFit) -> None:
 def _fit_chunk(
     patches: Tensor,
     support_fraction: float,
-    estimator: Estimator,
+    estimator: LaneEstimator,
     min_dimension: int,
     majority: Callable[[int], int] | None,
 ) -> RobustFit:

@@ -21,29 +21,23 @@ from torchrg.errors import ShapeError
 
 MAD_FACTOR = 1.4826
 """1 / Phi^-1(3/4), with the digits used in the literature."""
-
 QN_FACTOR = 2.2219
 """Factor of Qn in Rousseeuw and Croux (1993), eq. 3.9, and in the method's eq. 7.
 
 The exact value 1 / (sqrt(2) Phi^-1(5/8)) is 2.219144.
 """
-
 _QN_REVISED_FACTOR = 2.21914
 """Factor used with the finite-sample factors of :func:`qn_sample_factor`."""
-
 _QN_SMALL: tuple[float, ...] = (0.399356, 0.99365, 0.51321, 0.84401, 0.6122, 0.85877)
 _QN_SMALL += (0.66993, 0.87344, 0.72014, 0.88906, 0.75743)
 """Finite-sample factors for 2 to 12 values."""
 
 _TAU_WEIGHT_CUT = 4.5
 """Deviation, in median deviations, beyond which a value has no weight in the center."""
-
 _GPU_FRACTION = 256
 """Factor of the chunk size on a GPU, which has enough memory and a high launch overhead."""
-
 _MAX_LISTED_VALUES = 400
 """Number of values per row up to which Qn lists the pairs; beyond it, counting them is faster."""
-
 _TAU_SCALE_CUT = 3.0
 """Deviation at which values are truncated, in median deviations."""
 

@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
-from torchrg.linalg import machine_epsilon
+from torchrg.linalg.precision import machine_epsilon
 from torchrg.robust.lanes import (
     covariance_entries,
-    dot,
     eigenvectors,
     map_values,
     median_points,
     smallest_points,
     sorted_points,
+    sum_products,
     sum_squares,
 )
 from torchrg.robust.scale import (
@@ -35,17 +35,13 @@ MCDStarts = Literal[Starts, "more"]
 
 _MIN_TAU_VALUES = 1000
 """Number of values from which tau replaces Qn, as in robustbase, because Qn needs all pairs."""
-
 _LANES_PER_CHUNK = 12288
 """Number of starts times axes times lanes processed at a time, so that their data fits into the
 cache."""
-
 _NUM_PLANES = 64
 """Number of candidate planes."""
-
 _NUM_PLANE_STARTS = 4
 """Number of planes used as starts."""
-
 _PLANES_PER_CHUNK = 8
 """Number of planes processed at a time, so that their data fits into the cache."""
 
@@ -142,12 +138,13 @@ def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
     axes = [
         [factor.contiguous() for factor in axis.unbind(dim=2)] for axis in loadings.unbind(dim=3)
     ]
-    scores = torch.cat([dot(wide, axis).flatten(1) for axis in axes], dim=1)
+    scores = torch.cat([sum_products(wide, axis).flatten(1) for axis in axes], dim=1)
     rows = sorted_points(scores)
     scores /= _positive_scale(rows, median_of_sorted(rows))
     parts = scores.chunk(len(axes), dim=1)
     sphered = [
-        dot(parts, [factors.flatten() for factors in column]) for column in zip(*axes, strict=True)
+        sum_products(parts, [factors.flatten() for factors in column])
+        for column in zip(*axes, strict=True)
     ]
     return sum_squares([values - median_points(values) for values in sphered]).view(shape)
 
@@ -244,9 +241,9 @@ def _sq_residuals(columns: list[Tensor], sets: Tensor) -> Tensor:
     ]
     edges = [[a - b for a, b in zip(corner, corners[0], strict=True)] for corner in corners[1:]]
     normal = _orthogonal_direction(edges, corners[0])
-    residual = dot([column[:, None] for column in columns], normal)
+    residual = sum_products([column[:, None] for column in columns], normal)
     # Points that span no hyperplane get an infinite distance.
-    residual -= torch.where(sum_squares(normal) > 0, dot(corners[0], normal), torch.inf)
+    residual -= torch.where(sum_squares(normal) > 0, sum_products(corners[0], normal), torch.inf)
     return (residual * residual).reshape(num_points, -1)
 
 

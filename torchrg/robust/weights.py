@@ -7,13 +7,8 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.linalg import at_most
-from torchrg.robust.lanes import (
-    covariance_entries,
-    fit_ellipsoid,
-    sorted_points,
-    sq_distances,
-)
+from torchrg.linalg.angles import at_most
+from torchrg.robust.lanes import covariance_entries, fit_ellipsoid, sorted_points, sq_distances
 from torchrg.robust.scale import sum_points
 
 Scaling = Literal["consistency", "quantile"]

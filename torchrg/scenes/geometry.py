@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Triple = tuple[float, float, float]
 
@@ -24,18 +24,18 @@ class Frame:
         [[1.0, 2.0, 5.0]]
     """
 
-    origin: Array
-    axes: Array
+    origin: Doubles
+    axes: Doubles
 
     @classmethod
-    def upright(cls, origin: Array, heading_deg: float = 0.0) -> "Frame":
+    def upright(cls, origin: Doubles, heading_deg: float = 0.0) -> "Frame":
         """Return a frame with its third axis up, rotated about it by ``heading_deg``."""
         heading = np.deg2rad(heading_deg)
         cosine, sine = np.cos(heading), np.sin(heading)
         return cls(origin, np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1.0]]))
 
     @classmethod
-    def spanned(cls, origin: Array, first: Array, second: Array) -> "Frame":
+    def spanned(cls, origin: Doubles, first: Doubles, second: Doubles) -> "Frame":
         """Return a frame with its first axis along ``first``, and ``second`` in its first plane."""
         axis0 = unit(first)
         axis1 = unit(second - np.vecdot(second, axis0) * axis0)
@@ -54,32 +54,32 @@ class Frame:
         """Transform this frame from ``outer`` to the world coordinates of ``outer``."""
         return Frame(outer.to_world(self.origin), outer.vectors_to_world(self.axes))
 
-    def to_world(self, local: Array) -> Array:
+    def to_world(self, local: Doubles) -> Doubles:
         """Transform points of shape ``(*, 3)`` from this frame to world coordinates."""
         return self.origin + self.vectors_to_world(local)
 
-    def to_local(self, world: Array) -> Array:
+    def to_local(self, world: Doubles) -> Doubles:
         """Transform points of shape ``(*, 3)`` from world coordinates to this frame."""
         return self.vectors_to_local(world - self.origin)
 
-    def vectors_to_world(self, local: Array) -> Array:
+    def vectors_to_world(self, local: Doubles) -> Doubles:
         """Rotate vectors of shape ``(*, 3)`` from this frame to world axes."""
         # The rounding of a matrix product would depend on the number of rows.
-        world: Array = np.einsum("...i,ij->...j", local, self.axes)
+        world: Doubles = np.einsum("...i,ij->...j", local, self.axes)
         return world
 
-    def vectors_to_local(self, world: Array) -> Array:
+    def vectors_to_local(self, world: Doubles) -> Doubles:
         """Rotate vectors of shape ``(*, 3)`` from world axes to this frame."""
-        local: Array = np.vecdot(world[..., None, :], self.axes)
+        local: Doubles = np.vecdot(world[..., None, :], self.axes)
         return local
 
 
-def unit(vectors: Array) -> Array:
+def unit(vectors: Doubles) -> Doubles:
     """Normalize vectors of shape ``(*, 3)``."""
-    result: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    result: Doubles = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     return result
 
 
-def box_around(points: Array) -> Array:
+def box_around(points: Doubles) -> Doubles:
     """Return the bounding box of points of shape ``(N, 3)``, shape ``(2, 3)``."""
     return np.stack([points.min(axis=0), points.max(axis=0)])

@@ -10,7 +10,6 @@ from torchrg.scenes.surfaces import Hole, Solid, rectangle
 
 SIDES = ("left", "right", "front", "back")
 """Sides of a solid: left and right across its first axis, front and back across the second."""
-
 TABLE_HEIGHT = (0.62, 0.92)
 """Minimum and maximum height of a table top, in meters."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from torchrg.config import check_values, expect
 from torchrg.errors import ConfigError
 from torchrg.scenes import parts as draw
-from torchrg.scenes.geometry import Array, Frame, Triple
+from torchrg.scenes.geometry import Doubles, Frame, Triple
 from torchrg.scenes.parts import between, recess, room_walls
 from torchrg.scenes.scene import (
     Part,
@@ -27,10 +27,8 @@ from torchrg.scenes.surfaces import Hole, rectangle
 T = TypeVar("T")
 Furniture = Callable[[np.random.Generator, Frame], Part]
 """Function that creates an object at a position on the floor."""
-
 _ROOM = 100
 """Purpose of the random numbers: sizes and positions in a room."""
-
 _FLOOR_CELL = (1.85, 1.35)
 """Size of a floor cell in meters: a table with space to walk around it."""
 _WALL_CELL = 1.75
@@ -253,7 +251,7 @@ def _shell(
     )
 
 
-def _is_away(position: Frame, middles: Sequence[Array], distance: float) -> bool:
+def _is_away(position: Frame, middles: Sequence[Doubles], distance: float) -> bool:
     """Return whether a position is at least ``distance`` from all doorways."""
     gaps = (middle - position.origin for middle in middles)
     return all(np.vecdot(gap, gap) >= distance * distance for gap in gaps)
@@ -320,14 +318,14 @@ def _has_coplanar_face(part: Part, others: Sequence[Part], min_gap: float) -> bo
 
 def scanner_positions(
     layout: RoomLayout, room: Frame, parts: Sequence[Part], rng: np.random.Generator
-) -> Array:
+) -> Doubles:
     """Return scanner positions, spread along a room, shape ``(num_viewpoints, 3)``.
 
     Raises:
         ConfigError: If there is no free space.
     """
     length, width, _ = layout.size
-    positions: list[Array] = []
+    positions: list[Doubles] = []
     for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
         for _ in range(_POSITION_TRIES if len(positions) == number else 0):
             x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length

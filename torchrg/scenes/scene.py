@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrg._checks import check_choices
 from torchrg.errors import ConfigError
-from torchrg.scenes.geometry import Array, Floats
+from torchrg.scenes.geometry import Doubles, Floats
 from torchrg.scenes.surfaces import Solid, Surface
 from torchrg.structures import FARTHEST, MAX_POINTS
 
@@ -72,7 +72,7 @@ class SceneModel:
     """
 
     parts: tuple[Part, ...]
-    viewpoints: Array
+    viewpoints: Doubles
 
     @cached_property
     def surfaces(self) -> tuple[Surface, ...]:
@@ -85,7 +85,7 @@ class SceneModel:
         counts = [len(part.surfaces) for part in self.parts]
         return np.repeat(np.arange(len(counts)), counts)
 
-    def is_visible(self, face: int, points: Array, normals: Array) -> NDArray[np.bool_]:
+    def is_visible(self, face: int, points: Doubles, normals: Doubles) -> NDArray[np.bool_]:
         """Return the mask of points of a face with free space in front, shape ``(N,)``."""
         low, high = self.surfaces[face].bounds + np.outer((-1, 1), np.full(3, self._clearance))
         near = [
@@ -184,7 +184,7 @@ def _sample_faces(
     return points[chosen], normals[chosen], labels[chosen]
 
 
-def is_occupied(parts: Iterable[Part], points: Array) -> NDArray[np.bool_]:
+def is_occupied(parts: Iterable[Part], points: Doubles) -> NDArray[np.bool_]:
     """Return the mask of points of shape ``(N, 3)`` inside a solid."""
     inside = np.zeros(len(points), dtype=bool)
     for solid in (solid for part in parts for solid in part.solids):
@@ -192,7 +192,7 @@ def is_occupied(parts: Iterable[Part], points: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def plane_equations(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
+def plane_equations(surfaces: Iterable[Surface]) -> tuple[Doubles, Doubles]:
     """Return normals ``(M, 3)`` and offsets ``(M,)`` of surfaces; zero for curved ones."""
     curved = (np.zeros(3), 0.0)
     planes = [curved if surface.plane is None else surface.plane for surface in surfaces]
@@ -225,6 +225,6 @@ def seeded_generator(seed: int, purpose: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64([seed, purpose]))
 
 
-def to_float32(values: Array) -> Floats:
+def to_float32(values: Doubles) -> Floats:
     """Convert values to a contiguous float32 array."""
     return np.ascontiguousarray(values, dtype=np.float32)

@@ -9,9 +9,9 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg.scenes.geometry import Array, Frame, Triple, box_around
+from torchrg.scenes.geometry import Doubles, Frame, Triple, box_around
 
-PlaneEquation = tuple[Array, float]
+PlaneEquation = tuple[Doubles, float]
 Hole = tuple[float, float, float, float]
 """Rectangular hole in a surface: left, right, low and high end along its first two axes."""
 
@@ -39,24 +39,24 @@ class Surface(ABC):
         """Area including covered parts."""
 
     @cached_property
-    def bounds(self) -> Array:
+    def bounds(self) -> Doubles:
         """Bounding box, shape ``(2, 3)``."""
         return box_around(self.frame.to_world(self._corners()))
 
-    def sample(self, rng: np.random.Generator, count: int) -> Array:
+    def sample(self, rng: np.random.Generator, count: int) -> Doubles:
         """Return uniformly distributed points, shape ``(count, 3)``."""
         return self.frame.to_world(self._draw(rng, count))
 
     @abstractmethod
-    def normals_at(self, points: Array) -> Array:
+    def normals_at(self, points: Doubles) -> Doubles:
         """Return the outward unit normals at points of the surface, shape ``(N, 3)``."""
 
     @abstractmethod
-    def _corners(self) -> Array:
+    def _corners(self) -> Doubles:
         """Return local points whose bounding box contains the surface, shape ``(K, 3)``."""
 
     @abstractmethod
-    def _draw(self, rng: np.random.Generator, count: int) -> Array:
+    def _draw(self, rng: np.random.Generator, count: int) -> Doubles:
         """Implement :meth:`sample` in local coordinates."""
 
 
@@ -71,7 +71,7 @@ class Flat(Surface):
         cells: Corner and two edges of each cell, in the plane, shape ``(M, 3, 2)``.
     """
 
-    cells: Array
+    cells: Doubles
 
     @property
     def plane(self) -> PlaneEquation:
@@ -80,9 +80,9 @@ class Flat(Surface):
         return normal, float(np.vecdot(normal, self.frame.origin))
 
     @cached_property
-    def _cell_areas(self) -> Array:
+    def _cell_areas(self) -> Doubles:
         first, second = self.cells[:, 1], self.cells[:, 2]
-        areas: Array = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+        areas: Doubles = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
         return areas
 
     @property
@@ -90,27 +90,27 @@ class Flat(Surface):
         """Area including covered parts."""
         return float(self._cell_areas.sum())
 
-    def normals_at(self, points: Array) -> Array:
+    def normals_at(self, points: Doubles) -> Doubles:
         """Return the outward unit normal at each point, shape ``(N, 3)``."""
         return np.broadcast_to(self.frame.axes[2], points.shape)
 
-    def _corners(self) -> Array:
+    def _corners(self) -> Doubles:
         corner, first, second = self.cells[:, 0], self.cells[:, 1], self.cells[:, 2]
         ends = [corner, corner + first, corner + second, corner + first + second]
         return append_zero(np.concatenate(ends))
 
-    def _draw(self, rng: np.random.Generator, count: int) -> Array:
+    def _draw(self, rng: np.random.Generator, count: int) -> Doubles:
         counts = rng.multinomial(count, self._cell_areas / self._cell_areas.sum())
         first, second = self._edge_fractions(*rng.random((2, count)))
         corner, edge, other = self.cells[np.repeat(np.arange(len(counts)), counts)].swapaxes(0, 1)
         return append_zero(corner + (first[:, None] * edge + second[:, None] * other))
 
-    def _edge_fractions(self, first: Array, second: Array) -> tuple[Array, Array]:
+    def _edge_fractions(self, first: Doubles, second: Doubles) -> tuple[Doubles, Doubles]:
         """Map random numbers to the fractions of both edges of a cell."""
         return first, second
 
 
-def append_zero(positions: Array) -> Array:
+def append_zero(positions: Doubles) -> Doubles:
     """Append a zero coordinate to plane coordinates of shape ``(N, 2)``."""
     return np.column_stack([positions, np.zeros(len(positions))])
 
@@ -157,12 +157,12 @@ class Solid:
     num_round: int = 0
 
     @cached_property
-    def bounds(self) -> Array:
+    def bounds(self) -> Doubles:
         """Bounding box, shape ``(2, 3)``."""
         corners = np.array(list(product((-0.5, 0.5), repeat=3))) * self.size
         return box_around(self.frame.to_world(corners))
 
-    def contains(self, points: Array) -> NDArray[np.bool_]:
+    def contains(self, points: Doubles) -> NDArray[np.bool_]:
         """Return the mask of points of shape ``(N, 3)`` inside or on the solid."""
         fractions = 2 * np.abs(self.frame.to_local(points)) / self.size
         curved, straight = fractions[:, : self.num_round], fractions[:, self.num_round :]

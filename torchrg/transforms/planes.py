@@ -24,21 +24,14 @@ from torchrg.config import (
     settings_of,
 )
 from torchrg.errors import ConfigError
-from torchrg.io.colors import find_white
 from torchrg.neighbors import distinct_points
 from torchrg.normals import estimate_normals, orient_normals
-from torchrg.normals.orient import (
-    NUM_NEIGHBORS,
-    Orientation,
-    choose_side,
-    find_directions,
-    turn_faces,
-    turn_towards,
-)
+from torchrg.normals.orient import Orientation
 from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.regions.growth import rank_by_count
 from torchrg.structures import UNLABELED
+from torchrg.structures.colors import find_white
 from torchrg.transforms.rows import Sample, cloud_rows
 from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTransform
 
@@ -140,19 +133,9 @@ class EstimateNormals(OrientedTransform):
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return normals and curvature of a cloud."""
-        distinct = distinct_points(cloud["coord"])
-        neighbors = search(distinct.points, self.config.k)
-        points, front = find_directions(type(self).__name__, cloud["coord"], **self.side(cloud))
-        found = estimate_normals(
-            distinct.points, self.config, neighbors=neighbors, chunk_size=self.chunk_size
-        )
-
-        def turn(side: Orientation) -> Tensor:
-            return distinct.restore(turn_faces(distinct.points, found.normals, side, neighbors))
-
-        fit = found.map(distinct.restore)
-        normals = choose_side(points, fit.normals, self.orient, front, turn)
-        added = {"normal": normals, "curvature": fit.curvature}
+        options = self.side(cloud) | {"neighbors": search, "chunk_size": self.chunk_size}
+        fit = estimate_normals(cloud["coord"], self.config, **options)
+        added = {"normal": fit.normals, "curvature": fit.curvature}
         return {**added, "residual": fit.residual_rms} if self.residual else added
 
 
@@ -181,18 +164,8 @@ class OrientNormals(OrientedTransform):
 
     def add(self, cloud: Mapping[str, Tensor], search: NeighborSearch) -> dict[str, Tensor]:
         """Return the oriented normals of a cloud."""
-        points, normals = cloud["coord"], cloud["normal"]
-        is_all = bool((normals != 0).any(dim=1).all() & points.isfinite().all())
         side = self.side(cloud)
-        by_faces = self.orient == "auto" and side["front"] is None
-        if search.known and is_all and (by_faces or self.orient in ("interior", "consistent")):
-            distinct = distinct_points(points, normals.unbind(dim=1))
-            near = search(distinct.points, NUM_NEIGHBORS)
-            turned = orient_normals(
-                distinct.points, normals[distinct.rows], orient=self.orient, neighbors=near
-            )
-            return {"normal": turn_towards(normals, distinct.restore(turned))}
-        return {"normal": orient_normals(points, normals, **side)}
+        return {"normal": orient_normals(cloud["coord"], cloud["normal"], neighbors=search, **side)}
 
 
 class GrowRegions(CloudTransform):

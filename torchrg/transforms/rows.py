@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ConfigError
-from torchrg.structures import Array
+from torchrg.structures.points import Array
 
 Sample = Any
 """A sample: a dict of tensors, NumPy arrays and other values, or a PyG ``Data`` or ``Batch``."""
@@ -136,12 +136,7 @@ def check_lengths(caller: str, entries: Entries, num_points: int) -> None:
 
 
 def select_points(
-    caller: str,
-    sample: Sample,
-    rows: Tensor,
-    num_points: int,
-    *,
-    skip: Collection[str] = (),
+    caller: str, sample: Sample, rows: Tensor, num_points: int, *, skip: Collection[str] = ()
 ) -> SampleDict:
     """Return the entries of a sample that change when only ``rows`` (ascending) are kept.
 

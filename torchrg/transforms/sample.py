@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from torchrg._checks import as_tensor, check_batch, check_shapes, eager_only
 from torchrg.errors import ConfigError
-from torchrg.neighbors import sample_voxels, search_knn
+from torchrg.neighbors import sample_voxels
+from torchrg.neighbors.knn import search_distinct
 from torchrg.structures import UNLABELED, Neighbors
 from torchrg.transforms.rows import (
     LIST_KEY,
@@ -129,13 +130,7 @@ class SampleTransform(nn.Module):
         # Pointcept stores scalars per point with two axes.
         return tensor.squeeze(-1) if name in TORCHRG_KEYS and tensor.ndim == 2 else tensor
 
-    def replace(
-        self,
-        sample: Sample,
-        values: Entries,
-        *,
-        per_point: Sequence[str] = (),
-    ) -> Sample:
+    def replace(self, sample: Sample, values: Entries, *, per_point: Sequence[str] = ()) -> Sample:
         """Return a new sample of the same type with other values by key.
 
         The keys in ``per_point`` are added to the list of per-point entries.
@@ -198,8 +193,7 @@ class NeighborSearch:
         k = min(k, len(points))
         neighbors = self.recall(points, k)
         if neighbors is None:
-            none = Neighbors(torch.empty(0, 1, dtype=torch.int32, device=points.device))
-            neighbors = search_knn(points, k, canonical=True) if k else none
+            neighbors = search_distinct(points, k)
             self.remember(points, neighbors)
         return Neighbors(neighbors.indices[:, : max(k, 1)])
 

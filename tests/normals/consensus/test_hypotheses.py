@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.linalg.moments import split_columns
+from torchrg.linalg.moments import unbind_columns
 from torchrg.normals.consensus.hypotheses import (
     fit_corners,
     fit_wedges,
@@ -34,7 +34,7 @@ def faces(normals, rng, noise, first, num=40):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_ridges_and_valleys_blunt_and_sharp_are_explained(angle, sign, rng):
     patch, truth = faces([[0.0, 0, 1], [*angle, 0.2]], rng, 0.005, first=0)
-    columns = split_columns(patch * sign)
+    columns = unbind_columns(patch * sign)
     counted, noise = torch.ones_like(columns[0]), torch.tensor([0.005])
     start = vote_planes(columns, noise, truth[None], counted)
     wedge = fit_wedges(columns, *start, noise).planes
@@ -44,7 +44,7 @@ def test_ridges_and_valleys_blunt_and_sharp_are_explained(angle, sign, rng):
 
 def test_a_corner_needs_three_planes(rng):
     patch, truth = faces([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], rng, 0.005, first=2)
-    columns = split_columns(patch)
+    columns = unbind_columns(patch)
     counted, noise = torch.ones_like(columns[0]), torch.tensor([0.005])
     start = vote_planes(columns, noise, truth[None], counted)
     wedge = fit_wedges(columns, *start, noise).planes
@@ -55,7 +55,7 @@ def test_a_corner_needs_three_planes(rng):
 
 
 def test_a_single_plane_is_no_wedge(rng):
-    columns = split_columns(torch.rand(1, 50, 3, generator=rng) * torch.tensor([1.0, 1, 0]))
+    columns = unbind_columns(torch.rand(1, 50, 3, generator=rng) * torch.tensor([1.0, 1, 0]))
     noise = torch.tensor([0.01])
     up, zero = torch.tensor([[0.0, 0, 1]]), torch.zeros(1)
     assert not fit_wedges(columns, up, zero, noise).planes.deviations.isfinite().any()

@@ -55,13 +55,6 @@ def estimate_consensus(
         within three times the noise of the plane. The curvature excludes noise, which the small
         width of a narrow face would amplify. At other points both are from PCA. ``valid`` is from
         PCA, as is everything with fewer than 12 neighbors.
-
-    Example:
-        >>> floor = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
-        >>> cloud = torch.cat([floor + 0.5, floor[:, [0, 2, 1]]])
-        >>> fit = estimate_consensus(cloud, search_knn(cloud, 30), NormalsConfig(k=30), 256)
-        >>> bool((fit.normals[:400].abs() == torch.tensor([0.0, 0, 1])).all())
-        True
     """
     width = max(neighbors.indices.shape[1], config.adaptive_k or 0)
     size = min(chunk_size, limit_rows(ROWS_IN_CACHE, width))

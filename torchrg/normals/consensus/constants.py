@@ -8,7 +8,6 @@ how halving or doubling each one changes the scores, in ``sensitivity.json`` nex
 MIN_NEIGHBORS = 12
 """Neighbors. Fewer cannot distinguish surfaces, since a paraboloid alone has 6 parameters; such
 points keep the PCA normal."""
-
 NOISE_QUANTILE = 0.35
 """Fraction. The noise is this quantile of the deviations at the neighbors. It is low because most
 neighborhoods near an edge contain the edge, and deviate by their shape."""
@@ -50,7 +49,6 @@ a plane."""
 ADAPTIVE_NOISE = 0.15
 """Radii. Up to this noise k neighbors are enough; with ``adaptive_k`` a noisier neighborhood grows
 until its noise is this fraction of its radius."""
-
 FLAT_LIMIT = 1.05
 """s. A plane is accepted if the neighbors deviate from it by at most this."""
 CURVED_LIMIT = 1.2
@@ -62,7 +60,6 @@ this. A symmetric edge has 0.27."""
 FAR_OFF = 2.0
 """s. If the neighbors deviate from the paraboloid by more than this, the voted plane is better even
 if two or three planes fail."""
-
 NUM_CANDIDATES = 32
 """Planes. Number of candidates of the vote; each costs one pass over the neighbors."""
 CANDIDATE_POWER = 1.5
@@ -79,7 +76,6 @@ FIT_FALLOFF = 0.5
 NUM_REFITS = 2
 """Fits. Number of fits with each of the two reaches, for the vote and the last fit, and of the two
 faces of a plate."""
-
 NUM_ALTERNATIONS = 4
 """Iterations. Alternating updates of meeting planes and of the points assigned to each."""
 MEETING_GAP = 2.0
@@ -101,7 +97,6 @@ MAX_GAIN = 40.0
 """Chi-square. Maximum contribution of a single point to that average."""
 NUM_POOLED = 16
 """Neighbors. Number of nearest neighbors whose gains are averaged."""
-
 NUM_PASSES = 2
 """Passes. Number of passes of smoothing and of plane choice."""
 MIN_ERROR = 0.003

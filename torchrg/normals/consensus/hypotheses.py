@@ -1,16 +1,13 @@
 """Hypotheses at a broken point: the voted plane, two meeting planes, and three."""
 
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
-from torchrg.linalg import above, at_most
-from torchrg.linalg.eigen import square_root
+from torchrg.linalg.angles import above, at_most
 from torchrg.linalg.moments import (
     Columns,
     fit_planes_to_each,
@@ -20,7 +17,9 @@ from torchrg.linalg.moments import (
     sq_lengths,
     sum_neighbors,
 )
+from torchrg.linalg.precision import rounded_sqrt
 from torchrg.normals.consensus import constants
+from torchrg.normals.consensus.candidates import candidate_ranks
 
 _PLANE_PARAMETERS = 3
 
@@ -119,27 +118,8 @@ def _planes_through(columns: Columns, ranks: Tensor) -> tuple[Tensor, Tensor]:
     x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
     sq_area = x * x + y * y + z * z
     spanned = sq_area > 0
-    length = square_root(torch.where(spanned, sq_area, 1.0))
+    length = rounded_sqrt(torch.where(spanned, sq_area, 1.0))
     return torch.stack([x / length, y / length, z / length], dim=-1), spanned
-
-
-def candidate_ranks(num_neighbors: int) -> Tensor:
-    """Return the ranks ``(P, 2)`` of the neighbors that span candidates with the point."""
-    pairs = _pairs(num_neighbors, constants.NUM_CANDIDATES, constants.CANDIDATE_POWER)
-    return torch.tensor(pairs, dtype=torch.int64, device="cpu").view(-1, 2)
-
-
-@cache
-def _pairs(num_neighbors: int, num_pairs: int, power: float) -> tuple[tuple[int, int], ...]:
-    """Return pairs of ranks: spread over all neighbors, near ones more often."""
-    last = num_neighbors - 1
-    if last < 2:
-        return ()
-    # The plastic number's low-discrepancy sequence covers the square of pairs evenly.
-    steps = np.arange(1, 8 * num_pairs)[:, None] * np.array([0.7548776662466927, 0.569840290998])
-    ranks = 1 + np.floor(last * (steps % 1.0) ** power).astype(int)
-    pairs = dict.fromkeys((min(a, b), max(a, b)) for a, b in ranks.tolist() if a != b)
-    return tuple(pairs)[:num_pairs]
 
 
 class MeetingPlanes(NamedTuple):
@@ -352,6 +332,6 @@ def _summary(
         normals = torch.where(has_group[:, None], normal, normals)
         offsets = torch.where(has_group, offset, offsets)
     freedom = max(outer.shape[1] - _PLANE_PARAMETERS * len(planes), 1)
-    deviations = square_root(sum_neighbors(outer * outer) / freedom)
+    deviations = rounded_sqrt(sum_neighbors(outer * outer) / freedom)
     deviations = torch.where(present & _all_present(groups), deviations, torch.inf)
     return MeetingPlanes(normals, offsets, deviations)

@@ -8,19 +8,19 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, limit_rows, map_chunks, nonzero_rows
-from torchrg.linalg import above, coordinate_resolution
-from torchrg.linalg.eigen import square_root
+from torchrg.linalg.angles import above
 from torchrg.linalg.moments import (
     dot,
     fit_parallel_planes,
     fit_weighted_planes,
     project,
     residuals,
-    split_columns,
     sq_lengths,
     sum_neighbors,
+    unbind_columns,
 )
-from torchrg.neighbors import gather_columns, gather_patches
+from torchrg.linalg.precision import coordinate_resolution, rounded_sqrt
+from torchrg.neighbors.knn import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
 from torchrg.structures import Neighbors, NormalFit
 
@@ -170,9 +170,9 @@ def _deviations(
     distances = residuals(columns, normals, offsets)
     squares = distances * distances * counted
     second, fourth = sum_neighbors(squares), sum_neighbors(squares.square())
-    deviations = square_root(second / (count - 3).clamp(min=1))
+    deviations = rounded_sqrt(second / (count - 3).clamp(min=1))
     single = torch.where(valid & (count > 3), deviations, torch.inf)
-    radius = square_root((sq_lengths(columns) * counted).amax(dim=1))
+    radius = rounded_sqrt((sq_lengths(columns) * counted).amax(dim=1))
     low = fourth * count < constants.MAX_LAYERED_KURTOSIS * second * second
     moves = sum((column[:, 1:] - column[:, :-1]).abs_() for column in columns)
     assert isinstance(moves, Tensor)  # noqa: S101
@@ -191,7 +191,7 @@ def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, single
         normals, two, squares = fit_parallel_planes(columns, (upper, counted - upper))
         upper = above(project(columns, normals), two.mean(dim=0)[:, None]) * counted
     num_upper = upper.sum(dim=1)
-    deviations = square_root(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
+    deviations = rounded_sqrt(squares * count / (count - _LAYER_PARAMETERS).clamp_(min=1))
     layered = torch.minimum(num_upper, count - num_upper) >= constants.MIN_PLANE_POINTS
     layered &= deviations <= constants.MAX_LAYERED_FRACTION * single
     return torch.where(layered, deviations, torch.inf)
@@ -220,13 +220,13 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
     """
     if patches.shape[1] < count:
         return patches.new_full(patches.shape[:1], torch.inf)
-    columns = split_columns(patches[:, :count])
+    columns = unbind_columns(patches[:, :count])
     counted = counted[:, :count]
     normals, offsets, values = fit_weighted_planes(columns, counted)
     distances = residuals(columns, normals, offsets)
     spread = sum_neighbors(distances * distances) / (count - 3)
     broad = (values[:, 1] > constants.MIN_BREADTH * values[:, 2]) & (counted[:, -1] > 0)
-    return torch.where(broad, square_root(spread), torch.inf)
+    return torch.where(broad, rounded_sqrt(spread), torch.inf)
 
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:

@@ -5,8 +5,7 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows, map_chunks, map_selected
-from torchrg.linalg import signs
-from torchrg.linalg.eigen import square_root
+from torchrg.linalg.angles import signs
 from torchrg.linalg.moments import (
     Columns,
     dot,
@@ -16,7 +15,8 @@ from torchrg.linalg.moments import (
     sq_lengths,
     sum_neighbors,
 )
-from torchrg.neighbors import gather_columns
+from torchrg.linalg.precision import rounded_sqrt
+from torchrg.neighbors.knn import gather_columns
 from torchrg.normals.consensus import constants
 from torchrg.normals.consensus.hypotheses import support_scores
 from torchrg.normals.consensus.noise import NoiseEstimate
@@ -105,7 +105,7 @@ def _smooth_rows(
         weights *= near.valid
     weights = _recenter_weights(columns, weights) * sign
     mean = torch.stack([sum_neighbors(weights * column) for column in (x, y, z)], dim=-1)
-    length = square_root(dot(mean, mean))
+    length = rounded_sqrt(dot(mean, mean))
     has_mean = length > 0
     divisor = torch.where(has_mean, length, 1.0)
     normals = torch.where(has_mean[:, None], mean / divisor[:, None], torch.cat([a, b, c], dim=1))
@@ -279,7 +279,7 @@ def _distance_weights(columns: Columns, fraction: float) -> Tensor:
 
 def _recenter_weights(columns: Columns, weights: Tensor) -> Tensor:
     """Return weights tilted so that the weighted mean position is nearly the point."""
-    radius = square_root(sq_lengths(columns).amax(dim=1, keepdim=True))
+    radius = rounded_sqrt(sq_lengths(columns).amax(dim=1, keepdim=True))
     x, y, z = (column / torch.where(radius > 0, radius, 1.0) for column in columns)
     wx, wy, wz = weights * x, weights * y, weights * z
     xx, xy, xz = sum_neighbors(wx * x), sum_neighbors(wx * y), sum_neighbors(wx * z)

@@ -7,15 +7,11 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._parallel import map_chunks, map_selected
-from torchrg.linalg.moments import Columns, split_columns
-from torchrg.neighbors import gather_columns, gather_patches
+from torchrg.linalg.moments import Columns, unbind_columns
+from torchrg.neighbors.knn import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
-from torchrg.normals.consensus.hypotheses import (
-    MeetingPlanes,
-    candidate_ranks,
-    fit_meeting_planes,
-    vote_planes,
-)
+from torchrg.normals.consensus.candidates import candidate_ranks
+from torchrg.normals.consensus.hypotheses import MeetingPlanes, fit_meeting_planes, vote_planes
 from torchrg.normals.consensus.noise import NoiseEstimate
 from torchrg.normals.jet import FLAT_PIVOT, fit_paraboloids
 from torchrg.structures import Neighbors, NormalFit
@@ -161,7 +157,7 @@ def _gather_counted(points: Tensor, near: Neighbors) -> Columns:
         order = (~counted).to(torch.uint8).argsort(dim=1, stable=True)
         order = order[:, : int(counted[0].sum())]
         patches = patches.gather(1, order[:, :, None].expand(-1, -1, 3))
-    return split_columns(patches)
+    return unbind_columns(patches)
 
 
 def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:

@@ -5,9 +5,9 @@ import pytest
 
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
-from torchrg.io.colors import find_white, read_colors
-from torchrg.result import Result
+from torchrg.io.result import Result
 from torchrg.structures import Cloud
+from torchrg.structures.colors import find_white, read_colors
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.random((100, 3))

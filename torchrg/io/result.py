@@ -18,35 +18,29 @@ import torch
 from torch import Tensor
 
 from torchrg.errors import ShapeError
-from torchrg.io import atomic_path, read_cloud
-from torchrg.io.colors import narrow_colors, read_colors
+from torchrg.io import read_cloud
 from torchrg.io.fields import add_result_fields
-from torchrg.io.files import PARSE_ERRORS, local_path
+from torchrg.io.files import PARSE_ERRORS, atomic_path, local_path
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
-from torchrg.io.tables import are_integers
+from torchrg.io.plane_table import Arrays, Json, described_to_arrays, encode_csv, planes_from_arrays
+from torchrg.io.plane_table import describe_planes as describe_planes
 from torchrg.metrics.contingency import number_labels
-from torchrg.neighbors import distinct_rows, search_knn
-from torchrg.plane_table import (
-    Arrays,
-    Json,
-    described_to_arrays,
-    encode_csv,
-    planes_from_arrays,
-)
-from torchrg.plane_table import describe_planes as describe_planes
+from torchrg.neighbors import search_knn
+from torchrg.neighbors.order import distinct_rows
 from torchrg.regions import summarize_planes
 from torchrg.regions.adjacency import find_adjacency
 from torchrg.regions.superpoints import majority_planes
 from torchrg.structures import (
     UNLABELED,
     Cloud,
-    FilePath,
     Neighbors,
     PlaneAdjacency,
     Planes,
     Segmentation,
     Superpoints,
 )
+from torchrg.structures.colors import narrow_colors, read_colors
+from torchrg.structures.points import FilePath, are_integers
 
 __all__ = ["Result", "read_result", "write_table"]
 __dir__ = __all__.copy

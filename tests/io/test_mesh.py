@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg import mesh
 from torchrg.errors import ShapeError
-from torchrg.io import ply, read_cloud, write_cloud
-from torchrg.merge import merge_clouds
+from torchrg.io import mesh, ply, read_cloud, write_cloud
+from torchrg.io.merge import merge_clouds
 from torchrg.regions.axes import transform_cloud
 from torchrg.structures import Cloud
 

@@ -6,7 +6,7 @@ import torch
 
 import torchrg
 from torchrg import kernels
-from torchrg.linalg.single import to_single
+from torchrg.linalg.precision import to_single
 from torchrg.neighbors import search_knn
 from torchrg.scenes import make_room
 

@@ -11,7 +11,8 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.io import read_cloud
 from torchrg.metrics import score_labels
 from torchrg.pipeline import segment_planes
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, UNLABELED
+from torchrg.structures import PLANE_KINDS, UNLABELED
+from torchrg.structures.planes import PLANE_COLUMNS
 
 PRESETS = ["classic", "paper", "consensus"]
 

@@ -36,12 +36,6 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
     Raises:
         FormatError: If there are no clouds, two clouds have different coordinate reference systems,
             or LAS files have different kinds of GPS times.
-
-    Example:
-        >>> clouds = [Cloud(np.eye(3), {"labels": np.arange(3)}), Cloud(np.zeros((1, 3)))]
-        >>> merged = merge_clouds(clouds)
-        >>> len(merged), merged.notes
-        (4, ('fields left out, because not all files share them: labels',))
     """
     if not clouds:
         raise FormatError("merge: expected at least one cloud, got none; pass a file.")

@@ -43,11 +43,6 @@ def find_fronts(
 
     Raises:
         FormatError: If a vertex index is out of range.
-
-    Example:
-        >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        >>> find_fronts([np.array([[0, 2, 1]])], square, np.ones(4, bool)).tolist()
-        [[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]
     """
     positions, count = coordinates.astype(np.float64, copy=False), len(coordinates)
     sums, areas = np.zeros((3, count)), np.zeros(count)

@@ -10,10 +10,10 @@ from scipy.spatial import KDTree
 from torchrg import Cloud, estimate_normals, load_config, read_cloud, segment_planes, write_cloud
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.sources import CloudSource
-from torchrg.clouds import check_finite
 from torchrg.datasets import FolderOfClouds
 from torchrg.errors import PrecisionWarning
-from torchrg.precision import describe_placeholders, describe_steps
+from torchrg.pipeline.clouds import check_finite
+from torchrg.structures.precision import describe_placeholders, describe_steps
 from torchrg.transforms import SegmentPlanes
 
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])

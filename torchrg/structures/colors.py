@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg.errors import FormatError, TorchrgError
-from torchrg.structures import Array
+from torchrg.structures.points import Array
 
 BYTE, WORD = 255, 65535
 """Maximum of an 8-bit and of a 16-bit channel."""

@@ -8,10 +8,10 @@ import torch
 
 import torchrg
 from torchrg import Cloud, read_cloud, segment_planes, write_cloud
-from torchrg.axes import describe_units
-from torchrg.clouds import check_finite
 from torchrg.errors import UnitWarning
+from torchrg.pipeline.clouds import check_finite
 from torchrg.scenes import make_room
+from torchrg.structures.precision import describe_units
 
 ROOM = make_room(4000, noise=0.003, seed=1).points.double().numpy()
 DEGREES = ROOM * [1e-5, 1e-5, 1] + [8.5, 47.4, 400]

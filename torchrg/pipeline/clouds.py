@@ -22,21 +22,13 @@ from torchrg.errors import (
     PrecisionWarning,
     system_limit,
 )
-from torchrg.io.tables import are_integers
 from torchrg.normals.orient import Orientation
-from torchrg.pipeline import make_superpoints, segment_planes
-from torchrg.precision import describe_placeholders
-from torchrg.regions.selection import choose_planes, keep_planes, renumber_planes
-from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints, bounding_box
-
-__all__ = [
-    "check_finite",
-    "describe_multipliers",
-    "find_objects",
-    "note_on_copies",
-    "segment_cloud",
-]
-__dir__ = __all__.copy
+from torchrg.pipeline.planes import segment_planes
+from torchrg.pipeline.superpoints import make_superpoints
+from torchrg.regions.selection import keep_planes, renumber_planes, selected_rows
+from torchrg.structures import FARTHEST, Cloud, Segmentation, Superpoints
+from torchrg.structures.points import are_integers, bounding_box
+from torchrg.structures.precision import describe_placeholders
 
 Returned = TypeVar("Returned")
 
@@ -139,7 +131,7 @@ def segment_cloud(
     begin("superpoints")
     colors = cloud.fields.get("color")
     superpoints = make_superpoints(cloud.points, seg, partition, colors=colors, voxel=voxel)
-    rows = choose_planes(seg.planes, settings)
+    rows = selected_rows(seg.planes, settings)
     plane = renumber_planes(superpoints.plane, rows, len(seg.planes))
     return keep_planes(seg, rows), replace(superpoints, plane=plane)
 
@@ -171,7 +163,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
 
     Example:
         >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
-        ('2 of 3 points are not finite or beyond 1e+12; they stay unlabeled',)
+        ('2 of 3 points are not finite or beyond 1e+12; they have no normal and no plane',)
     """
     num_bad = len(cloud) - int(np.count_nonzero(cloud.finite))
     if num_bad == len(cloud):
@@ -183,7 +175,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
     if num_bad:
         notes.append(
             f"{num_bad:,} of {len(cloud):,} points are not finite or beyond {FARTHEST:g}; they "
-            "stay unlabeled"
+            "have no normal and no plane"
         )
     finite = cloud.coordinates[cloud.finite] if num_bad else cloud.coordinates
     low, high = bounding_box(finite)

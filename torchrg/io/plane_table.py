@@ -14,7 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Array, PlaneAdjacency, Planes
+from torchrg.structures import PLANE_KINDS, PlaneAdjacency, Planes
+from torchrg.structures.planes import PLANE_COLUMNS
+from torchrg.structures.points import Array
 
 __all__ = [
     "CSV_COLUMNS",

@@ -8,7 +8,7 @@ import pytest
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.io.e57 import ScanPose
-from torchrg.merge import merge_clouds
+from torchrg.io.merge import merge_clouds
 from torchrg.structures import Cloud
 
 

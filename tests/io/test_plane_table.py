@@ -11,7 +11,7 @@ import torch
 
 from torchrg import segment_planes
 from torchrg.config import load_config
-from torchrg.plane_table import (
+from torchrg.io.plane_table import (
     CSV_COLUMNS,
     describe_planes,
     encode_csv,

@@ -15,11 +15,12 @@ from torchrg.datasets import write_pointcept_scene
 from torchrg.datasets.pointcept import write_results
 from torchrg.errors import FormatError, ShapeError
 from torchrg.io import FORMATS
-from torchrg.neighbors import finite_rows
+from torchrg.io.result import Result
+from torchrg.neighbors.order import finite_rows
 from torchrg.render.page import make_page
-from torchrg.result import Result
 from torchrg.scenes import make_room
-from torchrg.structures import PLANE_COLUMNS, Cloud, PlaneAdjacency, Planes
+from torchrg.structures import Cloud, PlaneAdjacency, Planes
+from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.transforms import OrientNormals
 
 CLASSIC = load_config("classic")
@@ -241,7 +242,7 @@ def test_labels_from_elsewhere_get_one_table(monkeypatch, cloud, seg):
         calls.append(arguments)
         return torchrg.regions.summarize_planes(*arguments, **settings)
 
-    monkeypatch.setattr("torchrg.result.summarize_planes", counted)
+    monkeypatch.setattr("torchrg.io.result.summarize_planes", counted)
     # Numbers with gaps, in the opposite order, and a point that is nowhere.
     labels = torch.where(seg.labels >= 0, 1000 - 7 * seg.labels, -1).numpy()
     coordinates = np.concatenate([cloud.coordinates, [[np.nan, 0, 0]]]).astype(np.float32)
@@ -272,7 +273,7 @@ def test_neighbors_of_the_segmentation_are_not_searched_again(monkeypatch, cloud
     searched = Result.from_segmentation(cloud, bare).planes
     rows = finite_rows(cloud.points)
     known = replace(bare, neighbors=torchrg.search_knn(cloud.points[rows], 50, canonical=True))
-    monkeypatch.setattr("torchrg.result.search_knn", None)
+    monkeypatch.setattr("torchrg.io.result.search_knn", None)
     result = Result.from_segmentation(cloud, known)
     assert_same_table(result.planes, searched)
     assert result.segmentation.neighbors is known.neighbors

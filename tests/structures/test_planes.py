@@ -7,10 +7,10 @@ import torch
 import torchrg
 from tests.regions.test_table import columns_of
 from torchrg.depth import segment_depth
-from torchrg.errors import ShapeError
 from torchrg.pipeline import segment_planes
 from torchrg.scenes import make_room
-from torchrg.structures import PLANE_COLUMNS, PLANE_KINDS, Cloud
+from torchrg.structures import PLANE_KINDS
+from torchrg.structures.planes import PLANE_COLUMNS
 
 
 @pytest.fixture(scope="module")
@@ -83,13 +83,3 @@ def test_a_segmentation_goes_to_a_device_whole():
     assert torch.equal(back.labels, seg.labels)
     assert torch.equal(back.planes.normal, seg.planes.normal)
     assert back.sampling == seg.sampling
-
-
-def test_a_cloud_takes_tensors():
-    front = torch.ones(3, 3)
-    cloud = Cloud(torch.eye(3), {"labels": torch.arange(3)}, front=front)
-    values = cloud.coordinates, cloud.fields["labels"], cloud.front
-    assert all(isinstance(value, np.ndarray) for value in values)
-    assert torch.equal(cloud.points, torch.eye(3))
-    with pytest.raises(ShapeError, match=r"got list; use numpy\.array"):
-        Cloud([[0.0, 0.0, 1.0]])

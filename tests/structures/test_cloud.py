@@ -1,0 +1,18 @@
+"""Point clouds of arrays and tensors."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrg.errors import ShapeError
+from torchrg.structures import Cloud
+
+
+def test_a_cloud_takes_tensors():
+    front = torch.ones(3, 3)
+    cloud = Cloud(torch.eye(3), {"labels": torch.arange(3)}, front=front)
+    values = cloud.coordinates, cloud.fields["labels"], cloud.front
+    assert all(isinstance(value, np.ndarray) for value in values)
+    assert torch.equal(cloud.points, torch.eye(3))
+    with pytest.raises(ShapeError, match=r"got list; use numpy\.array"):
+        Cloud([[0.0, 0.0, 1.0]])
