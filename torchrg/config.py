@@ -162,8 +162,8 @@ class GrowingConfig:
     facet_tolerance: float | Auto | None = "auto"
     """Merge adjacent regions within this RMS distance of a common plane, in units of the cloud; for
     mesh facets and warped reconstructions. auto: 1/240 of the cloud height (11 mm in a room) if
-    deviations grow with scale, less than half of that (5 mm) if the noise is white. None disables
-    merging."""
+    deviations grow with scale, 1.5 times that in warped scans without a mesh, less than half of it
+    (5 mm) if the noise is white. None disables merging."""
     faceted: bool | Auto = field(default="auto", metadata=NO_FLAG)
     """Whether flat surfaces deviate from planes by shape (mesh facets, warped reconstructions)
     rather than by noise. If true, points instead of normals decide whether a region is flat;
@@ -224,6 +224,7 @@ class GrowingConfig:
             reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
             limit = min(_FACET_HEIGHT_FRACTION * sampling.height, _FACET_RADIUS_FRACTION * reach)
             fraction = max(_shape_fraction(sampling), _WHITE_FRACTION)
+            fraction += _WARP_FRACTION * _warp_fraction(sampling)
             tolerance = float(f"{fraction * limit:.3g}") or None
             if tolerance is not None and tolerance > FARTHEST:
                 raise ConfigError(
@@ -246,6 +247,9 @@ radius of 50 neighbors. The bound matters for scans of many stories."""
 _WHITE_FRACTION = 0.45
 """Fraction of the facet tolerance used if noise is white (5 mm in a room), since cushions and other
 bent surfaces are split there too."""
+_WARP_FRACTION = 0.5
+"""Increase of the facet tolerance in warped scans, where frames disagree over areas of any size.
+Twice as much merges faces a few centimeters apart."""
 _MIN_SIDE_FRACTION = 1 / 27
 """Side of the smallest region as a fraction of the cloud height: 10 cm in a room of 2.7 m."""
 _MIN_SIZES = 20, 50
@@ -261,6 +265,16 @@ points sampled from a mesh: smaller regions (20 cm in a room) are facets of curv
 def _shape_fraction(sampling: Sampling) -> float:
     """Return how much of the deviation from planes is shape rather than noise, in [0, 1]."""
     return 1 - _ramp(sampling.whiteness, *WHITENESS)
+
+
+def _warp_fraction(sampling: Sampling) -> float:
+    """Return how much of the deviation from planes is warp of a fused scan, in [0, 1].
+
+    The facets of a mesh are no warp. Points sampled from them are exact; vertices are evenly spaced.
+    """
+    if sampling.variation < _VARIATION:
+        return 0.0
+    return _shape_fraction(sampling) * (1 - _ramp(sampling.exactness, *_EXACTNESS))
 
 
 def _ramp(value: float, low: float, high: float) -> float:
@@ -370,7 +384,9 @@ class PipelineConfig(SelectionConfig):
 
         If whiteness is below 0.4, surfaces are bent or faceted, and ``facet_tolerance`` is 1/240 of
         the cloud height, at most 0.3 of the radius of 50 neighbors. From 0.6 noise is white, and it
-        is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``.
+        is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``. It
+        is 1.5 times that for warped surfaces: points that are neither exact (0.1 to 0.2) nor evenly
+        spaced are of no mesh, but fused from frames that disagree.
         Regional noise is used if noise is white and the distances to the nearest point vary by less
         than 0.38, as in mesh vertices and grids. ``min_size`` is the number of points in a square
         with sides 1/27 of the height. They are 1/13 for points sampled from a mesh, where small
@@ -381,6 +397,8 @@ class PipelineConfig(SelectionConfig):
             >>> config = load_config().with_sampling(mesh)
             >>> config.growing.facet_tolerance, config.growing.min_size, config.normals.noise_scope
             (0.0113, 173, 'local')
+            >>> load_config().with_sampling(mesh._replace(exactness=0.0)).growing.facet_tolerance
+            0.0169
         """
         return dataclasses.replace(
             self,
