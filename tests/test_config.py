@@ -194,6 +194,7 @@ def base_file(folder, name):
 FACETS = Sampling(whiteness=0.1, variation=0.5, exactness=0.5, density=4000.0, height=2.7)
 VERTICES = Sampling(whiteness=0.8, variation=0.28, density=700.0, height=2.7)
 RAYS = Sampling(whiteness=0.9, variation=0.6, density=7000.0, height=2.7)
+DESK = Sampling(0.7, variation=0.25, exactness=0.1, density=3e5, height=0.25, deviation=8e-4)
 
 
 @pytest.mark.parametrize(
@@ -210,6 +211,13 @@ RAYS = Sampling(whiteness=0.9, variation=0.6, density=7000.0, height=2.7)
         (VERTICES._replace(whiteness=0.55), "regional", 0.00506, False, 20),
         (VERTICES._replace(whiteness=0.48), "local", 0.00675, True, 20),
         (RAYS, "local", 0.00506, False, 50),
+        # Steps of sqrt(12) 0.8 mm; 50 points of a desk are within 7.3 mm, those of a wall 28 mm.
+        (DESK, "regional", 0.00277, True, 26),
+        (DESK._replace(exactness=0.06), "regional", 0.00139, True, 26),
+        (DESK._replace(exactness=0.04), "regional", 0.000469, False, 26),
+        (DESK._replace(deviation=1e-4), "regional", 0.000469, False, 26),
+        (DESK._replace(whiteness=0.4, exactness=0.2), "local", 0.00104, True, 111),
+        (DESK._replace(density=2e4, deviation=0.01, height=1.5), "regional", 0.0113, True, 50),
         (Sampling(), "local", None, False, 20),
     ],
 )

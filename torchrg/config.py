@@ -163,7 +163,8 @@ class GrowingConfig:
     """Merge adjacent regions within this RMS distance of a common plane, in units of the cloud; for
     mesh facets and warped reconstructions. auto: 1/240 of the cloud height (11 mm in a room) if
     deviations grow with scale, 1.5 times that in warped scans without a mesh, less than half of it
-    (5 mm) if the noise is white. None disables merging."""
+    (5 mm) if the noise is white, at least the rounding step of quantized coordinates. None disables
+    merging."""
     faceted: bool | Auto = field(default="auto", metadata=NO_FLAG)
     """Whether flat surfaces deviate from planes by shape (mesh facets, warped reconstructions)
     rather than by noise. If true, points instead of normals decide whether a region is flat;
@@ -212,7 +213,7 @@ class GrowingConfig:
 
     def with_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
-        count, tolerance = self.min_size, self.facet_tolerance
+        count, tolerance, is_stepped = self.min_size, self.facet_tolerance, False
         if count == "auto":
             side, (low, high) = _MIN_SIDE_FRACTION, _MIN_SIZES
             drawn = _shape_fraction(sampling) * _ramp(sampling.exactness, *_EXACTNESS)
@@ -225,7 +226,9 @@ class GrowingConfig:
             limit = min(_FACET_HEIGHT_FRACTION * sampling.height, _FACET_RADIUS_FRACTION * reach)
             fraction = max(_shape_fraction(sampling), _WHITE_FRACTION)
             fraction += _WARP_FRACTION * _warp_fraction(sampling)
-            tolerance = float(f"{fraction * limit:.3g}") or None
+            step = min(_rounding_step(sampling), _STEP_RADIUS_FRACTION * reach)
+            is_stepped = step > fraction * limit
+            tolerance = float(f"{max(fraction * limit, step):.3g}") or None
             if tolerance is not None and tolerance > FARTHEST:
                 raise ConfigError(
                     f"expected coordinates within {FARTHEST:g}, got a cloud of height "
@@ -233,7 +236,7 @@ class GrowingConfig:
                 )
         faceted = self.faceted
         if faceted == "auto" and tolerance is not None:
-            faceted = _shape_fraction(sampling) > 0.5
+            faceted = is_stepped or _shape_fraction(sampling) > 0.5
         return dataclasses.replace(self, min_size=count, facet_tolerance=tolerance, faceted=faceted)
 
 
@@ -250,6 +253,13 @@ bent surfaces are split there too."""
 _WARP_FRACTION = 0.5
 """Increase of the facet tolerance in warped scans, where frames disagree over areas of any size.
 Twice as much merges faces a few centimeters apart."""
+_QUANTIZED = 0.04, 0.08
+"""Exactness up to which white noise is that of points, and from which coordinates are rounded."""
+_STEP_PER_DEVIATION = math.sqrt(12)
+"""Rounding step per standard deviation: that of a uniform distribution."""
+_STEP_RADIUS_FRACTION = 0.4
+"""Upper bound of that step as a fraction of the radius of 50 neighbors. Steps of a depth camera are
+0.35 of it on a desk; steps of distant walls would merge near boards two centimeters apart."""
 _MIN_SIDE_FRACTION = 1 / 27
 """Side of the smallest region as a fraction of the cloud height: 10 cm in a room of 2.7 m."""
 _MIN_SIZES = 20, 50
@@ -270,11 +280,20 @@ def _shape_fraction(sampling: Sampling) -> float:
 def _warp_fraction(sampling: Sampling) -> float:
     """Return how much of the deviation from planes is warp of a fused scan, in [0, 1].
 
-    The facets of a mesh are no warp. Points sampled from them are exact; vertices are evenly spaced.
+    The facets of a mesh are no warp: points sampled from them are exact, vertices evenly spaced.
     """
     if sampling.variation < _VARIATION:
         return 0.0
     return _shape_fraction(sampling) * (1 - _ramp(sampling.exactness, *_EXACTNESS))
+
+
+def _rounding_step(sampling: Sampling) -> float:
+    """Return the rounding step of quantized coordinates, in units of the cloud, else 0.
+
+    Rounding makes terraces of a surface: nearest points are coplanar although the noise is white.
+    """
+    share = (1 - _shape_fraction(sampling)) * _ramp(sampling.exactness, *_QUANTIZED)
+    return share * _STEP_PER_DEVIATION * sampling.deviation
 
 
 def _ramp(value: float, low: float, high: float) -> float:
@@ -386,7 +405,10 @@ class PipelineConfig(SelectionConfig):
         the cloud height, at most 0.3 of the radius of 50 neighbors. From 0.6 noise is white, and it
         is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``. It
         is 1.5 times that for warped surfaces: points that are neither exact (0.1 to 0.2) nor evenly
-        spaced are of no mesh, but fused from frames that disagree.
+        spaced are of no mesh, but fused from frames that disagree. Coordinates are quantized if
+        noise is white, yet points are exact (0.04 to 0.08), as in one frame of a depth camera. Then
+        it is at least the rounding step, the square root of 12 times the deviation of 100 points,
+        at most 0.4 of that radius. If the step decides, surfaces are ``faceted``.
         Regional noise is used if noise is white and the distances to the nearest point vary by less
         than 0.38, as in mesh vertices and grids. ``min_size`` is the number of points in a square
         with sides 1/27 of the height. They are 1/13 for points sampled from a mesh, where small
