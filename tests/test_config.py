@@ -207,8 +207,9 @@ DESK = Sampling(0.7, variation=0.25, exactness=0.1, density=3e5, height=0.25, de
         (FACETS._replace(exactness=0.15), "local", 0.0141, True, 95),
         (FACETS._replace(exactness=0.0, variation=0.3), "local", 0.0113, True, 40),
         (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0284, True, 50),
-        (VERTICES, "regional", 0.00506, False, 20),
-        (VERTICES._replace(whiteness=0.55), "regional", 0.00506, False, 20),
+        (VERTICES, "regional", 0.00506, True, 20),
+        (VERTICES._replace(whiteness=0.55), "regional", 0.00506, True, 20),
+        (VERTICES._replace(exactness=0.04), "regional", 0.00506, False, 20),
         (VERTICES._replace(whiteness=0.48), "local", 0.00675, True, 20),
         (RAYS, "local", 0.00506, False, 50),
         # Steps of sqrt(12) 0.8 mm; 50 points of a desk are within 7.3 mm, those of a wall 28 mm.

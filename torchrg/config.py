@@ -106,8 +106,8 @@ class NormalsConfig:
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
         if self.noise_scope != "auto":
             return self
-        is_regional = _shape_fraction(sampling) < 0.5 and sampling.variation < _VARIATION
-        return dataclasses.replace(self, noise_scope="regional" if is_regional else "local")
+        scope = "regional" if _is_noisy_grid(sampling) else "local"
+        return dataclasses.replace(self, noise_scope=scope)
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class GrowingConfig:
     faceted: bool | Auto = field(default="auto", metadata=NO_FLAG)
     """Whether flat surfaces deviate from planes by shape (mesh facets, warped reconstructions)
     rather than by noise. If true, points instead of normals decide whether a region is flat;
-    requires facet_tolerance. auto: measured."""
+    requires facet_tolerance. auto: measured; also true for the vertices of noisy meshes."""
     max_plane_residual: float | None = None
     """After growth, unlabel points farther from their plane than this many times the thickness of
     the region. None disables the test."""
@@ -236,7 +236,8 @@ class GrowingConfig:
                 )
         faceted = self.faceted
         if faceted == "auto" and tolerance is not None:
-            faceted = is_stepped or _shape_fraction(sampling) > 0.5
+            are_vertices = _is_noisy_grid(sampling) and sampling.exactness < _QUANTIZED[0]
+            faceted = is_stepped or are_vertices or _shape_fraction(sampling) > 0.5
         return dataclasses.replace(self, min_size=count, facet_tolerance=tolerance, faceted=faceted)
 
 
@@ -275,6 +276,11 @@ points sampled from a mesh: smaller regions (20 cm in a room) are facets of curv
 def _shape_fraction(sampling: Sampling) -> float:
     """Return how much of the deviation from planes is shape rather than noise, in [0, 1]."""
     return 1 - _ramp(sampling.whiteness, *WHITENESS)
+
+
+def _is_noisy_grid(sampling: Sampling) -> bool:
+    """Return whether points with white noise are evenly spaced: vertices of a mesh, or a grid."""
+    return _shape_fraction(sampling) < 0.5 and sampling.variation < _VARIATION
 
 
 def _warp_fraction(sampling: Sampling) -> float:
@@ -403,7 +409,8 @@ class PipelineConfig(SelectionConfig):
 
         If whiteness is below 0.4, surfaces are bent or faceted, and ``facet_tolerance`` is 1/240 of
         the cloud height, at most 0.3 of the radius of 50 neighbors. From 0.6 noise is white, and it
-        is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``. It
+        is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``, and
+        so are evenly spaced points with white noise that are not exact: their normals are noisy. It
         is 1.5 times that for warped surfaces: points that are neither exact (0.1 to 0.2) nor evenly
         spaced are of no mesh, but fused from frames that disagree. Coordinates are quantized if
         noise is white, yet points are exact (0.04 to 0.08), as in one frame of a depth camera. Then

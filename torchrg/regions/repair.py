@@ -412,8 +412,8 @@ def refine_borders(
     intersection line with the other plane. The point goes to the region with the smaller :math:`r^2
     + e^2`, because noise moves points off their plane, not along it. A region is taken to end at
     the other plane if its points in the neighborhood lie on one side of that plane. Points of
-    nearly parallel planes keep their label. Changed points and their neighbors are revisited in the
-    next pass.
+    nearly parallel planes keep their label, and points beyond the reach of their region move only
+    to a nearer plane. Changed points and their neighbors are revisited in the next pass.
 
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
     which are left unchanged.
@@ -521,22 +521,26 @@ def _choose_regions(
     cost = torch.where(usable, cost, torch.inf)
     first, first_cost = _lowest(cost, options)
     second, second_cost = _lowest(torch.where(options == first[:, None], torch.inf, cost), options)
-    # Keep the label assigned by region growing if the point is far from its plane.
-    remains = ((label >= 0) & ~usable[:, 0]) | first_cost.isinf()
+    # Beyond the reach of its region, a point keeps the label of growth unless another is nearer.
+    is_nearest = torch.where(usable, distance, torch.inf).amin(dim=1) >= distance[:, 0]
+    remains = ((label >= 0) & ~usable[:, 0] & is_nearest) | first_cost.isinf()
     choice = torch.where(remains, label, first)
 
     both = (second_cost.isfinite() & ~remains).nonzero().squeeze(1)
-    first, second, position = first[both], second[both], position[both]
-    scale = torch.maximum(planes.thickness[first], planes.thickness[second])
-    excess = (
-        (_overshoot(cloud, labels, planes, rows[both], position, *pair) / scale).square()
-        for pair in ((first, second), (second, first))
-    )
-    first_cost, second_cost = first_cost[both] + next(excess), second_cost[both] + next(excess)
-    better = torch.where(second_cost < first_cost, second, first)
-    angle = unsigned_angle_deg(planes.normal[first], planes.normal[second])
-    keeps_label = (angle <= PARALLEL_DEG) & (label[both] >= 0)
-    choice[both] = torch.where(keeps_label, label[both], better)
+    rows, label, position = rows[both], label[both], position[both]
+    pair = first[both], second[both]
+    # A rounded edge is as far from a precise plane as from a rough one: both have one unit.
+    scale = torch.maximum(planes.thickness[pair[0]], planes.thickness[pair[1]])
+    costs = []
+    for one, other in (pair, pair[::-1]):
+        height = planes.signed_distances(position, one[:, None]).squeeze(1)
+        over = _overshoot(cloud, labels, planes, rows, position, one, other)
+        moves = _ROUNDING**2 * (one != label)
+        costs.append((height.square() + over.square()) / scale.square() + moves)
+    better = torch.where(costs[1] < costs[0], pair[1], pair[0])
+    angle = unsigned_angle_deg(planes.normal[pair[0]], planes.normal[pair[1]])
+    keeps_label = (angle <= PARALLEL_DEG) & (label >= 0)
+    choice[both] = torch.where(keeps_label, label, better)
     return choice
 
 
