@@ -49,9 +49,10 @@ _MAX_FACET_TURN_DEG = 25.0
 """Maximum angle between either of two facets and their joint plane. Facets of ten points come
 closest to it; the two sides of a thin board differ by 90 degrees."""
 
-_MAX_FACET_TILT = 2 / 3
+_MAX_TILT, _MAX_FACET_TILT = 1.0, 2 / 3
 """Maximum RMS distance, in tolerances, that tilting to the joint plane adds to the points of a
-facet. Otherwise one plane across a 5 cm step would explain two shelves."""
+region, and of a facet. Otherwise one plane across a 5 cm step would explain two shelves. White
+noise tilts small regions more."""
 
 
 class Adjacency(Protocol):
@@ -111,7 +112,8 @@ def refine_regions(
             near = cloud.neighbors if config.faceted is True else adjacency.neighbors
             tolerance = float(config.facet_tolerance)
             contacts = find_region_pairs(labels, near)
-            labels = merge_facets(labels, contacts, planes, tolerance=tolerance)
+            faceted = config.faceted is True
+            labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
     return labels
 
 
@@ -244,6 +246,7 @@ def merge_facets(
     planes: RegionPlanes,
     *,
     tolerance: float,
+    faceted: bool = True,
 ) -> Tensor:
     """Greedily merge adjacent regions within a fixed distance of one plane.
 
@@ -252,14 +255,16 @@ def merge_facets(
     distance first, if the RMS distance of each to their joint plane is at most ``tolerance`` (in
     coordinate units). The joint plane must be tilted by at most 25 degrees against both, since a
     strip narrower than the tolerance is close to any adjacent plane. The tilt alone must not move
-    the points of either by more than two thirds of the tolerance. The facets of a bend are thus
-    merged only as far as they are coplanar. For ``contacts`` and labels see :func:`merge_coplanar`.
+    the points of either by more than two thirds of the tolerance, or the tolerance if surfaces are
+    not ``faceted``. The facets of a bend are thus merged only as far as they are coplanar. For
+    ``contacts`` and labels see :func:`merge_coplanar`.
     """
     pairs, num_contacts = contacts
     pairs = pairs[num_contacts >= MIN_CONTACTS]
     scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
     moments = _region_moments(planes)._replace(scale=scale, noise=noise)
-    return _merge(labels, pairs, moments, 1.0, max_tilt=_MAX_FACET_TILT * tolerance)
+    max_tilt = (_MAX_FACET_TILT if faceted else _MAX_TILT) * tolerance
+    return _merge(labels, pairs, moments, 1.0, max_tilt=max_tilt)
 
 
 class _Moments(NamedTuple):
