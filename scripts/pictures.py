@@ -56,9 +56,9 @@ def draw_scan(path: Path, scan: Path) -> None:
     floor = points[:, :2].double()
     low, high = floor.quantile(torch.tensor([OUTSIDE, 1 - OUTSIDE]).double(), dim=0)
     shown = ((floor >= low - MARGIN) & (floor <= high + MARGIN)).all(dim=1)
-    given = {"normals": seg.normals[shown], "labels": seg.labels[shown], "width": WIDTH}
+    options = {"normals": seg.normals[shown], "labels": seg.labels[shown], "width": WIDTH}
     pictures = [
-        render_cloud(points[shown], colors[shown], elevation_deg=ELEVATION_DEG, **given).numpy()
+        render_cloud(points[shown], colors[shown], elevation_deg=ELEVATION_DEG, **options).numpy()
         for colors in panels.values()
     ]
     drawn = Image.fromarray(np.concatenate(pictures, axis=1))

@@ -106,8 +106,8 @@ class NormalsConfig:
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
         if self.noise_scope != "auto":
             return self
-        scope = "regional" if _is_noisy_grid(sampling) else "local"
-        return dataclasses.replace(self, noise_scope=scope)
+        is_regional = _is_noisy_grid(sampling)
+        return dataclasses.replace(self, noise_scope="regional" if is_regional else "local")
 
 
 @dataclass(frozen=True)
