@@ -7,10 +7,10 @@
     python scripts/readme_tables.py --peers peers.json --accuracy accuracy.json
         --superpoints superpoints.json
 
-``figures.json`` in the same folder stores the figures; omitted files and clouds keep theirs. Times are
-medians over the rounds, as multiples of torchrg's. A row on planes shows the fraction of
-the ground-truth planes detected at an IoU of 0.5, as a mean over the clouds of a kind; for CGAL it
-is the better one of region growing and RANSAC with PCA normals. A row on superpoints shows the
+``figures.json`` in the same folder stores the figures; omitted files and clouds keep theirs. Times
+are medians over the rounds, as multiples of torchrg's. A row on planes shows the fraction of the
+ground-truth planes detected at an IoU of 0.5, as a mean over the clouds of a kind; for CGAL it is
+the better one of region growing and RANSAC with PCA normals. A row on superpoints shows the
 fraction of points whose superpoint matches their object, for about 300 superpoints.
 """
 
