@@ -253,7 +253,7 @@ _WHITE_FRACTION = 0.45
 bent surfaces are split there too."""
 _WARP_FRACTION = 0.5
 """Increase of the facet tolerance in warped scans, where frames disagree over areas of any size.
-Twice as much merges faces a few centimeters apart."""
+A doubled tolerance merges faces a few centimeters apart."""
 _QUANTIZED = 0.04, 0.08
 """Exactness up to which white noise is that of points, and from which coordinates are rounded."""
 _STEP_PER_DEVIATION = math.sqrt(12)
@@ -298,8 +298,8 @@ def _rounding_step(sampling: Sampling) -> float:
 
     Rounding makes terraces of a surface: nearest points are coplanar although the noise is white.
     """
-    share = (1 - _shape_fraction(sampling)) * _ramp(sampling.exactness, *_QUANTIZED)
-    return share * _STEP_PER_DEVIATION * sampling.deviation
+    quantized = (1 - _shape_fraction(sampling)) * _ramp(sampling.exactness, *_QUANTIZED)
+    return quantized * _STEP_PER_DEVIATION * sampling.deviation
 
 
 def _ramp(value: float, low: float, high: float) -> float:
