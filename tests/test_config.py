@@ -216,6 +216,7 @@ DESK = Sampling(0.7, variation=0.25, exactness=0.1, density=3e5, height=0.25, de
         (DESK, "regional", 0.00277, True, 26),
         (DESK._replace(exactness=0.06), "regional", 0.00139, True, 26),
         (DESK._replace(exactness=0.04), "regional", 0.000469, False, 26),
+        (DESK._replace(variation=1.0), "local", 0.000469, False, 26),
         (DESK._replace(deviation=1e-4), "regional", 0.000469, False, 26),
         (DESK._replace(whiteness=0.4, exactness=0.2), "local", 0.00104, True, 111),
         (DESK._replace(density=2e4, deviation=0.01, height=1.5), "regional", 0.0113, True, 50),

@@ -256,6 +256,9 @@ _WARP_FRACTION = 0.5
 A doubled tolerance merges faces a few centimeters apart."""
 _QUANTIZED = 0.04, 0.08
 """Exactness up to which white noise is that of points, and from which coordinates are rounded."""
+_SCAN_LINES = 0.8
+"""Variation of the spacing from which points are on scan lines, where nearest points are coplanar
+without rounding. It is 0.15 to 0.65 for frames of a depth camera."""
 _STEP_PER_DEVIATION = math.sqrt(12)
 """Rounding step per standard deviation: that of a uniform distribution."""
 _STEP_RADIUS_FRACTION = 0.4
@@ -298,6 +301,8 @@ def _rounding_step(sampling: Sampling) -> float:
 
     Rounding makes terraces of a surface: nearest points are coplanar although the noise is white.
     """
+    if sampling.variation > _SCAN_LINES:
+        return 0.0
     quantized = (1 - _shape_fraction(sampling)) * _ramp(sampling.exactness, *_QUANTIZED)
     return quantized * _STEP_PER_DEVIATION * sampling.deviation
 
@@ -413,9 +418,10 @@ class PipelineConfig(SelectionConfig):
         so are evenly spaced points with white noise that are not exact: their normals are noisy. It
         is 1.5 times that for warped surfaces: points that are neither exact (0.1 to 0.2) nor evenly
         spaced are of no mesh, but fused from frames that disagree. Coordinates are quantized if
-        noise is white, yet points are exact (0.04 to 0.08), as in one frame of a depth camera. Then
-        it is at least the rounding step, the square root of 12 times the deviation of 100 points,
-        at most 0.4 of that radius. If the step decides, surfaces are ``faceted``.
+        noise is white, yet points are exact (0.04 to 0.08) and not on scan lines (variation 0.8),
+        as in one frame of a depth camera. Then it is at least the rounding step, the square root of
+        12 times the deviation of 100 points, at most 0.4 of that radius. If the step decides,
+        surfaces are ``faceted``.
         Regional noise is used if noise is white and the distances to the nearest point vary by less
         than 0.38, as in mesh vertices and grids. ``min_size`` is the number of points in a square
         with sides 1/27 of the height. They are 1/13 for points sampled from a mesh, where small
