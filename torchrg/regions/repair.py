@@ -108,7 +108,8 @@ def refine_regions(
         labels = refine_borders(cloud, labels, planes, reach)
         labels = assign_levels(cloud, labels, planes)
         if config.facet_tolerance is not None:
-            # A gap narrower than a neighborhood may divide a faceted surface.
+            # A gap narrower than a neighborhood may divide a faceted surface. With white noise, it
+            # separates faces such as cushions side by side; rooms differ little with all neighbors.
             near = cloud.neighbors if config.faceted is True else adjacency.neighbors
             tolerance = float(config.facet_tolerance)
             contacts = find_region_pairs(labels, near)
@@ -540,8 +541,8 @@ def _choose_regions(
     for one, other in (pair, pair[::-1]):
         height = planes.signed_distances(position, one[:, None]).squeeze(1)
         over = _overshoot(cloud, labels, planes, rows, position, one, other)
-        moves = _ROUNDING**2 * (one != label)
-        costs.append((height.square() + over.square()) / scale.square() + moves)
+        excess = (height.square() + over.square()) / scale.square()
+        costs.append(excess + _ROUNDING**2 * (one != label))
     better = torch.where(costs[1] < costs[0], pair[1], pair[0])
     angle = unsigned_angle_deg(planes.normal[pair[0]], planes.normal[pair[1]])
     keeps_label = (angle <= PARALLEL_DEG) & (label >= 0)
