@@ -22,7 +22,7 @@ FOLDER = Path(harness.__file__).parent
 NAMES = sorted(
     path.stem
     for path in FOLDER.glob("*.py")
-    if path.stem not in ("__init__", "harness", "protocols")
+    if path.stem not in ("__init__", "harness", "patches", "protocols")
 )
 
 

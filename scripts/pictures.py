@@ -1,10 +1,10 @@
 """README images: a scan with its planes and superpoints, and the viewer.
 
-    python scripts/pictures.py 1.png 1_depth.png
+    python scripts/pictures.py room_scan1.pcd
 
 Writes ``rooms.png`` and ``page.png`` next to this file; the latter needs Chromium and playwright,
-and is unchanged without them. The frame shows a desk at the Technical University of Munich, from
-the folder ch7 of https://github.com/gaoxiang12/slambook2; see ``LICENSE.rooms`` for its license.
+and is unchanged without them. The scan shows an office, from the folder tutorials of
+https://github.com/PointCloudLibrary/data; see ``LICENSE.rooms`` for its license.
 """
 
 import argparse
@@ -20,16 +20,17 @@ from PIL import Image, ImageDraw, ImageFont
 
 import torchrg
 from torchrg.config import PlanesConfig, SuperpointsConfig
-from torchrg.depth import depth_to_points, make_intrinsics, segment_depth
 from torchrg.io.result import Result
 from torchrg.render import color_planes, make_page, render_cloud, write_page
 
 FOLDER = Path(__file__).parent
-CAMERA, DEPTH_SCALE = (520.9, 521.0, 325.1, 249.7), 5000.0
-"""Focal lengths and principal point in pixels, and depth units per meter."""
-MAX_DEPTH = 2.6
-"""Maximum depth, in meters. Beyond it, Kinect depth steps are larger than objects on a desk."""
-NUM_PARTS = 120
+OUTSIDE, MARGIN = 0.02, 0.1
+"""Fraction of the points beyond the room on each side, seen through windows and the door, and
+space around the others in meters. Only the drawing leaves them out."""
+ELEVATION_DEG = 50
+GRAY = 150
+"""Brightness of points without a plane; the scan has no colors."""
+NUM_PARTS = 300
 WIDTH = 620
 """Width of each of the three panels, in pixels."""
 CAPTION, LINE = 34, 56
@@ -41,30 +42,23 @@ NUM_POINTS, NOISE, SEED = 600_000, 0.003, 4
 PAGE = {"width": 1360, "height": 960}
 
 
-def draw_frame(path: Path, color: Path, depth: Path) -> None:
-    """Render the points, planes and superpoints of a frame with captions."""
-    image = torch.from_numpy(np.array(Image.open(depth)).astype(np.float32)) / DEPTH_SCALE
-    image[image > MAX_DEPTH] = 0
-    intrinsics = make_intrinsics(*CAMERA)
-    points = depth_to_points(image[None], intrinsics[None])[0].flatten(0, 1)
-    found = segment_depth(image, intrinsics)
-    seg = dataclasses.replace(
-        found,
-        **{
-            name: getattr(found, name).flatten(0, 1)
-            for name in ("labels", "normals", "curvature", "sharp", "valid")
-        },
-    )
-    rgb = torch.from_numpy(np.array(Image.open(color).convert("RGB"))).flatten(0, 1)
-    config = SuperpointsConfig(counts=(NUM_PARTS,))
-    parts = torchrg.make_superpoints(points, seg, config, colors=rgb).labels
+def draw_scan(path: Path, scan: Path) -> None:
+    """Render the points, planes and superpoints of a scan with captions."""
+    cloud = torchrg.read_cloud(scan)
+    points = torch.as_tensor(cloud.points)
+    seg = torchrg.segment_planes(cloud, keep_neighbors=True)
+    parts = torchrg.make_superpoints(points, seg, SuperpointsConfig(counts=(NUM_PARTS,))).labels
     panels = {
-        "points": rgb,
+        "points": torch.full((len(points), 3), GRAY, dtype=torch.uint8),
         f"{len(seg.planes)} planes": color_planes(seg.labels, points),
         f"{int(parts.amax()) + 1} superpoints": color_planes(parts, points),
     }
+    floor = points[:, :2].double()
+    low, high = floor.quantile(torch.tensor([OUTSIDE, 1 - OUTSIDE]).double(), dim=0)
+    shown = ((floor >= low - MARGIN) & (floor <= high + MARGIN)).all(dim=1)
+    options = {"normals": seg.normals[shown], "labels": seg.labels[shown], "width": WIDTH}
     pictures = [
-        render_cloud(points, colors, normals=seg.normals, view="sensor", width=WIDTH).numpy()
+        render_cloud(points[shown], colors[shown], elevation_deg=ELEVATION_DEG, **options).numpy()
         for colors in panels.values()
     ]
     drawn = Image.fromarray(np.concatenate(pictures, axis=1))
@@ -119,10 +113,8 @@ def _save(path: Path, image: Image.Image) -> None:
 def main() -> None:
     """Write both images."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("color", type=Path, help="color image of a frame of a depth camera")
-    parser.add_argument("depth", type=Path, help="its 16-bit depth image")
-    frame = parser.parse_args()
-    draw_frame(FOLDER / "rooms.png", frame.color, frame.depth)
+    parser.add_argument("scan", type=Path, help="scan of a room")
+    draw_scan(FOLDER / "rooms.png", parser.parse_args().scan)
     if not draw_page(FOLDER / "page.png", segment_room()):
         print("page.png unchanged: Chromium not found")
 

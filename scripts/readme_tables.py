@@ -7,10 +7,10 @@
     python scripts/readme_tables.py --peers peers.json --accuracy accuracy.json
         --superpoints superpoints.json
 
-``figures.json`` in the same folder stores the figures; an omitted file keeps its part. Times are
-medians over the rounds, as multiples of torchrg's. A row on planes shows the fraction of
-the ground-truth planes detected at an IoU of 0.5, as a mean over the clouds of a kind; for CGAL it
-is the better one of region growing and RANSAC with PCA normals. A row on superpoints shows the
+``figures.json`` in the same folder stores the figures; omitted files and clouds keep theirs. Times
+are medians over the rounds, as multiples of torchrg's. A row on planes shows the fraction of the
+ground-truth planes detected at an IoU of 0.5, as a mean over the clouds of a kind; for CGAL it is
+the better one of region growing and RANSAC with PCA normals. A row on superpoints shows the
 fraction of points whose superpoint matches their object, for about 300 superpoints.
 """
 
@@ -52,7 +52,7 @@ KINDS = {
     "rgbd_like": "synthetic rooms, fused depth frames",
     "s3dis_like": "synthetic rooms, points sampled from a mesh, like S3DIS",
     "scannet_like": "synthetic rooms, mesh vertices, like ScanNet",
-    "office_parts": "real office, labeled parts",
+    "office_parts": "real office, planar patches inside labeled parts",
     "4 frames, exact": "single depth frames, noise-free",
     "4 frames, kinect": "single depth frames, Kinect",
 }
@@ -63,6 +63,8 @@ PEERS = {
     "CGAL": ("CGAL growing, pca", "CGAL RANSAC, pca"),
 }
 """Columns of the accuracy table: contenders of which the better one is shown."""
+PATCHES = "office_parts"
+"""Prefix of the clouds that also have a row with the mean IoU."""
 IMAGES = "4 frames"
 """Prefix of the clouds that torchrg segments as depth images."""
 FEW = 300
@@ -89,7 +91,9 @@ def times_of(peers: Figures) -> Figures:
 
 def quality_of(accuracy: Figures) -> Figures:
     """Return the fractions of detected planes from their benchmark."""
-    quality = {title: _fractions(accuracy["results"], kind) for kind, title in KINDS.items()}
+    results = accuracy["results"]
+    quality = {title: _fractions(results, kind) for kind, title in KINDS.items()}
+    quality[f"{KINDS[PATCHES]}: mean IoU"] = _fractions(results, PATCHES, "mean_best_iou")
     return {"quality": {title: fractions for title, fractions in quality.items() if fractions}}
 
 
@@ -114,14 +118,14 @@ def _time(by: Figures, name: str) -> float:
     return median(run["seconds"][stage] if stage else run["total"] for run in by[contender])
 
 
-def _fractions(results: Figures, kind: str) -> list[float]:
-    """Return the mean fractions of planes that torchrg and its peers detect in clouds of a kind."""
+def _fractions(results: Figures, kind: str, measure: str = "recall_iou50") -> list[float]:
+    """Return the mean scores of torchrg and its peers on clouds of a kind, by default detected."""
     clouds = [by for name, by in results.items() if name.split("/")[-1].startswith(kind)]
     ours = "depth" if kind.startswith(IMAGES) else "consensus"
     columns = [(ours,), *PEERS.values()] if clouds else []
 
     def mean(name: str) -> float:
-        return fmean(median(run["recall_iou50"] for run in by[name]) for by in clouds)
+        return fmean(median(run[measure] for run in by[name]) for by in clouds)
 
     return [max(map(mean, names)) for names in columns]
 
@@ -171,7 +175,8 @@ def main() -> None:
     figures = json.loads(FIGURES.read_text(encoding="utf-8"))
     for name, path in vars(parser.parse_args()).items():
         if path is not None:
-            figures |= tables[name](json.loads(path.read_text(encoding="utf-8")))
+            new = tables[name](json.loads(path.read_text(encoding="utf-8")))
+            figures |= {key: figures.get(key, {}) | rows for key, rows in new.items()}
     FIGURES.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     README.write_text(insert(README.read_text(encoding="utf-8"), figures), encoding="utf-8")
 

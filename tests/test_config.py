@@ -297,6 +297,7 @@ def base_file(folder, name):
 FACETS = Sampling(whiteness=0.1, variation=0.5, exactness=0.5, density=4000.0, height=2.7)
 VERTICES = Sampling(whiteness=0.8, variation=0.28, density=700.0, height=2.7)
 RAYS = Sampling(whiteness=0.9, variation=0.6, density=7000.0, height=2.7)
+DESK = Sampling(0.7, variation=0.25, exactness=0.1, density=3e5, height=0.25, deviation=8e-4)
 
 
 @pytest.mark.parametrize(
@@ -304,12 +305,24 @@ RAYS = Sampling(whiteness=0.9, variation=0.6, density=7000.0, height=2.7)
     [
         # A square of a 13th of 2.7 m has 173 of 4,000 points, of a 27th 7 of 700 and 70 of 7,000.
         (FACETS, "local", 0.0113, True, 173),
-        (FACETS._replace(exactness=0.0), "local", 0.0113, True, 40),
-        (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0189, True, 50),
-        (VERTICES, "regional", 0.00506, False, 20),
-        (VERTICES._replace(whiteness=0.55), "regional", 0.00506, False, 20),
+        # Warp is no mesh: neither exact nor evenly spaced.
+        (FACETS._replace(exactness=0.0), "local", 0.0169, True, 40),
+        (FACETS._replace(exactness=0.15), "local", 0.0141, True, 95),
+        (FACETS._replace(exactness=0.0, variation=0.3), "local", 0.0113, True, 40),
+        (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0284, True, 50),
+        (VERTICES, "regional", 0.00506, True, 20),
+        (VERTICES._replace(whiteness=0.55), "regional", 0.00506, True, 20),
+        (VERTICES._replace(exactness=0.04), "regional", 0.00506, False, 20),
         (VERTICES._replace(whiteness=0.48), "local", 0.00675, True, 20),
         (RAYS, "local", 0.00506, False, 50),
+        # Steps of sqrt(12) 0.8 mm; 50 points of a desk are within 7.3 mm, those of a wall 28 mm.
+        (DESK, "regional", 0.00277, True, 26),
+        (DESK._replace(exactness=0.06), "regional", 0.00139, True, 26),
+        (DESK._replace(exactness=0.04), "regional", 0.000469, False, 26),
+        (DESK._replace(variation=1.0), "local", 0.000469, False, 26),
+        (DESK._replace(deviation=1e-4), "regional", 0.000469, False, 26),
+        (DESK._replace(whiteness=0.4, exactness=0.2), "local", 0.00104, True, 111),
+        (DESK._replace(density=2e4, deviation=0.01, height=1.5), "regional", 0.0113, True, 50),
         (Sampling(), "local", None, False, 20),
     ],
 )

@@ -95,7 +95,9 @@ def test_links_of_the_readme_have_addresses_in_the_package():
     links = re.findall(r"\]\((.*?)\)", text)
     assert len(links) > 5
     assert all(link.startswith(("https://", "#")) for link in links)
-    assert "![A desk" in text.partition("](https://host/repository/raw/v1.2/scripts/rooms.png)")[0]
+    assert (
+        "![An office" in text.partition("](https://host/repository/raw/v1.2/scripts/rooms.png)")[0]
+    )
 
 
 def test_actions_are_pinned_by_hash():

@@ -106,7 +106,7 @@ class NormalsConfig:
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
         if self.noise_scope != "auto":
             return self
-        is_regional = _shape_fraction(sampling) < 0.5 and sampling.variation < _VARIATION
+        is_regional = _is_noisy_grid(sampling)
         return dataclasses.replace(self, noise_scope="regional" if is_regional else "local")
 
 
@@ -162,12 +162,13 @@ class GrowingConfig:
     facet_tolerance: float | Auto | None = "auto"
     """Merge adjacent regions within this RMS distance of a common plane, in units of the cloud; for
     mesh facets and warped reconstructions. auto: 1/240 of the cloud height (11 mm in a room) if
-    deviations grow with scale, less than half of that (5 mm) if the noise is white. None disables
+    deviations grow with scale, 1.5 times that in warped scans without a mesh, less than half of it
+    (5 mm) if the noise is white, at least the rounding step of quantized coordinates. None disables
     merging."""
     faceted: bool | Auto = "auto"
     """Whether flat surfaces deviate from planes by shape (mesh facets, warped reconstructions)
     rather than by noise. If true, points instead of normals decide whether a region is flat;
-    requires facet_tolerance. auto: measured."""
+    requires facet_tolerance. auto: measured; also true for the vertices of noisy meshes."""
     max_plane_residual: float | None = None
     """After growth, unlabel points farther from their plane than this many times the thickness of
     the region. None disables the test."""
@@ -212,7 +213,7 @@ class GrowingConfig:
 
     def with_sampling(self, sampling: Sampling) -> "GrowingConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
-        count, tolerance = self.min_size, self.facet_tolerance
+        count, tolerance, is_stepped = self.min_size, self.facet_tolerance, False
         if count == "auto":
             side, (low, high) = _MIN_SIDE_FRACTION, _MIN_SIZES
             drawn = _shape_fraction(sampling) * _ramp(sampling.exactness, *_EXACTNESS)
@@ -224,7 +225,10 @@ class GrowingConfig:
             reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
             limit = min(_FACET_HEIGHT_FRACTION * sampling.height, _FACET_RADIUS_FRACTION * reach)
             fraction = max(_shape_fraction(sampling), _WHITE_FRACTION)
-            tolerance = float(f"{fraction * limit:.3g}") or None
+            fraction += _WARP_FRACTION * _warp_fraction(sampling)
+            step = min(_rounding_step(sampling), _STEP_RADIUS_FRACTION * reach)
+            is_stepped = step > fraction * limit
+            tolerance = float(f"{max(fraction * limit, step):.3g}") or None
             if tolerance is not None and tolerance > FARTHEST:
                 raise ConfigError(
                     f"expected coordinates within {FARTHEST:g}, got a cloud of height "
@@ -232,7 +236,8 @@ class GrowingConfig:
                 )
         faceted = self.faceted
         if faceted == "auto" and tolerance is not None:
-            faceted = _shape_fraction(sampling) > 0.5
+            are_vertices = _is_noisy_grid(sampling) and sampling.exactness < _QUANTIZED[0]
+            faceted = is_stepped or are_vertices or _shape_fraction(sampling) > 0.5
         return dataclasses.replace(self, min_size=count, facet_tolerance=tolerance, faceted=faceted)
 
 
@@ -246,6 +251,19 @@ radius of 50 neighbors. The bound matters for scans of many stories."""
 _WHITE_FRACTION = 0.45
 """Fraction of the facet tolerance used if noise is white (5 mm in a room), since cushions and other
 bent surfaces are split there too."""
+_WARP_FRACTION = 0.5
+"""Increase of the facet tolerance in warped scans, where frames disagree over areas of any size.
+A doubled tolerance merges faces a few centimeters apart."""
+_QUANTIZED = 0.04, 0.08
+"""Exactness up to which white noise is that of points, and from which coordinates are rounded."""
+_SCAN_LINES = 0.8
+"""Variation of the spacing from which points are on scan lines, where nearest points are coplanar
+without rounding. It is 0.15 to 0.65 for frames of a depth camera."""
+_STEP_PER_DEVIATION = math.sqrt(12)
+"""Rounding step per standard deviation: that of a uniform distribution."""
+_STEP_RADIUS_FRACTION = 0.4
+"""Upper bound of that step as a fraction of the radius of 50 neighbors. Steps of a depth camera are
+0.35 of it on a desk; steps of distant walls would merge near boards two centimeters apart."""
 _MIN_SIDE_FRACTION = 1 / 27
 """Side of the smallest region as a fraction of the cloud height: 10 cm in a room of 2.7 m."""
 _MIN_SIZES = 20, 50
@@ -261,6 +279,32 @@ points sampled from a mesh: smaller regions (20 cm in a room) are facets of curv
 def _shape_fraction(sampling: Sampling) -> float:
     """Return how much of the deviation from planes is shape rather than noise, in [0, 1]."""
     return 1 - _ramp(sampling.whiteness, *WHITENESS)
+
+
+def _is_noisy_grid(sampling: Sampling) -> bool:
+    """Return whether points with white noise are evenly spaced: vertices of a mesh, or a grid."""
+    return _shape_fraction(sampling) < 0.5 and sampling.variation < _VARIATION
+
+
+def _warp_fraction(sampling: Sampling) -> float:
+    """Return how much of the deviation from planes is warp of a fused scan, in [0, 1].
+
+    The facets of a mesh are no warp: points sampled from them are exact, vertices evenly spaced.
+    """
+    if sampling.variation < _VARIATION:
+        return 0.0
+    return _shape_fraction(sampling) * (1 - _ramp(sampling.exactness, *_EXACTNESS))
+
+
+def _rounding_step(sampling: Sampling) -> float:
+    """Return the rounding step of quantized coordinates, in units of the cloud, else 0.
+
+    Rounding makes terraces of a surface: nearest points are coplanar although the noise is white.
+    """
+    if sampling.variation > _SCAN_LINES:
+        return 0.0
+    quantized = (1 - _shape_fraction(sampling)) * _ramp(sampling.exactness, *_QUANTIZED)
+    return quantized * _STEP_PER_DEVIATION * sampling.deviation
 
 
 def _ramp(value: float, low: float, high: float) -> float:
@@ -372,7 +416,14 @@ class PipelineConfig(SelectionConfig):
 
         If whiteness is below 0.4, surfaces are bent or faceted, and ``facet_tolerance`` is 1/240 of
         the cloud height, at most 0.3 of the radius of 50 neighbors. From 0.6 noise is white, and it
-        is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``.
+        is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``, and
+        so are evenly spaced points with white noise that are not exact: their normals are noisy. It
+        is 1.5 times that for warped surfaces: points that are neither exact (0.1 to 0.2) nor evenly
+        spaced are of no mesh, but fused from frames that disagree. Coordinates are quantized if
+        noise is white, yet points are exact (0.04 to 0.08) and not on scan lines (variation 0.8),
+        as in one frame of a depth camera. Then it is at least the rounding step, the square root of
+        12 times the deviation of 100 points, at most 0.4 of that radius. If the step decides,
+        surfaces are ``faceted``.
         Regional noise is used if noise is white and the distances to the nearest point vary by less
         than 0.38, as in mesh vertices and grids. ``min_size`` is the number of points in a square
         with sides 1/27 of the height. They are 1/13 for points sampled from a mesh, where small
@@ -383,6 +434,8 @@ class PipelineConfig(SelectionConfig):
             >>> config = load_config().with_sampling(mesh)
             >>> config.growing.facet_tolerance, config.growing.min_size, config.normals.noise_scope
             (0.0113, 173, 'local')
+            >>> load_config().with_sampling(mesh._replace(exactness=0.0)).growing.facet_tolerance
+            0.0169
         """
         return dataclasses.replace(
             self,

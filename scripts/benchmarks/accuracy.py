@@ -1,8 +1,8 @@
 """Plane accuracy of torchrg, PCL, Open3D, CGAL and GoCoPP by three published protocols.
 
 Clouds with exact ground truth: synthetic rooms at four noise levels and three densities, rendered
-depth frames without noise and with Kinect noise, a scan of SynPEB's test set, and scans with
-labeled parts (0 is none). Also folders of simulated scans and reconstructions of rooms,
+depth frames without noise and with Kinect noise, a scan of SynPEB's test set, and planar patches of
+scans with labeled parts (0 is none). Also folders of simulated scans and reconstructions of rooms,
 ``NAME_SEED.npz`` with ``points`` and ``labels`` (-1 is no plane).
 
 FOLDER contains the programs ``pclrg`` (PCL's normals and region growing), ``cgalrg`` (CGAL's region
@@ -33,6 +33,7 @@ from torch import Tensor
 
 import torchrg
 from benchmarks.harness import Benchmark, Figures, Results, markdown, medians, run_program, table
+from benchmarks.patches import label_patches
 from benchmarks.peers import MIN_SIZE, OPEN3D, pcl_command
 from benchmarks.protocols import count_segcomp, score_evops, score_voxels
 from tests.made import DepthFrame, cameras_around, render_depth
@@ -54,8 +55,8 @@ SYNPEB_MIN_SIZE = 10
 """Minimum number of points of regions and surfaces; SynPEB ignores smaller ones."""
 SYNPEB_VOID = 3
 """SynPEB's label of points without a plane."""
-PARTS_MIN_SIZE = 500
-"""Minimum number of points for a part of a scan to count as a surface."""
+PATCH_TOLERANCES = (0.010, 0.015, 0.020)
+"""Maximum distances of the points of a patch to its plane, in meters."""
 ROOMS_MIN_SIZES = {"s3dis": 300, "laser": 300, "rgbd": 200, "scannet": 60}
 """Minimum number of points of a surface, by a substring of the room name."""
 VOID = -2
@@ -128,7 +129,10 @@ class Case(Benchmark):
             makers[f"{NUM_FRAMES} frames, {sensor}"] = partial(_frames, sensor, self.scale)
         if self.synpeb is not None:
             makers["SynPEB, test 100"] = partial(_read_synpeb, self.synpeb)
-        makers |= {path.stem: partial(_read_parts, path) for path in self.parts}
+        for path in self.parts:
+            for size in PATCH_TOLERANCES:
+                name = f"{path.stem}, patches at {1000 * size:g} mm"
+                makers[name] = partial(_read_patches, path, size)
         for folder in self.rooms:
             for path in sorted(folder.glob("*.npz")):
                 makers[f"{folder.name}/{path.stem}"] = partial(_read_room, path)
@@ -197,11 +201,13 @@ def _read_synpeb(path: Path) -> Clouds:
     return [LabeledCloud(torch.as_tensor(cloud.points)[known], labels[known], SYNPEB_MIN_SIZE)]
 
 
-def _read_parts(path: Path) -> Clouds:
+def _read_patches(path: Path, tolerance: float) -> Clouds:
     """Read a scan whose field ``labels`` has the part of each point, 0 for none."""
     cloud = torchrg.read_cloud(path)
-    parts = torch.as_tensor(cloud.fields["labels"]).long() - 1
-    return [LabeledCloud(torch.as_tensor(cloud.points), _large_faces(parts, PARTS_MIN_SIZE))]
+    points = torch.as_tensor(cloud.points)
+    parts = np.asarray(cloud.fields["labels"]).astype(np.int64) - 1
+    patches = label_patches(points.double().numpy(), parts, tolerance)
+    return [LabeledCloud(points, torch.from_numpy(patches))]
 
 
 def _read_room(path: Path) -> Clouds:

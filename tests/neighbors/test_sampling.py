@@ -71,8 +71,8 @@ def cloud(request):
     return CLOUDS[request.param](1)
 
 
-def literal_measures(points: np.ndarray, k: int) -> tuple[float, float, float, float]:
-    """Whiteness, variation, exactness and density, point by point, of all neighbors there are."""
+def literal_measures(points: np.ndarray, k: int) -> list[float]:
+    """All measures except height, point by point, of all neighbors there are."""
     small, large, exact, radius, first, flatness = [], [], [], [], [], []
     order = np.linspace(0, len(points) - 1, min(600, len(points))).astype(int)
     cloud = torch.as_tensor(points, dtype=torch.float32)
@@ -97,18 +97,21 @@ def literal_measures(points: np.ndarray, k: int) -> tuple[float, float, float, f
         first.append(distances[1])
         flatness.append(deviation(near) / distances[-1])
     flat = np.array(flatness) <= np.median(flatness)
-    whiteness = np.median(np.array(small)[flat]) / np.median(np.array(large)[flat])
+    deviation = np.median(np.array(large)[flat])
+    whiteness = np.median(np.array(small)[flat]) / deviation
     density = k / (math.pi * np.median(radius) ** 2)
-    return min(whiteness, 1.0), np.std(first) / np.mean(first), np.mean(exact), density
+    variation = np.std(first) / np.mean(first)
+    return [min(whiteness, 1.0), variation, np.mean(exact), density, deviation]
 
 
 def test_the_measures_are_those_of_loops(cloud):
     found = measure(cloud)
-    whiteness, variation, exactness, density = literal_measures(cloud, K)
+    whiteness, variation, exactness, density, deviation = literal_measures(cloud, K)
     assert found.whiteness == pytest.approx(whiteness, rel=0.01)
     assert found.variation == pytest.approx(variation, rel=0.01)
     assert found.exactness == pytest.approx(exactness, abs=0.005)
     assert found.density == pytest.approx(density, rel=0.01)
+    assert found.deviation == pytest.approx(deviation, rel=0.01)
 
 
 def test_noise_is_white_and_waves_are_not():

@@ -230,6 +230,24 @@ def test_consensus_keeps_the_faces_of_a_plate_apart():
         assert both > 0.9 * either
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_quantized_boards_are_two_planes_and_no_terraces(seed):
+    # A slanted board and one 20 mm in front, in steps of 3 mm that bumps make ragged.
+    side = 0.0018 * np.arange(110)
+    x, y = np.meshgrid(side, side, indexing="ij")
+    rng = np.random.default_rng(seed)
+    # A normal curve with a deviation of two pixels.
+    spectrum = np.exp(-2 * (2 * np.pi * np.fft.fftfreq(110)) ** 2)
+    bumps = np.fft.ifft2(np.fft.fft2(rng.standard_normal(x.shape)) * np.outer(spectrum, spectrum))
+    z = 0.7 * x + 0.2 * y + 0.0006 * bumps.real / bumps.real.std()
+    z += 0.0003 * rng.standard_normal(x.shape)
+    front = (abs(x - x.mean()) < 0.05) & (abs(y - y.mean()) < 0.05)
+    z = 0.003 * np.rint((z - 0.02 * front) / 0.003)
+    seg = segment_planes(np.stack([x, y, z], axis=-1).reshape(-1, 3), orient="none")
+    assert len(seg.planes) == 2
+    assert score_labels(seg.labels, front.ravel().astype(int)).mean_best_iou > 0.99
+
+
 @pytest.mark.parametrize("exponent", [-60, 0, 38, 44])
 def test_scaling_by_a_power_of_two_keeps_planes(scene, exponent):
     points = scene.points.double()[::4]

@@ -265,8 +265,11 @@ def test_a_thin_side_is_no_facet_of_the_face_beside_it():
     assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == 2
 
 
-@pytest.mark.parametrize(("step", "faces"), [(0.012, 1), (0.035, 2)])
-def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, faces):
+@pytest.mark.parametrize(
+    ("step", "faceted", "faces"),
+    [(0.012, True, 1), (0.035, True, 2), (0.035, False, 1), (0.06, False, 2)],
+)
+def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, faceted, faces):
     rng = np.random.default_rng(19)
     upper, lower = (rng.uniform(0, 1, (3000, 3)) * (1.74, 0.29, 0) for _ in range(2))
     points = np.concatenate([upper + np.array([0, 0.295, step]), lower])
@@ -276,8 +279,10 @@ def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, faces
     planes = fit_regions(cloud, labels, OFF)
     both = points - points.mean(axis=0)
     across = both @ np.linalg.svd(both, full_matrices=False)[2][2]
-    assert np.sqrt(np.mean(across**2)) < 0.009
-    assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == faces
+    is_near = np.sqrt(np.mean(across**2)) < 0.009
+    assert is_near == (step < 0.06)
+    found = merge_facets(labels, contacts, planes, tolerance=0.009, faceted=faceted)
+    assert len(found.unique()) == faces
 
 
 def scattered(rng, count, angle_deg):

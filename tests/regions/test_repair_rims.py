@@ -27,7 +27,7 @@ def floor_and_wall(rng, num_points=6000, width=0.5, angle_deg=90.0):
     return points, truth, normals
 
 
-def refined(points, labels, normals, valid=None, reach=9e-3):
+def refined(points, labels, normals, valid=None, reach=9e-3, thickness=(NOISE, NOISE)):
     """Labels after refinement, in the order of the points."""
     points = torch.tensor(points)
     order = canonical_order(points)
@@ -43,7 +43,7 @@ def refined(points, labels, normals, valid=None, reach=9e-3):
     )
     count = len(normals)
     planes = fit_planes(Segments(torch.arange(count)), torch.zeros(count, 3).double(), normals)
-    planes = planes._replace(thickness=torch.full((count,), NOISE).double())
+    planes = planes._replace(thickness=torch.tensor(thickness).double())
     reach = torch.full((count,), reach).double()
     found = refine_borders(cloud, torch.as_tensor(labels)[order], planes, reach)
     return torch.empty_like(found).index_copy_(0, order, found)
@@ -81,6 +81,30 @@ def test_points_far_from_every_plane_and_invalid_ones_stay_as_they_are():
     off = torch.tensor((np.abs(points @ normals.T) > 9e-3).all(axis=1))[:300]
     assert off.sum() > 100
     assert (found[:300][off] == UNLABELED).all()
+
+
+def test_points_far_from_their_own_plane_move_to_a_nearer_one_only():
+    points, truth, normals = floor_and_wall(np.random.default_rng(5))
+    low = (truth == 1) & (points[:, 2] > 0.02) & (points[:, 2] < 0.05)
+    labels = np.where(low, 0, truth)
+    found = refined(points, labels, normals).numpy()
+    assert (found[low] == 1).all()
+    # Off both planes, growth decides.
+    points[low] -= [0.04, 0, 0]
+    assert (refined(points, labels, normals).numpy()[low] == 0).all()
+
+
+@pytest.mark.parametrize("thickness", [(NOISE, 4 * NOISE), (4 * NOISE, NOISE)])
+def test_a_rounded_edge_is_halved_though_one_plane_is_rougher(thickness):
+    points, _, normals = floor_and_wall(np.random.default_rng(6), width=0.2)
+    # A quarter of a circle with a radius of 2 cm replaces the edge.
+    edge = (np.abs(points[:, [0, 2]]) < 0.02).all(axis=1)
+    angle = np.random.default_rng(7).uniform(0, np.pi / 2, int(edge.sum()))
+    points[edge, 0] = 0.02 * (np.sin(angle) - 1)
+    points[edge, 2] = 0.02 * (1 - np.cos(angle))
+    nearest = nearest_plane(points, normals)
+    found = refined(points, nearest, normals, reach=0.03, thickness=thickness).numpy()
+    assert (found[edge] == nearest[edge]).mean() > 0.9
 
 
 def test_a_face_that_goes_on_behind_another_does_not_end_there():

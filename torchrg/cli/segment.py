@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import os
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -308,7 +309,11 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
     grid = cloud.grid_shape
     pixels = None if grid is None else torch.from_numpy(cloud.coordinates).view(*grid, 3)
     if pixels is not None and find_intrinsics(pixels) is not None:
-        warn(f"{source}: from a depth camera; torchrg depth also separates planes at depth steps.")
+        better = shlex.join(["torchrg", "depth", str(source), "--out", str(target)])
+        warn(
+            f"{source}: an organized cloud of a depth camera; torchrg depth is the better choice, "
+            f"as it knows depth steps. Run {better}"
+        )
 
 
 def _describe(arguments: Arguments, sources: tuple[Path, ...], seg: Segmentation) -> Record:

@@ -77,7 +77,8 @@ def measure_sampling(points: Tensor, neighbors: Neighbors | SomeNeighbors) -> Sa
         extended = lists_of(extended[:, ::_STRIDE].ravel()).reshape(len(rows), -1)
     large = np.median(_deviations(_nearest(points, rows, extended, _LARGE)[-1]))
     whiteness = min(float(small / large), 1.0) if large > 0 else 1.0
-    measures = whiteness, variation, float(exact.mean()), density, _height(points)
+    exactness, height = float(exact.mean()), _height(points)
+    measures = whiteness, variation, exactness, density, height, float(large)
     return Sampling(*(float(f"{measure:.{_DIGITS}g}") for measure in measures))
 
 

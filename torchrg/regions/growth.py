@@ -165,7 +165,8 @@ def label_regions(
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
         contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
         tolerance = float(config.facet_tolerance)
-        labels = merge_facets(labels, contacts, fits.get(labels), tolerance=tolerance)
+        planes, faceted = fits.get(labels), config.faceted is True
+        labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
         labels = rank_by_size(labels, min_points)
     if config.cut_bridges and bool((labels >= 0).any()):
         split = split_levels(cloud, labels, fits.get(labels), config)

@@ -50,9 +50,10 @@ _MAX_FACET_TURN_DEG = 25.0
 """Maximum angle between either of two facets and their joint plane. Facets of ten points come
 closest to it; the two sides of a thin board differ by 90 degrees."""
 
-_MAX_FACET_TILT = 2 / 3
+_MAX_TILT, _MAX_FACET_TILT = 1.0, 2 / 3
 """Maximum RMS distance, in tolerances, that tilting to the joint plane adds to the points of a
-facet. Otherwise one plane across a 5 cm step would explain two shelves."""
+region, and of a facet. Otherwise one plane across a 5 cm step would explain two shelves. White
+noise tilts small regions more."""
 
 
 class Adjacency(Protocol):
@@ -108,11 +109,13 @@ def refine_regions(
         labels = refine_borders(cloud, labels, planes, reach)
         labels = assign_levels(cloud, labels, planes)
         if config.facet_tolerance is not None:
-            # A gap narrower than a neighborhood may divide a faceted surface.
+            # A gap narrower than a neighborhood may divide a faceted surface. With white noise, it
+            # separates faces such as cushions side by side; rooms differ little with all neighbors.
             near = cloud.neighbors if config.faceted is True else adjacency.neighbors
             tolerance = float(config.facet_tolerance)
             contacts = find_region_pairs(labels, near)
-            labels = merge_facets(labels, contacts, planes, tolerance=tolerance)
+            faceted = config.faceted is True
+            labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
     return labels
 
 
@@ -245,6 +248,7 @@ def merge_facets(
     planes: RegionPlanes,
     *,
     tolerance: float,
+    faceted: bool = True,
 ) -> Tensor:
     """Greedily merge adjacent regions within a fixed distance of one plane.
 
@@ -253,14 +257,16 @@ def merge_facets(
     distance first, if the RMS distance of each to their joint plane is at most ``tolerance`` (in
     coordinate units). The joint plane must be tilted by at most 25 degrees against both, since a
     strip narrower than the tolerance is close to any adjacent plane. The tilt alone must not move
-    the points of either by more than two thirds of the tolerance. The facets of a bend are thus
-    merged only as far as they are coplanar. For ``contacts`` and labels see :func:`merge_coplanar`.
+    the points of either by more than two thirds of the tolerance, or the tolerance if surfaces are
+    not ``faceted``. The facets of a bend are thus merged only as far as they are coplanar. For
+    ``contacts`` and labels see :func:`merge_coplanar`.
     """
     pairs, num_contacts = contacts
     pairs = pairs[num_contacts >= MIN_CONTACTS]
     scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
     moments = _region_moments(planes)._replace(scale=scale, noise=noise)
-    return _merge(labels, pairs, moments, 1.0, max_tilt=_MAX_FACET_TILT * tolerance)
+    max_tilt = (_MAX_FACET_TILT if faceted else _MAX_TILT) * tolerance
+    return _merge(labels, pairs, moments, 1.0, max_tilt=max_tilt)
 
 
 class _Moments(NamedTuple):
@@ -413,8 +419,8 @@ def refine_borders(
     intersection line with the other plane. The point goes to the region with the smaller :math:`r^2
     + e^2`, because noise moves points off their plane, not along it. A region is taken to end at
     the other plane if its points in the neighborhood lie on one side of that plane. Points of
-    nearly parallel planes keep their label. Changed points and their neighbors are revisited in the
-    next pass.
+    nearly parallel planes keep their label, and points beyond the reach of their region move only
+    to a nearer plane. Changed points and their neighbors are revisited in the next pass.
 
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
     which are left unchanged.
@@ -522,22 +528,26 @@ def _choose_regions(
     cost = torch.where(usable, cost, torch.inf)
     first, first_cost = _lowest(cost, options)
     second, second_cost = _lowest(torch.where(options == first[:, None], torch.inf, cost), options)
-    # Keep the label assigned by region growing if the point is far from its plane.
-    remains = ((label >= 0) & ~usable[:, 0]) | first_cost.isinf()
+    # Beyond the reach of its region, a point keeps the label of growth unless another is nearer.
+    is_nearest = torch.where(usable, distance, torch.inf).amin(dim=1) >= distance[:, 0]
+    remains = ((label >= 0) & ~usable[:, 0] & is_nearest) | first_cost.isinf()
     choice = torch.where(remains, label, first)
 
     both = (second_cost.isfinite() & ~remains).nonzero().squeeze(1)
-    first, second, position = first[both], second[both], position[both]
-    scale = torch.maximum(planes.thickness[first], planes.thickness[second])
-    excess = (
-        (_overshoot(cloud, labels, planes, rows[both], position, *pair) / scale).square()
-        for pair in ((first, second), (second, first))
-    )
-    first_cost, second_cost = first_cost[both] + next(excess), second_cost[both] + next(excess)
-    better = torch.where(second_cost < first_cost, second, first)
-    angle = unsigned_angle_deg(planes.normal[first], planes.normal[second])
-    keeps_label = (angle <= PARALLEL_DEG) & (label[both] >= 0)
-    choice[both] = torch.where(keeps_label, label[both], better)
+    rows, label, position = rows[both], label[both], position[both]
+    pair = first[both], second[both]
+    # A rounded edge is as far from a precise plane as from a rough one: both have one unit.
+    scale = torch.maximum(planes.thickness[pair[0]], planes.thickness[pair[1]])
+    costs = []
+    for one, other in (pair, pair[::-1]):
+        height = planes.signed_distances(position, one[:, None]).squeeze(1)
+        over = _overshoot(cloud, labels, planes, rows, position, one, other)
+        excess = (height.square() + over.square()) / scale.square()
+        costs.append(excess + _ROUNDING**2 * (one != label))
+    better = torch.where(costs[1] < costs[0], pair[1], pair[0])
+    angle = unsigned_angle_deg(planes.normal[pair[0]], planes.normal[pair[1]])
+    keeps_label = (angle <= PARALLEL_DEG) & (label >= 0)
+    choice[both] = torch.where(keeps_label, label, better)
     return choice
 
 

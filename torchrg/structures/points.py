@@ -126,6 +126,7 @@ class Sampling(NamedTuple):
         density: Number of points per unit of area on a surface.
         height: Smallest extent along the principal axes, in units of the cloud; the height of most
             rooms.
+        deviation: RMS distance of 100 neighboring points from their plane, in units of the cloud.
     """
 
     whiteness: float = 1.0
@@ -133,6 +134,7 @@ class Sampling(NamedTuple):
     exactness: float = 0.0
     density: float = 0.0
     height: float = 0.0
+    deviation: float = 0.0
 
 
 class NormalFit(NamedTuple):
