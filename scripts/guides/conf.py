@@ -2,7 +2,7 @@
 
 import pkgutil
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 from sphinx.application import Sphinx
 
@@ -40,7 +40,7 @@ html_search_scorer = str(Path(__file__).with_name("search.js"))
 
 def show_public_bases(_app: Sphinx, _name: str, _of: type, _options: object, bases: Any) -> None:  # noqa: ANN401
     """Replace private bases by their bases."""
-    shown = [*bases]
+    shown = [get_origin(base) or base for base in bases]
     while private := [base for base in shown if getattr(base, "__name__", "").startswith("_")]:
         index = shown.index(private[0])
         shown[index : index + 1] = private[0].__bases__

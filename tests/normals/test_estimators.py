@@ -232,5 +232,5 @@ def test_three_points_span_a_plane(method):
 
 
 def test_unknown_method_is_refused():
-    with pytest.raises(ConfigError, match=r"method: expected one of pca, .*, got 'best'"):
+    with pytest.raises(ConfigError, match=r"method to be one of pca, .*, got 'best'"):
         estimate_normals(torch.rand(5, 3), method="best")

@@ -311,7 +311,7 @@ def test_a_real_room_has_a_ceiling_a_floor_and_nine_walls(scan, run, tmp_path):
     run("segment", scan("room_scan1.pcd"), "--out", path, "--up", "z")
     planes = read_result(path).planes
     kinds = [plane.kind for plane in planes]
-    assert kinds[int(planes.area.argmax())] == "ceiling"
+    assert {kinds[row] for row in planes.area.topk(2).indices.tolist()} == {"floor", "ceiling"}
     assert planes.area[torch.tensor([kind == "floor" for kind in kinds])].sum() > 20
     assert kinds.count("wall") >= 9
     # Of what is not high or not wide in the scan, nothing is a ceiling or a wall.
