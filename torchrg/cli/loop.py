@@ -15,7 +15,7 @@ from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import describe_renamed_fields
 from torchrg.io.files import check_writable, create_folder, normalize_file_name
 from torchrg.io.npy import DISPLAYED_FIELDS
-from torchrg.render.page import check_library
+from torchrg.render.page import read_library
 from torchrg.structures import Cloud
 
 # In Python 3.14 the default lock of tqdm starts a process that imports from the working directory.
@@ -120,7 +120,7 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
         )
     check_writable(path)
     if is_viewer(path):
-        check_library()
+        read_library()
 
 
 def is_viewer(path: Path) -> bool:

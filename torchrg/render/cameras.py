@@ -113,24 +113,13 @@ def fit_camera(
 def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "PinholeCamera":
     """Return a camera at the origin that looks along z, with x to the right and y down.
 
-    Args:
-        points: Points to show, shape ``(N, 3)``, finite; points behind the camera are ignored.
-        width: Width of the image, in pixels.
-        height: Height of the image. Default: fitted to the points, from a quarter of the width to
-            the width.
-
-    Returns:
-        The camera.
+    The arguments are those of :func:`fit_camera`; points behind the camera are ignored.
     """
     ahead = points[points[:, 2] > 0].double()
     rays = ahead[:, :2] / ahead[:, 2:]
     (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
-    available = (1 - 2 * _MARGIN_FRACTION) * width, (1 - 2 * _MARGIN_FRACTION) * (height or width)
-    scales = [
-        size / span
-        for size, span in zip(available, (right - left, bottom - top), strict=True)
-        if span > 0
-    ]
+    spans = (width, right - left), (height or width, bottom - top)
+    scales = ((1 - 2 * _MARGIN_FRACTION) * size / span for size, span in spans if span > 0)
     return _frame(torch.eye(4), min(scales, default=float(width)), rays, width, height)
 
 
@@ -177,14 +166,8 @@ class Projection(NamedTuple):
 def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Projection:
     """Return the projection of a camera, supersampled ``finer`` times per axis.
 
-    Args:
-        camera: A batch of one.
-        origin: Origin of the points, shape ``(3,)``; applied in float64, so that clouds far from
-            zero keep their precision.
-        finer: Subpixels per pixel and axis.
-
-    Returns:
-        The projection, float32.
+    The origin of the points, shape ``(3,)``, is applied in float64, so that clouds far from zero
+    keep their precision. The projection is float32.
     """
     intrinsics = camera.intrinsics[0, :3, :3].double().clone()
     intrinsics[:2] *= finer

@@ -14,6 +14,7 @@ from torchrg.metrics.contingency import check_labels, contingency_table
 from torchrg.metrics.labels import match_regions
 from torchrg.render.colors import UNLABELED_GRAY, color_curvature, color_normals, color_sharp
 from torchrg.structures import UNLABELED
+from torchrg.structures.points import Labels
 
 COLOR_MODES = {
     "plane": ("planes", "labels"),
@@ -150,9 +151,7 @@ def _angle_channel(angles_deg: Tensor) -> Channel:
     return _scale_channel("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
 
 
-def point_outcomes(
-    labels: Tensor | NDArray[np.integer], ground_truth: Tensor | NDArray[np.integer]
-) -> Tensor:
+def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
     """Return the outcome of each point as an index of :data:`OUTCOMES`.
 
     Args:

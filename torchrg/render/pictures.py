@@ -126,9 +126,8 @@ def _median_radius(
     sample, depth = sample[depth > 0], depth[depth > 0]
     if len(sample) == 0:
         return 1.0, 0.0
-    return float((lengths[sample] / depth).median()) * project.focal, float(
-        lengths[sample].median()
-    )
+    lengths = lengths[sample]
+    return float((lengths / depth).median()) * project.focal, float(lengths.median())
 
 
 def _discs(
