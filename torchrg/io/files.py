@@ -19,7 +19,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from torchrg.errors import FormatError, system_limit
+from torchrg._limits import system_limit
+from torchrg.errors import FormatError
 from torchrg.structures.points import FilePath
 
 PARSE_ERRORS = (
