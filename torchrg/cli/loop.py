@@ -13,7 +13,7 @@ from torchrg.cli.ending import SOME_FAILED, fail, printable, warn
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import describe_renamed_fields
-from torchrg.io.files import check_writable, create_folder, normalize_file_name
+from torchrg.io.files import check_writable, create_folder, list_some, normalize_file_name
 from torchrg.io.npy import DISPLAYED_FIELDS
 from torchrg.render.page import read_library
 from torchrg.structures import Cloud
@@ -135,8 +135,7 @@ def is_archive(path: Path) -> bool:
 
 def display_name(source: Path | Sequence[Path]) -> str:
     """Return the name of an input in messages: a file, or several merged files."""
-    first, *others = [source] if isinstance(source, Path) else source
-    return f"{first} and {len(others)} more" if others else f"{first}"
+    return list_some([*map(str, [source] if isinstance(source, Path) else source)], most=1)
 
 
 def run_each(

@@ -12,10 +12,10 @@ from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_warnings, warn
-from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
+from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.result import read_result
+from torchrg.io.files import list_some
 from torchrg.metrics import (
     METRICS,
     Index,
@@ -117,24 +117,15 @@ def _pair_scans(predicted: Path, ground_truth: Path) -> dict[str, tuple[Path, Pa
     )
     for folder, missing in ((ground_truth, {*ours} - {*theirs}), (predicted, {*theirs} - {*ours})):
         if missing:
-            first, more = sorted(missing, key=natural_key)[:_MAX_NAMED], len(missing) - _MAX_NAMED
-            raise FormatError(
-                f"{folder}: no scan found for {', '.join(first)}"
-                f"{f' and {more} more' if more > 0 else ''}."
-            )
+            names = list_some(sorted(missing, key=natural_key), _MAX_NAMED)
+            raise FormatError(f"{folder}: no scan found for {names}.")
     return {name: (path, theirs[name]) for name, path in ours.items()}
 
 
 def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> Scores:
     """Evaluate all parts present in both scans."""
     check_columns(arguments.columns, (predicted, ground_truth))
-    ours, theirs = (
-        read_result(path, columns=file_columns(path, arguments.columns)).cloud
-        for path in (predicted, ground_truth)
-    )
-    for cloud in (ours, theirs):
-        for note in cloud.notes:
-            warn(f"{cloud.source}: {note}.")
+    ours, theirs = (read_noted(path, arguments.columns).cloud for path in (predicted, ground_truth))
     scores: Scores = {}
     if arguments.match_distance is None:
         _check_rows(predicted, ground_truth, ours, theirs)

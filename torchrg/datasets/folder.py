@@ -17,7 +17,7 @@ from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
 from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_cloud, takes_columns
-from torchrg.io.files import decode_file, local_path
+from torchrg.io.files import decode_file, list_some, local_path
 from torchrg.io.npy import map_array, map_folder
 from torchrg.structures import Cloud
 from torchrg.structures.colors import read_colors
@@ -382,8 +382,8 @@ def find_files(
 def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> None:
     """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
-        more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
-        warn(f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.")
+        names = [str(path.relative_to(folder)) for path in skipped]
+        warn(f"{folder}: skipped {list_some(names, most=1)}: {why}.")
 
 
 def list_dir(folder: str | os.PathLike[str]) -> list[Path]:

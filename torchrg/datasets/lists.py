@@ -28,10 +28,7 @@ ListEntries = Mapping[str, Sequence[ListEntry]]
 def check_lists(layout: str, dataset: str, out: Path) -> None:
     """Raise FormatError if :func:`write_lists` would overwrite lists of other origin.
 
-    Args:
-        layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
-        dataset: A key of its row.
-        out: The output directory; it may not exist.
+    The output directory may not exist.
     """
     folders, contents = _DATABASES.get((layout, dataset), _NO_LISTS)
     if any((out / folder).is_dir() for folder in folders):

@@ -14,7 +14,7 @@ import tokenize
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -385,6 +385,17 @@ def wrap_errors(message: str, *errors: type[BaseException], repair: str = "") ->
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message without a full stop, or its class name."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def list_some(names: Sequence[str], most: int) -> str:
+    """List names for a message of one line, at most that many.
+
+    Example:
+        >>> list_some(["a", "b", "c"], 2)
+        'a, b and 1 more'
+    """
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
 
 
 def normalize_file_name(name: str) -> str:
