@@ -50,12 +50,8 @@ def make_camera(
 def view_axes(toward: Tensor, up: Tensor) -> Tensor:
     """Return the right, down and forward axes of a camera.
 
-    Args:
-        toward: Direction from the scene to the camera, shape ``(3,)``.
-        up: Up direction of the image, not parallel to ``toward``, shape ``(3,)``.
-
-    Returns:
-        Unit vectors as rows, shape ``(3, 3)``, float64.
+    They are unit vectors as rows, ``(3, 3)``, float64. ``toward`` ``(3,)`` is the direction from
+    the scene to the camera, and ``up`` ``(3,)`` that of the image, not parallel to it.
     """
     forward = -torch.nn.functional.normalize(toward.double(), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)
@@ -83,9 +79,6 @@ def fit_camera(
         height: Height of the image. Default: fitted to the points, from a quarter of the width to
             the width.
         field_of_view_deg: Field of view over the larger of width and height, in degrees.
-
-    Returns:
-        The camera. If all points coincide, it is at a distance of 1.
     """
     across = points.double() @ axes.to(points.device).T
     nearest, farthest = _bounds(across[:, 2])
@@ -100,7 +93,7 @@ def fit_camera(
         low, _ = _bounds(across[:, axis] + tangent * forward)
         midpoint[axis] = (low + high) / 2
         distance = max(distance, (high - low) / (2 * tangent))
-    if bool((across == across[:1]).all()):
+    if bool((across == across[:1]).all()):  # Any distance shows a single point.
         distance = 1.0
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = axes

@@ -131,9 +131,7 @@ def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> 
     """Return the colors of fractions of a scale, with a legend for selected values."""
     steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
     colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
-    legend = [
-        (colors[round(_LEVELS * fraction)].tolist(), text) for fraction, text in shown.items()
-    ]
+    legend = [(colors[round(_LEVELS * part)].tolist(), text) for part, text in shown.items()]
     values = (fractions.clamp(0, 1).nan_to_num() * _LEVELS).round().numpy().astype(np.uint8)
     return Channel(mode, values, colors, legend)
 
