@@ -130,17 +130,14 @@ def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> S
     if arguments.match_distance is None:
         _check_rows(predicted, ground_truth, ours, theirs)
     else:
-        ours, scores["match"] = _match_nearest(
-            arguments.match_distance, predicted, ground_truth, ours, theirs
-        )
+        distance = arguments.match_distance
+        ours, scores["match"] = _match_nearest(distance, predicted, ground_truth, ours, theirs)
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
-        for path, cloud, field in (
-            (predicted, ours, "superpoint"),
-            (ground_truth, theirs, "labels"),
-        ):
+        needed = (predicted, ours, "superpoint"), (ground_truth, theirs, "labels")
+        for path, cloud, field in needed:
             if field not in cloud.fields:
                 named = ", ".join(cloud.fields) or "points alone"
                 raise FormatError(
@@ -211,11 +208,8 @@ def _match_nearest(
 
 def _defined(values: Mapping[str, float | None]) -> dict[str, float | None]:
     """Drop scores that were not computed; replace NaN by None, as JSON has no NaN."""
-    return {
-        name: None if math.isnan(value) else value
-        for name, value in values.items()
-        if value is not None
-    }
+    known = {name: value for name, value in values.items() if value is not None}
+    return {name: None if math.isnan(value) else value for name, value in known.items()}
 
 
 def _mean(scans: Mapping[str, Scores]) -> Scores:

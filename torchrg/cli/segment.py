@@ -45,13 +45,7 @@ from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.provenance import Record, check_source
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
-from torchrg.io import (
-    RESULT_FIELDS,
-    check_output,
-    estimate_points,
-    read_cloud,
-    write_cloud,
-)
+from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
 from torchrg.io.files import check_space
 from torchrg.io.merge import merge_clouds
 from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes

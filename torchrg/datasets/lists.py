@@ -74,9 +74,8 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
 
     Names whose entry belongs to another split are removed from a list.
     """
-    listed_in = {
-        folder: [e["name"] for e in _read_entries(out, folder, without)] for folder in folders
-    }
+    entries = {folder: _read_entries(out, folder, without) for folder in folders}
+    listed_in = {folder: [entry["name"] for entry in found] for folder, found in entries.items()}
     removed = {path.stem for path in _entry_files(out, folders, without)}
     for folder, scans in listed_in.items() if any(listed_in.values()) or removed else ():
         path = out / f"{folder}.txt"
