@@ -142,7 +142,7 @@ def match_jobs(jobs: Sequence[Job], only: str | None) -> list[Job]:
     """
     selected = [job for job in jobs if only is None or fnmatchcase(job.name, only)]
     if not selected:
-        names = list_some([job.name for job in jobs], most=5)
+        names = list_some([job.name for job in jobs], max_names=5)
         raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}.")
     return selected
 

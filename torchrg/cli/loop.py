@@ -135,7 +135,7 @@ def is_archive(path: Path) -> bool:
 
 def display_name(source: Path | Sequence[Path]) -> str:
     """Return the name of an input in messages: a file, or several merged files."""
-    return list_some([*map(str, [source] if isinstance(source, Path) else source)], most=1)
+    return list_some([*map(str, [source] if isinstance(source, Path) else source)], max_names=1)
 
 
 def run_each(

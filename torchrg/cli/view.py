@@ -130,14 +130,14 @@ def _render(arguments: Arguments, result: Result, first: Result | None = None) -
 
 def _write_page(arguments: Arguments, result: Result) -> str:
     """Write a viewer and return its description."""
-    compare, truth = (
+    compare, ground_truth = (
         None if path is None else read_noted(path, arguments.columns)
         for path in (arguments.compare, arguments.ground_truth)
     )
     page = make_page(
         result,
         compare=compare,
-        ground_truth=None if truth is None else truth.cloud,
+        ground_truth=None if ground_truth is None else ground_truth.cloud,
         color=arguments.color,
         view=arguments.view,
         up=None if arguments.up is None else _direction(arguments.up),

@@ -383,7 +383,7 @@ def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> No
     """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
         names = [str(path.relative_to(folder)) for path in skipped]
-        warn(f"{folder}: skipped {list_some(names, most=1)}: {why}.")
+        warn(f"{folder}: skipped {list_some(names, max_names=1)}: {why}.")
 
 
 def list_dir(folder: str | os.PathLike[str]) -> list[Path]:

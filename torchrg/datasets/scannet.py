@@ -412,7 +412,7 @@ def _groups(
 def _warn_entries(path: Path, what: str, entries: Sequence[object]) -> None:
     """Warn of inconsistent entries of a file, if any, and name the first."""
     if entries:
-        warn(f"{path}: {what}: {list_some([*map(shortened, entries)], most=1)}.")
+        warn(f"{path}: {what}: {list_some([*map(shortened, entries)], max_names=1)}.")
 
 
 def _read_list(path: Path, key: str) -> list[Any]:

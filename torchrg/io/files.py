@@ -387,15 +387,15 @@ def first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
-def list_some(names: Sequence[str], most: int) -> str:
-    """List names for a message of one line, at most that many.
+def list_some(names: Sequence[str], max_names: int) -> str:
+    """List names for a message of one line, at most ``max_names``.
 
     Example:
         >>> list_some(["a", "b", "c"], 2)
         'a, b and 1 more'
     """
-    more = f" and {len(names) - most:,} more" if len(names) > most else ""
-    return f"{', '.join(names[:most])}{more}"
+    more = f" and {len(names) - max_names:,} more" if len(names) > max_names else ""
+    return f"{', '.join(names[:max_names])}{more}"
 
 
 def normalize_file_name(name: str) -> str:

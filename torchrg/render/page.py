@@ -133,8 +133,8 @@ def make_page(
         same = np.array_equal(cloud.coordinates, compare.cloud.coordinates, equal_nan=True)
         reference = result.labels if same and "labels" in result.fields else None
         others = choose_points(compare, frame, max_points)
-        truth = true_fields if same else {}
-        described.append(_describe_cloud(compare, others, truth, reference, frame))
+        true_fields = true_fields if same else {}
+        described.append(_describe_cloud(compare, others, true_fields, reference, frame))
     scenes, blobs = [scene for scene, _ in described], [blob for _, blob in described]
     modes = [mode for mode in COLOR_MODES if any(mode in scene["channels"] for scene in scenes)]
     if color is not None and color not in modes:

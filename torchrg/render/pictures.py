@@ -143,8 +143,8 @@ def _discs(
     normals = normals @ project.local_to_camera[0, :3, :3].T
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
-    least = torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE)
-    along = torch.where(along.abs() < _MIN_COSINE, least, along)
+    min_cosine = torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE)
+    along = torch.where(along.abs() < _MIN_COSINE, min_cosine, along)
     return Discs(
         pixels,
         inverse,
