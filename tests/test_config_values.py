@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from torchrg.config import SettingError, convert
-from torchrg.errors import ConfigError, add_note
+from torchrg.datasets.folder import add_note
+from torchrg.errors import ConfigError
 
 Choice = Literal["one", "two"]
 

@@ -79,10 +79,8 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
     for what in ("dtype", "device"):
         kinds = [str(getattr(tensor, what)).removeprefix("torch.") for tensor in tensors.values()]
         if len(set(kinds)) > 1:
-            names = " and ".join(tensors)
-            raise ShapeError(
-                f"{caller}: expected {names} of one {what}, got {' and '.join(kinds)}."
-            )
+            names, got = " and ".join(tensors), " and ".join(kinds)
+            raise ShapeError(f"{caller}: expected {names} of one {what}, got {got}.")
 
 
 def check_points(caller: str, points: Tensor) -> None:

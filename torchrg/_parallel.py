@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar, copy_context
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,30 +35,11 @@ ROWS_AT_ONCE = 65536
 """Number of rows per pass over a cloud: few calls, temporaries of bounded memory."""
 TYPICAL_WIDTH = 64
 """Number of values per row, such as neighbors, up to which the numbers above apply."""
-CHILD_ENVIRONMENT = dict.fromkeys(
-    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
-) | {"PYTHONSAFEPATH": "1"}
-"""Environment of all child processes, read by Python and its libraries at startup: one thread, and
-no imports from the working directory."""
 _MIN_ROWS = 4096
 """Minimum number of rows per thread: at a few tenths of a microsecond each they outweigh its
 start."""
 _RETAINED_BYTES = 31 * 2**20
 """Just below 32 MiB, the largest freed block that raises the trim threshold of glibc."""
-
-
-@contextmanager
-def in_root_directory() -> Iterator[None]:
-    """Start processes in an empty directory, because Python 3.10 and libraries import from there.
-
-    Their paths must be absolute.
-    """
-    folder = Path.cwd()
-    os.chdir("/")
-    try:
-        yield
-    finally:
-        os.chdir(folder)
 
 
 def split_rows(num_rows: int, chunk_size: int) -> list[slice]:
@@ -278,21 +259,13 @@ def _retain_freed_memory() -> None:
     Otherwise every temporary tensor of some hundred kilobytes is paged in again: segmenting 200,000
     points then takes a third more CPU time.
     """
-    block = torch.empty(_RETAINED_BYTES, dtype=torch.uint8)
-    del block
-
-
-def _limit_forked_child() -> None:
-    """Give torch one thread in a forked process, as data loaders do.
-
-    OpenMP does not survive a fork: an operation of the child that wants threads waits forever for
-    those of the parent.
-    """
-    torch.set_num_threads(1)
+    torch.empty(_RETAINED_BYTES, dtype=torch.uint8)
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_limit_forked_child)
+    # As in data loaders. OpenMP does not survive a fork: an operation of the child that wants
+    # threads waits forever for those of the parent.
+    os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
 def return_freed_memory() -> None:

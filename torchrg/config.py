@@ -20,7 +20,6 @@ from typing import Any, Literal, NoReturn, TypeVar
 import torch
 
 from torchrg._parallel import CHUNK_SIZE
-from torchrg._synonyms import advice_on, nearest_name
 from torchrg.errors import ConfigError
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
@@ -390,9 +389,7 @@ class PipelineConfig(SelectionConfig):
         """Set the paper's single threshold.
 
         Eq. (9) uses one theta for sharp points and for growth, so this sets both
-        ``normals.sharp_angle_deg`` and ``growing.max_angle_deg``. Equivalent to ``angle_deg: 8`` in
-        a file and ``--angle-deg 8`` on the command line, where explicit values of the two take
-        precedence.
+        ``normals.sharp_angle_deg`` and ``growing.max_angle_deg``, like ``angle_deg: 8`` in a file.
 
         Raises:
             ConfigError: If the angle is not in [0, 90].
@@ -414,20 +411,15 @@ class PipelineConfig(SelectionConfig):
     def with_sampling(self, sampling: Sampling) -> "PipelineConfig":
         """Replace ``auto`` by values that match how a cloud samples its surfaces.
 
-        If whiteness is below 0.4, surfaces are bent or faceted, and ``facet_tolerance`` is 1/240 of
-        the cloud height, at most 0.3 of the radius of 50 neighbors. From 0.6 noise is white, and it
-        is 0.45 of that; in between it decreases linearly. Below 0.5, surfaces are ``faceted``, and
-        so are evenly spaced points with white noise that are not exact: their normals are noisy. It
-        is 1.5 times that for warped surfaces: points that are neither exact (0.1 to 0.2) nor evenly
-        spaced are of no mesh, but fused from frames that disagree. Coordinates are quantized if
-        noise is white, yet points are exact (0.04 to 0.08) and not on scan lines (variation 0.8),
-        as in one frame of a depth camera. Then it is at least the rounding step, the square root of
-        12 times the deviation of 100 points, at most 0.4 of that radius. If the step decides,
-        surfaces are ``faceted``.
-        Regional noise is used if noise is white and the distances to the nearest point vary by less
-        than 0.38, as in mesh vertices and grids. ``min_size`` is the number of points in a square
-        with sides 1/27 of the height. They are 1/13 for points sampled from a mesh, where small
-        facets belong to curved surfaces.
+        If whiteness is below 0.4, surfaces are bent or faceted; from 0.6 noise is white; values in
+        between are interpolated. The fields of :class:`GrowingConfig` state the tolerances and
+        sizes. Below 0.5, surfaces are ``faceted``, and so are evenly spaced points with white noise
+        that are not exact: their normals are noisy. Points that are neither exact (0.1 to 0.2) nor
+        evenly spaced are of no mesh, but fused from frames that disagree (warped). Coordinates are
+        quantized if noise is white, yet points are exact (0.04 to 0.08) and not on scan lines
+        (variation 0.8), as in one frame of a depth camera. If their rounding step decides, surfaces
+        are ``faceted``. Regional noise is used if noise is white and the distances to the nearest
+        point vary by less than 0.38, as in mesh vertices and grids.
 
         Example:
             >>> mesh = Sampling(0.06, variation=0.5, exactness=0.6, density=4e3, height=2.7)
@@ -665,6 +657,8 @@ def _apply_to_base(values: object, where: str) -> PipelineConfig:
 def _preset_file(name: object, *, expected: str) -> Path:
     """Return the file of a preset; raise if it does not exist."""
     if name not in preset_names():
+        from torchrg._synonyms import advice_on
+
         advice = advice_on(str(name)) and f"; {advice_on(str(name))}"
         raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}{advice}.")
     return _preset_folder() / f"{name}.yaml"
@@ -705,6 +699,8 @@ def _override(config: Settings, values: object, where: str, prefix: str = "") ->
 
 def _fix_for(key: str, value: object, config: object, prefix: str) -> str:
     """Return the fix for an unknown key."""
+    from torchrg._synonyms import advice_on, nearest_name
+
     names = [*vars(config), *["angle_deg"] * isinstance(config, PipelineConfig)]
     if name := nearest_name(key, [*names, *(name for name, _ in _flat_values(config))]):
         return f"the nearest is {prefix}{name}, as in {{{f'{prefix}{name}'!r}: {value!r}}}"

@@ -20,6 +20,7 @@ normals need planes.
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import torch
@@ -285,13 +286,11 @@ _FITS: dict[str, Callable[..., NormalFit]] = {
     "pca": fit_normals_pca,
     "jet": fit_normals_jet,
     "irls": fit_normals_irls,
-}
-_ROBUST: dict[str, Callable[..., RobustFit]] = {
-    "detmcd": fit_detmcd,
-    "fastmcd": fit_fastmcd,
-    "mve": fit_mve,
-    "dets": fit_dets,
-    "detmm": fit_detmm,
+    "detmcd": partial(fit_normals_robust, estimator=fit_detmcd),
+    "fastmcd": partial(fit_normals_robust, estimator=fit_fastmcd),
+    "mve": partial(fit_normals_robust, estimator=fit_mve),
+    "dets": partial(fit_normals_robust, estimator=fit_dets),
+    "detmm": partial(fit_normals_robust, estimator=fit_detmm),
 }
 
 
@@ -328,8 +327,6 @@ class PatchNormals(nn.Module):
     def fit(self, patches: Tensor, mask: Tensor | None = None) -> NormalFit:
         """Return normals with curvature and residuals of patches ``(*, K, 3)``."""
         settings = dict(self.settings)
-        if self.method in _ROBUST:
-            return fit_normals_robust(patches, mask, estimator=_ROBUST[self.method], **settings)
         if self.method == "irls":
             settings["noise"] = torch.full_like(patches[..., 0, 0], settings["noise"])
         return _FITS[self.method](patches, mask, **settings)

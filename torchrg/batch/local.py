@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
+from pathlib import Path
 from threading import Thread
 
-from torchrg._parallel import CHILD_ENVIRONMENT, in_root_directory
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 
@@ -21,6 +21,11 @@ __dir__ = __all__.copy
 
 POLL_SECONDS = 0.5
 """Interval at which an engine yields None, so that progress is shown and Ctrl-C is handled."""
+CHILD_ENVIRONMENT = dict.fromkeys(
+    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
+) | {"PYTHONSAFEPATH": "1"}
+"""Environment of all child processes, read by Python and its libraries at startup: one thread, and
+no imports from the working directory."""
 _STDERR = 2
 """File descriptor of standard error."""
 _PRELOADED = ["torchrg.batch.local", "torchrg.batch.sources"]
@@ -188,6 +193,20 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+@contextlib.contextmanager
+def in_root_directory() -> Iterator[None]:
+    """Start processes in an empty directory, because Python 3.10 and libraries import from there.
+
+    Their paths must be absolute.
+    """
+    folder = Path.cwd()
+    os.chdir("/")
+    try:
+        yield
+    finally:
+        os.chdir(folder)
 
 
 @contextlib.contextmanager

@@ -62,10 +62,8 @@ def _group_remainders() -> Iterator[int]:
 
 def reset_peak_memory() -> None:
     """Reset the peak memory of this process, if the system supports it (Linux)."""
-    try:
+    with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return
 
 
 def peak_memory(process: int | str = "self") -> int:

@@ -12,8 +12,7 @@ from typing import Any
 import torch
 
 from torchrg._optional import require
-from torchrg._parallel import CHILD_ENVIRONMENT, in_root_directory
-from torchrg.batch.local import POLL_SECONDS
+from torchrg.batch.local import CHILD_ENVIRONMENT, POLL_SECONDS, in_root_directory
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.task import Reports, TaskReport
 from torchrg.errors import ConfigError

@@ -24,6 +24,7 @@ from torchrg.io.files import (
     PARSE_ERRORS,
     atomic_path,
     check_space,
+    list_some,
     normalize_file_name,
 )
 
@@ -141,9 +142,8 @@ def match_jobs(jobs: Sequence[Job], only: str | None) -> list[Job]:
     """
     selected = [job for job in jobs if only is None or fnmatchcase(job.name, only)]
     if not selected:
-        names = ", ".join(job.name for job in jobs[:5])
-        more = f" and {len(jobs) - 5:,} more" if len(jobs) > 5 else ""
-        raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}{more}.")
+        names = list_some([job.name for job in jobs], max_names=5)
+        raise ConfigError(f"expected --only to match a scan, got {only!r}; they are {names}.")
     return selected
 
 

@@ -76,11 +76,9 @@ class CloudSource(Source):
         for scene in self.data.scenes:
             dataset = "ScanNet" if scene.dataset is None else scene.dataset
             check_layout(self.layout, dataset, scene.dataset or scene.name)
-        in_place = out == self.root
+        in_place, count = out == self.root, self.data.count_points
         return [
-            scene._replace(
-                files=self._inputs(scene, in_place), num_points=self.data.count_points(scene)
-            )
+            scene._replace(files=self._inputs(scene, in_place), num_points=count(scene))
             for scene in self.data.scenes
         ]
 
@@ -184,10 +182,9 @@ class RGBDSource(Source):
         # A wrong scale affects all frames, so warn before the work.
         with suppress(FormatError, OSError):
             self.data.read_sample(0)
+        count = self.data.count_points
         return [
-            scene._replace(
-                files=(scene.path, *scene.item.sources), num_points=self.data.count_points(scene)
-            )
+            scene._replace(files=(scene.path, *scene.item.sources), num_points=count(scene))
             for scene in self.data.scenes
         ]
 

@@ -25,6 +25,7 @@ from torchrg.io.files import (
     find_leftovers,
     hash_file,
     is_unchanged,
+    list_some,
     remove_leftovers,
     sync_folder,
 )
@@ -94,7 +95,8 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
     if not is_same and not any(is_unchanged(paths[name], inputs[name][1]) for name in records):
         raise FormatError(
             f"{out}: expected results of {source.root}, got another data set "
-            f"({_join(missing or [*records])}); choose another directory, or remove them."
+            f"({list_some(missing or [*records], _MAX_NAMED)}); choose another directory, or "
+            "remove them."
         )
     stale = (name for name, scan in scans.items() if scan is not None or name in missing)
     return [_describe_stale(out, name, scans[name], records[name]) for name in stale]
@@ -131,8 +133,8 @@ def check_stale(results: Sequence[StaleResult], root: Path, *, prune: bool) -> N
     missing = [str(result.folder) for result in results if result.scan is None and result.paths]
     if missing and not prune:
         raise FormatError(
-            f"{_join(missing)}: no scan in {root} belongs to these results; remove them with "
-            "--prune, or keep them with --only '*'."
+            f"{list_some(missing, _MAX_NAMED)}: no scan in {root} belongs to these results; remove "
+            "them with --prune, or keep them with --only '*'."
         )
     for result in results:
         if (path := _changed_file(result)) is not None:
@@ -201,12 +203,6 @@ def _changed_file(result: StaleResult) -> Path | None:
     allowed = {*paths, folder / RECORD, *find_leftovers(folder)}
     entries = sorted(folder.iterdir())
     return next((path for path in entries if path not in allowed and not path.is_dir()), None)
-
-
-def _join(names: Sequence[str]) -> str:
-    """Join names for a message of one line."""
-    more = f" and {len(names) - _MAX_NAMED:,} more" if len(names) > _MAX_NAMED else ""
-    return f"{', '.join(names[:_MAX_NAMED])}{more}"
 
 
 def remove_empty(folder: Path, tops: Collection[Path]) -> None:

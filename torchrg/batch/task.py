@@ -10,8 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
+from torchrg._limits import system_limit
 from torchrg.batch.memory import peak_memory, reset_peak_memory
-from torchrg.errors import DepthWarning, PrecisionWarning, TorchrgError, system_limit
+from torchrg.errors import DepthWarning, PrecisionWarning, TorchrgError
 from torchrg.io.files import is_disk_full
 
 Status = Literal["converted", "kept", "failed", "not started"]

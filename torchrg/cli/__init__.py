@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
+from torchrg._limits import system_limit
 from torchrg._synonyms import nearest_name
 from torchrg.cli.ending import (
     INTERRUPTED,
@@ -16,12 +17,7 @@ from torchrg.cli.ending import (
     warn,
     writing_to,
 )
-from torchrg.errors import (
-    ConfigError,
-    PrecisionWarning,
-    TorchrgError,
-    system_limit,
-)
+from torchrg.errors import ConfigError, PrecisionWarning, TorchrgError
 
 COMMANDS = {
     "segment": "segment point clouds into planes",

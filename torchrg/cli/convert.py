@@ -57,7 +57,7 @@ from torchrg.io.files import (
 from torchrg.io.plane_table import TABLE_SUFFIXES
 from torchrg.io.result import PLANES_FILE, RECORD, read_result
 from torchrg.render.gallery import INDEX, Entry, check_gallery, write_entry, write_index
-from torchrg.render.page import check_library
+from torchrg.render.page import read_library
 
 _Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
 _MEMORY_FRACTION = 0.8
@@ -325,7 +325,7 @@ def _check(arguments: Arguments) -> None:
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address with --engine ray, got --engine local; add it.")
     if _page_folder(arguments) is not None:
-        check_library()
+        read_library()
     if isinstance(arguments, CloudArguments):
         is_on = arguments.superpoints or arguments.layout != "pointcept"
         flags.check_superpoints(arguments.partition, arguments.level, is_on=is_on)

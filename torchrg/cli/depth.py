@@ -21,11 +21,7 @@ from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import check_distinct, note_input, output_paths, run_each, sidecar_paths
 from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.datasets.rgbd import scale_camera
-from torchrg.datasets.rgbd_files import (
-    DEPTH_SUFFIXES,
-    num_pixels,
-    refuse_form,
-)
+from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, refuse_form
 from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
 from torchrg.depth.camera import Pinhole, format_intrinsics, reprojection_error, unproject_image
 from torchrg.errors import ConfigError, DepthWarning, FormatError
@@ -90,11 +86,9 @@ def run(argv: list[str]) -> int:
     flags.limit_threads(arguments.threads)
     camera = flags.parse_intrinsics(arguments.intrinsics)
     frames = [_find_frame(arguments, camera, path) for path in arguments.inputs]
-    sources = [camera if frame is None else frame for frame in frames]
-    inputs = [
-        path if frame is None else frame.depth
-        for path, frame in zip(arguments.inputs, frames, strict=True)
-    ]
+    sources = [frame or camera for frame in frames]
+    pairs = zip(arguments.inputs, frames, strict=True)
+    inputs = [path if frame is None else frame.depth for path, frame in pairs]
     if any(path.is_dir() for path in arguments.inputs) and not arguments.out.suffix:
         create_folder(arguments.out)
     is_folder = arguments.out.is_dir() or (
@@ -108,9 +102,7 @@ def run(argv: list[str]) -> int:
         if arguments.picture is None:
             pictures = [targets[0].with_name(f"{targets[0].stem}_planes.png")]
         tables[0].add(targets[0].with_suffix(".json"))
-    sidecars = [
-        path for path in (*pictures, *itertools.chain(*map(sorted, tables))) if path is not None
-    ]
+    sidecars = [*filter(None, pictures), *itertools.chain(*map(sorted, tables))]
     check_distinct([*targets, *sidecars], [*inputs, Path(arguments.intrinsics or "")])
     for path in sidecars:
         check_writable(path)
@@ -126,10 +118,8 @@ def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGB
     Raises before reading if the camera or the depth scale is missing.
     """
     if path.is_dir():
-        options: dict[str, Any] = {
-            "depth_scale": arguments.depth_scale,
-            "depth_kind": arguments.depth_kind,
-        }
+        names = ("depth_scale", "depth_kind")
+        options: dict[str, Any] = {name: getattr(arguments, name) for name in names}
         with print_warnings():
             frame, *others = RGBDFrames.from_folder(path, intrinsics=camera, **options).frames
         if others:

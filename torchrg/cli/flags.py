@@ -26,6 +26,7 @@ from torchrg.depth.camera import Pinhole
 from torchrg.depth.values import DepthKind
 from torchrg.errors import ConfigError
 from torchrg.io import FORMATS, takes_columns
+from torchrg.io.result import Result, read_result
 from torchrg.io.tables import COLUMNS_RULE
 from torchrg.normals import Orientation
 from torchrg.structures import FARTHEST, Sampling
@@ -207,6 +208,14 @@ def split_columns(columns: str | None) -> tuple[str, ...] | None:
 def file_columns(path: str | os.PathLike[str], columns: str | None) -> tuple[str, ...] | None:
     """Return the column names for a file; None if the file stores its own."""
     return split_columns(columns) if takes_columns(path) else None
+
+
+def read_noted(path: Path, columns: str | None) -> Result:
+    """Read a cloud or result, and print its notes."""
+    result = read_result(path, columns=file_columns(path, columns))
+    for note in result.cloud.notes:
+        warn(f"{path}: {note}.")
+    return result
 
 
 def check_viewpoint(viewpoint: tuple[float, float, float] | None, orient: str) -> None:

@@ -91,9 +91,8 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         if len(positions) > 1:
             search = prepare_search(positions, min(_NUM_NEIGHBORS, len(positions)))
             rows = np.arange(0, len(positions), -(-len(positions) // _NUM_FOR_SPACING))
-            spacing = np.median(
-                np.linalg.norm(positions[rows] - positions[search(rows)[:, 1]], axis=1)
-            )
+            steps = positions[rows] - positions[search(rows)[:, 1]]
+            spacing = np.median(np.linalg.norm(steps, axis=1))
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
             sampling = measure_sampling(torch.from_numpy(positions), search)
             chosen = load_config().measured(sampling)["settings"]

@@ -13,9 +13,9 @@ from torchrg.cli.ending import SOME_FAILED, fail, printable, warn
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import describe_renamed_fields
-from torchrg.io.files import check_writable, create_folder, normalize_file_name
+from torchrg.io.files import check_writable, create_folder, list_some, normalize_file_name
 from torchrg.io.npy import DISPLAYED_FIELDS
-from torchrg.render.page import check_library
+from torchrg.render.page import read_library
 from torchrg.structures import Cloud
 
 # In Python 3.14 the default lock of tqdm starts a process that imports from the working directory.
@@ -120,7 +120,7 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
         )
     check_writable(path)
     if is_viewer(path):
-        check_library()
+        read_library()
 
 
 def is_viewer(path: Path) -> bool:
@@ -135,8 +135,7 @@ def is_archive(path: Path) -> bool:
 
 def display_name(source: Path | Sequence[Path]) -> str:
     """Return the name of an input in messages: a file, or several merged files."""
-    first, *others = [source] if isinstance(source, Path) else source
-    return f"{first} and {len(others)} more" if others else f"{first}"
+    return list_some([*map(str, [source] if isinstance(source, Path) else source)], max_names=1)
 
 
 def run_each(

@@ -12,10 +12,10 @@ from tqdm import tqdm
 
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_warnings, warn
-from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
+from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
-from torchrg.io.result import read_result
+from torchrg.io.files import list_some
 from torchrg.metrics import (
     METRICS,
     Index,
@@ -117,39 +117,27 @@ def _pair_scans(predicted: Path, ground_truth: Path) -> dict[str, tuple[Path, Pa
     )
     for folder, missing in ((ground_truth, {*ours} - {*theirs}), (predicted, {*theirs} - {*ours})):
         if missing:
-            first, more = sorted(missing, key=natural_key)[:_MAX_NAMED], len(missing) - _MAX_NAMED
-            raise FormatError(
-                f"{folder}: no scan found for {', '.join(first)}"
-                f"{f' and {more} more' if more > 0 else ''}."
-            )
+            names = list_some(sorted(missing, key=natural_key), _MAX_NAMED)
+            raise FormatError(f"{folder}: no scan found for {names}.")
     return {name: (path, theirs[name]) for name, path in ours.items()}
 
 
 def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> Scores:
     """Evaluate all parts present in both scans."""
     check_columns(arguments.columns, (predicted, ground_truth))
-    ours, theirs = (
-        read_result(path, columns=file_columns(path, arguments.columns)).cloud
-        for path in (predicted, ground_truth)
-    )
-    for cloud in (ours, theirs):
-        for note in cloud.notes:
-            warn(f"{cloud.source}: {note}.")
+    ours, theirs = (read_noted(path, arguments.columns).cloud for path in (predicted, ground_truth))
     scores: Scores = {}
     if arguments.match_distance is None:
         _check_rows(predicted, ground_truth, ours, theirs)
     else:
-        ours, scores["match"] = _match_nearest(
-            arguments.match_distance, predicted, ground_truth, ours, theirs
-        )
+        distance = arguments.match_distance
+        ours, scores["match"] = _match_nearest(distance, predicted, ground_truth, ours, theirs)
     for part, score in (("labels", score_labels), ("normals", score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
-        for path, cloud, field in (
-            (predicted, ours, "superpoint"),
-            (ground_truth, theirs, "labels"),
-        ):
+        needed = (predicted, ours, "superpoint"), (ground_truth, theirs, "labels")
+        for path, cloud, field in needed:
             if field not in cloud.fields:
                 named = ", ".join(cloud.fields) or "points alone"
                 raise FormatError(
@@ -220,11 +208,8 @@ def _match_nearest(
 
 def _defined(values: Mapping[str, float | None]) -> dict[str, float | None]:
     """Drop scores that were not computed; replace NaN by None, as JSON has no NaN."""
-    return {
-        name: None if math.isnan(value) else value
-        for name, value in values.items()
-        if value is not None
-    }
+    known = {name: value for name, value in values.items() if value is not None}
+    return {name: None if math.isnan(value) else value for name, value in known.items()}
 
 
 def _mean(scans: Mapping[str, Scores]) -> Scores:

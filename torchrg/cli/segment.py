@@ -45,13 +45,7 @@ from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.datasets.provenance import Record, check_source
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
-from torchrg.io import (
-    RESULT_FIELDS,
-    check_output,
-    estimate_points,
-    read_cloud,
-    write_cloud,
-)
+from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
 from torchrg.io.files import check_space
 from torchrg.io.merge import merge_clouds
 from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
@@ -154,8 +148,9 @@ def run(argv: list[str]) -> int:
     with _layout_lock(arguments, outputs):
         code = run_each(_segment, arguments, clouds, outputs, tables, pictures)
     if arguments.pages and arguments.picture is not None:
-        done = [path for path in pictures if path is not None and _page_of(path).is_file()]
-        entries = [Entry(path.stem, path.name, _page_of(path).name) for path in done]
+        pages = [(path, path.with_suffix(".html")) for path in filter(None, pictures)]
+        done = [(path, page) for path, page in pages if page.is_file()]
+        entries = [Entry(path.stem, path.name, page.name) for path, page in done]
         print_lines(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
     return code
 
@@ -181,11 +176,6 @@ def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
     if arguments.picture is None or not arguments.picture.is_dir():
         raise ConfigError("expected --pages together with --picture DIRECTORY.")
     check_gallery(arguments.picture, [path.stem for path in pictures if path is not None])
-
-
-def _page_of(picture: Path) -> Path:
-    """Return the path of the viewer of an image."""
-    return picture.with_suffix(".html")
 
 
 def _reject_images(argv: list[str]) -> None:

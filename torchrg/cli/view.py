@@ -10,12 +10,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import print_lines, warn
-from torchrg.cli.flags import ColumnsFlag, check_columns, file_columns
+from torchrg.cli.ending import print_lines
+from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
 from torchrg.cli.loop import check_sidecar, is_viewer
 from torchrg.config import Up
 from torchrg.errors import ConfigError
-from torchrg.io.result import Result, read_result
+from torchrg.io.result import Result
 from torchrg.render import (
     color_curvature,
     color_normals,
@@ -87,17 +87,9 @@ def run(argv: list[str]) -> int:
     files = (arguments.file, arguments.compare, arguments.ground_truth)
     check_columns(arguments.columns, [path for path in files if path is not None])
     write = _write_page if is_viewer(arguments.out) else _write_picture
-    summary = write(arguments, _read(arguments.file, arguments))
+    summary = write(arguments, read_noted(arguments.file, arguments.columns))
     print_lines(f"{arguments.file} -> {arguments.out} ({summary})")
     return 0
-
-
-def _read(path: Path, arguments: Arguments) -> Result:
-    """Read a cloud or result, and print its notes."""
-    result = read_result(path, columns=file_columns(path, arguments.columns))
-    for note in result.cloud.notes:
-        warn(f"{path}: {note}.")
-    return result
 
 
 def _write_picture(arguments: Arguments, result: Result) -> str:
@@ -108,7 +100,7 @@ def _write_picture(arguments: Arguments, result: Result) -> str:
         )
     halves = [_render(arguments, result)]
     if arguments.compare is not None:
-        halves.append(_render(arguments, _read(arguments.compare, arguments), result))
+        halves.append(_render(arguments, read_noted(arguments.compare, arguments.columns), result))
     height = max(len(half) for half in halves)
     level = [
         functional.pad(half, (0, 0, 0, 0, 0, height - len(half)), value=255) for half in halves
@@ -138,12 +130,14 @@ def _render(arguments: Arguments, result: Result, first: Result | None = None) -
 
 def _write_page(arguments: Arguments, result: Result) -> str:
     """Write a viewer and return its description."""
+    compare, ground_truth = (
+        None if path is None else read_noted(path, arguments.columns)
+        for path in (arguments.compare, arguments.ground_truth)
+    )
     page = make_page(
         result,
-        compare=None if arguments.compare is None else _read(arguments.compare, arguments),
-        ground_truth=None
-        if arguments.ground_truth is None
-        else _read(arguments.ground_truth, arguments).cloud,
+        compare=compare,
+        ground_truth=None if ground_truth is None else ground_truth.cloud,
         color=arguments.color,
         view=arguments.view,
         up=None if arguments.up is None else _direction(arguments.up),

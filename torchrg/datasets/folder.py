@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,9 +15,9 @@ from torch.utils.data import Dataset, Subset
 from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
-from torchrg.errors import ConfigError, FormatError, add_note, warn
+from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_cloud, takes_columns
-from torchrg.io.files import decode_file, local_path
+from torchrg.io.files import decode_file, list_some, local_path
 from torchrg.io.npy import map_array, map_folder
 from torchrg.structures import Cloud
 from torchrg.structures.colors import read_colors
@@ -381,8 +382,8 @@ def find_files(
 def warn_skipped(folder: Path, skipped: Sequence[Path], why: str = _LINKS) -> None:
     """Warn if entries of a folder were skipped, with the reason."""
     if skipped:
-        more = f" and {len(skipped) - 1:,} more" if len(skipped) > 1 else ""
-        warn(f"{folder}: skipped {skipped[0].relative_to(folder)}{more}: {why}.")
+        names = [str(path.relative_to(folder)) for path in skipped]
+        warn(f"{folder}: skipped {list_some(names, max_names=1)}: {why}.")
 
 
 def list_dir(folder: str | os.PathLike[str]) -> list[Path]:
@@ -398,3 +399,19 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     ]
     # The name itself breaks ties of case and leading zeros.
     return (*key, (2, name))
+
+
+def add_note(error: BaseException, note: str) -> None:
+    """Add a line to an error; to its message in Python 3.10, which has no notes.
+
+    Example:
+        >>> import traceback
+        >>> error = ValueError("expected a floor")
+        >>> add_note(error, "This was room 3.")
+        >>> "room 3" in "".join(traceback.format_exception(error))
+        True
+    """
+    if sys.version_info >= (3, 11):
+        error.add_note(note)
+    else:
+        error.args = (f"{error} {note}",)

@@ -82,7 +82,7 @@ class LayoutScan:
     superpoint: NDArray[np.int64]
     plane: NDArray[np.int64]
     inputs: Mapping[str, NDArray[Any]]
-    objects: Sequence[tuple[Mapping[str, Any], NDArray[np.integer]]] | None = None
+    objects: Sequence[tuple[dict[str, Any], NDArray[np.integer]]] | None = None
     coarser: Sequence[NDArray[np.integer]] = ()
 
     @property
@@ -236,13 +236,11 @@ def _scannet(scan: LayoutScan) -> Files:
         # The release numbers segments by vertices. Larger IDs ensure that mixing its files with
         # these yields no objects instead of wrong ones.
         parts = len(scan.coord) + _split(scan.superpoint, [rows for _, rows in scan.objects])
+        groups = [entry | {"segments": np.unique(parts[r]).tolist()} for entry, r in scan.objects]
         content = {
             "sceneId": f"scannet.{scan.name}",
             "appId": "torchrg",
-            "segGroups": [
-                {**entry, "segments": np.unique(parts[rows]).tolist()}
-                for entry, rows in scan.objects
-            ],
+            "segGroups": groups,
             "segmentsFile": f"scannet.{scan.name}_vh_clean_2.0.010000.segs.json",
         }
         files[f"{scan.folder}/{scan.name}.aggregation.json"] = _json(content)
@@ -294,14 +292,13 @@ def _mmdet3d(scan: LayoutScan) -> Files:
     # MMDetection3D counts objects from one.
     category, instance = scan.category, scan.ground_truth[1] + 1
     matrix = scan.inputs.get("axis_align_matrix", np.eye(4))
+    aligned = scan.coord @ matrix[:3, :3].T + matrix[:3, 3]
     files |= {
         f"{prefix}_sem_label.npy": category,
         f"{prefix}_ins_label.npy": instance,
         f"{prefix}_axis_align_matrix.npy": matrix,
         f"{prefix}_unaligned_bbox.npy": _boxes(scan.coord, category, instance),
-        f"{prefix}_aligned_bbox.npy": _boxes(
-            scan.coord @ matrix[:3, :3].T + matrix[:3, 3], category, instance
-        ),
+        f"{prefix}_aligned_bbox.npy": _boxes(aligned, category, instance),
         f"semantic_mask/{scan.name}.bin": category.tobytes(),
         f"instance_mask/{scan.name}.bin": instance.tobytes(),
     }

@@ -28,10 +28,7 @@ ListEntries = Mapping[str, Sequence[ListEntry]]
 def check_lists(layout: str, dataset: str, out: Path) -> None:
     """Raise FormatError if :func:`write_lists` would overwrite lists of other origin.
 
-    Args:
-        layout: A key of :data:`torchrg.datasets.layouts.LAYOUTS`, or ``"pointcept"``.
-        dataset: A key of its row.
-        out: The output directory; it may not exist.
+    The output directory may not exist.
     """
     folders, contents = _DATABASES.get((layout, dataset), _NO_LISTS)
     if any((out / folder).is_dir() for folder in folders):
@@ -77,9 +74,8 @@ def _write_names(out: Path, folders: Sequence[str], without: Collection[Path]) -
 
     Names whose entry belongs to another split are removed from a list.
     """
-    listed_in = {
-        folder: [e["name"] for e in _read_entries(out, folder, without)] for folder in folders
-    }
+    entries = {folder: _read_entries(out, folder, without) for folder in folders}
+    listed_in = {folder: [entry["name"] for entry in found] for folder, found in entries.items()}
     removed = {path.stem for path in _entry_files(out, folders, without)}
     for folder, scans in listed_in.items() if any(listed_in.values()) or removed else ():
         path = out / f"{folder}.txt"

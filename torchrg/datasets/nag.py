@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg._optional import require
 from torchrg.errors import MissingDependencyError, ShapeError
 from torchrg.structures import Superpoints
-from torchrg.structures.points import Array
+from torchrg.structures.points import Array, Points
 
 
 class Cluster(NamedTuple):
@@ -30,7 +29,7 @@ class Cluster(NamedTuple):
 
 
 def make_nag(
-    points: Tensor | NDArray[np.floating],
+    points: Points,
     superpoints: Superpoints,
     *,
     data: Callable[..., Any] | None = None,

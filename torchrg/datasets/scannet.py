@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import read_cloud
-from torchrg.io.files import PARSE_ERRORS, decode_file, local_path, wrap_errors
+from torchrg.io.files import PARSE_ERRORS, decode_file, list_some, local_path, wrap_errors
 from torchrg.io.plane_table import Arrays
 from torchrg.linalg.rigid import check_rigid
 from torchrg.structures import UNLABELED, Cloud
@@ -412,8 +412,7 @@ def _groups(
 def _warn_entries(path: Path, what: str, entries: Sequence[object]) -> None:
     """Warn of inconsistent entries of a file, if any, and name the first."""
     if entries:
-        more = f" and {len(entries) - 1:,} more" if len(entries) > 1 else ""
-        warn(f"{path}: {what}: {shortened(entries[0])}{more}.")
+        warn(f"{path}: {what}: {list_some([*map(shortened, entries)], max_names=1)}.")
 
 
 def _read_list(path: Path, key: str) -> list[Any]:

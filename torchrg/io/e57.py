@@ -328,9 +328,8 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
     if count:
         buffers = libe57.VectorSourceDestBuffer()
         for name, column in block.items():
-            buffers.append(
-                libe57.SourceDestBuffer(file.image_file, name, column, count, True, True)
-            )
+            buffer = libe57.SourceDestBuffer(file.image_file, name, column, count, True, True)
+            buffers.append(buffer)
         reader = header.points.reader(buffers)
         num_read = reader.read()
         if num_read < count:

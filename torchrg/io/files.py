@@ -14,12 +14,13 @@ import tokenize
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from torchrg.errors import FormatError, system_limit
+from torchrg._limits import system_limit
+from torchrg.errors import FormatError
 from torchrg.structures.points import FilePath
 
 PARSE_ERRORS = (
@@ -384,6 +385,17 @@ def wrap_errors(message: str, *errors: type[BaseException], repair: str = "") ->
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message without a full stop, or its class name."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def list_some(names: Sequence[str], max_names: int) -> str:
+    """List names for a message of one line, at most ``max_names``.
+
+    Example:
+        >>> list_some(["a", "b", "c"], 2)
+        'a, b and 1 more'
+    """
+    more = f" and {len(names) - max_names:,} more" if len(names) > max_names else ""
+    return f"{', '.join(names[:max_names])}{more}"
 
 
 def normalize_file_name(name: str) -> str:

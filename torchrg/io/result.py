@@ -119,12 +119,8 @@ class Result:
                 f"Result: expected a segmentation of {len(cloud):,} points, got "
                 f"{segmentation.labels.numel():,}; pass the points that were segmented."
             )
-        results = {
-            name: getattr(segmentation, name)
-            .numpy(force=True)
-            .reshape(len(cloud), *_KINDS[name][1])
-            for name in POINT_RESULTS
-        }
+        arrays = ((name, getattr(segmentation, name).numpy(force=True)) for name in POINT_RESULTS)
+        results = {name: array.reshape(len(cloud), *_KINDS[name][1]) for name, array in arrays}
         if superpoints is not None:
             results |= superpoints.by_level()
         labeled = replace(cloud, fields=add_result_fields(cloud.fields, results))
@@ -214,9 +210,8 @@ class Result:
         if table is None:
             has_normals = "normals" in self.fields
             knn = neighbors if has_normals and len(sampled) == len(rows) else None
-            table = summarize_planes(
-                *(values[rows] for values in whole), neighbors=knn, canonical=True
-            )
+            parts = (values[rows] for values in whole)
+            table = summarize_planes(*parts, neighbors=knn, canonical=True)
             count = torch.bincount(self.labels + 1, minlength=1)[1:]
             table = replace(table, count=count, curved=table.curved & has_normals)
         if neighbors is None or not len(present) or table.adjacency is not None:

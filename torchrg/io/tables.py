@@ -101,7 +101,9 @@ def guess_column_names(table: Table, *, color_last: bool = False) -> list[str]:
     first = {i: _guess_triple(three[:_GUESSED_ROWS]) for i, three in threes.items()}
     triples = {i: triple for i, triple in first.items() if triple}
     if _COLOR not in triples.values():
-        triples |= {i: _COLOR for i, three in threes.items() if _is_wide_color(three)}
+        # A 16-bit color has every channel above the 8-bit maximum.
+        wide = {i: three for i, three in threes.items() if three.max(axis=0).min() > BYTE}
+        triples |= {i: _COLOR for i, three in wide.items() if _is_color(three, WORD)}
     varied = [i for i in triples if (threes[i] != threes[i][:1]).any(axis=0).all()]
     for start in varied or triples:
         is_alone = all(abs(other - start) >= 3 or other == start for other in varied or triples)
@@ -117,11 +119,6 @@ def _guess_triple(three: Table) -> tuple[str, str, str] | None:
     if _are_units(three):
         return _NORMAL
     return _COLOR if _is_color(three, BYTE) else None
-
-
-def _is_wide_color(three: Table) -> bool:
-    """Whether three columns can be a 16-bit color with every channel above the 8-bit maximum."""
-    return bool(three.max(axis=0).min() > BYTE) and _is_color(three, WORD)
 
 
 def _is_color(three: Table, white: int) -> bool:

@@ -13,15 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._checks import Arguments
+from torchrg._limits import OUT_OF_MEMORY, system_limit
 from torchrg.config import NormalsConfig, PipelineConfig, SuperpointsConfig
-from torchrg.errors import (
-    OUT_OF_MEMORY,
-    CloudWarning,
-    ConfigError,
-    FormatError,
-    PrecisionWarning,
-    system_limit,
-)
+from torchrg.errors import CloudWarning, ConfigError, FormatError, PrecisionWarning
 from torchrg.normals.orient import Orientation
 from torchrg.pipeline.planes import segment_planes
 from torchrg.pipeline.superpoints import make_superpoints

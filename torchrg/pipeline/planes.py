@@ -153,7 +153,7 @@ def segment_planes(
             on_stage(stage)
 
     objects = None if objects is None else objects.long().to(points.device)
-    side = _Side(orient, directions)
+    side = orient, directions
     if settings.min_area > 0 or settings.kinds is not None or settings.sort != "points":
         seg = _segment(points, settings.without_selection(), side, voxel, objects, begin)
         seg = keep_planes(seg, selected_rows(seg.planes, settings))
@@ -162,22 +162,18 @@ def segment_planes(
     return seg if keep_neighbors else replace(seg, neighbors=None)
 
 
-class _Side(NamedTuple):
-    """Normal orientation, and the front directions ``(N, 3)`` if known."""
-
-    orient: Orientation
-    front: Tensor | None
-
-
 def _segment(
     points: Tensor,
     config: PipelineConfig,
-    side: _Side,
+    side: tuple[Orientation, Tensor | None],
     voxel: float | None,
     objects: Tensor | None,
     begin: Callable[[str], None],
 ) -> Segmentation:
-    """Run the stages of :func:`segment_planes`."""
+    """Run the stages of :func:`segment_planes`.
+
+    ``side`` is the orientation of the normals, with the front directions ``(N, 3)`` if known.
+    """
     begin("neighbors")
     distinct = distinct_points(points)
     sites = _find_sites(distinct, voxel)
@@ -209,7 +205,13 @@ def _segment(
     labels, point_labels = numbers[labels], numbers[point_labels]
 
     begin("planes")
-    describe = _describer(config)
+    growing = config.growing
+    describe = partial(
+        summarize_planes,
+        up=config.planes.up,
+        outline=config.planes.outline,
+        facet_tolerance=growing.facet_tolerance if growing.faceted is True else None,
+    )
     site_planes = describe(
         sites.points[parts.rows], normals, labels, neighbors=parts.surrounding, canonical=True
     )
@@ -231,7 +233,7 @@ def _segment(
         turned = turn_faces(sites.points, fit.normals, orient, neighbors, site_labels, axes)
         return expand_to_points(turned, sites.inverse)
 
-    normals = choose_side(points, found.normals, side.orient, side.front, turn)
+    normals = choose_side(points, found.normals, *side, turn)
     begin("done")
     return Segmentation(
         point_labels,
@@ -266,7 +268,16 @@ def _find_sites(distinct: DistinctPoints, voxel: float | None) -> _Sites:
     voxels = sample_voxels(distinct.points, voxel)
     order = canonical_order(distinct.points[voxels.rows])
     site = distinct.restore(order.argsort()[voxels.inverse], fill=UNLABELED)
-    _check_voxels(len(order), len(distinct.points), voxel)
+    num_voxels, num_points, result = len(order), len(distinct.points), ""
+    if num_voxels < _MIN_SITES <= num_points:
+        result = f"leaves {num_voxels:,} of {num_points:,} points"
+    elif num_voxels == num_points > 0:
+        result = f"leaves all {num_points:,} points"
+    if result:
+        warn(
+            f"segment_planes: voxel {voxel:g} {result}; check that it is in units of the cloud.",
+            CloudWarning,
+        )
     return _Sites(distinct.points[voxels.rows[order]], site)
 
 
@@ -306,17 +317,6 @@ def _split_by_object(
     return _Parts(rows, inverse, restricted, neighbors)
 
 
-def _describer(config: PipelineConfig) -> Callable[..., Planes]:
-    """Return :func:`torchrg.regions.summarize_planes` with its settings."""
-    growing = config.growing
-    return partial(
-        summarize_planes,
-        up=config.planes.up,
-        outline=config.planes.outline,
-        facet_tolerance=growing.facet_tolerance if growing.faceted is True else None,
-    )
-
-
 def _complete(
     planes: Planes, points: Tensor, labels: Tensor, objects: Tensor | None, config: PipelineConfig
 ) -> Planes:
@@ -341,20 +341,6 @@ def _warn_about_size(num_points: int, k: int) -> None:
             "voxel size.",
             CloudWarning,
         )
-
-
-def _check_voxels(num_voxels: int, num_points: int, voxel: float) -> None:
-    """Warn if a voxel size is probably in another unit than the cloud."""
-    if num_voxels < _MIN_SITES <= num_points:
-        result = f"leaves {num_voxels:,} of {num_points:,} points"
-    elif num_voxels == num_points > 0:
-        result = f"leaves all {num_points:,} points"
-    else:
-        return
-    warn(
-        f"segment_planes: voxel {voxel:g} {result}; check that it is in units of the cloud.",
-        CloudWarning,
-    )
 
 
 def _number_parts(inverse: Tensor, objects: Tensor, num_sites: int) -> tuple[Rows, Tensor, Tensor]:

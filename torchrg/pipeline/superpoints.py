@@ -92,21 +92,16 @@ def make_superpoints(
     settings = settings_of("make_superpoints", SuperpointsConfig, config, changes)
     if voxel is None:
         is_searched = seg.points is not None and seg.points.data_ptr() == tensor.data_ptr()
-        neighbors = seg.neighbors if is_searched else None
-        return partition_points(
-            tensor, seg.normals, seg.labels, settings, shades, neighbors=neighbors
-        )
+        near = seg.neighbors if is_searched else None
+        return partition_points(tensor, seg.normals, seg.labels, settings, shades, neighbors=near)
     distinct, shades = merge_duplicates(tensor, seg.normals, seg.labels, shades)
     rows, inverse = sample_voxels(distinct.points, voxel)
     shades = None if shades is None else shades[rows]
     rows, inverse = distinct.rows[rows], distinct.restore(inverse, fill=UNLABELED)
-    partition = partition_points(
-        tensor[rows], seg.normals[rows], seg.labels[rows], settings, shades
-    )
-    labels, *levels = (
-        expand_to_points(level, inverse, fill=UNLABELED)
-        for level in (partition.labels, *partition.levels)
-    )
+    normals, plane = seg.normals[rows], seg.labels[rows]
+    partition = partition_points(tensor[rows], normals, plane, settings, shades)
+    of_sample = (partition.labels, *partition.levels)
+    labels, *levels = (expand_to_points(each, inverse, fill=UNLABELED) for each in of_sample)
     return Superpoints(labels, partition.plane, tuple(levels))
 
 

@@ -50,12 +50,8 @@ def make_camera(
 def view_axes(toward: Tensor, up: Tensor) -> Tensor:
     """Return the right, down and forward axes of a camera.
 
-    Args:
-        toward: Direction from the scene to the camera, shape ``(3,)``.
-        up: Up direction of the image, not parallel to ``toward``, shape ``(3,)``.
-
-    Returns:
-        Unit vectors as rows, shape ``(3, 3)``, float64.
+    They are unit vectors as rows, ``(3, 3)``, float64. ``toward`` ``(3,)`` is the direction from
+    the scene to the camera, and ``up`` ``(3,)`` that of the image, not parallel to it.
     """
     forward = -torch.nn.functional.normalize(toward.double(), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.double()), dim=0)
@@ -83,9 +79,6 @@ def fit_camera(
         height: Height of the image. Default: fitted to the points, from a quarter of the width to
             the width.
         field_of_view_deg: Field of view over the larger of width and height, in degrees.
-
-    Returns:
-        The camera. If all points coincide, it is at a distance of 1.
     """
     across = points.double() @ axes.to(points.device).T
     nearest, farthest = _bounds(across[:, 2])
@@ -100,7 +93,7 @@ def fit_camera(
         low, _ = _bounds(across[:, axis] + tangent * forward)
         midpoint[axis] = (low + high) / 2
         distance = max(distance, (high - low) / (2 * tangent))
-    if bool((across == across[:1]).all()):
+    if bool((across == across[:1]).all()):  # Any distance shows a single point.
         distance = 1.0
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = axes
@@ -113,24 +106,13 @@ def fit_camera(
 def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "PinholeCamera":
     """Return a camera at the origin that looks along z, with x to the right and y down.
 
-    Args:
-        points: Points to show, shape ``(N, 3)``, finite; points behind the camera are ignored.
-        width: Width of the image, in pixels.
-        height: Height of the image. Default: fitted to the points, from a quarter of the width to
-            the width.
-
-    Returns:
-        The camera.
+    The arguments are those of :func:`fit_camera`; points behind the camera are ignored.
     """
     ahead = points[points[:, 2] > 0].double()
     rays = ahead[:, :2] / ahead[:, 2:]
     (left, right), (top, bottom) = _bounds(rays[:, 0]), _bounds(rays[:, 1])
-    available = (1 - 2 * _MARGIN_FRACTION) * width, (1 - 2 * _MARGIN_FRACTION) * (height or width)
-    scales = [
-        size / span
-        for size, span in zip(available, (right - left, bottom - top), strict=True)
-        if span > 0
-    ]
+    spans = (width, right - left), (height or width, bottom - top)
+    scales = ((1 - 2 * _MARGIN_FRACTION) * size / span for size, span in spans if span > 0)
     return _frame(torch.eye(4), min(scales, default=float(width)), rays, width, height)
 
 
@@ -177,14 +159,8 @@ class Projection(NamedTuple):
 def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Projection:
     """Return the projection of a camera, supersampled ``finer`` times per axis.
 
-    Args:
-        camera: A batch of one.
-        origin: Origin of the points, shape ``(3,)``; applied in float64, so that clouds far from
-            zero keep their precision.
-        finer: Subpixels per pixel and axis.
-
-    Returns:
-        The projection, float32.
+    The origin of the points, shape ``(3,)``, is applied in float64, so that clouds far from zero
+    keep their precision. The projection is float32.
     """
     intrinsics = camera.intrinsics[0, :3, :3].double().clone()
     intrinsics[:2] *= finer

@@ -14,6 +14,7 @@ from torchrg.metrics.contingency import check_labels, contingency_table
 from torchrg.metrics.labels import match_regions
 from torchrg.render.colors import UNLABELED_GRAY, color_curvature, color_normals, color_sharp
 from torchrg.structures import UNLABELED
+from torchrg.structures.points import Labels
 
 COLOR_MODES = {
     "plane": ("planes", "labels"),
@@ -130,9 +131,7 @@ def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> 
     """Return the colors of fractions of a scale, with a legend for selected values."""
     steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
     colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
-    legend = [
-        (colors[round(_LEVELS * fraction)].tolist(), text) for fraction, text in shown.items()
-    ]
+    legend = [(colors[round(_LEVELS * part)].tolist(), text) for part, text in shown.items()]
     values = (fractions.clamp(0, 1).nan_to_num() * _LEVELS).round().numpy().astype(np.uint8)
     return Channel(mode, values, colors, legend)
 
@@ -150,9 +149,7 @@ def _angle_channel(angles_deg: Tensor) -> Channel:
     return _scale_channel("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
 
 
-def point_outcomes(
-    labels: Tensor | NDArray[np.integer], ground_truth: Tensor | NDArray[np.integer]
-) -> Tensor:
+def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
     """Return the outcome of each point as an index of :data:`OUTCOMES`.
 
     Args:

@@ -1,8 +1,6 @@
 """Perceptually distinct colors for planes, normals, curvature and sharp points."""
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
@@ -13,6 +11,8 @@ from torchrg.metrics.labels import match_regions
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.voxels import sample_voxels
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
+from torchrg.regions.directions import horizontal_toward, unit_axis
+from torchrg.structures.points import Array, Labels, Points, Values
 
 
 def rgb_to_lab(colors: Tensor) -> Tensor:
@@ -146,9 +146,7 @@ _REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
 """Red, green and blue of regular points (light gray) and of sharp ones (red)."""
 
 
-def color_normals(
-    normals: Tensor | NDArray[np.floating], *, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-) -> Tensor:
+def color_normals(normals: Points, *, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Tensor:
     """Color normals by direction; opposite normals get the same color.
 
     Horizontal surfaces are light gray. Vertical surfaces are colored by the direction they face,
@@ -173,9 +171,7 @@ def color_normals(
     check_shapes("color_normals", normals=(tensor, "* 3"))
     check_floating("color_normals", normals=tensor)
     axis = unit_direction("color_normals", up).to(tensor)
-    east = torch.zeros_like(axis)
-    east[axis.abs().argmin()] = 1
-    east = torch.nn.functional.normalize(east - (east @ axis) * axis, dim=0)
+    east = horizontal_toward(unit_axis(axis), axis)
     x, y, z = (tensor @ side for side in (east, torch.linalg.cross(axis, east), axis))
     lightness = _UPRIGHT_LIGHTNESS + (_HORIZONTAL_LIGHTNESS - _UPRIGHT_LIGHTNESS) * z * z
     lab = torch.stack([lightness, _CHROMA * (x * x - y * y), 2 * _CHROMA * x * y], dim=-1)
@@ -184,9 +180,7 @@ def color_normals(
     return torch.where(missing, gray, _to_bytes(_lab_to_rgb(lab)))
 
 
-def color_curvature(
-    curvature: Tensor | NDArray[np.floating], *, max_curvature: float = 0.1
-) -> Tensor:
+def color_curvature(curvature: Values, *, max_curvature: float = 0.1) -> Tensor:
     """Color curvature from light gray through yellow and red to dark violet.
 
     The scale is proportional to the square root of the curvature, and the same for every cloud.
@@ -219,7 +213,7 @@ def color_curvature(
     return _to_bytes(_lab_to_rgb(lab))
 
 
-def color_sharp(sharp: Tensor | NDArray[np.generic]) -> Tensor:
+def color_sharp(sharp: Tensor | Array) -> Tensor:
     """Color sharp feature points red and all others light gray.
 
     Args:
@@ -248,10 +242,10 @@ _NEIGHBORHOODS = ((256, 1.0), (48, 0.2))
 
 
 def color_planes(
-    labels: Tensor | NDArray[np.generic],
-    points: Tensor | NDArray[np.floating] | None = None,
+    labels: Labels,
+    points: Points | None = None,
     *,
-    reference: Tensor | NDArray[np.generic] | None = None,
+    reference: Labels | None = None,
 ) -> Tensor:
     """Color the points of each plane.
 

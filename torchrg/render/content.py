@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from torchrg.io.plane_table import Json, describe_planes
 from torchrg.io.result import Result
@@ -16,11 +15,13 @@ from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors.order import finite_rows
 from torchrg.regions.classes import classify_planes
+from torchrg.regions.directions import horizontal_toward, unit_axis
 from torchrg.regions.table import summarize_planes
 from torchrg.render.channels import COLOR_MODES
 from torchrg.render.cutaway import Sides, find_sides
 from torchrg.render.surface import VisibleSurface, sample_surface
 from torchrg.structures import PLANE_KINDS, Cloud, Planes
+from torchrg.structures.points import bounding_box
 
 NUM_STRATA = 8
 """Number of random strata of the points, each sorted along a Morton curve. While the camera moves,
@@ -82,16 +83,12 @@ def make_frame(cloud: Cloud, up: tuple[float, float, float]) -> PageFrame:
     """Return the axes of a viewer for its first cloud."""
     third = unit_direction("make_page", up)
     # With z up, x stays x; otherwise use the axis most perpendicular to the up direction.
-    start = torch.zeros(3, dtype=torch.float64)
-    start[int(third.abs().argmin())] = 1
-    first = functional.normalize(start - (start @ third) * third, dim=0)
+    first = horizontal_toward(unit_axis(third), third)
     rotation = torch.stack([first, torch.linalg.cross(third, first), third])
     finite = cloud.coordinates[cloud.finite]
     if len(finite) == 0:
         return PageFrame(torch.zeros(3, dtype=torch.float64), rotation, 1.0)
-    low, high = (
-        torch.from_numpy(end(axis=0).astype(np.float64)) for end in (finite.min, finite.max)
-    )
+    low, high = map(torch.from_numpy, bounding_box(finite))
     extent = float((high - low).amax())
     return PageFrame(low + (high - low) / 2, rotation, extent / PAGE_EXTENT if extent > 0 else 1.0)
 

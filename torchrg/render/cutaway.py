@@ -195,9 +195,8 @@ def choose_viewpoint(
             surface.centers @ side
             for side in (sides.heading, torch.linalg.cross(up, sides.heading))
         )
-        azimuths = (
-            (-90.0,) if along.amax() - along.amin() > across.amax() - across.amin() else (0.0,)
-        )
+        is_long = along.amax() - along.amin() > across.amax() - across.amin()
+        azimuths = (-90.0,) if is_long else (0.0,)
     viewpoints = []
     for azimuth in azimuths:
         toward = _turned(sides.heading, up, azimuth, elevation_deg)

@@ -9,7 +9,7 @@ from torchrg.errors import FormatError
 from torchrg.io.files import atomic_path, check_writable
 from torchrg.io.result import PAGE_SUFFIXES, Result
 from torchrg.render.colors import color_planes
-from torchrg.render.page import check_library, load_template, make_page, write_page
+from torchrg.render.page import load_template, make_page, read_library, write_page
 from torchrg.render.pictures import render_cloud, write_png
 
 INDEX = "index.html"
@@ -52,7 +52,7 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
         FormatError: If a file cannot be written, or a scan has the name of the index.
         MissingDependencyError: If viewers cannot be created.
     """
-    check_library()
+    read_library()
     check_writable(folder / INDEX)
     for name in names:
         page = folder / f"{name}.html"
@@ -65,12 +65,7 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
 
 
 def write_entry(folder: Path, name: str, result: Result) -> None:
-    """Write the image and viewer of a result.
-
-    Raises:
-        FormatError: If a file cannot be written.
-        MissingDependencyError: If viewers cannot be created.
-    """
+    """Write the image and viewer of a result; raises like :func:`check_gallery`."""
     picture, page = (folder / f"{name}{suffix}" for suffix in PAGE_SUFFIXES)
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_planes(picture, result)
@@ -78,12 +73,7 @@ def write_entry(folder: Path, name: str, result: Result) -> None:
 
 
 def write_index(folder: Path, title: str, entries: Sequence[Entry]) -> Path:
-    """Write the index of the entries of a folder, and return its path.
-
-    Raises:
-        FormatError: If it cannot be written.
-        MissingDependencyError: If viewers cannot be created.
-    """
+    """Write the index of the entries of a folder, and return its path."""
     text = load_template("gallery.html.jinja").render(title=title, entries=entries)
     with atomic_path(folder / INDEX) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")

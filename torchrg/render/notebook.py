@@ -18,16 +18,12 @@ MAX_ROWS = 12
 
 
 def show(segmentation: Segmentation, **settings: Any) -> Page:  # noqa: ANN401
-    """Return the viewer of a segmentation; ``settings`` are passed to :func:`make_page`.
-
-    Raises:
-        ConfigError: If the segmentation has no points.
-    """
+    """Return the viewer of a segmentation; ``settings`` are passed to :func:`make_page`."""
     return make_page(_result_of(segmentation), **settings)
 
 
 def _result_of(segmentation: Segmentation) -> Result:
-    """Return the result of a segmentation with its points."""
+    """Return the result of a segmentation; raise if it has no points."""
     if segmentation.points is None:
         raise ConfigError(
             "Segmentation: expected points to display, got None; use "

@@ -124,7 +124,7 @@ def make_page(
     """
     cloud = result.cloud
     up = _check_settings(cloud, ground_truth, up, view, max_points)
-    library = _read_library()
+    library = read_library()
     frame = make_frame(cloud, up)
     true_fields = {} if ground_truth is None else Result(ground_truth).fields
     shown = choose_points(result, frame, max_points)
@@ -133,15 +133,12 @@ def make_page(
         same = np.array_equal(cloud.coordinates, compare.cloud.coordinates, equal_nan=True)
         reference = result.labels if same and "labels" in result.fields else None
         others = choose_points(compare, frame, max_points)
-        described += [
-            _describe_cloud(compare, others, true_fields if same else {}, reference, frame)
-        ]
+        true_fields = true_fields if same else {}
+        described.append(_describe_cloud(compare, others, true_fields, reference, frame))
     scenes, blobs = [scene for scene, _ in described], [blob for _, blob in described]
     modes = [mode for mode in COLOR_MODES if any(mode in scene["channels"] for scene in scenes)]
     if color is not None and color not in modes:
-        required = (
-            COLOR_MODES[color][1] if color in COLOR_MODES else f"one of {', '.join(COLOR_MODES)}"
-        )
+        required = COLOR_MODES.get(color, ("", f"one of {', '.join(COLOR_MODES)}"))[1]
         hint = " and ground truth" if color.endswith("error") else ""
         raise ConfigError(
             f"{cloud.source or 'make_page'}: expected {required}{hint} for color={color!r}, "
@@ -205,13 +202,12 @@ def write_page(path: str | os.PathLike[str], page: Page) -> None:
         temporary.write_text(page.html, encoding="utf-8", errors="backslashreplace")
 
 
-def check_library() -> None:
-    """Raise MissingDependencyError if viewers cannot be created; call before long computations."""
-    _read_library()
+def read_library() -> str:
+    """Read the JavaScript of deck.gl; call before long computations that end in a viewer.
 
-
-def _read_library() -> str:
-    """Read the JavaScript of deck.gl."""
+    Raises:
+        MissingDependencyError: If viewers cannot be created.
+    """
     module = require("pydeck", extra="view", purpose="create viewers")
     source = Path(str(module.__file__)).parent / _LIBRARY
     if not source.is_file():
@@ -231,11 +227,8 @@ def _describe_cloud(
 ) -> tuple[dict[str, Any], str]:
     """Return the entry of a result in the description, and the packed arrays of its points."""
     cloud = result.cloud
-    true_fields = {
-        name: ground_truth[name][shown.rows]
-        for name in ("labels", "normals")
-        if name in ground_truth
-    }
+    names = ground_truth.keys() & {"labels", "normals"}
+    true_fields = {name: ground_truth[name][shown.rows] for name in names}
     if "normals" in true_fields:
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     palettes = _palettes(result, shown, reference)
@@ -244,9 +237,8 @@ def _describe_cloud(
     covered = scatter_rows(shown.sides.of_points, shown.surface.rows, len(shown.rows))
     if planes:
         labels = shown.fields["labels"]
-        sides = covered.new_zeros(len(planes)).index_put_(
-            (labels[labels >= 0],), covered[labels >= 0]
-        )
+        sides = covered.new_zeros(len(planes))
+        sides[labels[labels >= 0]] = covered[labels >= 0]
         for plane, side in zip(planes, sides.tolist(), strict=True):
             plane["sides"] = side
     low = shown.points.amin(dim=0) if len(shown.points) else torch.zeros(3)
@@ -369,11 +361,7 @@ def _fill_template(description: Mapping[str, object], blobs: Iterable[str], libr
 
 
 def load_template(name: str) -> "Template":
-    """Load a template of this folder, with autoescaping.
-
-    Raises:
-        MissingDependencyError: If jinja2 is not installed.
-    """
+    """Load a template of this folder, with autoescaping."""
     jinja2 = require("jinja2", extra="view", purpose="create viewers")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined

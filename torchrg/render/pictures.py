@@ -26,6 +26,7 @@ from torchrg.render.raster import (
     shade_hollows,
 )
 from torchrg.render.surface import VisibleSurface, sample_surface
+from torchrg.structures.points import Labels, Points
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -67,17 +68,8 @@ def draw_picture(
 ) -> Tensor:
     """Draw points as discs, close gaps, shade, and average subpixels.
 
-    Args:
-        camera: A batch of one, with the size of the image.
-        surface: Surface of at least one finite point.
-        is_shown: Mask of its n points to draw, shape ``(n,)``, bool.
-        colors: Colors of all points, shape ``(N, 3)``, uint8.
-        normals: Normals of all points, shape ``(N, 3)``. Default: voxel normals.
-        labels: Plane of each of the n points, shape ``(n,)``, or negative.
-        supersampling: Subpixels per pixel and axis.
-
-    Returns:
-        Shape ``(H, W, 3)``, uint8.
+    ``is_shown`` ``(n,)`` is the mask of the points of the surface to draw, and ``labels`` ``(n,)``
+    their planes; colors and normals are those of all points. See :func:`render_cloud`.
     """
     width, height = int(camera.width), int(camera.height)
     if width * height * supersampling**2 > _MAX_SUBPIXELS:
@@ -126,9 +118,8 @@ def _median_radius(
     sample, depth = sample[depth > 0], depth[depth > 0]
     if len(sample) == 0:
         return 1.0, 0.0
-    return float((lengths[sample] / depth).median()) * project.focal, float(
-        lengths[sample].median()
-    )
+    lengths = lengths[sample]
+    return float((lengths / depth).median()) * project.focal, float(lengths.median())
 
 
 def _discs(
@@ -152,9 +143,8 @@ def _discs(
     normals = normals @ project.local_to_camera[0, :3, :3].T
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
-    along = torch.where(
-        along.abs() < _MIN_COSINE, torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE), along
-    )
+    min_cosine = torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE)
+    along = torch.where(along.abs() < _MIN_COSINE, min_cosine, along)
     return Discs(
         pixels,
         inverse,
@@ -173,11 +163,11 @@ def _reduce(image: Tensor, size: int, combine: Callable[[Tensor, Tensor], Tensor
 
 
 def render_cloud(
-    points: Tensor | NDArray[np.floating],
+    points: Points,
     colors: Tensor | NDArray[np.uint8],
     *,
-    normals: Tensor | NDArray[np.floating] | None = None,
-    labels: Tensor | NDArray[np.integer] | None = None,
+    normals: Points | None = None,
+    labels: Labels | None = None,
     view: View = "cutaway",
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     azimuth_deg: float | None = None,
@@ -262,11 +252,11 @@ def render_cloud(
 
 
 def render_points(
-    points: Tensor | NDArray[np.floating],
+    points: Points,
     colors: Tensor | NDArray[np.uint8],
     camera: "PinholeCamera",
     *,
-    normals: Tensor | NDArray[np.floating] | None = None,
+    normals: Points | None = None,
     supersampling: int = 2,
 ) -> Tensor:
     """Render a cloud from a given camera; see :func:`render_cloud`.
@@ -357,9 +347,9 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic])
 
 def _check_cloud(
     caller: str,
-    points: Tensor | NDArray[np.floating],
+    points: Points,
     colors: Tensor | NDArray[np.uint8],
-    normals: Tensor | NDArray[np.floating] | None,
+    normals: Points | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return the arguments as tensors, after checking shapes and dtypes."""
     cloud, paint = as_tensor(caller, "points", points), as_tensor(caller, "colors", colors)

@@ -23,12 +23,9 @@ def room_walls(room: Frame, size: Triple) -> list[Frame]:
         [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]]
     """
     length, width, _ = size
-    starts = ((length, 0), (length, width), (0, width), (0, 0))
-    along = ((-1, 0), (0, -1), (1, 0), (0, 1))
-    return [
-        room.placed((*start, 0), (*axis, 0), (0, 0, 1))
-        for start, axis in zip(starts, along, strict=True)
-    ]
+    starts = ((length, 0, 0), (length, width, 0), (0, width, 0), (0, 0, 0))
+    along = ((-1, 0, 0), (0, -1, 0), (1, 0, 0), (0, 1, 0))
+    return [room.placed(*axes, (0, 0, 1)) for axes in zip(starts, along, strict=True)]
 
 
 def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:

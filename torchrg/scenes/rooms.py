@@ -177,15 +177,18 @@ def furnish(
     parts = [_shell(layout, room, holes, with_floor)]
     is_flat = [surface.plane is not None for surface in parts[0].surfaces[-len(walls) :]]
     wall_slots = [
-        (wall, along)
-        for wall, along in _wall_cells(layout.size)
-        if is_flat[wall] and _is_away(walls[wall].moved(along), middles, _DOORWAY_AISLE)
+        (wall, _CORNER + along)
+        for wall, length in enumerate((*layout.size[:2], *layout.size[:2]))
+        for along in _cell_centers(length - 2 * _CORNER, _WALL_CELL)
+        if is_flat[wall] and _is_away(walls[wall].moved(_CORNER + along), middles, _DOORWAY_AISLE)
     ]
     wall_slots = [wall_slots[row] for row in rng.permutation(len(wall_slots))]
+    sides = zip(layout.size[:2], _FLOOR_CELL, strict=True)
+    xs, ys = (_cell_centers(length - 2 * _AISLE, cell) for length, cell in sides)
     floor_slots = [
-        (x, y)
-        for x, y in _floor_cells(layout.size)
-        if _is_away(room.moved(x, y), middles, _DOORWAY_SPACE)
+        (_AISLE + x, _AISLE + y)
+        for x, y in product(xs, ys)
+        if _is_away(room.moved(_AISLE + x, _AISLE + y), middles, _DOORWAY_SPACE)
     ]
     floor_slots = [floor_slots[row] for row in rng.permutation(len(floor_slots))]
 
@@ -278,24 +281,6 @@ def _take(cells: list[T], where: str) -> T:
     return cells.pop()
 
 
-def _wall_cells(size: Triple) -> list[tuple[int, float]]:
-    """Return the cells on the four walls: wall, and distance from its start."""
-    return [
-        (wall, _CORNER + middle)
-        for wall, length in enumerate((size[0], size[1]) * 2)
-        for middle in _cell_centers(length - 2 * _CORNER, _WALL_CELL)
-    ]
-
-
-def _floor_cells(size: Triple) -> list[tuple[float, float]]:
-    """Return the cells on the floor, away from the walls."""
-    xs, ys = (
-        [_AISLE + middle for middle in _cell_centers(length - 2 * _AISLE, cell)]
-        for length, cell in zip(size[:2], _FLOOR_CELL, strict=True)
-    )
-    return list(product(xs, ys))
-
-
 def _cell_centers(length: float, cell: float) -> list[float]:
     """Split a length into equal cells of at least ``cell`` and return their centers."""
     count = max(int(length / cell), 0)
@@ -329,9 +314,8 @@ def scanner_positions(
     for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
         for _ in range(_POSITION_TRIES if len(positions) == number else 0):
             x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
-            position = room.moved(
-                x, between(rng, 0.25, 0.75) * width, between(rng, 1.4, 1.7)
-            ).origin
+            y = between(rng, 0.25, 0.75) * width
+            position = room.moved(x, y, between(rng, 1.4, 1.7)).origin
             near = position + clearance * (2 * rng.random((64, 3)) - 1)
             if not is_occupied(parts, near).any():
                 positions.append(position)

@@ -173,7 +173,9 @@ def _sample_faces(
             tried = model.surfaces[face].sample(rng, int(count))
             outwards = model.surfaces[face].normals_at(tried)
             is_seen = model.is_visible(face, tried, outwards)
-            points, normals = to_float32(tried[is_seen]), to_float32(outwards[is_seen])
+            points, normals = (
+                np.ascontiguousarray(values[is_seen], np.float32) for values in (tried, outwards)
+            )
             drawn.append((points, normals, np.full(len(points), face)))
             num_kept += len(points)
         missing -= num_kept
@@ -223,8 +225,3 @@ def seeded_generator(seed: int, purpose: int) -> np.random.Generator:
     if seed < 0:
         raise ConfigError(f"torchrg.scenes: expected seed >= 0, got {seed}.")
     return np.random.Generator(np.random.PCG64([seed, purpose]))
-
-
-def to_float32(values: Doubles) -> Floats:
-    """Convert values to a contiguous float32 array."""
-    return np.ascontiguousarray(values, dtype=np.float32)

@@ -60,13 +60,10 @@ class Cloud:
     repairs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        values: dict[str, Any] = {
-            "coordinates": _as_array(self.coordinates),
-            "fields": {name: _as_array(field) for name, field in self.fields.items()},
-            "front": _as_array(self.front),
-        }
-        vars(self).update(values)
-        if not isinstance(values["coordinates"], np.ndarray):
+        fields = {name: _as_array(field) for name, field in self.fields.items()}
+        vars(self)["coordinates"] = coordinates = _as_array(self.coordinates)
+        vars(self).update(fields=fields, front=_as_array(self.front))
+        if not isinstance(coordinates, np.ndarray):
             raise ShapeError(
                 "Cloud: expected coordinates to be a tensor or a NumPy array, got "
                 f"{type(self.coordinates).__name__}; use numpy.array."
@@ -80,12 +77,8 @@ class Cloud:
         return len(self.coordinates)
 
     def __repr__(self) -> str:
-        parts = [
-            f"{len(self):,} points",
-            *sorted(self.fields),
-            *["front"] * (self.front is not None),
-        ]
-        return f"Cloud({', '.join(parts)})"
+        parts = [*sorted(self.fields), *["front"] * (self.front is not None)]
+        return f"Cloud({', '.join([f'{len(self):,} points', *parts])})"
 
     if not TYPE_CHECKING:
 
@@ -104,13 +97,16 @@ class Cloud:
             finite: NDArray[np.bool_] = (np.abs(self.coordinates) <= FARTHEST).all(axis=1)
         return finite
 
+    @property
+    def _finite_coordinates(self) -> NDArray[np.floating]:
+        """Coordinates of the finite points, not copied if all are."""
+        return self.coordinates if self.finite.all() else self.coordinates[self.finite]
+
     @cached_property
     def origin(self) -> NDArray[np.float64]:
         """Origin of :attr:`points`, shape ``(3,)``; see ``local_origin``."""
-        finite = self.coordinates[self.finite]
-        if len(finite) == 0:
-            return np.zeros(3)
-        return local_origin(*bounding_box(finite))
+        finite = self._finite_coordinates
+        return local_origin(*bounding_box(finite)) if len(finite) else np.zeros(3)
 
     @cached_property
     def points(self) -> Tensor:
@@ -137,7 +133,7 @@ class Cloud:
         extended for float32. Without a period.
         """
         scale = float(max(getattr(self.header.get("las"), "scales", (0.0,))))
-        finite = self.coordinates if self.finite.all() else self.coordinates[self.finite]
+        finite = self._finite_coordinates
         if note := describe_steps(finite, scale=scale):
             return note
         if finite.dtype == np.float32:
@@ -151,8 +147,7 @@ class Cloud:
 
         Judged by the header of the file and by the spans of the axes. Without a period.
         """
-        coordinates = self.coordinates if self.finite.all() else self.coordinates[self.finite]
-        return describe_units(coordinates, self.header)
+        return describe_units(self._finite_coordinates, self.header)
 
     def relative_to(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates relative to ``origin`` ``(3,)``, float32, shape ``(N, 3)``."""

@@ -333,10 +333,8 @@ class Superpoints:
     levels: tuple[Tensor, ...]
 
     def __repr__(self) -> str:
-        counts = ", ".join(
-            f"{int(level.max()) + 1 if len(level) else 0:,}"
-            for level in (self.labels, *self.levels)
-        )
+        levels = (self.labels, *self.levels)
+        counts = ", ".join(f"{int(each.max()) + 1 if len(each) else 0:,}" for each in levels)
         return f"Superpoints({_count_points(self.labels)}, {counts} superpoints)"
 
     def by_level(self) -> dict[str, NDArray[np.int32]]:

@@ -107,9 +107,8 @@ class Neighbors(NamedTuple):
         """Return the mask of valid entries of the selected points, shape ``(n, K)``, bool."""
         if self.valid is not None:
             return self.valid[rows]
-        first = self.indices[rows, :1]
-        shape = first.shape[0], self.indices.shape[1]
-        return torch.ones(shape, dtype=torch.bool, device=first.device)
+        num_rows, num_neighbors = len(self.indices[rows, :1]), self.indices.shape[1]
+        return self.indices.new_ones((num_rows, num_neighbors), dtype=torch.bool)
 
 
 class Sampling(NamedTuple):
@@ -157,6 +156,4 @@ class NormalFit(NamedTuple):
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
         """Apply a function to all tensors; None stays None."""
-        sharp = None if self.sharp is None else change(self.sharp)
-        normals, curvature, valid, residual_rms = (change(values) for values in self[:4])
-        return NormalFit(normals, curvature, valid, residual_rms, sharp)
+        return NormalFit(*(change(values) for values in self if values is not None))

@@ -81,19 +81,19 @@ def describe_steps(
     is_single = points.dtype == np.float32
     if not is_single and scale == 0:
         return ""
-    finite = np.logical_and.reduce(np.isfinite(points.T))
-    finite_points = points if finite.all() else points[finite]
-    if len(finite_points) < 3:
+    is_finite = np.logical_and.reduce(np.isfinite(points.T))
+    finite = points if is_finite.all() else points[is_finite]
+    if len(finite) < 3:
         return ""
     with np.errstate(over="ignore", invalid="ignore"):
-        low, high = _middle_half(finite_points)
+        low, high = _middle_half(finite)
         width, reach = float((high - low).max()), np.float32(np.abs([low, high]).max())
         single = float(np.spacing(reach)) if is_single else 0.0
     step = max(single, scale)
-    even = width / math.sqrt(len(finite_points))
+    even = width / math.sqrt(len(finite))
     if not 0 < width < math.inf or step <= _MAX_FINE_STEP * even:
         return ""
-    spacing = _spacing(finite_points, _CELL * even) if step < even else even
+    spacing = _spacing(finite, _CELL * even) if step < even else even
     is_grid = scale > _COARSE_GRID * spacing
     if not is_grid and single <= _COARSE * spacing:
         return ""

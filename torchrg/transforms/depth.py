@@ -166,9 +166,6 @@ class SegmentDepth(DepthTransform):
         config: Configuration, as an object or a dictionary.
         orient: Orientation of normals. Default: towards the camera.
         planes: Whether to add the plane table.
-        depth_scale: Depth units per meter, as in :func:`segment_depth`.
-        depth_kind: Meaning of the depth, as in :func:`segment_depth`.
-        keys: Other names for some entries.
         **changes: Single parameters, as in ``max_depth=4.0``.
 
     Example:

@@ -39,12 +39,13 @@ from torchrg.transforms.sample import CloudTransform, NeighborSearch, SampleTran
 class OrientedTransform(CloudTransform):
     """Base class of transforms that orient normals.
 
-    Reads ``coord`` and, if present, ``front`` ``(N, 3)``, the direction from each point to the
-    sensor. ``orient="viewpoint"`` reads ``viewpoint`` unless it is passed here: the scanner
+    Reads ``coord`` and, if present, ``front``, both ``(N, 3)``: the direction from each point to
+    the sensor. ``orient="viewpoint"`` reads ``viewpoint`` unless it is passed here: the scanner
     position, of shape ``(3,)``, ``(B, 3)`` for the clouds of a batch, or ``(N, 3)``.
 
     Args:
-        orient: Orientation of normals; see :func:`torchrg.normals.orient_normals`.
+        orient: Orientation of normals; see :func:`torchrg.normals.orient_normals`. Default:
+            towards ``front`` if the sample has it, else into the free space of rooms.
         viewpoint: Scanner position of all samples. Default: read from the sample.
 
     Raises:
@@ -98,12 +99,11 @@ class OrientedTransform(CloudTransform):
 class EstimateNormals(OrientedTransform):
     """Add unit normals and curvature; see :func:`torchrg.estimate_normals`.
 
-    Reads ``coord`` ``(N, 3)``; adds ``normal`` ``(N, 3)``, ``curvature`` and ``residual`` ``(N,)``.
+    Reads the entries of :class:`OrientedTransform`; adds ``normal`` ``(N, 3)``, ``curvature`` and
+    ``residual`` ``(N,)``.
 
     Args:
         config: Configuration of the estimator.
-        orient: Orientation of normals, as in :class:`SegmentPlanes`.
-        viewpoint: Scanner position, for ``orient="viewpoint"``.
         residual: Whether to add ``residual`` ``(N,)``, the RMS distance of the neighbors to the
             plane, which ``GrowRegions`` reads if ``plane_reach`` is set.
         chunk_size: Points processed at a time; bounds the memory, does not change results.
@@ -142,16 +142,9 @@ class EstimateNormals(OrientedTransform):
 class OrientNormals(OrientedTransform):
     """Orient the normals of a sample; see :func:`torchrg.normals.orient_normals`.
 
-    Reads ``coord``, ``normal`` ``(N, 3)`` and the entries of :class:`OrientedTransform`; changes
-    ``normal``. Each cloud of a batch is oriented separately. :class:`SegmentPlanes` and
+    Reads ``normal`` ``(N, 3)`` and the entries of :class:`OrientedTransform`; changes ``normal``.
+    Each cloud of a batch is oriented separately. :class:`SegmentPlanes` and
     :class:`EstimateNormals` already orient the normals that they add.
-
-    Args:
-        orient: Orientation of normals.
-        viewpoint: Scanner position of all samples. Default: read from the sample.
-
-    Raises:
-        ConfigError: If ``orient`` is unknown, or does not match ``viewpoint``.
 
     Example:
         >>> floor = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0), torch.zeros(1))
@@ -226,14 +219,11 @@ class GrowRegions(CloudTransform):
 class SegmentPlanes(OrientedTransform):
     """Add plane labels, normals and curvature; see :func:`torchrg.segment_planes`.
 
-    Reads ``coord`` ``(N, 3)`` and the entries of :class:`OrientedTransform`; adds ``plane``
-    ``(N,)``, int64, -1 for none, ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
+    Reads the entries of :class:`OrientedTransform`; adds ``plane`` ``(N,)``, int64, -1 for none,
+    ``normal`` ``(N, 3)`` and ``curvature`` ``(N,)``.
 
     Args:
         config: Configuration, as in ``{"normals.k": 30}``. Default: the preset ``consensus``.
-        orient: Orientation of normals. Default: towards ``front`` if the sample has it, else into
-            the free space of rooms.
-        viewpoint: Scanner position, for ``orient="viewpoint"``. Default: read from the sample.
         **changes: Single parameters, as in ``min_area=0.5``.
 
     Example:

@@ -171,23 +171,6 @@ def select_points(
     return selected
 
 
-def remap_rows(caller: str, inverse: Tensor, new_rows: Tensor) -> Tensor:
-    """Return the indices ``inverse`` after rows moved to ``new_rows``, negative for removed points.
-
-    Raises:
-        ConfigError: If ``inverse`` contains rows that do not exist.
-    """
-    if len(inverse) and int(inverse.max()) >= len(new_rows):
-        raise ConfigError(
-            f"{caller}: expected inverse to contain rows of {len(new_rows)} points, got row "
-            f"{int(inverse.max())}; points were removed after it was made, so remove it too."
-        )
-    exists = inverse >= 0
-    remapped = inverse.long().clone()
-    remapped[exists] = new_rows.to(inverse.device)[remapped[exists]]
-    return remapped
-
-
 def cloud_rows(sample: Sample, num_points: int) -> list[slice]:
     """Return the rows of each cloud of a sample, from its ``offset`` or ``batch`` if present."""
     return [slice(*ends) for ends in itertools.pairwise([0, *_cloud_ends(sample, num_points)])]

@@ -32,7 +32,6 @@ from torchrg.transforms.rows import (
     extend_list,
     get_entries,
     per_point_keys,
-    remap_rows,
     select_points,
 )
 
@@ -160,12 +159,20 @@ class SampleTransform(nn.Module):
         return select_points(type(self).__name__, sample, rows, num_points, skip=skip)
 
     def update_inverse(self, sample: Sample, new_rows: Tensor) -> dict[str, Tensor]:
-        """Return ``inverse`` updated for rows moved to ``new_rows``, if the sample has one."""
+        """Return ``inverse`` for rows that moved to ``new_rows``, negative for removed points."""
         key = self.key(sample, "inverse")
         if get_entries(sample).get(key) is None:
             return {}
-        inverse = self.read(sample, "inverse")
-        return {key: remap_rows(type(self).__name__, inverse, new_rows)}
+        inverse = self.read(sample, "inverse").long().clone()
+        if len(inverse) and int(inverse.max()) >= len(new_rows):
+            raise ConfigError(
+                f"{type(self).__name__}: expected inverse to contain rows of {len(new_rows)} "
+                f"points, got row {int(inverse.max())}; points were removed after it was made, so "
+                "remove it too."
+            )
+        exists = inverse >= 0
+        inverse[exists] = new_rows.to(inverse.device)[inverse[exists]]
+        return {key: inverse}
 
     def _skipped_keys(self, sample: Sample) -> list[str]:
         """Return the keys of entries that are never per point."""
@@ -245,9 +252,8 @@ class CloudTransform(SampleTransform):
             self.add({name: value[rows] for name, value in values.items()}, search)
             for rows in cloud_rows(sample, len(values["coord"]))
         ]
-        added = {
-            self.key(sample, name): torch.cat([part[name] for part in parts]) for name in parts[0]
-        }
+        joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        added = {self.key(sample, name): value for name, value in joined.items()}
         changed = self.replace(sample, added, per_point=list(added))
         if self.keep_neighbors:
             changed[key] = NeighborSearch(search.used or search.known)
@@ -274,11 +280,9 @@ class CenterCloud(SampleTransform):
         """Return a new sample with shifted coordinates."""
         coord = self.read(sample, "coord")
         clouds = [coord[rows] for rows in cloud_rows(sample, len(coord))]
-        centers = torch.stack([_center(cloud) for cloud in clouds])
-        shifted = [
-            (cloud.double() - center).to(cloud.dtype)
-            for cloud, center in zip(clouds, centers, strict=True)
-        ]
+        centers = torch.stack([*map(_center, clouds)])
+        pairs = zip(clouds, centers, strict=True)
+        shifted = [(cloud.double() - center).to(cloud.dtype) for cloud, center in pairs]
         key = self.key(sample, "origin")
         if key in sample:
             centers = centers + self.read(sample, "origin").reshape(-1, 3)
@@ -350,10 +354,9 @@ class SampleVoxels(SampleTransform):
             inverse.append(torch.where(voxels.inverse >= 0, voxels.inverse + num_voxels, UNLABELED))
             num_voxels += len(voxels.rows)
         voxel_index = torch.cat(inverse)
+        added = {self.key(sample, "inverse"): voxel_index}
+        added |= self.update_inverse(sample, voxel_index)
         selected = self.select_rows(sample, torch.cat(rows), len(coord))
-        added = {self.key(sample, "inverse"): voxel_index} | self.update_inverse(
-            sample, voxel_index
-        )
         return self.replace(sample, selected | added)
 
 
