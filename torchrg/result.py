@@ -125,6 +125,8 @@ class Result:
                 f"Result: expected a segmentation of {len(cloud):,} points, got "
                 f"{segmentation.labels.numel():,}; pass the points that were segmented."
             )
+        segmentation = segmentation.cpu()
+        superpoints = None if superpoints is None else superpoints.cpu()
         results = {
             name: getattr(segmentation, name)
             .numpy(force=True)
