@@ -162,6 +162,7 @@ def segment_planes(
     if not is_cloud:
         warn_about_coordinates("segment_planes", points)
     objects = None if within is None else as_tensor("segment_planes", "within", within)
+    objects = None if objects is None else objects.to(points.device)
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
     if objects is not None and (objects.is_floating_point() or objects.is_complex()):
         raise ShapeError(
@@ -177,7 +178,7 @@ def segment_planes(
         if on_stage is not None:
             on_stage(stage)
 
-    objects = None if objects is None else objects.long().to(points.device)
+    objects = None if objects is None else objects.long()
     side = _Side(orient, directions)
     if settings.min_area > 0 or settings.kinds is not None or settings.sort != "points":
         seg = _segment(points, settings.without_selection(), side, voxel, objects, begin)
@@ -428,6 +429,7 @@ def make_superpoints(
             f"make_superpoints: expected seg of {len(tensor):,} points, got {len(seg.labels):,}; "
             "pass the segmentation of these points."
         )
+    check_shapes("make_superpoints", points=(tensor, "N 3"), seg=(seg.labels, "N"))
     settings = settings_of("make_superpoints", SuperpointsConfig, config, changes)
     if voxel is None:
         is_searched = seg.points is not None and seg.points.data_ptr() == tensor.data_ptr()
@@ -461,7 +463,7 @@ def _unit_colors(
     """
     if colors is None:
         return None
-    shades = as_tensor(caller, "colors", colors).detach()
+    shades = as_tensor(caller, "colors", colors).detach().to(points.device)
     check_shapes(caller, points=(points, "N 3"), colors=(shades, "N 3"))
     shades = shades.float() if shades.dtype == torch.bfloat16 else shades
     found, notes = read_colors(caller, shades.cpu().numpy(), error=ConfigError)
