@@ -278,6 +278,8 @@ void fallback(const c10::OperatorHandle& op, c10::DispatchKeySet, torch::jit::St
         else if (is_device(values) && values.dim()) report(3, "index_put of a mask", 8, 1, 0);
       }
   }
+  // CUDA has one driver of least squares, which needs full rank.
+  if (name == "linalg_lstsq" && any_device) converted.back() = IValue(std::string("gels"));
   if (name == "segment_reduce" && !originals[6].toBool()) {
     // Without unsafe=True it reads the least length, and whether their sum is the number of values.
     report(4, "segment_reduce", 0, work, dtype);
