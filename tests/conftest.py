@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests import pretend
 from torchrg.cli import main
 from torchrg.io import write_cloud
 from torchrg.scenes import make_room
@@ -20,8 +21,14 @@ ORACLES = Path(__file__).parent / "oracles"
 
 def pytest_addoption(parser):
     usual = "all" if torch.cuda.is_available() else "cpu"
-    parser.addoption("--device", default=usual, help="cpu, cuda or all")
+    parser.addoption("--device", default=usual, help="cpu, cuda, pretend or all")
     parser.addoption("--run-slow", action="store_true", help="run the tests marked slow too")
+
+
+def pytest_configure(config):
+    """Register the pretend device before the tests that ask for it."""
+    if config.getoption("--device") == "pretend":
+        pretend.load()
 
 
 def pytest_collection_modifyitems(config, items):

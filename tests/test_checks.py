@@ -30,6 +30,12 @@ def test_missing_axes_are_refused():
         check_shapes("f", points=(torch.zeros(3), "N 3"))
 
 
+def test_tensors_of_two_devices_are_refused_with_both_names():
+    meta = torch.zeros(4, 3, device="meta")
+    with pytest.raises(ShapeError, match=r"^f: expected x and y on one device, got cpu and meta;"):
+        check_shapes("f", x=(torch.zeros(4, 3), "N 3"), y=(meta, "N 3"))
+
+
 def test_arrays_become_tensors_that_share_memory():
     array = np.zeros((4, 3), dtype=np.float32)
     tensor = as_tensor("f", "points", array)

@@ -1,7 +1,7 @@
 """Argument checks that never read tensor values, and so need no device synchronization."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any, NoReturn, ParamSpec, TypeGuard, TypeVar, get_args
 
@@ -57,7 +57,7 @@ def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
 
 
 def check_floating(caller: str, **arguments: Tensor | None) -> None:
-    """Check that tensors are float32 or float64, of one dtype and device; None is skipped."""
+    """Check that tensors are float32 or float64, and of one dtype; None is skipped."""
     tensors = {name: tensor for name, tensor in arguments.items() if tensor is not None}
     for name, tensor in tensors.items():
         if tensor.dtype not in (torch.float32, torch.float64):
@@ -76,11 +76,10 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
                 f"{caller}: expected {name} to be dense, got a sparse tensor; pass "
                 f"{name}.to_dense()."
             )
-    for what in ("dtype", "device"):
-        kinds = [str(getattr(tensor, what)).removeprefix("torch.") for tensor in tensors.values()]
-        if len(set(kinds)) > 1:
-            names, got = " and ".join(tensors), " and ".join(kinds)
-            raise ShapeError(f"{caller}: expected {names} of one {what}, got {got}.")
+    kinds = [str(tensor.dtype).removeprefix("torch.") for tensor in tensors.values()]
+    if len(set(kinds)) > 1:
+        names = " and ".join(tensors)
+        raise ShapeError(f"{caller}: expected {names} of one dtype, got {' and '.join(kinds)}.")
 
 
 def check_points(caller: str, points: Tensor) -> None:
@@ -106,13 +105,14 @@ def check_batch(caller: str, name: str, points: Tensor, repair: str) -> None:
 
 
 def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
-    """Check the axes of several tensors against patterns that share their letters.
+    """Check that tensors are on one device, and their axes against patterns with shared letters.
 
     Arguments are a tensor and its pattern, as in ``x=(x, "* N 3")``. A letter stands for a length
     that is equal in all patterns, a number for a fixed length, and a leading ``*`` for any leading
     axes, equal in all patterns. None is skipped. A ``mask`` must be bool, too.
     """
     bound: dict[str, tuple[int, ...]] = {}
+    first: tuple[str, Tensor] | None = None
     for name, (tensor, pattern) in arguments.items():
         if tensor is None:
             continue
@@ -127,6 +127,12 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
             fixed = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in sizes.items())
             expected = f"({', '.join(pattern.split())})" + (f" with {fixed}" if fixed else "")
             raise ShapeError(f"{caller}: expected {name} of shape {expected}, got {shape}.")
+        first = first or (name, tensor)
+        if tensor.device != first[1].device:
+            raise ShapeError(
+                f"{caller}: expected {first[0]} and {name} on one device, got {first[1].device} "
+                f"and {tensor.device}; move one of them with .to(device)."
+            )
 
 
 def _bind(shape: tuple[int, ...], axes: list[str], bound: dict[str, tuple[int, ...]]) -> bool:
@@ -232,10 +238,11 @@ def disable_autocast(function: Callable[Arguments, Returned]) -> Callable[Argume
 
     @wraps(function)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Returned:
-        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
-        if not kinds:
-            return function(*args, **kwargs)
-        with torch.autocast(kinds[0], enabled=False), torch.autocast(kinds[-1], enabled=False):
+        kinds = {value.device.type for value in (*args, *kwargs.values()) if is_tensor(value)}
+        with ExitStack() as stack:
+            for kind in kinds:
+                if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
+                    stack.enter_context(torch.autocast(kind, enabled=False))
             return function(*args, **kwargs)
 
     return call

@@ -130,7 +130,9 @@ def _backward(tensors: list[Tensor], call: str) -> Tensor:
         values = arguments[name].detach().clone().requires_grad_()
         outputs = _as_list(function.run(**{**arguments, name: values}))
         chosen = [outputs[index] for index in function.differentiable]
-        (gradient,) = torch.autograd.grad(chosen, values, gradients)
+        # On a device, autograd would give the work to the thread of the device, which waits here.
+        with torch.autograd.set_multithreading_enabled(False):
+            (gradient,) = torch.autograd.grad(chosen, values, gradients)
         copied: Tensor = gradient.clone()
         return copied
 

@@ -67,12 +67,8 @@ def collate_offset(
             raise ShapeError(
                 f"collate_offset: expected samples with {key!r}, got {', '.join(keys) or 'none'}."
             )
-    counts = [
-        torch.as_tensor(s["offset"]).diff(prepend=torch.zeros(1, dtype=torch.int64))
-        if "offset" in s
-        else torch.tensor([len(s[coord])])
-        for s in samples
-    ]
+    ends = [torch.as_tensor(s.get("offset", [len(s[coord])])) for s in samples]
+    counts = [end.diff(prepend=end.new_zeros(1)).to(ends[0].device) for end in ends]
     batch = {key: _join(key, [s[key] for s in samples]) for key in keys if key != "offset"}
     for key in dict.fromkeys([*[inverse] * (inverse in batch), *unique]):
         numbers = [as_tensor("collate_offset", key, s[key]) for s in samples]

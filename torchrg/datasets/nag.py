@@ -73,6 +73,7 @@ def make_nag(
         [3, 1]
     """
     pos = as_tensor("make_nag", "points", points)
+    superpoints = superpoints.to(pos.device)
     check_shapes("make_nag", points=(pos, "N 3"), labels=(superpoints.labels, "N"))
     without = int((superpoints.labels < 0).sum())
     if without:
@@ -93,7 +94,7 @@ def make_nag(
     levels = []
     for level, labels in enumerate((superpoints.labels, *superpoints.levels)):
         check_shapes("make_nag", points=(pos, "N 3"), labels=(labels, "N"))
-        labels, count = labels.to(pos.device), int(labels.max()) + 1 if len(labels) else 0
+        count = int(labels.max()) + 1 if len(labels) else 0
         # All points of a child node belong to the same node here.
         super_index = labels.new_empty(len(entries["pos"])).index_copy(0, below, labels)
         _check_level(level, labels, count, below, super_index)

@@ -57,6 +57,7 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
                 [-1.,  1.]])
     """
     intrinsics = read_intrinsics("depth_to_points", intrinsics, depth)
+    poses = None if poses is None else poses.to(depth.device)
     check_shapes(
         "depth_to_points",
         depth=(depth, "B H W"),
@@ -79,7 +80,6 @@ def _unproject(depth: Tensor, intrinsics: Tensor, poses: Tensor | None) -> Tenso
     points = torch.where(seen[..., None], points, torch.nan)
     if poses is None:
         return points
-    poses = poses.to(depth.device)
     return points.to(poses.dtype) @ poses[:, None, :3, :3].mT + poses[:, None, None, :3, 3]
 
 
@@ -109,7 +109,7 @@ def read_intrinsics(caller: str, source: Any, depth: Tensor) -> Tensor:  # noqa:
                 f"{depth.shape[-2]} pixels, got a PinholeCamera of {width} x {height}; scale it.",
                 DepthWarning,
             )
-    return tensor
+    return tensor.to(depth.device)
 
 
 def check_camera(caller: str, intrinsics: Tensor) -> None:

@@ -84,7 +84,7 @@ def segment_depth(
         ([0, 0, 1, 1], [2.0, 3.0])
     """
     depth = drop_channel(as_tensor("segment_depth", "depth", depth))
-    pose = None if pose is None else as_tensor("segment_depth", "pose", pose)
+    pose = None if pose is None else as_tensor("segment_depth", "pose", pose).to(depth.device)
     intrinsics = read_intrinsics("segment_depth", intrinsics, depth)
     intrinsics = intrinsics[0] if intrinsics.shape[:-2] == (1,) else intrinsics
     check_shapes(

@@ -119,6 +119,8 @@ class Result:
                 f"Result: expected a segmentation of {len(cloud):,} points, got "
                 f"{segmentation.labels.numel():,}; pass the points that were segmented."
             )
+        segmentation = segmentation.cpu()
+        superpoints = None if superpoints is None else superpoints.cpu()
         arrays = ((name, getattr(segmentation, name).numpy(force=True)) for name in POINT_RESULTS)
         results = {name: array.reshape(len(cloud), *_KINDS[name][1]) for name, array in arrays}
         if superpoints is not None:

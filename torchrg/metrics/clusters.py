@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import check_labels, check_same_device, number_labels
+from torchrg.metrics.contingency import check_labels, number_labels
 from torchrg.metrics.sphere import (
     chord_table,
     chord_to_angle,
@@ -123,7 +123,6 @@ def score_clusters(
     (labels,) = check_labels("score_clusters", labels=labels)
     check_shapes("score_clusters", normals=(normals, "N 3"), labels=(labels, "N"))
     check_floating("score_clusters", normals=normals)
-    check_same_device("score_clusters", normals=normals, labels=labels)
     for name, value, minimum in (("min_size", min_size, 1), ("sample_size", sample_size, 2)):
         if value < minimum:
             raise ConfigError(f"score_clusters: expected {name} >= {minimum}, got {value!r}.")

@@ -135,7 +135,6 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
                 f"{caller}: expected integer {name}, got {dtype}; convert with .long()."
             )
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
-    check_same_device(caller, **tensors)
     return [tensor.long() for tensor in tensors.values()]
 
 
@@ -149,14 +148,6 @@ def is_not_ignored(ground_truth: Tensor, ignore: int | None) -> Tensor:
     if ignore is None or not -(2**63) <= ignore < 2**63:
         return torch.ones_like(ground_truth, dtype=torch.bool)
     return ground_truth != ignore
-
-
-def check_same_device(caller: str, **arguments: Tensor) -> None:
-    """Raise ShapeError for tensors on different devices."""
-    devices = [str(tensor.device) for tensor in arguments.values()]
-    if len(set(devices)) > 1:
-        names = " and ".join(arguments)
-        raise ShapeError(f"{caller}: expected {names} on one device, got {' and '.join(devices)}.")
 
 
 def fraction(count: float, whole: float) -> float:

@@ -10,7 +10,6 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.metrics.contingency import check_same_device
 from torchrg.metrics.sphere import unit_vectors
 
 _CHUNK = 2**20
@@ -91,7 +90,6 @@ def score_normals(
     if mask.dtype != torch.bool:
         dtype = str(mask.dtype).removeprefix("torch.")
         raise ShapeError(f"score_normals: expected valid of bool, got {dtype}.")
-    check_same_device("score_normals", normals=normals, ground_truth=ground_truth, valid=mask)
     errors, scored, has_ground_truth = _angle_errors(
         normals.reshape(-1, 3), ground_truth.reshape(-1, 3)
     )

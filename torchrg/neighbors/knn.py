@@ -159,11 +159,6 @@ def check_neighbors(caller: str, neighbors: Neighbors, points: Tensor) -> None:
         raise ShapeError(
             f"{caller}: expected neighbors of int32 or int64, got {indices.dtype}. Convert them."
         )
-    if indices.device != points.device:
-        raise ShapeError(
-            f"{caller}: expected points and neighbors on one device, got {points.device} and "
-            f"{indices.device}."
-        )
     if num_points == 0:
         return
     if indices.shape[1] == 0:

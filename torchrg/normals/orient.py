@@ -165,6 +165,7 @@ def find_directions(
             )
         is_array = isinstance(viewpoint, Tensor | np.ndarray)
         position = as_tensor(caller, "viewpoint", viewpoint if is_array else np.array(viewpoint))
+        position = position.to(positions.device)
         check_shapes(
             caller,
             points=(positions, "N 3"),

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchrg._checks import check_shapes
 from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
 from torchrg.errors import ConfigError
@@ -92,6 +93,7 @@ def find_sharp_points(
         chunk_size: Points processed at a time.
 
     Raises:
+        ShapeError: If a shape or device is invalid.
         ConfigError: If ``rule`` is unknown.
 
     Example:
@@ -102,6 +104,12 @@ def find_sharp_points(
     """
     if rule not in ("qn", "percentile"):
         raise ConfigError(f"find_sharp_points: expected rule to be qn or percentile, got {rule!r}.")
+    check_shapes(
+        "find_sharp_points",
+        normals=(normals, "N 3"),
+        neighbors=(neighbors.indices, "M K"),
+        valid=(valid, "N"),
+    )
     columns = normals.detach().T.contiguous()
     if valid is not None and bool(valid.all()):
         valid = None

@@ -137,6 +137,7 @@ def segment_planes(
     if not is_cloud:
         warn_about_coordinates("segment_planes", points)
     objects = None if within is None else as_tensor("segment_planes", "within", within)
+    objects = None if objects is None else objects.to(points.device)
     check_shapes("segment_planes", points=(points, "N 3"), within=(objects, "N"))
     if objects is not None and (objects.is_floating_point() or objects.is_complex()):
         raise ShapeError(
@@ -152,7 +153,7 @@ def segment_planes(
         if on_stage is not None:
             on_stage(stage)
 
-    objects = None if objects is None else objects.long().to(points.device)
+    objects = None if objects is None else objects.long()
     side = orient, directions
     if settings.min_area > 0 or settings.kinds is not None or settings.sort != "points":
         seg = _segment(points, settings.without_selection(), side, voxel, objects, begin)

@@ -89,6 +89,7 @@ def make_superpoints(
             f"make_superpoints: expected seg of {len(tensor):,} points, got {len(seg.labels):,}; "
             "pass the segmentation of these points."
         )
+    check_shapes("make_superpoints", points=(tensor, "N 3"), seg=(seg.labels, "N"))
     settings = settings_of("make_superpoints", SuperpointsConfig, config, changes)
     if voxel is None:
         is_searched = seg.points is not None and seg.points.data_ptr() == tensor.data_ptr()
@@ -113,7 +114,7 @@ def _unit_colors(caller: str, points: Tensor, colors: Colors | None) -> Tensor |
     """
     if colors is None:
         return None
-    shades = as_tensor(caller, "colors", colors).detach()
+    shades = as_tensor(caller, "colors", colors).detach().to(points.device)
     check_shapes(caller, points=(points, "N 3"), colors=(shades, "N 3"))
     shades = shades.float() if shades.dtype == torch.bfloat16 else shades
     found, notes = read_colors(caller, shades.cpu().numpy(), error=ConfigError)

@@ -446,9 +446,11 @@ def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
         (2 * offset / segments.broadcast(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
     )
     bins += segments.labels * _BINS + _BINS // 2
-    counts = torch.bincount(bins, minlength=len(width) * _BINS).view(-1, 1, _BINS)
-    window = counts.new_tensor(_WINDOW).view(1, 1, -1)
-    peak = torch.conv1d(counts, window, padding=len(_WINDOW) // 2).argmax(dim=2).squeeze(1)
+    counts = torch.bincount(bins, minlength=len(width) * _BINS).view(-1, _BINS)
+    # A sum of shifted counts, because convolutions of integers exist on the CPU alone.
+    padded = torch.nn.functional.pad(counts, (len(_WINDOW) // 2,) * 2)
+    window = counts.new_tensor(_WINDOW)
+    peak = (padded.unfold(1, len(_WINDOW), 1) * window).sum(dim=2).argmax(dim=1)
     peak = (peak - _BINS // 2 + 0.5) * width / 2
     near = (offset - segments.broadcast(peak)).abs() <= _PEAK_WIDTH * segments.broadcast(width)
     total = segments.sum(torch.where(near, offset, 0.0).double())

@@ -258,7 +258,8 @@ def _fit_mcd(
             return fit.support
         # The second cutoff keeps location and covariance: the weights are those of the first.
         offsets = (points.nan_to_num(0.0, 0.0, 0.0) - fit.raw_location[..., None, :]).mT
-        solved = torch.linalg.lstsq(fit.raw_covariance.double(), offsets.double()).solution
+        # Singular scatters have no inverse, and lstsq on CUDA takes none of them.
+        solved = torch.linalg.pinv(fit.raw_covariance.double(), hermitian=True) @ offsets.double()
         bound = chi2_quantile(settings.quantile, points.shape[-1])
         within: Tensor = (offsets * solved).sum(dim=-2) <= bound
         return within & fit.sq_distances.isfinite()

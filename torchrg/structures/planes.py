@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, TypeVar, cast, get_args
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ PlaneKind = Literal["other", "floor", "ceiling", "wall", "horizontal", "vertical
 PLANE_KINDS: tuple[PlaneKind, ...] = get_args(PlaneKind)
 """Classes of planes; see :func:`torchrg.regions.classes.classify_planes`. Curved planes are
 "other"; "horizontal" and "vertical" planes are neither floor nor ceiling nor wall."""
+Moved = TypeVar("Moved", bound="_Movable")
 
 
 class PlaneAdjacency(NamedTuple):
@@ -106,8 +107,33 @@ class Plane:
         )
 
 
+def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401
+    """Move tensors, and tuples and tables of tensors, to a device; return others unchanged."""
+    if isinstance(value, Tensor | _Movable):
+        return value.to(device)
+    if isinstance(value, tuple):
+        parts = [moved(item, device) for item in value]
+        if all(map(operator.is_, parts, value)):
+            return value
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value
+
+
+class _Movable:
+    """Base of dataclasses of tensors on one device."""
+
+    def to(self: Moved, device: torch.device | str) -> Moved:
+        """Move all tensors to a device."""
+        columns = {name: moved(value, device) for name, value in vars(self).items()}
+        return cast(Moved, replace(cast(Any, self), **columns))
+
+    def cpu(self: Moved) -> Moved:
+        """Move all tensors to the CPU."""
+        return self.to("cpu")
+
+
 @dataclass(frozen=True, eq=False)
-class Planes:
+class Planes(_Movable):
     """Plane table with one row per region, in the order of the labels.
 
     Iterating yields :class:`Plane` objects; attributes are tensors with one row per plane. Lengths
@@ -220,16 +246,6 @@ def _count_points(labels: Tensor) -> str:
     return f"{len(labels):,} points"
 
 
-def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401
-    """Move tensors, and tuples and tables of tensors, to a device; return others unchanged."""
-    if isinstance(value, Tensor | Planes):
-        return value.to(device)
-    if isinstance(value, tuple):
-        parts = [moved(item, device) for item in value]
-        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-    return value
-
-
 PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "normal": ("f8", (3,)),
     "offset": ("f8", ()),
@@ -246,7 +262,7 @@ PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Segmentation:
+class Segmentation(_Movable):
     """Plane segmentation: per-point labels and normals, and the plane table.
 
     Attributes:
@@ -283,14 +299,6 @@ class Segmentation:
             f"{labeled:.1f} % labeled)"
         )
 
-    def to(self, device: torch.device | str) -> "Segmentation":
-        """Move the segmentation to a device."""
-        return replace(self, **{name: moved(value, device) for name, value in vars(self).items()})
-
-    def cpu(self) -> "Segmentation":
-        """Move the segmentation to the CPU."""
-        return self.to("cpu")
-
     def show(self, **settings: Any) -> "Page":  # noqa: ANN401
         """Return an interactive viewer, displayed by notebooks; needs ``torchrg[view]``.
 
@@ -316,7 +324,7 @@ class Segmentation:
 
 
 @dataclass(frozen=True, eq=False)
-class Superpoints:
+class Superpoints(_Movable):
     """Partition of all points into superpoints, in levels from fine to coarse.
 
     Attributes:
