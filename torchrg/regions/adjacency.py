@@ -268,12 +268,12 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
         position = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
         cell = position.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
-        return _unique_cells(contacts.pair, cell)
+        return unique_cells(contacts.pair, cell)
 
     for found in edges.map_contacts(find_cells):
         for indices, values in zip(cells, found, strict=True):
             indices.frombytes(values.cpu().numpy().tobytes())
-    pair, cell = _unique_cells(
+    pair, cell = unique_cells(
         *(torch.from_numpy(np.array(indices)).to(points.device) for indices in cells)
     )
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
@@ -282,14 +282,13 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
     return steps * torch.where(spacing.isfinite(), spacing, 0.0)
 
 
-def _unique_cells(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distinct cells of each pair, ascending."""
-    if len(cell) == 0:
-        return pair, cell
-    # Cell ranks fit into one integer with the pair; indices of distant cells do not.
+def unique_cells(owner: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distinct cells of each owner, ascending."""
+    # Cell ranks fit into one integer with the owner; indices of distant cells do not.
     cells, rank = torch.unique(cell, return_inverse=True)
-    keys = torch.unique(pair * len(cells) + rank)
-    return keys // len(cells), cells[keys % len(cells)]
+    width = max(len(cells), 1)
+    keys = torch.unique(owner * width + rank)
+    return keys // width, cells[keys % width]
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:
