@@ -68,12 +68,6 @@ class GrowingInput(NamedTuple):
         )
 
 
-def is_order_independent(config: GrowingConfig) -> bool:
-    """Return whether the seed test of a claimed point depends on the point alone."""
-    is_global = config.curvature_scope == "cloud"
-    return config.seed_rule == "curvature" and is_global and not has_late_promotion(config)
-
-
 def has_late_promotion(config: GrowingConfig) -> bool:
     """Return whether any edge of its region, not only the claiming one, can promote a point."""
     return config.connectivity is not None and config.connectivity_scope == "seed"
@@ -84,10 +78,11 @@ def mark_edges(
 ) -> tuple[Tensor, Tensor | None]:
     """Return the neighbors that join and the edges that make seeds, packed into bits.
 
-    The bits are in 64-bit words, ``(N, words)``, int64. If the seed test is order-independent, the
-    second value is None. ``limit`` is the curvature limit.
+    The bits are in 64-bit words, ``(N, words)``, int64. If the seed test depends on the claimed
+    point alone, the second value is None. ``limit`` is the curvature limit.
     """
-    order_independent, shared = is_order_independent(config), None
+    is_global = config.seed_rule == "curvature" and config.curvature_scope == "cloud"
+    order_independent, shared = is_global and not has_late_promotion(config), None
     num_points, k = cloud.neighbors.indices.shape
     if config.connectivity is not None:
         shared = SharedNeighbors(cloud.neighbors, min_shared_neighbors(config.connectivity, k))

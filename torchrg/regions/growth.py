@@ -13,13 +13,7 @@ from torch import Tensor
 
 from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
-from torchrg._parallel import (
-    CHUNK_SIZE,
-    ROWS_AT_ONCE,
-    limit_rows,
-    map_chunks,
-    split_rows,
-)
+from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, limit_rows, map_chunks, split_rows
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major

@@ -13,12 +13,7 @@ from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments, eigh3_lapack
-from torchrg.regions.adjacency import (
-    MIN_CONTACTS,
-    PARALLEL_DEG,
-    KnnAdjacency,
-    find_region_pairs,
-)
+from torchrg.regions.adjacency import MIN_CONTACTS, PARALLEL_DEG, KnnAdjacency, find_region_pairs
 from torchrg.regions.edges import GrowingInput
 from torchrg.regions.fit import MIN_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
@@ -214,12 +209,9 @@ def _pairs_to_merge(
     points belong to the adjacent surfaces.
     """
     strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
-    parts = (
-        adjacency.contacts(labels),
-        find_region_pairs(torch.where(strips, labels, UNLABELED), neighbors),
-    )
-    pairs, counts = (torch.cat(values) for values in zip(*parts, strict=True))
-    return pairs, counts
+    pairs, counts = adjacency.contacts(labels)
+    others = find_region_pairs(torch.where(strips, labels, UNLABELED), neighbors)
+    return torch.cat([pairs, others[0]]), torch.cat([counts, others[1]])
 
 
 def merge_coplanar(

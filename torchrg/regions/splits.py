@@ -205,7 +205,8 @@ def _add_plane_cores(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tupl
 
 def _join_curved(cloud: GrowingInput, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
     """Merge the cores ``(N,)`` of each curved region, except its flat surfaces."""
-    flat, owner = ~_fit_cores(cloud, cores).curved, _core_regions(labels, cores)
+    segments, owner = Segments(cores, max_points=MAX_FITTED), _core_regions(labels, cores)
+    flat = ~fit_planes(segments, cloud.points, cloud.normals).curved
     num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
     of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
     covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
@@ -225,11 +226,6 @@ def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
     points = (cores >= 0).nonzero().squeeze(1)
     indices, rows = torch.unique(cores[points], return_inverse=True)
     return labels.new_zeros(len(indices)).index_copy_(0, rows, labels[points])
-
-
-def _fit_cores(cloud: GrowingInput, cores: Tensor) -> RegionPlanes:
-    """Fit planes to cores."""
-    return fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
 
 
 def _are_smooth(
@@ -290,9 +286,8 @@ def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tenso
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(indices, minlength=len(pairs))
     num_open = torch.bincount(indices[edges.passed[between]], minlength=len(pairs))
-    planes = _fit_cores(cloud, cores)
-    one, other = planes.normal[pairs].unbind(dim=1)
-    turn = unsigned_angle_deg(one, other)
+    planes = fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
+    turn = unsigned_angle_deg(*planes.normal[pairs].unbind(dim=1))
     joined = (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
     joined |= num_open >= _MIN_OPEN_FRACTION * num_edges
     return remap_labels(cores, _components(num_cores, *pairs[joined].unbind(dim=1)))

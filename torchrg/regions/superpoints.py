@@ -276,16 +276,12 @@ def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
 
     parts = map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device)
     counts, targets = (torch.cat(parts) for parts in zip(*parts, strict=True))
-    starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    starts = functional.pad(counts.cumsum(0), (1, 0))
     links = np.ones(len(targets), dtype=np.int8)
     shape = (len(labels), len(labels))
     edges = csr_array((links, targets.numpy(), starts.numpy()), shape=shape)
     indices = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
-    return _by_first_point(indices)
-
-
-def _by_first_point(indices: Tensor) -> Tensor:
-    """Number regions by their first points, so that ties do not depend on scipy's numbering."""
+    # Numbered by first points, ties do not depend on scipy's order.
     first = torch.full((int(indices.max()) + 1,), len(indices))
     first = first.scatter_reduce(0, indices, torch.arange(len(indices)), "amin")
     return first.argsort().argsort()[indices]
@@ -392,8 +388,6 @@ def _aggregate(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor
     contacts = torch.ones_like(difference) if contacts is None else contacts
     different = nonzero_rows(a != b)
     a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
-    if len(a) == 0:
-        return _Boundaries(a, b, contacts, difference)
     a, b = a.long(), b.long()
     keys, order = (torch.minimum(a, b) * width + torch.maximum(a, b)).sort(stable=True)
     keys, counts = torch.unique_consecutive(keys, return_counts=True)

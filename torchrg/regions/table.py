@@ -119,12 +119,11 @@ def measure_planes(
     frames, chunks = _plane_axes(fit), segments.chunks(POINTS_AT_ONCE)
     sizes = [len(chunk.counts) for chunk in chunks]
     parts = zip(chunks, *(torch.split(part, sizes) for part in (fit.center, frames)), strict=True)
-    measures = map_tasks(
-        lambda part: _measure(points, part[0], part[1:], outline=outline),
-        list(parts),
-        points.device,
-    )
-    measured, polygons = zip(*measures, strict=True)
+
+    def measure(part: tuple[Segments, Tensor, Tensor]) -> tuple[list[Tensor], _Polygons]:
+        return _measure(points, part[0], part[1:], outline=outline)
+
+    measured, polygons = zip(*map_tasks(measure, list(parts), points.device), strict=True)
     mean, area, sides, directions, middle = map(torch.cat, zip(*measured, strict=True))
     axes = directions @ frames[:, :2]
 
