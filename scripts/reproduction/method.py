@@ -14,8 +14,9 @@ from reproduction.pictures import settings
 from reproduction.records import Block, Record, figure, section, text
 from tests.made import make_shape
 from torchrg import estimate_normals, load_config, search_knn
-from torchrg.neighbors.knn import gather_patches
-from torchrg.regions.edges import coplanarity_limits, patch_radii, plane_residuals
+from torchrg.linalg.moments import project, unbind_columns
+from torchrg.neighbors.knn import gather_columns
+from torchrg.regions.edges import coplanarity_limits, patch_radii
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.structures import Neighbors
 
@@ -200,9 +201,9 @@ def _test(title: str, cloud: Tensor, axes: tuple[int, int]) -> Case:
     fit = estimate_normals(cloud, config=settings_.normals, neighbors=neighbors)
     row = int((cloud - torch.tensor([-2.0, 0.0, 0.0])).square().sum(dim=1).argmin())
     one = slice(row, row + 1)
-    patches = gather_patches(cloud, neighbors.indices[one])
-    residuals = plane_residuals(patches, fit.normals[one])
-    floor = settings_.growing.coplanarity_floor * patch_radii(patches)
+    columns = gather_columns(cloud, neighbors.indices[one])
+    residuals = project(columns, fit.normals[one]).abs()
+    floor = settings_.growing.coplanarity_floor * patch_radii(columns)
     limit = coplanarity_limits(residuals, floor)
     every = torch.ones_like(residuals, dtype=torch.bool)
     min_shared = min_shared_neighbors(settings_.growing.connectivity, settings_.normals.k)
@@ -211,7 +212,7 @@ def _test(title: str, cloud: Tensor, axes: tuple[int, int]) -> Case:
         title,
         axes,
         cloud - cloud[row],
-        patches[0],
+        torch.cat(columns).T,
         fit.normals[row],
         (residuals <= limit[:, None])[0],
         connective[0],
@@ -239,7 +240,7 @@ def _draw_cases(path: Path, cases: list[Case]) -> None:
 def _draw_case(axis: plt.Axes, case: Case) -> None:
     """Draw a point, its plane and its neighbors."""
     first, second = case.axes
-    reach = float(patch_radii(case.patch[None])) * 1.3
+    reach = float(patch_radii(unbind_columns(case.patch[None]))) * 1.3
     if second == 2:
         a, b = float(case.normal[first]), float(case.normal[second])
         ends = [-2 * reach, 2 * reach]

@@ -131,14 +131,12 @@ def score_clusters(
             f"score_clusters: expected max_angle_deg in [0, 90], got {max_angle_deg!r}."
         )
     directions, clusters, invalid = _labeled_directions(normals, labels, min_size)
-    num_clusters = int(clusters.max()) + 1 if len(clusters) else 0
-    centers, turned = find_centers(directions, clusters, num_clusters)
+    centers, turned = find_centers(directions, clusters)
     if distinct_directions:
         clusters = merge_directions(centers, max_angle_deg=max_angle_deg)[clusters]
-        num_clusters = int(clusters.max()) + 1 if len(clusters) else 0
-        centers, turned = find_centers(directions, clusters, num_clusters)
+        centers, turned = find_centers(directions, clusters)
     members = turned[clusters.argsort(stable=True)]
-    parts = torch.split(members, torch.bincount(clusters).tolist()) if num_clusters else ()
+    parts = torch.split(members, torch.bincount(clusters).tolist()) if len(clusters) else ()
     means, diameters, num_sampled, exact = measure_spreads(
         parts, centers, sample_size=sample_size, seed=seed
     )
@@ -148,7 +146,7 @@ def score_clusters(
         sp=sp,
         dbi=dbi,
         dvi=_dunn(closest_between(directions, clusters), diameters),
-        clusters=num_clusters,
+        clusters=len(centers),
         points=len(clusters),
         invalid=invalid,
         sampled_clusters=num_sampled,

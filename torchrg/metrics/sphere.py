@@ -63,7 +63,7 @@ def chord_to_angle(chords: Tensor) -> Tensor:
     return chords.div_(2).asin_().mul_(2)
 
 
-def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> tuple[Tensor, Tensor]:
+def find_centers(directions: Tensor, clusters: Tensor) -> tuple[Tensor, Tensor]:
     """Return the normalized mean direction of each cluster (eq. 16), after aligning the signs.
 
     Normals have no sign, so each is first flipped to the side of the cluster's principal axis,
@@ -73,12 +73,12 @@ def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> tup
 
     Example:
         >>> directions = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]], dtype=torch.float64)
-        >>> find_centers(directions, torch.tensor([0, 0]), 1)[0].abs().tolist()
+        >>> find_centers(directions, torch.tensor([0, 0]))[0].abs().tolist()
         [[0.0, 0.0, 1.0]]
     """
     columns = directions.unbind(dim=1)
     products = [
-        torch.bincount(clusters, columns[min(i, j)] * columns[max(i, j)], num_clusters)
+        torch.bincount(clusters, columns[min(i, j)] * columns[max(i, j)])
         for i in range(3)
         for j in range(3)
     ]
@@ -87,7 +87,7 @@ def find_centers(directions: Tensor, clusters: Tensor, num_clusters: int) -> tup
     axes = torch.where(largest < 0, -axes, axes)
     opposite = (directions * axes[clusters]).sum(dim=1) < 0
     aligned = torch.where(opposite[:, None], -directions, directions)
-    sums = [torch.bincount(clusters, column, num_clusters) for column in aligned.unbind(dim=1)]
+    sums = [torch.bincount(clusters, column) for column in aligned.unbind(dim=1)]
     centers, _ = unit_vectors(torch.stack(sums, dim=1))
     return centers, aligned
 

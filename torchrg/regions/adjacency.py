@@ -92,11 +92,15 @@ def find_adjacency(
             length_each[flat],
         )
 
-    lines, curves = _Totals(len(pairs)), _Totals(len(pairs))
-    for on_line, size, on_curve, length_each in edges.map_contacts(measure):
-        lines.add(on_line, size)
-        curves.add(on_curve, length_each)
-    (sizes, on_line), (lengths, on_curve) = (kind.to(points.device) for kind in (lines, curves))
+    sums, counts = np.zeros((2, len(pairs))), np.zeros((2, len(pairs)), dtype=np.int64)
+    # Added in a fixed order on every device.
+    for measured in edges.map_contacts(measure):
+        for kind in range(2):
+            owner, values = (part.cpu().numpy() for part in measured[2 * kind : 2 * kind + 2])
+            np.add.at(sums[kind], owner, values)
+            np.add.at(counts[kind], owner, 1)
+    sizes, lengths = torch.from_numpy(sums).to(points.device)
+    on_line, on_curve = torch.from_numpy(counts).to(points.device)
     along = torch.linalg.cross(first, second)
     along = along / along.norm(dim=1, keepdim=True)
     length = _length_on_line(points, edges, along, sizes / on_line)
@@ -154,23 +158,6 @@ class _Contacts(NamedTuple):
     column: Tensor
 
 
-class _Totals:
-    """Per-pair sums and counts, accumulated in a fixed order on every device."""
-
-    def __init__(self, num_pairs: int) -> None:
-        self._sums, self._counts = np.zeros(num_pairs), np.zeros(num_pairs, dtype=np.int64)
-
-    def add(self, pair: Tensor, values: Tensor) -> None:
-        """Add values ``(n,)`` to the sums of their pairs ``(n,)``."""
-        owner = pair.cpu().numpy()
-        np.add.at(self._sums, owner, values.cpu().numpy())
-        np.add.at(self._counts, owner, 1)
-
-    def to(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Return sums and counts, each ``(E,)``."""
-        return torch.from_numpy(self._sums).to(device), torch.from_numpy(self._counts).to(device)
-
-
 class _RegionEdges:
     """Edges between regions, recomputed on each pass: storing all could take more than the cloud.
 
@@ -181,6 +168,8 @@ class _RegionEdges:
         # int32 indexing is three times faster.
         self._labels, self._neighbors = labels.to(torch.int32), neighbors
         self._num_regions = int(labels.max()) + 1 if len(labels) else 0
+        self._width = max(neighbors.indices.shape[1], 1)
+        self._at_once = limit_rows(ROWS_IN_CACHE, self._width)
         meets = torch.empty_like(labels, dtype=torch.bool)
 
         def mark(chunk: slice) -> None:
@@ -197,14 +186,6 @@ class _RegionEdges:
         self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
         num_regions = max(self._num_regions, 1)
         self.pairs = torch.stack([self._keys // num_regions, self._keys % num_regions], dim=1)
-
-    @property
-    def _width(self) -> int:
-        return max(self._neighbors.indices.shape[1], 1)
-
-    @property
-    def _at_once(self) -> int:
-        return limit_rows(ROWS_IN_CACHE, self._width)
 
     def _at_boundary(self, rows: slice) -> Tensor:
         """Return which points have a neighbor in another region, shape ``(n,)``."""
@@ -268,28 +249,26 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
         position = ((start + end) / 2 * along[contacts.pair]).sum(dim=1) / spacing[contacts.pair]
         cell = position.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
-        return _unique_cells(contacts.pair, cell)
+        return unique_cells(contacts.pair, cell)
 
     for found in edges.map_contacts(find_cells):
         for indices, values in zip(cells, found, strict=True):
             indices.frombytes(values.cpu().numpy().tobytes())
-    pair, cell = _unique_cells(
-        *(torch.from_numpy(np.array(indices)).to(points.device) for indices in cells)
-    )
+    columns = (torch.from_numpy(np.array(indices)).to(points.device) for indices in cells)
+    pair, cell = unique_cells(*columns)
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
     steps = torch.bincount(pair[1:][is_next], minlength=len(spacing))
     return steps * torch.where(spacing.isfinite(), spacing, 0.0)
 
 
-def _unique_cells(pair: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distinct cells of each pair, ascending."""
-    if len(cell) == 0:
-        return pair, cell
-    # Cell ranks fit into one integer with the pair; indices of distant cells do not.
+def unique_cells(owner: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distinct cells of each owner, ascending."""
+    # Cell ranks fit into one integer with the owner; indices of distant cells do not.
     cells, rank = torch.unique(cell, return_inverse=True)
-    keys = torch.unique(pair * len(cells) + rank)
-    return keys // len(cells), cells[keys % len(cells)]
+    width = max(len(cells), 1)
+    keys = torch.unique(owner * width + rank)
+    return keys // width, cells[keys % width]
 
 
 def _contact_radii(points: Tensor, neighbors: Neighbors, rows: Tensor) -> tuple[Tensor, Tensor]:

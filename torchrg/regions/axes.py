@@ -98,8 +98,8 @@ def transform_planes(planes: Planes, motion: Tensor) -> Planes:
     """
     check_rigid("transform_planes", "motion", motion)
     dtype = planes.normal.dtype
-    rotation, shift = motion[:3, :3].to(planes.normal.device), motion[:3, 3]
-    shift = shift.to(planes.normal.device)
+    motion = motion.to(planes.normal.device)
+    rotation, shift = motion[:3, :3], motion[:3, 3]
 
     def rotate(vectors: Tensor) -> Tensor:
         return vectors.double() @ rotation.T
@@ -110,9 +110,9 @@ def transform_planes(planes: Planes, motion: Tensor) -> Planes:
     normal = canonicalize_sign(rotate(planes.normal))
     center = rotate(planes.center) + shift
     # A nearby point of the plane keeps precision if the origin is far away.
-    foot = planes.center.double() - planes.normal.double() * (
-        (planes.center.double() * planes.normal.double()).sum(dim=1) - planes.offset.double()
-    ).unsqueeze(1)
+    before, near = planes.normal.double(), planes.center.double()
+    height = (near * before).sum(dim=1) - planes.offset.double()
+    foot = near - before * height[:, None]
     outline = planes.outline
     if outline is not None:
         outline = tuple(tuple(transform(ring) for ring in rings) for rings in outline)

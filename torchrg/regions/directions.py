@@ -66,12 +66,8 @@ def unit_axis(up: Tensor) -> Tensor:
 def find_heading(normals: Tensor, areas: Tensor, up: Tensor) -> Tensor | None:
     """Return the main horizontal direction of walls closest to x, or None without walls.
 
-    It is the direction of vertical planes, modulo 90 degrees, with most area.
-
-    Args:
-        normals: Unit normals of planes, shape ``(M, 3)``.
-        areas: Their areas, shape ``(M,)``.
-        up: Upward unit vector, shape ``(3,)``.
+    It is the direction of vertical planes, modulo 90 degrees, with most area. Planes have unit
+    ``normals`` ``(M, 3)`` and ``areas`` ``(M,)``; ``up`` is a unit vector.
     """
     weights = areas * bisquare((normals @ up).abs().clamp(max=1).asin())
     if not bool(weights.sum() > MIN_FRACTION * areas.sum()):
@@ -109,11 +105,8 @@ def likely_up(
 ) -> str:
     """Return the axis whose floor and ceiling exceed all that faces up or another axis, or "".
 
-    Args:
-        normals: Unit normals of planes or points, shape ``(M, 3)``.
-        positions: Their centers, shape ``(M, 3)``.
-        areas: Their areas, shape ``(M,)``.
-        up: Assumed upward direction, shape ``(3,)``.
+    Planes or points have unit ``normals`` and ``positions``, both ``(M, 3)``, and ``areas``
+    ``(M,)``; ``up`` is the assumed upward direction, ``(3,)``.
 
     Example:
         >>> normals, positions = np.eye(3), np.array([[0, 1.0, 1], [2, 0, 1], [2, 1, 0]])

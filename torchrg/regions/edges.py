@@ -19,7 +19,8 @@ from torchrg import kernels
 from torchrg._parallel import map_chunks
 from torchrg.config import GrowingConfig
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
-from torchrg.neighbors.knn import gather_patches
+from torchrg.linalg.moments import Columns, project, sq_lengths, to_column_major
+from torchrg.neighbors.knn import gather_columns
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
 from torchrg.structures import Neighbors
@@ -54,11 +55,17 @@ class GrowingInput(NamedTuple):
     signed_normals: bool = False
     angle_fraction: float = 1.0
 
-
-def is_order_independent(config: GrowingConfig) -> bool:
-    """Return whether the seed test of a claimed point depends on the point alone."""
-    is_global = config.curvature_scope == "cloud"
-    return config.seed_rule == "curvature" and is_global and not has_late_promotion(config)
+    def select(self, rows: Tensor, neighbors: Neighbors) -> "GrowingInput":
+        """Return the points ``rows`` ``(n,)`` as a cloud with the given neighbors."""
+        return self._replace(
+            points=to_column_major(self.points[rows]),
+            normals=to_column_major(self.normals[rows]),
+            curvature=self.curvature[rows],
+            neighbors=neighbors,
+            valid=self.valid[rows],
+            reach=None if self.reach is None else self.reach[rows],
+            colors=None if self.colors is None else to_column_major(self.colors[rows]),
+        )
 
 
 def has_late_promotion(config: GrowingConfig) -> bool:
@@ -71,16 +78,20 @@ def mark_edges(
 ) -> tuple[Tensor, Tensor | None]:
     """Return the neighbors that join and the edges that make seeds, packed into bits.
 
-    The bits are in 64-bit words, ``(N, words)``, int64. If the seed test is order-independent, the
-    second value is None. ``limit`` is the curvature limit.
+    The bits are in 64-bit words, ``(N, words)``, int64. If the seed test depends on the claimed
+    point alone, the second value is None. ``limit`` is the curvature limit.
     """
-    shared, order_independent = _shared_neighbors(cloud, config), is_order_independent(config)
+    is_global = config.seed_rule == "curvature" and config.curvature_scope == "cloud"
+    order_independent, shared = is_global and not has_late_promotion(config), None
     num_points, k = cloud.neighbors.indices.shape
+    if config.connectivity is not None:
+        shared = SharedNeighbors(cloud.neighbors, min_shared_neighbors(config.connectivity, k))
     joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
     seeds = joins if order_independent else np.zeros_like(joins)
 
     def mark(rows: slice) -> None:
-        accepted, connected = accept_edges(cloud, config, rows, _connect(shared, rows))
+        connect = None if shared is None else partial(shared.connected, rows)
+        accepted, connected = accept_edges(cloud, config, rows, connect)
         _write_bits(joins[rows], accepted)
         if not order_independent:
             _write_bits(seeds[rows], _become_seeds(cloud, config, rows, limit, connected))
@@ -177,19 +188,6 @@ def accept_edges(
     return joins, connected
 
 
-def _connect(shared: SharedNeighbors | None, rows: slice) -> Callable[[Tensor], Tensor] | None:
-    """Return the connectivity test of a block of points."""
-    return None if shared is None else partial(shared.connected, rows)
-
-
-def _shared_neighbors(cloud: GrowingInput, config: GrowingConfig) -> SharedNeighbors | None:
-    """Return the connectivity test, eq. (10), or None if disabled."""
-    if config.connectivity is None:
-        return None
-    k = cloud.neighbors.indices.shape[1]
-    return SharedNeighbors(cloud.neighbors, min_shared_neighbors(config.connectivity, k))
-
-
 def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
     """Return a mask of the edges between two different valid points."""
     passed = near.gather(valid) & valid[rows][:, None]
@@ -244,23 +242,14 @@ def are_coplanar(
     """
     tested = (mask.sum(dim=1) > 0).nonzero().squeeze(-1)
     indices, counted = cloud.neighbors.select(rows).select(tested)
-    patches = gather_patches(cloud.points, indices)
-    residuals = plane_residuals(patches, cloud.normals[rows][tested])
-    floor = floor_fraction * patch_radii(patches, counted)
+    columns = gather_columns(cloud.points, indices)
+    # |(p_j - p_i) . n_i|, below eq. (10).
+    residuals = project(columns, cloud.normals[rows][tested]).abs_()
+    floor = floor_fraction * patch_radii(columns, counted)
     limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[tested])
     result = torch.zeros_like(mask)
     result[tested] = residuals <= limits[:, None]
     return result
-
-
-def plane_residuals(patches: Tensor, normals: Tensor) -> Tensor:
-    """Return ``|(p_j - p_i) . n_i|`` of patches about p_i, shape ``(n, K)``, below eq. (10)."""
-    x, y, z = patches.unbind(dim=-1)
-    a, b, c = normals[:, :, None].unbind(dim=1)
-    result = x * a
-    result += y * b
-    result += z * c
-    return result.abs_()
 
 
 def coplanarity_limits(residuals: Tensor, floor: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -281,15 +270,12 @@ def neighborhood_radii(points: Tensor, neighbors: Neighbors) -> Tensor:
     if counted is not None:
         last = counted.sum(dim=1, keepdim=True, dtype=last.dtype).sub_(1).clamp_(min=0)
     ends = torch.cat([indices[:, :1], indices.gather(1, last.long())], dim=1)
-    return patch_radii(gather_patches(points, ends))
+    return patch_radii(gather_columns(points, ends))
 
 
-def patch_radii(patches: Tensor, mask: Tensor | None = None) -> Tensor:
+def patch_radii(columns: Columns, mask: Tensor | None = None) -> Tensor:
     """Return the distance from each point to its farthest counted neighbor, shape ``(n,)``."""
-    x, y, z = patches.unbind(dim=-1)
-    sq_distances = x * x
-    sq_distances += y * y
-    sq_distances += z * z
+    sq_distances = sq_lengths(columns)
     if mask is not None:
         sq_distances = torch.where(mask, sq_distances, 0.0)
     return sq_distances.amax(dim=-1).sqrt()

@@ -55,28 +55,20 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
         closed curve. Communications of the ACM 18(7), 1975.
     """
     rectangles = [_min_rectangle(positions) for positions in hull_candidates(segments, u, v)]
-    cosine, sine, *ends = u.new_tensor(rectangles).view(-1, 6).unbind(dim=1)
-    low, high = torch.stack(ends[:2], dim=1), torch.stack(ends[2:], dim=1)
-    directions = torch.stack([cosine, sine, -sine, cosine], dim=1).view(-1, 2, 2)
-    sides, centers = high - low, (high + low) / 2
-    swap = sides[:, 0] < sides[:, 1]
-    return Rectangles(
-        torch.where(swap[:, None], sides.flip(1), sides),
-        torch.where(swap[:, None, None], directions.flip(1), directions),
-        torch.where(swap[:, None], centers.flip(1), centers),
-    )
+    table = u.new_tensor(np.array(rectangles)).view(-1, 2, 4)
+    return Rectangles(table[:, :, 0], table[:, :, 1:3], table[:, :, 3])
 
 
-def _min_rectangle(positions: NDArray[np.float64]) -> list[float]:
-    """Return cosine and sine of the minimum-area rectangle of points ``(n, 2)``, and its bounds.
-
-    The bounds are the minimum coordinates along its two directions, then the maximum ones.
-    """
+def _min_rectangle(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return length, direction and center of the long and the short side, shape ``(2, 4)``."""
     angle = _min_area_angle(positions)
     cosine, sine = math.cos(angle), math.sin(angle)
     u, v = positions.T
     along = np.stack([u * cosine + v * sine, v * cosine - u * sine])
-    return [cosine, sine, *along.min(axis=1).tolist(), *along.max(axis=1).tolist()]
+    low, high = along.min(axis=1), along.max(axis=1)
+    columns = high - low, (cosine, -sine), (sine, cosine), (high + low) / 2
+    rectangle = np.stack(columns, axis=1)
+    return rectangle[::-1] if rectangle[0, 0] < rectangle[1, 0] else rectangle
 
 
 def _min_area_angle(positions: NDArray[np.float64]) -> float:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, split_rows
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks
 from torchrg.config import Auto, GrowingConfig
 from torchrg.linalg.moments import Segments, eigh3_lapack
 from torchrg.linalg.precision import coordinate_resolution
@@ -108,13 +108,10 @@ class RegionPlanes(NamedTuple):
 
     def distances(self, points: Tensor, regions: Tensor) -> Tensor:
         """Return the distance of each point ``(n, 3)`` to the plane of a region ``(n,)``."""
-        offset = points.new_zeros(len(points), dtype=torch.float64)
-        columns = [values.unbind(dim=1) for values in (points, self.center, self.normal)]
-        for chunk in split_rows(len(points), ROWS_AT_ONCE):
-            owner = regions[chunk]
-            for position, center, normal in zip(*columns, strict=True):
-                offset[chunk] += (position[chunk].double() - center[owner]) * normal[owner]
-        return offset.abs_()
+        parts = zip(
+            *(torch.split(v, ROWS_AT_ONCE) for v in (points, regions[:, None])), strict=True
+        )
+        return torch.cat([self.signed_distances(*part) for part in parts]).squeeze(1).abs_()
 
     def signed_distances(self, points: Tensor, regions: Tensor) -> Tensor:
         """Return signed distances of points ``(n, 3)`` to planes of regions ``(n, C)``."""

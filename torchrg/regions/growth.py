@@ -13,13 +13,7 @@ from torch import Tensor
 
 from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
-from torchrg._parallel import (
-    CHUNK_SIZE,
-    ROWS_AT_ONCE,
-    limit_rows,
-    map_chunks,
-    split_rows,
-)
+from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, limit_rows, map_chunks, split_rows
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
@@ -163,9 +157,8 @@ def label_regions(
             labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
             labels = rank_by_size(labels, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
-        contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
-        tolerance = float(config.facet_tolerance)
-        planes, faceted = fits.get(labels), config.faceted is True
+        contacts, planes = KnnAdjacency(cloud.neighbors).contacts(labels), fits.get(labels)
+        tolerance, faceted = float(config.facet_tolerance), config.faceted is True
         labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
         labels = rank_by_size(labels, min_points)
     if config.cut_bridges and bool((labels >= 0).any()):
@@ -253,15 +246,7 @@ def _reordered(cloud: GrowingInput, order: Tensor) -> GrowingInput:
     row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
     row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
     neighbors = cloud.neighbors.select(order)
-    return cloud._replace(
-        points=to_column_major(cloud.points[order]),
-        normals=to_column_major(cloud.normals[order]),
-        curvature=cloud.curvature[order],
-        neighbors=neighbors._replace(indices=neighbors.gather(row_of)),
-        valid=cloud.valid[order],
-        reach=None if cloud.reach is None else cloud.reach[order],
-        colors=None if cloud.colors is None else to_column_major(cloud.colors[order]),
-    )
+    return cloud.select(order, neighbors._replace(indices=neighbors.gather(row_of)))
 
 
 def rank_by_size(regions: Tensor, min_size: int) -> Tensor:

@@ -1,6 +1,7 @@
 """Region refinement after growing: boundary reassignment and merging of coplanar regions."""
 
 import heapq
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -12,12 +13,7 @@ from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments, eigh3_lapack
-from torchrg.regions.adjacency import (
-    MIN_CONTACTS,
-    PARALLEL_DEG,
-    KnnAdjacency,
-    find_region_pairs,
-)
+from torchrg.regions.adjacency import MIN_CONTACTS, PARALLEL_DEG, KnnAdjacency, find_region_pairs
 from torchrg.regions.edges import GrowingInput
 from torchrg.regions.fit import MIN_FITTED, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
@@ -101,6 +97,7 @@ def refine_regions(
         contacts = _pairs_to_merge(labels, adjacency, planes, cloud.neighbors)
         labels = merge_coplanar(labels, contacts, planes, tolerance=config.merge_tolerance)
     if config.refine_borders:
+        faceted = config.faceted is True
         labels = _remove_small(labels, 1)
         planes = fits.get(labels)
         # The plane of a bent region does not show where the region ends.
@@ -111,10 +108,8 @@ def refine_regions(
         if config.facet_tolerance is not None:
             # A gap narrower than a neighborhood may divide a faceted surface. With white noise, it
             # separates faces such as cushions side by side; rooms differ little with all neighbors.
-            near = cloud.neighbors if config.faceted is True else adjacency.neighbors
-            tolerance = float(config.facet_tolerance)
-            contacts = find_region_pairs(labels, near)
-            faceted = config.faceted is True
+            near = cloud.neighbors if faceted else adjacency.neighbors
+            contacts, tolerance = find_region_pairs(labels, near), float(config.facet_tolerance)
             labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
     return labels
 
@@ -136,8 +131,12 @@ def _remove_inconsistent(
 
 def _remove_small(labels: Tensor, min_size: int) -> Tensor:
     """Remove regions smaller than ``min_size`` and make the labels consecutive."""
-    is_large = torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1)
-    return remap_labels(labels, torch.where(is_large, is_large.cumsum(0) - 1, UNLABELED))
+    return keep_regions(labels, torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1))
+
+
+def keep_regions(labels: Tensor, kept: Tensor) -> Tensor:
+    """Unlabel the points of other regions than the ``kept`` ``(M,)``, and renumber these."""
+    return remap_labels(labels, torch.where(kept, kept.cumsum(0) - 1, UNLABELED))
 
 
 def remap_labels(labels: Tensor, mapping: Tensor) -> Tensor:
@@ -210,12 +209,9 @@ def _pairs_to_merge(
     points belong to the adjacent surfaces.
     """
     strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
-    parts = (
-        adjacency.contacts(labels),
-        find_region_pairs(torch.where(strips, labels, UNLABELED), neighbors),
-    )
-    pairs, counts = (torch.cat(values) for values in zip(*parts, strict=True))
-    return pairs, counts
+    pairs, counts = adjacency.contacts(labels)
+    others = find_region_pairs(torch.where(strips, labels, UNLABELED), neighbors)
+    return torch.cat([pairs, others[0]]), torch.cat([counts, others[1]])
 
 
 def merge_coplanar(
@@ -238,8 +234,8 @@ def merge_coplanar(
     label of its parts.
     """
     pairs, num_contacts = contacts
-    pairs = pairs[(num_contacts >= MIN_CONTACTS) & ~planes.curved[pairs].all(dim=1)]
-    return _merge(labels, pairs, _region_moments(planes), tolerance)
+    flat = ~planes.curved[pairs].all(dim=1)
+    return _merge(labels, (pairs[flat], num_contacts[flat]), _region_moments(planes), tolerance)
 
 
 def merge_facets(
@@ -261,12 +257,10 @@ def merge_facets(
     not ``faceted``. The facets of a bend are thus merged only as far as they are coplanar. For
     ``contacts`` and labels see :func:`merge_coplanar`.
     """
-    pairs, num_contacts = contacts
-    pairs = pairs[num_contacts >= MIN_CONTACTS]
     scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
     moments = _region_moments(planes)._replace(scale=scale, noise=noise)
     max_tilt = (_MAX_FACET_TILT if faceted else _MAX_TILT) * tolerance
-    return _merge(labels, pairs, moments, 1.0, max_tilt=max_tilt)
+    return _merge(labels, contacts, moments, 1.0, max_tilt=max_tilt)
 
 
 class _Moments(NamedTuple):
@@ -316,14 +310,15 @@ def pairwise_misfit(planes: RegionPlanes, pairs: Tensor) -> Tensor:
 
 def _merge(
     labels: Tensor,
-    pairs: Tensor,
+    contacts: tuple[Tensor, Tensor],
     moments: _Moments,
     tolerance: float,
     *,
     max_tilt: float | None = None,
 ) -> Tensor:
-    """Merge pairs within both limits; a merged region takes its smallest label."""
-    pairs, groups = pairs.cpu(), _Moments(*(values.cpu().clone() for values in moments))
+    """Merge regions in contact within both limits of their misfit."""
+    pairs = contacts[0][contacts[1] >= MIN_CONTACTS].cpu()
+    groups = _Moments(*(values.cpu().clone() for values in moments))
     adjacent: list[set[int]] = [set() for _ in groups.weight]
     owner, age = list(range(len(adjacent))), [0] * len(adjacent)
     queue: list[tuple[float, int, int, int, int]] = []
@@ -331,10 +326,7 @@ def _merge(
     def offer(pairs: Tensor) -> None:
         first, second = pairs.unbind(dim=1)
         sides = groups.select(first), groups.select(second)
-        both = _combined(*sides)
-        misfits = _misfit(*sides, both)
-        if max_tilt is not None:
-            misfits = torch.where(_are_tilted(*sides, both, max_tilt), torch.inf, misfits)
+        misfits = _misfit(*sides, _combined(*sides), max_tilt)
         for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
             if misfit <= tolerance:
                 heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
@@ -385,8 +377,11 @@ def _combined(a: _Moments, b: _Moments) -> _Moments:
     return _Moments(weight, mean, covariance, scale, noise, values[:, 0], axes[:, :, 0])
 
 
-def _misfit(a: _Moments, b: _Moments, both: _Moments) -> Tensor:
-    """Return the larger of both regions' RMS distances to the joint plane, in their own scales."""
+def _misfit(a: _Moments, b: _Moments, both: _Moments, max_tilt: float | None = None) -> Tensor:
+    """Return the larger of both regions' RMS distances to the joint plane, in their own scales.
+
+    With ``max_tilt`` it is infinite if the joint plane is tilted too far against either region's.
+    """
     misfits, normal = [], both.normal
     for side, other in ((a, b), (b, a)):
         variance = (normal[:, None] @ side.covariance @ normal[:, :, None])[:, 0, 0]
@@ -394,18 +389,11 @@ def _misfit(a: _Moments, b: _Moments, both: _Moments) -> Tensor:
         rms = (variance.clamp(min=0) + shift * shift).sqrt()
         lent = torch.where(other.weight > side.weight, other.noise, 0.0)
         misfits.append(torch.where(rms > 0, rms / torch.maximum(side.scale, lent), 0.0))
+        if max_tilt is not None:
+            tilted = unsigned_angle_deg(side.normal, normal) > _MAX_FACET_TURN_DEG
+            tilted |= variance - side.min_variance > max_tilt**2
+            misfits[-1].masked_fill_(tilted, torch.inf)
     return torch.maximum(*misfits)
-
-
-def _are_tilted(a: _Moments, b: _Moments, both: _Moments, max_tilt: float) -> Tensor:
-    """Return whether the joint plane is tilted too far against either region's plane."""
-    joint = both.normal
-    tilted = torch.zeros(len(joint), dtype=torch.bool)
-    for side in (a, b):
-        variance = (joint[:, None] @ side.covariance @ joint[:, :, None])[:, 0, 0]
-        tilted |= unsigned_angle_deg(side.normal, joint) > _MAX_FACET_TURN_DEG
-        tilted |= variance - side.min_variance > max_tilt**2
-    return tilted
 
 
 def refine_borders(
@@ -420,32 +408,50 @@ def refine_borders(
     + e^2`, because noise moves points off their plane, not along it. A region is taken to end at
     the other plane if its points in the neighborhood lie on one side of that plane. Points of
     nearly parallel planes keep their label, and points beyond the reach of their region move only
-    to a nearer plane. Changed points and their neighbors are revisited in the next pass.
+    to a nearer plane.
 
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
     which are left unchanged.
     """
-    adjacency = KnnAdjacency(cloud.neighbors)
-    flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
-    labels = labels.clone()
-    rows = _boundary_points(labels, adjacency)
-    for _ in range(_MAX_PASSES):
-        rows = rows[cloud.valid[rows] & flat[labels[rows]]]
-        near_rows, chosen = adjacency.neighbor_rows(rows), labels[rows]
-        near = labels[near_rows]
 
-        def work(
-            block: slice, rows: Tensor = rows, near: Tensor = near, chosen: Tensor = chosen
-        ) -> None:
+    def choose(labels: Tensor, rows: Tensor, near: Tensor) -> Tensor:
+        near, chosen = labels[near], labels[rows]
+
+        def work(block: slice) -> None:
             chosen[block] = _choose_regions(cloud, labels, planes, reach, rows[block], near[block])
 
         map_chunks(work, len(rows), ROWS_IN_CACHE, labels.device)
+        return torch.where(cloud.valid[rows], chosen, labels[rows])
+
+    flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
+    return _reassign(cloud, labels, flat, choose)
+
+
+def _reassign(
+    cloud: GrowingInput,
+    labels: Tensor,
+    movable: Tensor,
+    choose: Callable[[Tensor, Tensor, Tensor], Tensor],
+) -> Tensor:
+    """Reassign boundary points; changed points and their neighbors are revisited.
+
+    ``choose`` returns the new labels of points, given all labels, their rows ``(n,)`` and those of
+    their 8 nearest neighbors. Only points of ``movable`` regions are passed, ``(M + 1,)``, the last
+    entry for unlabeled points.
+    """
+    adjacency = KnnAdjacency(cloud.neighbors)
+    labels = labels.clone()
+    rows = _boundary_points(labels, adjacency)
+    for _ in range(_MAX_PASSES):
+        rows = rows[movable[labels[rows]]]
+        near = adjacency.neighbor_rows(rows)
+        chosen = choose(labels, rows, near)
         moved = chosen != labels[rows]
         if not bool(moved.any()):
             break
         rows = rows[moved]
         labels[rows] = chosen[moved]
-        rows = torch.unique(torch.cat([rows, near_rows[moved].flatten()]))
+        rows = torch.unique(torch.cat([rows, near[moved].flatten()]))
     return labels
 
 
@@ -454,28 +460,20 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
 
     The planes must be 1.5 thicknesses apart at the point, so that parts of one surface are
     unchanged. A point moves if it is nearer to the other plane, and so is the mean of the points of
-    both regions among its 8 nearest. A single residual is noise. Changed points and their neighbors
-    are revisited in the next pass.
+    both regions among its 8 nearest. A single residual is noise.
     """
-    adjacency = KnnAdjacency(cloud.neighbors)
     flat = ~planes.curved & (planes.num_points >= MIN_FITTED)
     flat = torch.cat([flat, flat.new_zeros(1)])
-    labels = labels.clone()
-    rows = _boundary_points(labels, adjacency)
-    for _ in range(_MAX_PASSES):
-        rows = rows[flat[labels[rows]]]
-        near, label = adjacency.neighbor_rows(rows).long(), labels[rows]
-        options = labels[near]
+
+    def choose(labels: Tensor, rows: Tensor, near: Tensor) -> Tensor:
+        label, options = labels[rows], labels[near]
         turn = unsigned_angle_deg(planes.normal[options], planes.normal[label][:, None])
         usable = flat[options] & (options != label[:, None]) & (turn <= PARALLEL_DEG)
-        position = cloud.points[rows].double()
-        distance = planes.signed_distances(position, options).abs()
+        distance = planes.signed_distances(cloud.points[rows], options).abs()
         other, min_cost = _lowest(torch.where(usable, distance, torch.inf), options)
-        both = min_cost.isfinite()
-        rows, near, pair = rows[both], near[both], torch.stack([label, other], dim=1)[both]
-        if not len(rows):
-            break
-        group = torch.cat([rows[:, None], near], dim=1)
+        both = nonzero_rows(min_cost.isfinite())
+        pair = torch.stack([label, other], dim=1)[both]
+        group = torch.cat([rows[:, None], near], dim=1)[both]
         members = (labels[group][:, :, None] == pair[:, None]).any(dim=2, keepdim=True)
         normal, center = planes.normal[pair], planes.center[pair]
         normal = torch.where((normal[:, :1] * normal).sum(dim=2, keepdim=True) < 0, -normal, normal)
@@ -486,12 +484,9 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
         mean, first = (offset * members).sum(dim=1).abs(), offset[:, 0].abs()
         moved = apart & (mean[:, 1] < mean[:, 0]) & (first[:, 1] < first[:, 0])
         moved &= first[:, 1] <= _LEVEL_REACH * planes.thickness[pair[:, 1]]
-        if not bool(moved.any()):
-            break
-        rows = rows[moved]
-        labels[rows] = pair[moved, 1]
-        rows = torch.unique(group[moved])
-    return labels
+        return label.index_copy(0, both[moved], other[both[moved]])
+
+    return _reassign(cloud, labels, flat, choose)
 
 
 def _boundary_points(labels: Tensor, adjacency: KnnAdjacency) -> Tensor:

@@ -1,9 +1,8 @@
 """Under-segmentation repair: splitting regions at bridges and at parallel levels.
 
-A bridge is a few points that connect two surfaces. :func:`find_mixed_regions` detects mixed
-regions. Growing them again under stricter limits yields *cores*. :func:`cut_bridges` decides which
-cores are one surface and assigns the points between cores to the nearest. :func:`split_levels`
-splits regions that contain two parallel surfaces, such as a wall and a board on it.
+A bridge is a few points that connect two surfaces. Growing regions that :func:`find_mixed_regions`
+detects again under stricter limits yields the *cores* of :func:`cut_bridges`. Two parallel
+surfaces, such as a wall and a board on it, are separated by :func:`split_levels`.
 """
 
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, KnnAdjacency
 from torchrg.regions.edges import GrowingInput, accept_edges, within_angle
 from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
-from torchrg.regions.repair import pairwise_misfit, remap_labels
+from torchrg.regions.repair import keep_regions, pairwise_misfit, remap_labels
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -132,14 +131,11 @@ def find_mixed_regions(
     if len(rows) == 0:
         return None
     remaining = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
-    turns = [
-        sq_chords(
-            cloud.normals[chunk].double().unbind(dim=1),
-            planes.normal[labels[chunk]].unbind(dim=1),
-        )
-        for chunk in torch.split(remaining, ROWS_AT_ONCE)
-    ]
-    turn = torch.cat(turns)
+    parts = []
+    for chunk in torch.split(remaining, ROWS_AT_ONCE):
+        ours, theirs = cloud.normals[chunk].double(), planes.normal[labels[chunk]]
+        parts.append(sq_chords(ours.unbind(dim=1), theirs.unbind(dim=1)))
+    turn = torch.cat(parts)
     near, aligned = (
         torch.zeros_like(off).index_fill_(0, remaining[turn <= deg_to_sq_chord(limit)], True)
         for limit in (config.max_angle_deg, _CORE_FRACTION * config.max_angle_deg)
@@ -204,13 +200,13 @@ def _add_plane_cores(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tupl
     has_core[labels[cores >= 0]] = True
     on_plane = mixed.aligned & has_core[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
     cores = torch.where(on_plane, labels + int(cores.max()) + 1, cores)
-    is_core = torch.bincount(cores + 1)[1:] > 0
-    return torch.cat([is_core.cumsum(0) - 1, cores.new_tensor([UNLABELED])])[cores], on_plane
+    return keep_regions(cores, torch.bincount(cores + 1)[1:] > 0), on_plane
 
 
 def _join_curved(cloud: GrowingInput, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
     """Merge the cores ``(N,)`` of each curved region, except its flat surfaces."""
-    flat, owner = ~_fit_cores(cloud, cores).curved, _core_regions(labels, cores)
+    segments, owner = Segments(cores, max_points=MAX_FITTED), _core_regions(labels, cores)
+    flat = ~fit_planes(segments, cloud.points, cloud.normals).curved
     num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
     of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
     covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
@@ -232,20 +228,12 @@ def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
     return labels.new_zeros(len(indices)).index_copy_(0, rows, labels[points])
 
 
-def _fit_cores(cloud: GrowingInput, cores: Tensor) -> RegionPlanes:
-    """Fit planes to cores."""
-    return fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
-
-
 def _are_smooth(
     cloud: GrowingInput, regions: Tensor, max_angle_deg: float, chunk_size: int
 ) -> Tensor:
     """Return a mask of points where the surface is as smooth as is typical for its region."""
     fractions = torch.zeros_like(cloud.curvature, dtype=torch.float64)
-    rows, limit = (
-        torch.arange(len(fractions), device=fractions.device),
-        deg_to_sq_chord(max_angle_deg),
-    )
+    rows, limit = torch.arange(len(regions), device=regions.device), deg_to_sq_chord(max_angle_deg)
     for chunk in split_rows(len(fractions), chunk_size):
         near, counted = cloud.neighbors.select(chunk), cloud.neighbors.mask(chunk)
         smooth = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
@@ -269,15 +257,7 @@ def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor, chunk_size: int) 
         same = (near.gather(narrow) == narrow[rows[chunk], None]) & (local_rows >= 0)
         counted[chunk] = same & near.mask()
         indices[chunk] = torch.where(counted[chunk], local_rows, itself)
-    return cloud._replace(
-        points=cloud.points.T[:, rows].T,
-        normals=cloud.normals.T[:, rows].T,
-        curvature=cloud.curvature[rows],
-        neighbors=Neighbors(indices, counted),
-        valid=cloud.valid[rows],
-        reach=None if cloud.reach is None else cloud.reach[rows],
-        colors=None if cloud.colors is None else cloud.colors[rows],
-    )
+    return cloud.select(rows, Neighbors(indices, counted))
 
 
 def _find_edges(
@@ -296,9 +276,6 @@ def _find_edges(
 
 def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tensor:
     """Return the cores ``(N,)`` with cores of one surface merged."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     num_cores = int(cores.max()) + 1
     narrow = cores.to(torch.int32)
     ours, theirs = narrow[edges.rows, None], Neighbors(edges.targets).gather(narrow)
@@ -309,16 +286,22 @@ def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tenso
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(indices, minlength=len(pairs))
     num_open = torch.bincount(indices[edges.passed[between]], minlength=len(pairs))
-    planes = _fit_cores(cloud, cores)
-    one, other = planes.normal[pairs].unbind(dim=1)
-    turn = unsigned_angle_deg(one, other)
+    planes = fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
+    turn = unsigned_angle_deg(*planes.normal[pairs].unbind(dim=1))
     joined = (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
     joined |= num_open >= _MIN_OPEN_FRACTION * num_edges
-    ends = pairs[joined].T.cpu().numpy()
-    ones = np.ones(ends.shape[1], dtype=np.int8)
-    graph = coo_array((ones, (ends[0], ends[1])), shape=(num_cores, num_cores))
-    _, owner = connected_components(graph, directed=False)
-    return torch.from_numpy(np.append(owner, UNLABELED)).to(cores)[cores]
+    return remap_labels(cores, _components(num_cores, *pairs[joined].unbind(dim=1)))
+
+
+def _components(num_nodes: int, first: Tensor, second: Tensor) -> Tensor:
+    """Return the connected component of each node ``(n,)`` of a graph with edges ``(E,)``."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = first.numpy(force=True), second.numpy(force=True)
+    graph = coo_array((np.ones(len(first), np.int8), ends), shape=(num_nodes, num_nodes))
+    owner = connected_components(graph, directed=False)[1]
+    return torch.from_numpy(owner).to(first.device, torch.int64)
 
 
 def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
@@ -351,15 +334,8 @@ def split_levels(
     - its plane is parallel to the region's, and its thickness is below 0.6 of the step;
     - in the surrounding rings fewer points lie halfway than on the level: there is a valley.
 
-    Args:
-        cloud: Points, normals and neighbors, in canonical order.
-        labels: Regions, 0 to M-1 or negative, shape ``(N,)``.
-        planes: Planes of the regions.
-        config: Growing configuration; ``min_size`` and ``facet_tolerance`` are numbers.
-
-    Returns:
-        Labels, shape ``(N,)``; second levels are numbered from M. ``labels`` itself if there are
-        none.
+    The cloud is in canonical order, with the ``planes`` of its regions ``labels`` ``(N,)``, 0 to
+    M-1 or negative. Second levels are numbered from M; without any, ``labels`` itself is returned.
     """
     searched = labels
     for search in range(_MAX_LEVELS):
@@ -368,10 +344,9 @@ def split_levels(
         large = (planes.num_points >= _MIN_SIZE_FACTOR * int(config.min_size)) & ~planes.curved
         if not bool(large.any()):
             break
-        region = remap_labels(searched, _compact_indices(large))
-        level, owner = _find_levels(
-            cloud, region, RegionPlanes(*(v[large] for v in planes)), config
-        )
+        region = keep_regions(searched, large)
+        planes = RegionPlanes(*(values[large] for values in planes))
+        level, owner = _find_levels(cloud, region, planes, config)
         if not len(owner):
             break
         labels = torch.where(level >= 0, level + int(labels.max()) + 1, labels)
@@ -389,24 +364,19 @@ def _find_levels(
     residual, average, noise = _measure_residuals(cloud, region, planes)
     adjacency = KnnAdjacency(cloud.neighbors)
     limit = _SEED_NOISE_FACTOR * torch.cat([noise, noise.new_tensor([torch.inf])])
-    level = _components(average.abs() > limit[region], 2 * region + (average > 0), adjacency)
+    level = _connected_points(average.abs() > limit[region], 2 * region + (average > 0), adjacency)
     step = _median_steps(level, residual)
-    level = _components(average.abs() > step[level] / 2, level, adjacency)
+    level = _connected_points(average.abs() > step[level] / 2, level, adjacency)
     step, owner = _median_steps(level, residual)[:-1], Segments(level).first(region)
     min_step = (_STEP_NOISE_FACTOR * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
     num_points = torch.bincount(level + 1, minlength=1)[1:]
     kept = (num_points >= int(config.min_size)) & (step >= min_step)
-    level, step, owner = remap_labels(level, _compact_indices(kept)), step[kept], owner[kept]
+    level, step, owner = keep_regions(level, kept), step[kept], owner[kept]
     fits = fit_planes(Segments(level), cloud.points, cloud.normals)
     turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
     kept = (turn <= PARALLEL_DEG) & (fits.thickness <= _MAX_THICKNESS * step)
     kept &= _have_valleys(level, step, average, region, adjacency)
-    return remap_labels(level, _compact_indices(kept)), owner[kept]
-
-
-def _compact_indices(kept: Tensor) -> Tensor:
-    """Return consecutive numbers of the kept regions ``(M,)``, -1 for removed ones."""
-    return torch.where(kept, kept.cumsum(0) - 1, UNLABELED)
+    return keep_regions(level, kept), owner[kept]
 
 
 def _measure_residuals(
@@ -457,22 +427,16 @@ def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
     return (middle + total / segments.sum(near.double()).clamp(min=1)).float()
 
 
-def _components(chosen: Tensor, groups: Tensor, adjacency: KnnAdjacency) -> Tensor:
+def _connected_points(chosen: Tensor, groups: Tensor, adjacency: KnnAdjacency) -> Tensor:
     """Label the connected components of chosen points within each group, -1 for other points."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     rows = nonzero_rows(chosen & (groups >= 0))
     index = torch.full_like(groups, UNLABELED).index_copy_(
         0, rows, torch.arange(len(rows), device=rows.device)
     )
     near = adjacency.neighbor_rows(rows).long()
     joined = (index[near] >= 0) & (groups[near] == groups[rows, None])
-    ends = index[rows, None].expand_as(near)[joined].cpu(), index[near][joined].cpu()
-    ones = torch.ones(len(ends[0]), dtype=torch.int8)
-    graph = coo_array((ones.numpy(), ends), shape=(len(rows), len(rows)))
-    components = torch.from_numpy(connected_components(graph, directed=False)[1]).to(groups)
-    return index.index_copy_(0, rows, components)
+    ends = index[rows, None].expand_as(near)[joined], index[near][joined]
+    return index.index_copy_(0, rows, _components(len(rows), *ends))
 
 
 def _median_steps(level: Tensor, residual: Tensor) -> Tensor:

@@ -22,8 +22,6 @@ from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
 from torchrg.regions.growth import rank_by_count
 from torchrg.structures import UNLABELED, Neighbors, Superpoints
 
-_NUM_NEIGHBORS = 1 + NUM_CONTACTS
-"""The point itself and its adjacent neighbors."""
 _RADIUS_SPACINGS = 1.6
 """Radius, in spacings, of a circle around 8 points that are one spacing apart."""
 _COLOR_WEIGHT = 3.0
@@ -160,7 +158,7 @@ def _partition_distinct(
     """Return the region of each distinct point ``(n,)`` in canonical order, level by level."""
     if len(positions) == 0:
         return [torch.zeros(0, dtype=torch.int64) for _ in range(config.num_levels)]
-    k = min(_NUM_NEIGHBORS, len(positions))
+    k = min(1 + NUM_CONTACTS, len(positions))
     if neighbors is None or neighbors.indices.shape[1] < k:
         neighbors = search_knn(positions, k, canonical=True)
     neighbors = Neighbors(neighbors.indices[:, :k].cpu())
@@ -173,18 +171,16 @@ def _partition_distinct(
     regions = torch.arange(len(positions))
     if config.planes == "whole":
         regions = _plane_components(labels, nearest)
+    bound = math.inf if config.max_extent is None else config.max_extent
     graphs = [
         _Graph(
-            _initial_regions(regions, positions, spacing, normals, colors, config),
+            _initial_regions(regions, positions, spacing, normals, colors, bound),
             _initial_boundaries(regions, positions, normals, labels, nearest),
         )
     ]
-    levels: list[Callable[..., tuple[_Graph, Tensor]]]
-    if config.counts is None:
-        levels = [partial(_merge_to_strength, strength) for strength in config.strengths]
-    else:
+    levels = [partial(_merge_to_strength, strength) for strength in config.strengths]
+    if config.counts is not None:
         levels = [partial(_merge_to_count, count) for count in config.counts]
-    bound = math.inf if config.max_extent is None else config.max_extent
     partitions = []
     for merge in levels:
         graph, merged = merge(graphs, config.min_size, bound)
@@ -280,16 +276,12 @@ def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
 
     parts = map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device)
     counts, targets = (torch.cat(parts) for parts in zip(*parts, strict=True))
-    starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    starts = functional.pad(counts.cumsum(0), (1, 0))
     links = np.ones(len(targets), dtype=np.int8)
     shape = (len(labels), len(labels))
     edges = csr_array((links, targets.numpy(), starts.numpy()), shape=shape)
     indices = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
-    return _by_first_point(indices)
-
-
-def _by_first_point(indices: Tensor) -> Tensor:
-    """Number regions by their first points, so that ties do not depend on scipy's numbering."""
+    # Numbered by first points, ties do not depend on scipy's order.
     first = torch.full((int(indices.max()) + 1,), len(indices))
     first = first.scatter_reduce(0, indices, torch.arange(len(indices)), "amin")
     return first.argsort().argsort()[indices]
@@ -301,21 +293,19 @@ def _initial_regions(
     spacing: float,
     normals: Tensor,
     colors: Tensor | None,
-    config: SuperpointsConfig,
+    bound: float,
 ) -> _Regions:
     """Return the feature sums and boxes of the initial regions."""
     positions = positions.double()
     x, y, z = normals.double().unbind(dim=1)
     off = math.sqrt(2)
     features = [x * x, y * y, z * z, off * x * y, off * y * z, off * z * x]
-    length = _POSITION_SPACINGS * spacing
-    if config.max_extent is not None:
-        length = min(length, config.max_extent)
+    length = min(_POSITION_SPACINGS * spacing, bound)
     if length > 0:
         features += ((positions - positions.amin(dim=0)) / length).unbind(dim=1)
     if colors is not None:
         features += colors.double().unbind(dim=1)
-    corners = positions[:, : 0 if config.max_extent is None else 3]
+    corners = positions[:, : 3 if bound < math.inf else 0]
     points = _Regions(torch.ones_like(x), torch.stack(features, dim=1), corners, corners)
     return _merged_regions(points, regions)
 
@@ -398,8 +388,6 @@ def _aggregate(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor
     contacts = torch.ones_like(difference) if contacts is None else contacts
     different = nonzero_rows(a != b)
     a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
-    if len(a) == 0:
-        return _Boundaries(a, b, contacts, difference)
     a, b = a.long(), b.long()
     keys, order = (torch.minimum(a, b) * width + torch.maximum(a, b)).sort(stable=True)
     keys, counts = torch.unique_consecutive(keys, return_counts=True)
@@ -479,8 +467,8 @@ def _merge_rounds(
             return
         chosen = _choose_pairs(boundaries, cost, regions.size, ratio, max_merges)
         del cost
-        regions, boundaries, new = _merge(regions, boundaries, *chosen)
-        graph, assignment = _Graph(regions, boundaries), new[assignment]
+        graph, new = _merge(graph, *chosen)
+        assignment = new[assignment]
 
 
 def _merge_costs(regions: _Regions, boundaries: _Boundaries, bound: float) -> Tensor:
@@ -528,9 +516,8 @@ def _choose_pairs(
         cheapest = min_cost[source].argsort(stable=True)[:max_merges]
         source, target = source[cheapest], target[cheapest]
     owner = torch.arange(num_regions).index_copy(0, source, target)
-    sources = source
     # The target may itself have merged into its mutual partner.
-    return sources, owner[owner[sources]]
+    return source, owner[target]
 
 
 def _cheapest(boundaries: _Boundaries, cost: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
@@ -549,22 +536,14 @@ def _cheapest(boundaries: _Boundaries, cost: Tensor, num_regions: int) -> tuple[
     return min_cost, best.scatter_reduce(0, ends[is_min], rows[is_min], "amin")
 
 
-def _merge(
-    regions: _Regions, boundaries: _Boundaries, sources: Tensor, targets: Tensor
-) -> tuple[_Regions, _Boundaries, Tensor]:
+def _merge(graph: _Graph, sources: Tensor, targets: Tensor) -> tuple[_Graph, Tensor]:
     """Merge regions into their targets; also return the new index of each region."""
-    num_regions = len(regions.size)
-    owner = torch.arange(num_regions).index_copy(0, sources, targets)
-    stays = owner == torch.arange(num_regions)
-    new = (stays.cumsum(0) - 1)[owner]
-    narrow = new.int()
-    merged = _aggregate(
-        narrow.index_select(0, boundaries.first),
-        narrow.index_select(0, boundaries.second),
-        boundaries.contacts,
-        boundaries.difference,
-    )
-    return _merged_regions(regions, new), merged, new
+    regions, (first, second, *sums) = graph
+    rows = torch.arange(len(regions.size))
+    owner = rows.index_copy(0, sources, targets)
+    new = ((owner == rows).cumsum(0) - 1)[owner]
+    ends = (new.int().index_select(0, side) for side in (first, second))
+    return _Graph(_merged_regions(regions, new), _aggregate(*ends, *sums)), new
 
 
 def majority_planes(superpoints: Tensor, labels: Tensor) -> Tensor:

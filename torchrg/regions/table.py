@@ -92,9 +92,8 @@ def summarize_planes(
         meeting = find_adjacency(
             points, labels, neighbors, fit.normal, fit.thickness, curved=fit.curved
         )
-        lengths, angles = meeting.boundary_length, meeting.dihedral_deg
-        lengths, angles = lengths.to(points.dtype), angles.to(points.dtype)
-        planes = replace(planes, adjacency=PlaneAdjacency(meeting.pairs, lengths, angles))
+        sizes = (size.to(points.dtype) for size in meeting[1:])
+        planes = replace(planes, adjacency=PlaneAdjacency(meeting.pairs, *sizes))
     return planes
 
 
@@ -117,19 +116,16 @@ def measure_planes(
     segments: Segments, points: Tensor, fit: RegionPlanes, *, outline: bool = False
 ) -> Planes:
     """Measure regions on their fitted planes; see :func:`summarize_planes`."""
-    first, second = _plane_axes(fit)
-    chunks = segments.chunks(POINTS_AT_ONCE)
+    frames, chunks = _plane_axes(fit), segments.chunks(POINTS_AT_ONCE)
     sizes = [len(chunk.counts) for chunk in chunks]
-    frame = fit.center, torch.stack([first, second, fit.normal], dim=1)
-    frames = zip(*(torch.split(part, sizes) for part in frame), strict=True)
-    measures = map_tasks(
-        lambda part: _measure(points, *part, outline=outline),
-        list(zip(chunks, frames, strict=True)),
-        points.device,
-    )
-    measured, polygons = zip(*measures, strict=True)
+    parts = zip(chunks, *(torch.split(part, sizes) for part in (fit.center, frames)), strict=True)
+
+    def measure(part: tuple[Segments, Tensor, Tensor]) -> tuple[list[Tensor], _Polygons]:
+        return _measure(points, part[0], part[1:], outline=outline)
+
+    measured, polygons = zip(*map_tasks(measure, list(parts), points.device), strict=True)
     mean, area, sides, directions, middle = map(torch.cat, zip(*measured, strict=True))
-    axes = directions @ torch.stack([first, second], dim=1)
+    axes = directions @ frames[:, :2]
 
     def to_input_dtype(values: Tensor) -> Tensor:
         return values.to(points.dtype)
@@ -167,15 +163,15 @@ def _measure(
     return [mean, area, *boxes], rings
 
 
-def _plane_axes(fit: RegionPlanes) -> tuple[Tensor, Tensor]:
-    """Return two unit directions that span each plane, the first along the region."""
+def _plane_axes(fit: RegionPlanes) -> Tensor:
+    """Return three unit axes of each plane ``(M, 3, 3)``: along the region, across, and normal."""
     first = _reject(eigh3_lapack(fit.covariance)[1][:, :, 2], fit.normal)
     # A region at a single position has no direction: any direction in the plane will do.
     min_axis = fit.normal.abs().argmin(dim=1)
     other = _reject(torch.eye(3, dtype=first.dtype, device=first.device)[min_axis], fit.normal)
     first = torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, other)
     first = first / first.norm(dim=1, keepdim=True)
-    return first, torch.linalg.cross(fit.normal, first)
+    return torch.stack([first, torch.linalg.cross(fit.normal, first), fit.normal], dim=1)
 
 
 def _reject(vectors: Tensor, normals: Tensor) -> Tensor:
@@ -193,13 +189,10 @@ def _trace_polygons(
 ) -> _Polygons:
     """Trace the polygons of each region, and lift them into space."""
     polygons = []
-    counts = segments.counts.tolist()
-    parts = torch.split(torch.stack([u, v], dim=1), counts)
+    parts = torch.split(torch.stack([u, v], dim=1), segments.counts.tolist())
     for positions, size, center, axes in zip(parts, width.tolist(), *frame, strict=True):
-        rings = (
-            torch.from_numpy(ring).to(u.device)
-            for ring in trace_polygon(positions.cpu().numpy(), size)
-        )
+        traced = trace_polygon(positions.cpu().numpy(), size)
+        rings = (torch.from_numpy(ring).to(u.device) for ring in traced)
         lifted = (center + ring[:, :1] * axes[0] + ring[:, 1:] * axes[1] for ring in rings)
         polygons.append(tuple(ring.to(dtype) for ring in lifted))
     return tuple(polygons)

@@ -1,7 +1,7 @@
 """S- and MM-estimators of location and scatter with deterministic starts."""
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from math import exp, lgamma, log
 from typing import Literal, NamedTuple
 
@@ -22,7 +22,7 @@ from torchrg.robust.lanes import (
     sq_distances,
     take_lanes,
 )
-from torchrg.robust.patches import LaneEstimator, RobustFit, fit_patchwise, patchwise
+from torchrg.robust.patches import RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, initial_sets
 from torchrg.robust.weights import Estimate, chi2_quantile
@@ -80,21 +80,7 @@ def fit_dets(
         tensor(True)
     """
     check_choices("fit_dets", starts=(starts, Starts))
-
-    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
-        shape, scale = _best_s_estimate(columns, floor, size, starts)
-        return _estimate(columns, shape, shape, scale, quantile)
-
-    return _fit_shapes(
-        "fit_dets",
-        patches,
-        mask,
-        quantile,
-        min_dimension,
-        chunk_size,
-        estimator,
-        breakdown_constant,
-    )
+    return _fit_shapes("fit_dets", patches, mask, quantile, starts, min_dimension, chunk_size)
 
 
 @patchwise
@@ -125,21 +111,8 @@ def fit_detmm(
         tensor(True)
     """
     check_choices("fit_detmm", starts=(starts, Starts), tuned_for=(tuned_for, Target))
-
-    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
-        first, scale = _best_s_estimate(columns, floor, size, starts)
-        cutoff = efficiency_constant(len(columns), tuned_for)
-        weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
-        final = _fit_shape(columns, weights, floor)
-        sq_unit = cutoff * cutoff * scale * scale
-        before = sum_points(_bisquare_loss(first.distances / sq_unit))
-        after = sum_points(_bisquare_loss(final.distances / sq_unit))
-        final = _fit_shape(columns, torch.where(after <= before, weights, first.weights), floor)
-        return _estimate(columns, first, final, scale, quantile)
-
-    cutoff_of = partial(efficiency_constant, target=tuned_for)
     return _fit_shapes(
-        "fit_detmm", patches, mask, quantile, min_dimension, chunk_size, estimator, cutoff_of
+        "fit_detmm", patches, mask, quantile, starts, min_dimension, chunk_size, tuned_for
     )
 
 
@@ -148,12 +121,28 @@ def _fit_shapes(
     patches: Tensor,
     mask: Tensor | None,
     quantile: float,
+    starts: Starts,
     min_dimension: int,
     chunk_size: int,
-    estimator: LaneEstimator,
-    cutoff_of: Callable[[int], float],
+    tuned_for: Target | None = None,
 ) -> RobustFit:
-    """Fit patches by an estimator with bisquare weights that vanish at a cutoff for P."""
+    """Fit patches by the S-estimator, or by the MM-estimator tuned for an efficiency."""
+
+    def cutoff_of(size: int) -> float:
+        return efficiency_constant(size, tuned_for) if tuned_for else breakdown_constant(size)
+
+    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
+        first, scale = _best_s_estimate(columns, floor, size, starts)
+        if tuned_for is None:
+            return _estimate(columns, first, first, scale, quantile)
+        cutoff = cutoff_of(len(columns))
+        weights, _ = _reweight(columns, first, scale, floor, cutoff, adapt_scale=False)
+        final = _fit_shape(columns, weights, floor)
+        sq_unit = cutoff * cutoff * scale * scale
+        before = sum_points(_bisquare_loss(first.distances / sq_unit))
+        after = sum_points(_bisquare_loss(final.distances / sq_unit))
+        final = _fit_shape(columns, torch.where(after <= before, weights, first.weights), floor)
+        return _estimate(columns, first, final, scale, quantile)
 
     def weigh(fit: RobustFit, points: Tensor) -> Tensor:
         return _bisquare_weights(fit.sq_distances / cutoff_of(points.shape[-1]) ** 2)

@@ -1,5 +1,7 @@
 """Bilateral smoothing of normals, and plane choice among neighbors."""
 
+from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor
 
@@ -45,7 +47,6 @@ def smooth_planes(
     are the ``a_i`` in radians, ``(N,)``, positive; ``rows`` are the points to smooth, ``(n,)``.
     Returns all planes.
     """
-    normals, offsets = planes.normals.clone(), planes.offsets.clone()
     are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
     table = _table(points, planes, errors) if are_served else planes.normals.T.contiguous()
     parameters = (
@@ -56,19 +57,25 @@ def smooth_planes(
         constants.MAX_TILT,
     )
 
-    def work(block: slice) -> None:
-        chosen = rows[block]
+    def find(chosen: Tensor) -> Sequence[Tensor]:
         if are_served:
-            normals[chosen], offsets[chosen] = kernels.call(
-                "smooth_planes", table, *neighbors, noise, chosen, *parameters
-            )
-            return
-        normals[chosen], offsets[chosen] = _smooth_rows(
-            points, *neighbors, table, planes.offsets, noise, errors, chosen
-        )
+            return kernels.call("smooth_planes", table, *neighbors, noise, chosen, *parameters)
+        return _smooth_rows(points, *neighbors, table, planes.offsets, noise, errors, chosen)
+
+    return _replace_planes(planes, rows, chunk_size, find)
+
+
+def _replace_planes(
+    planes: TangentPlanes, rows: Tensor, chunk_size: int, find: Callable[[Tensor], Sequence[Tensor]]
+) -> TangentPlanes:
+    """Return all planes, those of some rows replaced by the normals and offsets of ``find``."""
+    replaced = TangentPlanes(planes.normals.clone(), planes.offsets.clone())
+
+    def work(block: slice) -> None:
+        replaced.normals[rows[block]], replaced.offsets[rows[block]] = find(rows[block])
 
     map_chunks(work, len(rows), chunk_size, rows.device)
-    return TangentPlanes(normals, offsets)
+    return replaced
 
 
 def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
@@ -130,7 +137,6 @@ def choose_planes(
     than three times the noise are excluded. ``rows`` ``(n,)`` are the points to update. Returns all
     planes.
     """
-    normals, offsets = planes.normals.clone(), planes.offsets.clone()
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
 
     are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
@@ -144,21 +150,14 @@ def choose_planes(
         constants.CHOICE_COST,
     )
 
-    def work(block: slice) -> None:
-        chosen = rows[block]
+    def find(chosen: Tensor) -> Sequence[Tensor]:
         if are_served:
-            normals[chosen], offsets[chosen] = kernels.call(
-                "choose_planes", table, *neighbors, points, chosen, *parameters
-            )
-            return
-        normals[chosen], offsets[chosen] = _best_neighbor_planes(
-            points, *neighbors, *planes, noise, chosen, ranks
-        )
+            return kernels.call("choose_planes", table, *neighbors, points, chosen, *parameters)
+        return _best_neighbor_planes(points, *neighbors, *planes, noise, chosen, ranks)
 
     at_once = ROWS_IN_CACHE // (1 if are_served else len(ranks))
     size = min(chunk_size, limit_rows(at_once, neighbors.indices.shape[1]))
-    map_chunks(work, len(rows), size, rows.device)
-    return TangentPlanes(normals, offsets)
+    return _replace_planes(planes, rows, size, find)
 
 
 def _best_neighbor_planes(
