@@ -31,6 +31,9 @@ _NUM_MEASURED = 50
 _MAX_RMS = 0.3
 """Maximum RMS distance of the points of terraces to their plane, as a fraction of the RMS distance
 along it. It is 0.05 for a table seen by a Kinect; a slab a third as thick as long has 0.33."""
+_PLANE_REACH = 3.0
+"""Maximum distance of a point of a terrace to the plane, in thicknesses, as for absorbed points;
+others may be on another surface."""
 _RADIUS_SPACINGS = 1.6
 """Radius, in spacings, of a circle around 8 points that are one spacing apart."""
 _COLOR_WEIGHT = 3.0
@@ -156,7 +159,9 @@ def _flatten_terraces(points: Tensor, normals: Tensor, labels: Tensor) -> Tensor
     fits = fit_planes(Segments(plane), points[rows], normals[rows])
     length = eigh3_lapack(fits.covariance)[0][:, 2].sqrt()
     are_flat = ~fits.curved & (fits.rms <= _MAX_RMS * length)
-    offset = fits.signed_distances(points[rows], plane[:, None]).where(are_flat[plane, None], 0)
+    reach = torch.where(are_flat, _PLANE_REACH * fits.thickness, -1.0)[plane, None]
+    offset = fits.signed_distances(points[rows], plane[:, None])
+    offset = offset.where(offset.abs() <= reach, 0)
     return points.index_copy(0, rows, (points[rows] - offset * fits.normal[plane]).to(points))
 
 
