@@ -449,6 +449,14 @@ def test_terraces_of_a_plane_are_no_stripes(step):
     assert torch.equal(shuffled, found[order])
 
 
+def test_points_far_from_the_terraces_of_their_plane_stay_apart():
+    points, normals, planes = board(2.0)
+    is_far = (points[:, :2] < 8).all(dim=1)
+    points[:, 2] += 15 * is_far
+    found = partition_points(points, normals, planes, SuperpointsConfig(counts=(20,))).labels
+    assert not set(found[is_far].tolist()) & set(found[~is_far].tolist())
+
+
 def test_a_step_inside_a_plane_separates_without_quantized_coordinates():
     rng = torch.Generator().manual_seed(5)
     points = torch.rand(3000, 3, generator=rng) * torch.tensor([60.0, 60.0, 0.1])
