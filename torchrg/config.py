@@ -221,7 +221,7 @@ class GrowingConfig:
             size = round(sampling.density * (side * sampling.height) ** 2)
             count = min(max(size, low), high)
         if tolerance == "auto":
-            reach = math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
+            reach = _reach(sampling)
             limit = min(_FACET_HEIGHT_FRACTION * sampling.height, _FACET_RADIUS_FRACTION * reach)
             fraction = max(_shape_fraction(sampling), _WHITE_FRACTION)
             fraction += _WARP_FRACTION * _warp_fraction(sampling)
@@ -263,6 +263,9 @@ _STEP_PER_DEVIATION = math.sqrt(12)
 _STEP_RADIUS_FRACTION = 0.4
 """Upper bound of that step as a fraction of the radius of 50 neighbors. Steps of a depth camera are
 0.35 of it on a desk; steps of distant walls would merge near boards two centimeters apart."""
+_MIN_TERRACE_DEVIATION = 0.01
+"""Deviation of 100 points of terraces, as a fraction of the radius of 50 neighbors. It is 0.03 to
+0.3 for frames of a depth camera, 0.002 for points sampled from a mesh."""
 _MIN_SIDE_FRACTION = 1 / 27
 """Side of the smallest region as a fraction of the cloud height: 10 cm in a room of 2.7 m."""
 _MIN_SIZES = 20, 50
@@ -304,6 +307,23 @@ def _rounding_step(sampling: Sampling) -> float:
         return 0.0
     quantized = (1 - _shape_fraction(sampling)) * _ramp(sampling.exactness, *_QUANTIZED)
     return quantized * _STEP_PER_DEVIATION * sampling.deviation
+
+
+def is_terraced(sampling: Sampling) -> bool:
+    """Return whether rounding of quantized coordinates makes terraces of surfaces, of any width.
+
+    Nearest points are coplanar, but not a hundred. If terraces are wider than a neighborhood, the
+    deviation is no white noise, and only even spacing distinguishes them from the facets of a mesh.
+    """
+    max_variation = _SCAN_LINES if _shape_fraction(sampling) < 0.5 else _VARIATION
+    is_rounded = _ramp(sampling.exactness, *_QUANTIZED) > 0.5
+    deviates = sampling.deviation > _MIN_TERRACE_DEVIATION * _reach(sampling)
+    return is_rounded and deviates and sampling.variation < max_variation
+
+
+def _reach(sampling: Sampling) -> float:
+    """Return the radius of 50 neighbors, in units of the cloud; 0 if the density is unknown."""
+    return math.sqrt(50 / (math.pi * sampling.density)) if sampling.density > 0 else 0.0
 
 
 def _ramp(value: float, low: float, high: float) -> float:

@@ -47,9 +47,12 @@ def show_public_bases(_app: Sphinx, _name: str, _of: type, _options: object, bas
     bases[:] = shown
 
 
-def leave_out_aliases(*event: Any) -> bool | None:  # noqa: ANN401
-    """Skip fields of named tuples, which their class docstrings describe."""
-    return True if str(event[3].__doc__).startswith("Alias for field number") else None
+def leave_out_aliases(app: Sphinx, _what: str, name: str, member: Any, *_: Any) -> bool | None:  # noqa: ANN401
+    """Skip fields of named tuples, which their classes describe, and classes of the first page."""
+    is_field = str(member.__doc__).startswith("Alias for field number")
+    is_class_of_page = isinstance(member, type) and name in torchrg.__all__
+    is_second = is_class_of_page and app.env.docname == "reference/torchrg.structures"
+    return True if is_field or is_second else None
 
 
 def keep_colons(*event: Any) -> None:  # noqa: ANN401

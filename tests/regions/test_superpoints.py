@@ -16,6 +16,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import score_partition
 from torchrg.regions import partition_points, superpoints
 from torchrg.scenes import make_room
+from torchrg.structures import Sampling
 
 CONFIG = SuperpointsConfig(strengths=(0.3, 1.0, 4.0), min_size=4)
 
@@ -425,3 +426,60 @@ def test_neighbors_that_are_known_are_not_searched_again(monkeypatch):
     assert torch.equal(other.labels.flip(0), expected.labels)
     monkeypatch.setattr("torchrg.regions.superpoints.search_knn", None)
     assert torch.equal(make_superpoints(points, seg).labels, expected.labels)
+
+
+def board(step, size=60):
+    """A board tilted by 14 degrees, its noisy coordinates along z rounded to ``step``."""
+    rng = torch.Generator().manual_seed(3)
+    x, y = torch.cartesian_prod(torch.arange(float(size)), torch.arange(float(size))).unbind(1)
+    z = x / 4 + 0.1 * torch.randn(len(x), generator=rng)
+    points = torch.stack([x, y, step * (z / step).round()], dim=1)
+    return points, torch.tensor([0.0, 0.0, 1.0]).expand(len(x), 3), torch.zeros(len(x)).long()
+
+
+@pytest.mark.parametrize("step", [1.0, 2.0])
+def test_terraces_of_a_plane_are_no_stripes(step):
+    points, normals, planes = board(step)
+    config = SuperpointsConfig(counts=(20,))
+    found = partition_points(points, normals, planes, config).labels
+    extents = [np.ptp(points[found == part, :2].numpy(), axis=0) for part in range(20)]
+    assert np.median([extent.max() / extent.min() for extent in extents]) < 2
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(4))
+    shuffled = partition_points(points[order], normals[order], planes[order], config).labels
+    assert torch.equal(shuffled, found[order])
+
+
+def test_points_far_from_the_terraces_of_their_plane_stay_apart():
+    points, normals, planes = board(2.0)
+    is_far = (points[:, :2] < 8).all(dim=1)
+    points[:, 2] += 15 * is_far
+    found = partition_points(points, normals, planes, SuperpointsConfig(counts=(20,))).labels
+    assert not set(found[is_far].tolist()) & set(found[~is_far].tolist())
+
+
+def test_a_step_inside_a_plane_separates_without_quantized_coordinates():
+    rng = torch.Generator().manual_seed(5)
+    points = torch.rand(3000, 3, generator=rng) * torch.tensor([60.0, 60.0, 0.1])
+    is_raised = points[:, 0] > 30
+    points[:, 2] += 3 * is_raised
+    normals = torch.tensor([0.0, 0.0, 1.0]).expand(3000, 3)
+    found = partition_points(
+        points, normals, torch.zeros(3000).long(), SuperpointsConfig(counts=(2,))
+    )
+    assert torch.equal(found.labels == found.labels[is_raised][0], is_raised)
+
+
+@pytest.mark.parametrize(
+    ("measures", "expected"),
+    [
+        ((0.72, 0.27, 0.08, 307_000.0, 0.26, 0.0008), True),  # A desk seen by a Kinect.
+        ((0.0, 0.19, 0.83, 35_800.0, 1.2, 0.0043), True),  # Terraces wider than a neighborhood.
+        ((0.06, 0.53, 0.6, 4510.0, 2.8, 0.0001), False),  # Points sampled from a mesh.
+        ((0.06, 0.53, 0.6, 4510.0, 2.8, 0.005), False),  # Facets that deviate as much.
+        ((1.0, 0.1, 1.0, 4000.0, 2.8, 0.0), False),  # An exact grid.
+        ((0.9, 0.9, 0.6, 4000.0, 2.8, 0.005), False),  # Scan lines.
+        ((0.32, 0.55, 0.0, 7880.0, 2.3, 0.0028), False),  # A fused scan of an office.
+    ],
+)
+def test_terraces_are_told_by_the_sampling(measures, expected):
+    assert superpoints.is_terraced(Sampling(*measures)) is expected

@@ -111,7 +111,7 @@ class DistinctPoints(NamedTuple):
         """Number of duplicates, i.e. points after the first one of each position."""
         return int(torch.count_nonzero(self.inverse >= 0)) - len(self.rows)
 
-    def restore(self, values: Tensor, *, fill: int = 0) -> Tensor:
+    def restore(self, values: Tensor, *, fill: float = 0) -> Tensor:
         """Expand values per position to all points; see :func:`expand_to_points`."""
         return expand_to_points(values, self.inverse, fill=fill)
 
@@ -186,7 +186,7 @@ def scatter_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0
     return result.index_copy_(0, rows, values)
 
 
-def expand_to_points(values: Tensor, inverse: Tensor, *, fill: int = 0) -> Tensor:
+def expand_to_points(values: Tensor, inverse: Tensor, *, fill: float = 0) -> Tensor:
     """Return each point's value of its position or voxel, shape ``(N, ...)``.
 
     ``values`` has one row per position or voxel; ``inverse`` ``(N,)`` is the row of each point.

@@ -41,7 +41,8 @@ def make_superpoints(
     graph of the 8 nearest neighbors, have one orientation, and respect the boundaries of objects
     and planes. Initially each point, or each plane, is a region. Regions merge while the merging
     cost, an energy like that of cut pursuit, is at most the strength of the level; see
-    :func:`torchrg.regions.superpoints.partition_points` for details and sources.
+    :func:`torchrg.regions.superpoints.partition_points` for details and sources. If coordinates are
+    quantized, as in one frame of a depth camera, points are first moved to their plane.
 
     Convention:
         The result does not depend on the order of the points or the number of threads. Duplicates

@@ -13,15 +13,25 @@ from torch.nn import functional
 
 from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, map_chunks, nonzero_rows, split_rows
-from torchrg.config import SuperpointsConfig
+from torchrg.config import SuperpointsConfig, is_terraced
 from torchrg.linalg.angles import sq_chords
 from torchrg.linalg.moments import Segments, eigh3_lapack, reduce_runs
-from torchrg.neighbors import distinct_points, search_knn
+from torchrg.neighbors import distinct_points, measure_sampling, search_knn
+from torchrg.neighbors.knn import prepare_search
 from torchrg.neighbors.order import DistinctPoints, finite_rows
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
+from torchrg.regions.fit import fit_planes
 from torchrg.regions.growth import rank_by_count
-from torchrg.structures import UNLABELED, Neighbors, Superpoints
+from torchrg.structures import UNLABELED, Neighbors, Sampling, Superpoints
 
+_NUM_MEASURED = 50
+"""Number of neighbors by which the sampling is measured, the default of ``normals.k``."""
+_MAX_RMS = 0.3
+"""Maximum RMS distance of the points of terraces to their plane, as a fraction of the RMS distance
+along it. It is 0.05 for a table seen by a Kinect; a slab a third as thick as long has 0.33."""
+_PLANE_REACH = 3.0
+"""Maximum distance of a point of a terrace to the plane, in thicknesses, as for absorbed points;
+others may be on another surface."""
 _RADIUS_SPACINGS = 1.6
 """Radius, in spacings, of a circle around 8 points that are one spacing apart."""
 _COLOR_WEIGHT = 3.0
@@ -79,6 +89,9 @@ def partition_points(
     configured number of superpoints remains. Each round merges mutually cheapest partners, and
     small regions into a much larger cheapest partner, so no visiting order is needed.
 
+    Rounding of quantized coordinates makes terraces of a surface. Their points are moved to the
+    plane of their label, so that steps between terraces neither cost nor separate.
+
     If the normals of a plane agree, each point normal is moved halfway to the plane normal, which
     gives noise less weight and positions more.
 
@@ -102,6 +115,11 @@ def partition_points(
         indoor point cloud partition method. ICCS, 2020.
     """
     distinct, unique_colors = merge_duplicates(points, normals, labels, colors)
+    if is_terraced(_measure(distinct.points, neighbors)):
+        rows = distinct.rows
+        flat = _flatten_terraces(distinct.points.detach(), normals[rows], labels[rows])
+        points, neighbors = distinct.restore(flat, fill=torch.nan), None
+        distinct, unique_colors = merge_duplicates(points, normals, labels, colors)
     edges = None
     if faces is not None:
         edges = _mesh_edges(faces.cpu(), distinct.inverse.cpu())
@@ -119,6 +137,30 @@ def partition_points(
         of_points = distinct.restore(level.to(points.device), fill=UNLABELED)
         levels.append(rank_by_count(of_points)[of_points])
     return Superpoints(levels[0], majority_planes(levels[0], labels), tuple(levels[1:]))
+
+
+def _measure(points: Tensor, neighbors: Neighbors | None) -> Sampling:
+    """Measure the sampling of distinct points; search a few neighborhoods if not known."""
+    if neighbors is not None and neighbors.indices.shape[1] == _NUM_MEASURED:
+        return measure_sampling(points, neighbors)
+    if len(points) < _NUM_MEASURED:
+        return Sampling()
+    return measure_sampling(points, prepare_search(points.numpy(force=True), _NUM_MEASURED))
+
+
+def _flatten_terraces(points: Tensor, normals: Tensor, labels: Tensor) -> Tensor:
+    """Return points ``(n, 3)`` projected onto the plane of their label, if this is flat."""
+    rows = nonzero_rows(labels >= 0)
+    if len(rows) == 0:
+        return points
+    plane = torch.unique(labels[rows], return_inverse=True)[1]
+    fits = fit_planes(Segments(plane), points[rows], normals[rows])
+    length = eigh3_lapack(fits.covariance)[0][:, 2].sqrt()
+    are_flat = ~fits.curved & (fits.rms <= _MAX_RMS * length)
+    reach = torch.where(are_flat, _PLANE_REACH * fits.thickness, -1.0)[plane, None]
+    offset = fits.signed_distances(points[rows], plane[:, None])
+    offset = offset.where(offset.abs() <= reach, 0)
+    return points.index_copy(0, rows, (points[rows] - offset * fits.normal[plane]).to(points))
 
 
 def merge_duplicates(

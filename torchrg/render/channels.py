@@ -73,7 +73,7 @@ def make_channels(
     """Yield the available color channels, in the order of :data:`COLOR_MODES`.
 
     Args:
-        fields: Fields of n points; see :class:`torchrg.structures.Cloud`. Labels and superpoints
+        fields: Fields of n points; see :class:`torchrg.Cloud`. Labels and superpoints
             are consecutive.
         ground_truth: Ground-truth ``labels`` or ``normals`` of the same points.
         palettes: Results of :func:`torchrg.render.colors.palette_of_planes` for the available modes
