@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchrg.result import Result
 
 import torchrg
 from tests import pretend
 from tests.test_inputs import CALLS, PATCHES, argument
 from torchrg.datasets import collate_offset
+from torchrg.io.result import Result
 from torchrg.linalg.moments import reduce_runs
 from torchrg.metrics import score_clusters, score_labels, score_normals
 from torchrg.normals import ESTIMATORS

@@ -279,7 +279,7 @@ void fallback(const c10::OperatorHandle& op, c10::DispatchKeySet, torch::jit::St
       }
   }
   // CUDA has one driver of least squares, which needs full rank.
-  if (name == "linalg_lstsq" && any_device) converted.back() = IValue(std::string("gels"));
+  if (name == "linalg_lstsq" && any_device) converted[3] = IValue(std::string("gels"));
   if (name == "segment_reduce" && !originals[6].toBool()) {
     // Without unsafe=True it reads the least length, and whether their sum is the number of values.
     report(4, "segment_reduce", 0, work, dtype);
