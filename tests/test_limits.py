@@ -17,8 +17,9 @@ def test_out_of_memory_has_one_message(error):
     assert system_limit(error) == OUT_OF_MEMORY
 
 
-def test_a_limit_of_threads_names_the_repair():
-    assert "OMP_NUM_THREADS=1" in system_limit(RuntimeError("can't start new thread"))
+@pytest.mark.parametrize("what", ["thread", "process"])
+def test_a_limit_of_threads_names_the_repair(what):
+    assert "OMP_NUM_THREADS=1" in system_limit(RuntimeError(f"can't start new {what}"))
 
 
 def test_other_errors_have_no_limit():

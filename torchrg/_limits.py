@@ -7,7 +7,7 @@ _LIMITS = {
     "not enough memory": OUT_OF_MEMORY,
     "out of memory": OUT_OF_MEMORY,
     "failed to map segment": OUT_OF_MEMORY,
-    "can't start new thread": "no further thread can be started; raise the limit of processes, or "
+    "can't start new": "no further thread can be started; raise the limit of processes, or "
     "set OMP_NUM_THREADS=1.",
 }
 """Messages by words in errors of Python, torch and the loader of libraries."""

@@ -2,9 +2,12 @@
 
 import sys
 from contextlib import closing
-from multiprocessing import Pipe
+from multiprocessing import Pipe, get_context
 from pathlib import Path
 
+import pytest
+
+from torchrg._limits import system_limit
 from torchrg.batch.local import _serve, run_local
 from torchrg.batch.memory import scan_memory
 
@@ -104,3 +107,13 @@ def test_closing_stops_workers_and_removes_what_they_were_writing(faults, tmp_pa
 
 def test_no_jobs_start_no_worker():
     assert list(run_local([], workers=2, memory_limit=1)) == []
+
+
+def test_a_process_that_cannot_start_is_a_limit_of_the_system(faults, tmp_path, monkeypatch):
+    def start(self):
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(get_context("spawn").Process, "start", start)
+    with pytest.raises(RuntimeError, match="can't start new process") as error:
+        run(faults.make_jobs(tmp_path, {"9_a": "plain"}))
+    assert "raise the limit of processes" in system_limit(error.value)

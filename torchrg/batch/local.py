@@ -2,10 +2,8 @@
 
 import contextlib
 import gc
-import multiprocessing
 import os
 import signal
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
@@ -28,10 +26,6 @@ CHILD_ENVIRONMENT = dict.fromkeys(
 no imports from the working directory."""
 _STDERR = 2
 """File descriptor of standard error."""
-_PRELOADED = ["torchrg.batch.local", "torchrg.batch.sources"]
-"""Modules that the server loads, which forks the workers."""
-_MAX_CAUSE_BYTES = 65_536
-"""Bytes that a pipe holds, of a worker's messages."""
 _MAX_CAUSE_LENGTH = 300
 """Maximum characters of a worker's last message in a report; a few lines of a terminal."""
 
@@ -97,20 +91,19 @@ class _Worker:
 
     job: Job
     attempt: int
-    messages = b""
 
     def __init__(self) -> None:
-        multiprocessing.set_forkserver_preload(_PRELOADED)
-        # System libraries of macOS do not work after a fork.
-        is_linux = sys.platform == "linux"
-        context = get_context("forkserver") if is_linux else get_context("spawn")
+        context = get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
         # Errors before the first scan go to a report, not as a traceback to the terminal.
-        self.errors, errors = context.Pipe(duplex=False)
-        with in_root_directory(), _environment(), _block_sigint():
-            self.process = context.Process(target=_serve, args=(child_pipe, errors))
-            self.process.start()
-        errors.close()
+        self.errors, errors = os.pipe()
+        try:
+            with in_root_directory(), _environment(), _block_sigint(), _redirect(errors) as stderr:
+                self.process = context.Process(target=_serve, args=(child_pipe, stderr))
+                self.process.start()
+        except BlockingIOError as error:
+            raise RuntimeError("can't start new process") from error
+        os.close(errors)
         child_pipe.close()
 
     def begin(self, job: Job, *, attempt: int) -> None:
@@ -142,7 +135,7 @@ class _Worker:
 
     def _cause(self) -> str:
         """Return the last message of the process before its first scan, in one line."""
-        lines = self.messages.decode(errors="replace").splitlines()
+        lines = self.stderr_bytes.decode(errors="replace").splitlines()
         # Continuation lines of a message are indented; the traceback precedes it.
         starts = [number for number, line in enumerate(lines) if line[:1].strip()]
         return " ".join(" ".join(lines[starts[-1] :]).split())[:_MAX_CAUSE_LENGTH] if starts else ""
@@ -155,26 +148,17 @@ class _Worker:
             self.process.kill()
             self.process.join()
         self.pipe.close()
-        os.set_blocking(self.errors.fileno(), False)
-        with contextlib.suppress(BlockingIOError):
-            self.messages = os.read(self.errors.fileno(), _MAX_CAUSE_BYTES)
-        self.errors.close()
+        os.set_blocking(self.errors, False)
+        with os.fdopen(self.errors, "rb") as errors:
+            self.stderr_bytes = errors.read() or b""
         if hasattr(self, "job"):
             self.job.clean()
 
 
-def _serve(pipe: Connection, errors: Connection | None) -> None:
-    """Convert scans until the pipe closes; before the first one, errors go to ``errors``."""
+def _serve(pipe: Connection, stderr: Connection | None) -> None:
+    """Convert scans until the pipe closes; from the first scan on, errors go to ``stderr``."""
     import torch
 
-    try:
-        stderr = os.dup(_STDERR)
-    except OSError:  # The command has closed its own.
-        stderr = os.open(os.devnull, os.O_WRONLY)
-    if errors is not None:
-        os.dup2(errors.fileno(), _STDERR)
-        errors.close()
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     gc.freeze()  # Loaded modules are not garbage.
     gc.enable()
     Thread(target=_end_with_parent, daemon=True).start()
@@ -183,7 +167,10 @@ def _serve(pipe: Connection, errors: Connection | None) -> None:
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
             job = pipe.recv()
-            os.dup2(stderr, _STDERR)
+            if stderr is not None:
+                os.dup2(stderr.fileno(), _STDERR)
+                stderr.close()
+                stderr = None
             pipe.send(convert_scan(job))
 
 
@@ -232,3 +219,22 @@ def _block_sigint() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+@contextlib.contextmanager
+def _redirect(pipe: int) -> Iterator[Connection | None]:
+    """Redirect the errors of processes that start here to a pipe, and yield the original stream.
+
+    It is None if this process has closed its own.
+    """
+    try:
+        original = Connection(os.dup(_STDERR), readable=False)
+    except OSError:
+        yield None
+        return
+    os.dup2(pipe, _STDERR)
+    try:
+        yield original
+    finally:
+        os.dup2(original.fileno(), _STDERR)
+        original.close()
