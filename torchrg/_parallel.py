@@ -263,8 +263,8 @@ def _retain_freed_memory() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    # As in data loaders. OpenMP does not survive a fork: an operation of the child that wants
-    # threads waits forever for those of the parent.
+    # As in data loaders. OpenMP threads do not survive a fork: an operation of the child that uses
+    # several would wait for them forever.
     os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 

@@ -311,7 +311,8 @@ def list_flags(
 ) -> Iterator[Flag]:
     """Yield the arguments defined by the fields of a dataclass, in order.
 
-    Settings are those of ``default``, at ``path`` with a dot; ``section`` begins their names.
+    ``default`` has the default values. ``path`` and ``section`` are the prefixes of an argument's
+    path and name.
     """
     texts = _field_docstrings(kind)
     for field, hint, argument in _fields(kind):

@@ -293,7 +293,7 @@ class Segments:
 def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
     """Return the "sum", "min" or "max" ``(M,)`` of runs with ``counts`` values each.
 
-    Integers must be below 2^53, as they are reduced in float64 on other devices.
+    Integers must be below 2^53: float64 represents them on devices other than the CPU.
 
     Example:
         >>> reduce_runs(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([2, 1]), "min")

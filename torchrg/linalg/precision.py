@@ -69,9 +69,9 @@ def safe_sqrt(squares: Tensor) -> Tensor:
 def to_single(points: Tensor) -> Tensor:
     """Return finite float64 points ``(N, 3)`` as float32, if its steps are fine for their spacing.
 
-    Estimators and region growing depend on differences of coordinates alone. The points are
-    therefore relative to the local origin, as those of a cloud are. Other
-    points are unchanged: of another dtype or device, or with gradients.
+    Estimators and region growing depend only on differences of coordinates, so the result is
+    relative to a local origin, like :attr:`torchrg.Cloud.points`. Points of another dtype or
+    device, and points with gradients, are unchanged.
     """
     is_plain = points.device.type == "cpu" and not points.requires_grad
     if points.dtype != torch.float64 or not is_plain or len(points) == 0:

@@ -64,8 +64,8 @@ def make_superpoints(
         **changes: Individual settings, as in ``counts=100``.
 
     Returns:
-        The partition of the first strength, and those of the remaining strengths. A superpoint
-        smaller than ``min_size`` has no neighbor that it could join within ``max_extent``.
+        The partition of each strength, as levels from fine to coarse. A superpoint smaller than
+        ``min_size`` has no neighbor that it could join within ``max_extent``.
 
     Raises:
         ShapeError: If a shape or dtype is wrong, or ``seg`` has another number of points.

@@ -254,7 +254,7 @@ def merge_facets(
     coordinate units). The joint plane must be tilted by at most 25 degrees against both, since a
     strip narrower than the tolerance is close to any adjacent plane. The tilt alone must not move
     the points of either by more than two thirds of the tolerance, or the tolerance if surfaces are
-    not ``faceted``. The facets of a bend are thus merged only as far as they are coplanar. For
+    not ``faceted``. The facets of a bend are thus merged only if they are nearly coplanar. For
     ``contacts`` and labels see :func:`merge_coplanar`.
     """
     scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
@@ -435,7 +435,7 @@ def _reassign(
 ) -> Tensor:
     """Reassign boundary points; changed points and their neighbors are revisited.
 
-    ``choose`` returns the new labels of points, given all labels, their rows ``(n,)`` and those of
+    ``choose`` returns new labels, given all labels, the rows ``(n,)`` of points, and the rows of
     their 8 nearest neighbors. Only points of ``movable`` regions are passed, ``(M + 1,)``, the last
     entry for unlabeled points.
     """

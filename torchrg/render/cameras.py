@@ -106,7 +106,7 @@ def fit_camera(
 def sensor_camera(points: Tensor, *, width: int, height: int | None = None) -> "PinholeCamera":
     """Return a camera at the origin that looks along z, with x to the right and y down.
 
-    The arguments are those of :func:`fit_camera`; points behind the camera are ignored.
+    For the arguments see :func:`fit_camera`; points behind the camera are ignored.
     """
     ahead = points[points[:, 2] > 0].double()
     rays = ahead[:, :2] / ahead[:, 2:]

@@ -68,8 +68,8 @@ def draw_picture(
 ) -> Tensor:
     """Draw points as discs, close gaps, shade, and average subpixels.
 
-    ``is_shown`` ``(n,)`` is the mask of the points of the surface to draw, and ``labels`` ``(n,)``
-    their planes; colors and normals are those of all points. See :func:`render_cloud`.
+    ``is_shown`` ``(n,)`` masks the points of the surface to draw, and ``labels`` ``(n,)`` are their
+    planes. Colors and normals cover all points. See :func:`render_cloud`.
     """
     width, height = int(camera.width), int(camera.height)
     if width * height * supersampling**2 > _MAX_SUBPIXELS:

@@ -43,8 +43,8 @@ _QUANTILES = (0.01, 0.99)
 _MIN_POINTS = 100
 """Minimum number of points whose spans are judged; fewer have any shape."""
 _MAX_HEIGHT = 50.0
-"""Maximum ratio of the span of z to those of x and y in one unit: a mast of 0.2 m and 10 m. Degrees
-are 100,000 times longer than meters."""
+"""Maximum ratio of the span of z to the spans of x and y in one unit: a mast is 0.2 m wide and 10 m
+high. A degree is 100,000 times longer than a meter."""
 _MAX_WIDTH = 1000.0
 """Maximum ratio of the span of x or y to that of z in one unit, unless z is noise: polders of 10 km
 with houses of 10 m."""

@@ -1,10 +1,9 @@
 """Transforms that add normals, plane labels and superpoints.
 
 ``config`` is a configuration object, a dictionary, a complete configuration, or the name of a
-preset. Default: that of :func:`torchrg.load_config`. ``changes`` override single parameters, as in
-``k=30``; those of a complete configuration are in a dictionary, as in ``{"normals.k": 30}``. Points
-with equal coordinates are treated as one and get the same result, as in
-:func:`torchrg.segment_planes`.
+preset. Default: see :func:`torchrg.load_config`. ``changes`` override single parameters, as in
+``k=30``; a dictionary overrides those in a section, as in ``{"normals.k": 30}``. Points with equal
+coordinates are treated as one and get the same result, as in :func:`torchrg.segment_planes`.
 """
 
 from collections.abc import Mapping, Sequence

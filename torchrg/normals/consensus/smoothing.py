@@ -68,7 +68,7 @@ def smooth_planes(
 def _replace_planes(
     planes: TangentPlanes, rows: Tensor, chunk_size: int, find: Callable[[Tensor], Sequence[Tensor]]
 ) -> TangentPlanes:
-    """Return all planes, those of some rows replaced by the normals and offsets of ``find``."""
+    """Return all planes, with the normals and offsets of some ``rows`` replaced by ``find``."""
     replaced = TangentPlanes(planes.normals.clone(), planes.offsets.clone())
 
     def work(block: slice) -> None:
