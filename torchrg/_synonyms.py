@@ -35,7 +35,7 @@ _SYNONYMS = {
 }
 """Words of other libraries by the name in torchrg."""
 _ADVICE = {
-    "torchrg runs on the CPU; leave it out": "cuda device gpu",
+    "the device is that of the points, for commands the CPU; leave it out": "cuda device gpu",
     "only commands print progress, to standard error; 2>/dev/null hides it": "debug log_level "
     "quiet silent verbose",
     "distances to planes follow from the noise; growing.facet_tolerance merges regions within a "
@@ -85,7 +85,7 @@ def advice_on(word: str) -> str:
 
     Example:
         >>> advice_on("gpu")
-        'torchrg runs on the CPU; leave it out'
+        'the device is that of the points, for commands the CPU; leave it out'
     """
     last = word.rpartition(".")[2]
     return next((advice for advice, words in _ADVICE.items() if last in words.split()), "")

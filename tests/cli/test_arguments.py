@@ -173,8 +173,8 @@ def test_a_setting_without_its_section_and_a_foreign_name_are_suggested(word, fl
 @pytest.mark.parametrize(
     ("word", "advice"),
     [
-        ("--gpu", ": torchrg runs on the CPU; leave it out"),
-        ("--device=cuda", ": torchrg runs on the CPU; leave it out"),
+        ("--gpu", ": the device is that of the points, for commands the CPU; leave it out"),
+        ("--device=cuda", ": the device is that of the points, for commands the CPU; leave it out"),
         ("--quiet", ": only commands print progress, to standard error; 2>/dev/null hides it"),
         ("--distance-threshold", ": distances to planes follow from the noise; .*"),
         ("--lr", ""),
