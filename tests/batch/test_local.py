@@ -1,5 +1,6 @@
 """The local engine: every scan gets its report, whatever happens to the workers."""
 
+import subprocess
 import sys
 from contextlib import closing
 from multiprocessing import Pipe, get_context
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from torchrg._limits import system_limit
-from torchrg.batch.local import _serve, run_local
+from torchrg.batch.local import _convert_scans, run_local
 from torchrg.batch.memory import scan_memory
 
 PLENTY = 10**12
@@ -60,11 +61,13 @@ def test_a_worker_ends_in_silence_when_nobody_takes_its_report(faults, tmp_path,
     ours, theirs = Pipe()
     ours.send(job)
     ours.close()
-    _serve(theirs, None)
+    _convert_scans(theirs, None)
     assert log_of(tmp_path)[-1] == ("9_a", "done")
 
 
-def test_a_worker_that_cannot_begin_is_told_by_its_cause(faults, tmp_path, capfd):
+def test_a_worker_that_cannot_begin_is_told_by_its_cause(faults, tmp_path, capfd, monkeypatch):
+    # A forked one has begun.
+    monkeypatch.setattr("torchrg.batch.local._context", lambda: get_context("spawn"))
     jobs = faults.make_jobs(tmp_path, {"9_a": "plain"})
     # Workers do not find the module of their tasks.
     sys.path.remove(str(Path(faults.__file__).parent))
@@ -109,11 +112,31 @@ def test_no_jobs_start_no_worker():
     assert list(run_local([], workers=2, memory_limit=1)) == []
 
 
-def test_a_process_that_cannot_start_is_a_limit_of_the_system(faults, tmp_path, monkeypatch):
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_process_that_cannot_start_is_a_limit_of_the_system(
+    faults, tmp_path, monkeypatch, method
+):
     def start(self):
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(get_context("spawn").Process, "start", start)
+    monkeypatch.setattr("torchrg.batch.local._context", lambda: get_context(method))
+    monkeypatch.setattr(get_context(method).Process, "start", start)
     with pytest.raises(RuntimeError, match="can't start new process") as error:
         run(faults.make_jobs(tmp_path, {"9_a": "plain"}))
     assert "raise the limit of processes" in system_limit(error.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux only")
+def test_only_a_process_of_one_thread_forks():
+    script = """
+import torchrg.__main__
+from threading import Event, Thread
+from torchrg.batch.local import _context
+print(_context().get_start_method())
+done = Event()
+Thread(target=done.wait).start()
+print(_context().get_start_method())
+done.set()
+"""
+    printed = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
+    assert printed.stdout.decode().split() == ["fork", "spawn"]

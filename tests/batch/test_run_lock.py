@@ -1,5 +1,6 @@
 """One writer in a directory, and no lock outlives its holder."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -65,8 +66,10 @@ def test_a_holder_that_is_killed_leaves_no_lock(tmp_path):
 
 
 def test_a_worker_ends_with_its_parent_whatever_it_does(tmp_path, faults):
+    fcntl = pytest.importorskip("fcntl")
     script = f"""
-import sys
+import torchrg.__main__
+import fcntl, sys
 sys.path.insert(0, {str(Path(faults.__file__).parent)!r})
 import faults
 from pathlib import Path
@@ -74,6 +77,8 @@ from torchrg.batch.local import run_local
 if __name__ == "__main__":
     place = Path(sys.argv[1])
     jobs = faults.make_jobs(place, {{"1_a": "slow writing"}})
+    held = (place / "held").open("w")
+    fcntl.flock(held, fcntl.LOCK_EX)
     for report in run_local(jobs, workers=1, memory_limit=10**12):
         if any((place / "out").rglob(".result.*")):
             print("writing", flush=True)
@@ -82,6 +87,13 @@ if __name__ == "__main__":
     command = [sys.executable, str(tmp_path / "run.py"), str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout.readline() == "writing\n"
+        worker = int((tmp_path / "log").read_text().split()[1])
+        os.kill(worker, signal.SIGSTOP)
         parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        # A worker that has not ended yet does not hold the locks of its parent.
+        with (tmp_path / "held").open("w") as held:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.kill(worker, signal.SIGCONT)
         parent.stdout.read()  # Until the worker has ended, too, which has the same stream.
     assert "done" not in (tmp_path / "log").read_text()

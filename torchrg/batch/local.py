@@ -4,10 +4,13 @@ import contextlib
 import gc
 import os
 import signal
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkContext, SpawnContext
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Thread
 
@@ -93,7 +96,7 @@ class _Worker:
     attempt: int
 
     def __init__(self) -> None:
-        context = get_context("spawn")
+        context = _context()
         self.pipe, child_pipe = context.Pipe()
         # Errors before the first scan go to a report, not as a traceback to the terminal.
         self.errors, errors = os.pipe()
@@ -155,13 +158,48 @@ class _Worker:
             self.job.clean()
 
 
-def _serve(pipe: Connection, stderr: Connection | None) -> None:
-    """Convert scans until the pipe closes; from the first scan on, errors go to ``stderr``."""
-    import torch
+def _context() -> ForkContext | SpawnContext:
+    """Return how workers start: forked, with all modules loaded, if no other thread is running.
 
+    A forked process lacks the other threads and would wait for their locks. System libraries of
+    macOS do not work after a fork.
+    """
+    if sys.platform == "linux" and len(list(Path("/proc/self/task").iterdir())) == 1:
+        return get_context("fork")
+    return get_context("spawn")
+
+
+def _serve(pipe: Connection, stderr: Connection | None) -> None:
+    """Convert scans in a new process; from the first scan on, errors go to ``stderr``."""
+    parent = parent_process()
+    kept = {pipe.fileno(), *([] if stderr is None else [stderr.fileno()])}
+    if parent is not None:
+        kept.add(int(parent.sentinel))
+        Thread(target=_end_with, args=(parent,), daemon=True).start()
+    if sys.platform == "linux":
+        _close_others(kept)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     gc.freeze()  # Loaded modules are not garbage.
     gc.enable()
-    Thread(target=_end_with_parent, daemon=True).start()
+    _convert_scans(pipe, stderr)
+
+
+def _close_others(kept: Collection[int]) -> None:
+    """Close all file descriptors above standard error except ``kept``.
+
+    Among those of a forked process are the lock of the output directory and the pipes of other
+    workers: they would outlive the parent process.
+    """
+    for descriptor in [int(path.name) for path in Path("/proc/self/fd").iterdir()]:
+        if descriptor > _STDERR and descriptor not in kept:
+            with contextlib.suppress(OSError):  # The one that lists the directory.
+                os.close(descriptor)
+
+
+def _convert_scans(pipe: Connection, stderr: Connection | None) -> None:
+    """Convert scans until the pipe closes."""
+    import torch
+
     torch.set_num_threads(1)
     # The pipe fails once the parent process is gone.
     with contextlib.suppress(EOFError, ConnectionError):
@@ -174,12 +212,10 @@ def _serve(pipe: Connection, stderr: Connection | None) -> None:
             pipe.send(convert_scan(job))
 
 
-def _end_with_parent() -> None:
+def _end_with(parent: BaseProcess) -> None:
     """End this process as soon as its parent is gone."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    parent.join()
+    os._exit(1)
 
 
 @contextlib.contextmanager

@@ -20,6 +20,8 @@ from torchrg.structures import Cloud
 
 # In Python 3.14 the default lock of tqdm starts a process that imports from the working directory.
 tqdm.set_lock(RLock())
+# Its thread would keep workers from being forked. Bars of long steps refresh without it.
+tqdm.monitor_interval = 0
 
 IMAGE_SUFFIXES = (".png", ".html")
 """File extensions of images and viewers."""
