@@ -51,7 +51,8 @@ def main() -> None:
         )
     path = arguments.out / "quick" if arguments.quick else arguments.out
     folder = Folder(path)
-    run = Run(folder, arguments.quick, {key: getattr(arguments, key) for key in TITLES})
+    paths = {key: getattr(arguments, key) for key in TITLES}
+    run = Run(folder, arguments.quick, paths, arguments.estimator)
     for name in arguments.parts or PARTS:
         begin = time.perf_counter()
         print(f"== {name}: {PARTS[name][1]}", flush=True)
@@ -83,6 +84,11 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument(
         "--keep", action="store_true", help="replace the results shown in the documentation"
+    )
+    parser.add_argument(
+        "--estimator",
+        metavar="MODULE:FUNCTION",
+        help="also evaluate a function from points to normals and curvature (part normals)",
     )
     for key, title in TITLES.items():
         words = f"the paper's {title}; its labels and normals are the ground truth"

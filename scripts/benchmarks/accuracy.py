@@ -15,6 +15,10 @@ clouds of a kind. Published figures below the tables are for other data.
     python scripts/bench.py accuracy --programs FOLDER --open3d-python PYTHON --synpeb FILE.pcd
         --parts office_parts.pcd --rooms CHOSEN HELD_OUT --out accuracy.json
     python scripts/bench.py accuracy --scale 0.1 --only classic consensus
+
+Your estimator of normals, of which ``classic`` grows regions, as the contender ``own``:
+
+    python scripts/bench.py accuracy --scale 0.1 --estimator my_module:my_function
 """
 
 import dataclasses
@@ -29,6 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from estimator import Estimator, load_estimator
 from torch import Tensor
 
 import torchrg
@@ -115,6 +120,8 @@ class Case(Benchmark):
     """Scans with labeled parts."""
     rooms: tuple[Path, ...] = ()
     """Folders of rooms with ground truth."""
+    estimator: str | None = None
+    """Function from points to normals and curvature, as module:function."""
     scale: float = 1.0
     """Fraction of the default number of points of synthetic data."""
 
@@ -143,6 +150,8 @@ class Case(Benchmark):
             name: partial(_run_preset, name) for name in PRESETS
         }
         runs["depth"] = _run_depth
+        if self.estimator is not None:
+            runs["own"] = partial(_run_estimator, load_estimator(self.estimator))
         if self.programs is not None and (self.programs / "pclrg").exists():
             runs["PCL"] = partial(_run_pcl, self.programs / "pclrg")
         if self.programs is not None and (program := self.programs / "cgalrg").exists():
@@ -243,6 +252,14 @@ def _run_preset(name: str, cloud: LabeledCloud) -> Tensor:
     if growing.min_size != "auto":
         growing = dataclasses.replace(growing, min_size=cloud.min_size)
     return torchrg.segment_planes(cloud.points, dataclasses.replace(config, growing=growing)).labels
+
+
+def _run_estimator(estimate: Estimator, cloud: LabeledCloud) -> Tensor:
+    """Grow the regions of ``classic`` from other normals."""
+    config = torchrg.load_config("classic")
+    growing = dataclasses.replace(config.growing, min_size=cloud.min_size)
+    neighbors = torchrg.search_knn(cloud.points, config.normals.k)
+    return torchrg.grow_regions(cloud.points, *estimate(cloud.points), neighbors, growing)
 
 
 def _run_depth(cloud: LabeledCloud) -> Tensor:

@@ -264,11 +264,13 @@ class Run:
         folder: Output folder.
         quick: Whether to use small clouds.
         paths: Files of the paper's own clouds, by key.
+        estimator: Another estimator of normals, ``module:function``, evaluated like the others.
     """
 
     folder: Folder
     quick: bool
     paths: Mapping[str, Path | None] = field(default_factory=dict)
+    estimator: str | None = None
     _clouds: dict[str, "LoadedCloud"] = field(default_factory=dict)
     _warm: set[str] = field(default_factory=set)
 

@@ -10,8 +10,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
+from estimator import load_estimator
 from matplotlib import pyplot as plt
 from matplotlib import ticker
+from torch import Tensor
 
 from reproduction.clouds import Run
 from reproduction.pictures import settings, write_tiles
@@ -123,11 +125,12 @@ QUICK = (
 
 def reproduce(run: Run) -> Record:
     """Make Table 1 and Figures 3 and 4."""
+    own = () if run.estimator is None else (run.estimator,)
     cells = [
         (shape, noise, grid.num_points, seed, variant)
         for grid in (QUICK if run.quick else FULL)
         for variant, shape, noise, seed in product(
-            grid.variants, grid.shapes, grid.noises, grid.seeds
+            (*grid.variants, *own), grid.shapes, grid.noises, grid.seeds
         )
     ]
     records = []
@@ -147,6 +150,8 @@ def reproduce(run: Run) -> Record:
 
 def _cell(run: Run, shape: str, noise: float, size: int, seed: int, variant: str) -> Record:
     """Return the record of one estimator on one cloud."""
+    if variant == run.estimator:  # Its code may change between two runs.
+        return _measure(shape, noise, size, seed, variant)
     name = f"normals-{shape}-{noise}-{size}-{seed}-{variant}"
     return run.folder.cell(name, lambda: _measure(shape, noise, size, seed, variant))
 
@@ -154,7 +159,16 @@ def _cell(run: Run, shape: str, noise: float, size: int, seed: int, variant: str
 @functools.cache
 def _warm_up(variant: str) -> None:
     """Run an estimator once, so that no run time includes the loading of code."""
-    estimate_normals(make_shape("cuboid", 500).points, config=VARIANTS[variant])
+    _estimate(variant, make_shape("cuboid", 500).points)
+
+
+def _estimate(variant: str, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normals of an estimator and the mask of points that have one."""
+    if variant not in VARIANTS:
+        normals, _ = load_estimator(variant)(points)
+        return normals, normals.isfinite().all(dim=1)
+    fit = estimate_normals(points, config=VARIANTS[variant])
+    return fit.normals, fit.valid
 
 
 def _blocks(run: Run, records: list[Record]) -> list[Block]:
@@ -185,16 +199,16 @@ def _measure(shape: str, noise: float, num_points: int, seed: int, variant: str)
     scene = make_shape(shape, num_points, noise / 100, seed)
     _warm_up(variant)
     begin = time.perf_counter()
-    fit = estimate_normals(scene.points, config=VARIANTS[variant])
+    normals, valid = _estimate(variant, scene.points)
     seconds = time.perf_counter() - begin
-    score = score_normals(fit.normals, scene.normals, valid=fit.valid)._asdict()
+    score = score_normals(normals, scene.normals, valid=valid)._asdict()
     return {
         "shape": shape,
         "noise_percent": noise,
         "num_points": num_points,
         "seed": seed,
         "variant": variant,
-        "config": dataclasses.asdict(VARIANTS[variant]),
+        "config": dataclasses.asdict(VARIANTS[variant]) if variant in VARIANTS else {},
         "seconds": seconds,
         "score": score,
     }
@@ -368,7 +382,9 @@ def draw_errors(path: Path, records: list[Record], shapes: Sequence[str]) -> Non
 def _draw_panel(axis: plt.Axes, records: list[Record]) -> None:
     """Plot a line per estimator, with evenly spaced noise levels."""
     noises = sorted({record["noise_percent"] for record in records})
-    for name, (label, color, marker, line) in STYLES.items():
+    others = [name for name in values(records, "variant") if name not in STYLES]
+    styles = STYLES | {name: (name, "black", "P", "-") for name in others}
+    for name, (label, color, marker, line) in styles.items():
         found = {
             noise: mean_score(records, "msae", noise_percent=noise, variant=name)
             for noise in noises

@@ -116,6 +116,31 @@ def test_accuracy_scores_clouds_and_images():
     assert "| RSPD |" in text
 
 
+OWN = """
+import torchrg
+
+def estimate(points):
+    fit = torchrg.estimate_normals(points, "classic")
+    return fit.normals, fit.curvature
+
+def estimate_one(points):
+    return points[0], points[:, 0]
+"""
+
+
+def test_an_estimator_of_ones_own_is_scored_as_ours(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own_estimator.py").write_text(OWN)
+    only = {"scale": 0.004, "only": ("classic", "own")}
+    results, _ = run(accuracy.Case(**only, estimator="own_estimator:estimate"))
+    assert all(by["own"] == by["classic"] for by in results.values())
+    case = accuracy.Case(**only, estimator="own_estimator:estimate_one")
+    with pytest.raises(SystemExit, match=r"expected normals \(1200, 3\) .* got \(3,\) and"):
+        harness.measure(case)
+    with pytest.raises(SystemExit, match="expected module:function, got own_estimator:nothing"):
+        accuracy.Case(estimator="own_estimator:nothing").contenders()
+
+
 def test_breakdown_is_that_of_contaminated_neighborhoods():
     results, text = run(breakdown.Case(patches=20, only=("PCA", "planes")))
     assert results["cluster 30%"]["PCA"][0]["median"] > 10

@@ -133,6 +133,22 @@ def test_one_call_makes_the_whole_report(small, normals, tmp_path, monkeypatch):
     assert json.loads((folder / "report.json").read_text()) == report
 
 
+def test_an_estimator_of_ones_own_is_in_the_tables(normals, tmp_path, monkeypatch):
+    from reproduction.clouds import Run
+    from reproduction.records import Folder
+
+    (tmp_path / "their_pca.py").write_text(
+        "import torchrg\n\ndef estimate(points):\n"
+        "    fit = torchrg.estimate_normals(points, method='pca', k=50)\n"
+        "    return fit.normals, fit.curvature\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    run = Run(Folder(tmp_path), quick=True, estimator="their_pca:estimate")
+    records = normals.reproduce(run)["records"]
+    theirs = [record["score"] for record in normals.where(records, variant=run.estimator)]
+    assert theirs == [record["score"] for record in normals.where(records, variant="pca")]
+
+
 def test_results_of_another_commit_or_without_their_file_are_computed_again(run, monkeypatch):
     from reproduction import records
 
