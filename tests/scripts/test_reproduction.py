@@ -133,6 +133,7 @@ def test_one_call_makes_the_whole_report(small, normals, tmp_path, monkeypatch):
     assert json.loads((folder / "report.json").read_text()) == report
 
 
+@pytest.mark.slow
 def test_an_estimator_of_ones_own_is_in_the_tables(normals, tmp_path, monkeypatch):
     from reproduction.clouds import Run
     from reproduction.records import Folder
