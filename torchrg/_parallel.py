@@ -35,6 +35,9 @@ ROWS_AT_ONCE = 65536
 """Number of rows per pass over a cloud: few calls, temporaries of bounded memory."""
 TYPICAL_WIDTH = 64
 """Number of values per row, such as neighbors, up to which the numbers above apply."""
+_DEVICE_CHUNKS = 5
+"""Factor by which chunks on other devices have more rows: they must fit not into a cache but into
+few hundred MB of memory, and the start of an operation takes as long as a small chunk."""
 _MIN_ROWS = 4096
 """Minimum number of rows per thread: at a few tenths of a microsecond each they outweigh its
 start."""
@@ -67,6 +70,16 @@ def limit_rows(num_rows: int, width: int) -> int:
     return max(num_rows * TYPICAL_WIDTH // max(width, TYPICAL_WIDTH), 1)
 
 
+def rows_at_once(num_rows: int, device: torch.device) -> int:
+    """Return the number of rows to process at a time on a device instead of ``num_rows`` on a CPU.
+
+    Example:
+        >>> rows_at_once(8192, torch.device("cpu"))
+        8192
+    """
+    return num_rows if device.type == "cpu" else num_rows * _DEVICE_CHUNKS
+
+
 def map_chunks(
     work: Callable[[slice], Returned],
     num_rows: int,
@@ -87,6 +100,7 @@ def map_chunks(
         [slice(0, 0, None)]
     """
     num_threads = allowed_threads() if device.type == "cpu" else 1
+    chunk_size = rows_at_once(chunk_size, device)
     # Each thread gets the same number of slices.
     num_chunks = -(-num_rows // (chunk_size * num_threads)) * num_threads
     size = max(-(-num_rows // max(num_chunks, 1)), min(min_rows, chunk_size))
@@ -286,3 +300,16 @@ def nonzero_rows(mask: Tensor) -> Tensor:
         # Ten times faster than nonzero in torch, and than indexing with the mask.
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.reshape(-1).nonzero().squeeze(1)
+
+
+def split_rows_by(mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the indices of True and of False elements ``(n,)``, with one wait for a device.
+
+    Example:
+        >>> split_rows_by(torch.tensor([False, True, False]))
+        (tensor([1]), tensor([0, 2]))
+    """
+    if mask.device.type == "cpu":
+        return nonzero_rows(mask), nonzero_rows(~mask)
+    order, count = (~mask).to(torch.uint8).argsort(stable=True), int(mask.sum())
+    return order[:count], order[count:]

@@ -20,6 +20,8 @@ dtype."""
 _FIRST_STEPS, _MAX_MORE_STEPS = 4, 36
 """Number of Newton steps for a simple root, and maximum number of further steps for a nearly double
 one, where each step halves the distance until the two roots separate."""
+_STEPS_AT_ONCE = 6
+"""Number of further steps before converged roots leave: counting them waits for a device."""
 _CONVERGED = 1e-9
 """Maximum last step of a converged root, as a fraction of the trace."""
 _NEARLY_EQUAL = 1e-9
@@ -158,12 +160,17 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     root, step = _newton(torch.zeros_like(coefficients[0]), coefficients, _FIRST_STEPS)
     # Convergence is quadratic except near a double root, so few need more steps.
     moving = step.abs() > _CONVERGED * coefficients[0]
-    rows = moving.nonzero().squeeze(1)
-    for _ in range(_MAX_MORE_STEPS):
-        if len(rows) == 0:
-            break
-        root[rows], step = _newton(root[rows], coefficients[:, rows], 1)
-        rows = rows[step.abs() > _CONVERGED * coefficients[0, rows]]
+    rows = torch.arange(len(root), device=root.device)
+    for step_number in range(_MAX_MORE_STEPS):
+        if step_number % _STEPS_AT_ONCE == 0:
+            left = moving.nonzero().squeeze(1)
+            rows, moving = rows[left], moving[left]
+            if len(rows) == 0:
+                break
+        old, own = root[rows], coefficients[:, rows]
+        new, step = _newton(old, own, 1)
+        root[rows] = torch.where(moving, new, old)
+        moving &= step.abs() > _CONVERGED * own[0]
     return root.view_as(trace)
 
 
@@ -198,10 +205,11 @@ def _null_vectors(
     u, v, w = torch.where(use, ac, u), torch.where(use, bc, v), torch.where(use, c, w)
     length = (u * u + v * v + w * w).sqrt()
     u, v, w = u / length, v / length, w / length
-    rank_one = best < _NEARLY_EQUAL
-    if bool(rank_one.any()):
-        x, y, z, yz, xz, xy = (entry[rank_one] for entry in (*diagonal, *off_diagonal))
-        u[rank_one], v[rank_one], w[rank_one] = _orthogonal((x, xy, xz), (xy, y, yz), (xz, yz, z))
+    rows = (best < _NEARLY_EQUAL).flatten().nonzero().squeeze(1)
+    if len(rows):
+        x, y, z, yz, xz, xy = (entry.take(rows) for entry in (*diagonal, *off_diagonal))
+        others = _orthogonal((x, xy, xz), (xy, y, yz), (xz, yz, z))
+        u, v, w = (old.put(rows, new) for old, new in zip((u, v, w), others, strict=True))
     return u, v, w
 
 

@@ -90,11 +90,19 @@ def second_moments(
     1). ``add`` sums a column, by default along the last axis, to shape ``(*)``. Sums are divided by
     ``total``, for a covariance the sum of the weights.
     """
-    size = len(columns)
+    return _symmetric([add(column) / total for column in _products(columns, weights)], len(columns))
+
+
+def _products(columns: Sequence[Tensor], weights: Tensor | None) -> list[Tensor]:
+    """Return the weighted products of all pairs of columns, the upper triangle by rows."""
     weighted = columns if weights is None else [weights * column for column in columns]
-    entries = {
-        (i, j): add(weighted[i] * columns[j]) / total for i in range(size) for j in range(i, size)
-    }
+    return [weighted[i] * other for i in range(len(columns)) for other in columns[i:]]
+
+
+def _symmetric(triangle: Sequence[Tensor], size: int) -> Tensor:
+    """Return symmetric matrices ``(*, P, P)`` from their upper triangle by rows."""
+    pairs = [(i, j) for i in range(size) for j in range(i, size)]
+    entries = dict(zip(pairs, triangle, strict=True))
     rows = [
         torch.stack([entries[min(i, j), max(i, j)] for j in range(size)], dim=-1)
         for i in range(size)
@@ -125,16 +133,12 @@ class Segments:
         self.rows = _ascending(labels)[num_unlabeled:]
         self.counts = self.sizes = counts[1:]
         if max_points is not None:
-            ends = self.counts.cumsum(0).tolist()
-            parts = [
-                torch.arange(
-                    end - count, end, max(-(-count // max_points), 1), device=labels.device
-                )
-                for end, count in zip(ends, self.counts.tolist(), strict=True)
-            ]
-            self.rows = self.rows[torch.cat(parts)] if parts else self.rows
-            sizes = [len(block) for block in parts]
-            self.counts = torch.tensor(sizes, dtype=torch.int64, device=labels.device)
+            steps = (self.counts + (max_points - 1)) // max_points
+            steps, first = steps.clamp(min=1), self.counts.cumsum(0) - self.counts
+            self.labels = torch.repeat_interleave(self.counts, output_size=len(self.rows))
+            place = torch.arange(len(self.rows), device=labels.device) - self.broadcast(first)
+            self.rows = self.rows[place % self.broadcast(steps) == 0]
+            self.counts = (self.counts + steps - 1) // steps
         self.labels = torch.repeat_interleave(self.counts, output_size=len(self.rows))
 
     def _take_rows(self, labels: Tensor, max_points: int | None) -> None:
@@ -279,15 +283,21 @@ class Segments:
 
     def quantile(self, values: Tensor, fraction: float) -> Tensor:
         """Return the lower quantile of the values of each region, without interpolation."""
+        on_cpu = values.device.type == "cpu"
+        first = self.counts.cumsum(0) - self.counts
+        rank = (fraction * (self.counts - 1).double()).long()
         are_small = len(values) < _SORTED_SIZE * len(self.counts) and bool(self.counts.all())
-        if are_small and values.device.type == "cpu":
-            order = np.lexsort((values.numpy(), self.labels.numpy()))
-            first = self.counts.cumsum(0) - self.counts
-            rank = (fraction * (self.counts - 1).double()).long()
-            return values[torch.from_numpy(order)[first + rank]]
+        if on_cpu and are_small:
+            order = torch.from_numpy(np.lexsort((values.numpy(), self.labels.numpy())))
+            return values[order[first + rank]]
+        if not on_cpu and len(values):
+            order = values.argsort()
+            order = order[self.labels[order].argsort(stable=True)]
+            found = values[order[(first + rank).clamp(0, len(values) - 1)]]
+            return torch.where(self.counts > 0, found, torch.nan)
         parts = torch.split(values, self.counts.tolist())
-        found = [kth_smallest(region, int(fraction * (len(region) - 1))) for region in parts]
-        return torch.stack(found) if parts else values
+        each = [kth_smallest(region, int(fraction * (len(region) - 1))) for region in parts]
+        return torch.stack(each) if parts else values
 
 
 def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
@@ -360,16 +370,20 @@ def sum_neighbors(values: Tensor) -> Tensor:
         >>> sum_neighbors(torch.arange(10.0))
         tensor(45.)
     """
-    num_neighbors = max(values.shape[-1], 1)
-    width = -(-num_neighbors // _NUM_LANES) * _NUM_LANES
-    padded = torch.nn.functional.pad(values, (0, width - values.shape[-1]))
-    first, *others = torch.split(padded, _NUM_LANES, dim=-1)
+    first, *others = torch.split(_pad_lanes(values), _NUM_LANES, dim=-1)
+    first = first.clone()
     for lanes in others:
-        first = first + lanes
+        first += lanes
     while first.shape[-1] > 1:
         half = first.shape[-1] // 2
         first = first[..., :half] + first[..., half:]
     return first.squeeze(-1)
+
+
+def _pad_lanes(values: Tensor) -> Tensor:
+    """Append zeros to values ``(*, K)`` until they fill the lanes."""
+    missing = -values.shape[-1] % _NUM_LANES if values.shape[-1] else _NUM_LANES
+    return torch.nn.functional.pad(values, (0, missing)) if missing else values
 
 
 def sq_lengths(columns: Columns) -> Tensor:
@@ -404,11 +418,7 @@ def fit_weighted_planes(columns: Columns, weights: Tensor) -> tuple[Tensor, Tens
 
 def fit_planes_to_each(columns: Columns, groups: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
     """Fit a plane to the neighbors for each set of weights; see :func:`fit_weighted_planes`."""
-    means, covariances = zip(
-        *(weighted_moments(columns, weights) for weights in groups), strict=True
-    )
-    normals = smallest_eigenvector3(torch.stack(covariances))[1]
-    offsets = dot(normals, torch.stack(means))
+    normals, offsets, _ = fit_weighted_planes(columns, torch.stack(list(groups)))
     return list(zip(normals.unbind(), offsets.unbind(), strict=True))
 
 
@@ -421,26 +431,27 @@ def fit_parallel_planes(
     residual over all sets ``(n,)``.
     """
     totals = torch.stack([weights.sum(dim=1) for weights in groups])
-    means, covariances = zip(
-        *(weighted_moments(columns, weights) for weights in groups), strict=True
-    )
+    means, covariances = weighted_moments(columns, torch.stack(list(groups)))
     fractions = totals / totals.sum(dim=0).clamp(min=1)
-    pooled = (fractions[:, :, None, None] * torch.stack(covariances)).sum(dim=0)
+    pooled = (fractions[:, :, None, None] * covariances).sum(dim=0)
     values, normals = smallest_eigenvector3(pooled)
-    offsets = dot(normals, torch.stack(means))
-    return normals, offsets, values[:, 0].clamp(min=0)
+    return normals, dot(normals, means), values[:, 0].clamp(min=0)
 
 
 def weighted_moments(columns: Sequence[Tensor], weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return the weighted mean ``(*, 3)`` and covariance ``(*, 3, 3)`` of each neighborhood.
 
-    Columns and weights have shape ``(*, K)``.
+    Columns have shape ``(n, K)``, weights the same or, for several fits, ``(*, n, K)``.
     """
+    columns, weights = [_pad_lanes(column) for column in columns], _pad_lanes(weights)
     total = sum_neighbors(weights)
     inverse = 1 / torch.where(total > 0, total, 1.0)
-    means = [sum_neighbors(weights * column) * inverse for column in columns]
+    # One sum of all products: a device takes longer to start a sum than to run it.
+    sums = sum_neighbors(torch.stack([weights * column for column in columns]))
+    means = [moment * inverse for moment in sums.unbind()]
     centered = [column - mean[..., None] for column, mean in zip(columns, means, strict=True)]
-    matrix = second_moments(centered, weights * inverse[..., None], sum_neighbors)
+    products = torch.stack(_products(centered, weights * inverse[..., None]))
+    matrix = _symmetric(sum_neighbors(products).unbind(), len(columns))
     return torch.stack(means, dim=-1), matrix
 
 

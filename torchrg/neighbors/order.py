@@ -196,11 +196,10 @@ def expand_to_points(values: Tensor, inverse: Tensor, *, fill: float = 0) -> Ten
         >>> expand_to_points(torch.tensor([7, 8]), torch.tensor([1, -1, 0, 1]), fill=-1).tolist()
         [8, -1, 7, 8]
     """
-    has_value = inverse >= 0
-    if bool(has_value.all()):
-        return values.index_select(0, inverse)
-    result = values.new_full((len(inverse), *values.shape[1:]), fill)
-    result[has_value] = values[inverse[has_value]]
+    if len(values) == 0:
+        return values.new_full((len(inverse), *values.shape[1:]), fill)
+    result = values.index_select(0, inverse.clamp(min=0))
+    result[inverse < 0] = fill
     return result
 
 

@@ -336,11 +336,14 @@ def _count_steps(mu: Tensor, limit: Tensor, decay: float, *, stay_above: bool) -
 
     Computed by division, not by a logarithm, whose last bit depends on the element's position.
     """
-    num_steps = torch.zeros(len(mu), dtype=torch.int64, device=mu.device)
+    device = mu.device
+    # Each step looks at all values, which a device would wait for.
+    mu, limit = mu.cpu(), limit.cpu()
+    num_steps = torch.zeros(len(mu), dtype=torch.int64, device="cpu")
     while True:
         following = mu / decay
         continues = following >= limit if stay_above else mu > limit
         if not bool(continues.any()):
-            return num_steps.clamp(min=_MIN_STEPS)
+            return num_steps.clamp(min=_MIN_STEPS).to(device)
         num_steps += continues.squeeze(-1)
         mu = torch.where(continues, following, mu)

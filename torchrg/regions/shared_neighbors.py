@@ -12,6 +12,8 @@ from torchrg.structures import Neighbors
 _BLOCK_SIZE = 64
 """Points per block: smaller blocks repeat more of the surrounding lists, larger ones have larger
 matrix products."""
+_DEVICE_BLOCK_SIZE = 2048
+"""The same on other devices, which wait for each block; matrices of some 3,000 members, 40 MB."""
 _MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
 """Maximum number of neighbors for which the kernel is faster: a block of the kernel has at most
 eight times this number of members."""
@@ -57,14 +59,16 @@ class SharedNeighbors:
             self._buffers.append(column_of)
             return joined
         result = candidates.clone()
+        on_cpu = candidates.device.type == "cpu"
+        size = _BLOCK_SIZE if on_cpu else _DEVICE_BLOCK_SIZE
 
         def test(block: slice) -> None:
-            if bool(result[block].any()):
+            if not on_cpu or bool(result[block].any()):
                 first = rows.start + block.start
                 shared = self._count(first, first + len(result[block]))
                 result[block] &= shared >= self._min_shared
 
-        map_tasks(test, split_rows(len(result), _BLOCK_SIZE), candidates.device)
+        map_tasks(test, split_rows(len(result), size), candidates.device)
         return result
 
     def _count(self, start: int, stop: int) -> Tensor:

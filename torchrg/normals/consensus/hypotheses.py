@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
+from torchrg._parallel import ROWS_IN_CACHE, limit_rows, rows_at_once, split_rows
 from torchrg.linalg.angles import above, at_most
 from torchrg.linalg.moments import (
     Columns,
@@ -51,7 +51,7 @@ def vote_planes(
     ranks = candidate_ranks(sq_distances.shape[1]).to(noise.device)
     normals, offsets = torch.empty_like(start), torch.zeros_like(noise)
     at_once = limit_rows(ROWS_IN_CACHE // (1 + len(ranks)), sq_distances.shape[1])
-    for chunk in split_rows(len(noise), at_once):
+    for chunk in split_rows(len(noise), rows_at_once(at_once, noise.device)):
         near = columns[0][chunk], columns[1][chunk], columns[2][chunk]
         normals[chunk] = _best_normals(near, weights[chunk], start[chunk], reach[chunk], ranks)
     for _ in range(constants.NUM_REFITS):
