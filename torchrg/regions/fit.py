@@ -144,7 +144,7 @@ def fit_planes(
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
+def mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean normal of each region, up to sign, and its spread in degrees."""
     columns = segments.gather_centered(normals, normals.new_zeros(len(segments.counts), 3).double())
     _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
@@ -157,7 +157,7 @@ def _fit_chunk(
 ) -> RegionPlanes:
     """Fit planes to one chunk of regions; see :func:`fit_planes`."""
     if shared is None:
-        mean_normal, spread = _mean_normals(segments, normals)
+        mean_normal, spread = mean_normals(segments, normals)
     else:
         mean_normal, spread = shared.double(), torch.zeros_like(shared[:, 0])
     origin = segments.first(points).double()
