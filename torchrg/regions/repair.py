@@ -1,6 +1,7 @@
 """Region refinement after growing: boundary reassignment and merging of coplanar regions."""
 
 import heapq
+import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -42,9 +43,9 @@ least this fraction of the mean absolute distance. It is near 0 for a region tha
 it."""
 
 
-_MAX_FACET_TURN_DEG = 25.0
-"""Maximum angle between either of two facets and their joint plane. Facets of ten points come
-closest to it; the two sides of a thin board differ by 90 degrees."""
+_MIN_FACET_COSINE = math.cos(math.radians(25.0))
+"""Minimum cosine of the angle between either of two facets and their joint plane. Facets of ten
+points come closest to it; the two sides of a thin board differ by 90 degrees."""
 
 _MAX_TILT, _MAX_FACET_TILT = 1.0, 2 / 3
 """Maximum RMS distance, in tolerances, that tilting to the joint plane adds to the points of a
@@ -320,45 +321,38 @@ def _merge(
     pairs = contacts[0][contacts[1] >= MIN_CONTACTS].cpu()
     groups = _Moments(*(values.cpu().clone() for values in moments))
     adjacent: list[set[int]] = [set() for _ in groups.weight]
-    owner, age = list(range(len(adjacent))), [0] * len(adjacent)
+    owner, age = torch.arange(len(adjacent)), [0] * len(adjacent)
     queue: list[tuple[float, int, int, int, int]] = []
 
     def offer(pairs: Tensor) -> None:
-        first, second = pairs.unbind(dim=1)
-        sides = groups.select(first), groups.select(second)
-        misfits = _misfit(*sides, _combined(*sides), max_tilt)
+        pairs = pairs.sort(dim=1).values
+        first, second = (groups.select(side) for side in pairs.unbind(dim=1))
+        misfits = _misfit(first, second, _combined(first, second), max_tilt)
         for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
+            adjacent[a].add(b)
+            adjacent[b].add(a)
             if misfit <= tolerance:
                 heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
 
-    for a, b in pairs.tolist():
-        adjacent[a].add(b)
-        adjacent[b].add(a)
     offer(pairs)
     while queue:
-        _, a, b, age_a, age_b = heapq.heappop(queue)
-        if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
+        _, a, b, *ages = heapq.heappop(queue)
+        if [age[a], age[b]] != ages:
             continue
         both = _combined(groups.select(slice(a, a + 1)), groups.select(slice(b, b + 1)))
         for values, joined in zip(groups, both, strict=True):
             values[a] = joined[0]
         owner[b] = a
         age[a] += 1
-        adjacent[a] = {_root(owner, c) for c in adjacent[a] | adjacent[b]} - {a}
-        for c in adjacent[a]:
-            adjacent[c].add(a)
-        joined_pairs = [(min(a, c), max(a, c)) for c in adjacent[a]]
+        age[b] += 1
+        for c in adjacent[b]:
+            adjacent[c].remove(b)
+        joined_pairs = [(a, c) for c in (adjacent[a] | adjacent[b]) - {a}]
         offer(torch.tensor(joined_pairs, dtype=torch.int64).view(-1, 2))
-    roots = [_root(owner, i) for i in range(len(owner))]
-    return remap_labels(labels, torch.tensor(roots, dtype=torch.int64, device=labels.device))
-
-
-def _root(owner: list[int], i: int) -> int:
-    """Return the representative of region i (union-find)."""
-    while owner[i] != i:
-        owner[i] = owner[owner[i]]
-        i = owner[i]
-    return i
+    # Regions join those of smaller labels, whose owner is known first.
+    for b, a in enumerate(owner.tolist()):
+        owner[b] = owner[a]
+    return remap_labels(labels, owner.to(labels.device))
 
 
 def _combined(a: _Moments, b: _Moments) -> _Moments:
@@ -390,7 +384,7 @@ def _misfit(a: _Moments, b: _Moments, both: _Moments, max_tilt: float | None = N
         lent = torch.where(other.weight > side.weight, other.noise, 0.0)
         misfits.append(torch.where(rms > 0, rms / torch.maximum(side.scale, lent), 0.0))
         if max_tilt is not None:
-            tilted = unsigned_angle_deg(side.normal, normal) > _MAX_FACET_TURN_DEG
+            tilted = (side.normal * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
             tilted |= variance - side.min_variance > max_tilt**2
             misfits[-1].masked_fill_(tilted, torch.inf)
     return torch.maximum(*misfits)
@@ -490,14 +484,13 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
 
 
 def _boundary_points(labels: Tensor, adjacency: KnnAdjacency) -> Tensor:
-    """Return the boundary points: points with a nearest neighbor in another region."""
+    """Return the boundary points: points with a nearest neighbor of another label."""
     # int32 indexing is three times faster.
     narrow = labels.to(torch.int32)
 
     def find(chunk: slice) -> Tensor:
         near = Neighbors(adjacency.neighbor_rows(chunk)).gather(narrow)
-        is_adjacent = (near != narrow[chunk, None]) & (near >= 0)
-        rows: Tensor = chunk.start + nonzero_rows(is_adjacent.any(dim=1))
+        rows: Tensor = chunk.start + nonzero_rows((near != narrow[chunk, None]).any(dim=1))
         return rows
 
     return torch.cat(map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device))

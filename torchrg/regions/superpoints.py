@@ -309,7 +309,8 @@ def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
     """Return the initial region of each point ``(n,)``: connected parts of planes, or the point."""
     segments, regions = Segments(connected_points(labels, nearest)), torch.arange(len(labels))
     regions[segments.rows] = segments.broadcast(segments.first(regions))
-    return torch.unique(regions, return_inverse=True)[1]
+    initial: Tensor = torch.unique(regions, return_inverse=True)[1]
+    return initial
 
 
 def _initial_regions(
