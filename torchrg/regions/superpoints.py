@@ -19,6 +19,7 @@ from torchrg.neighbors import distinct_points, measure_sampling, search_knn
 from torchrg.neighbors.knn import prepare_search
 from torchrg.neighbors.order import DistinctPoints, finite_rows
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
+from torchrg.regions.edges import neighborhood_radii
 from torchrg.regions.fit import fit_planes, mean_normals
 from torchrg.regions.growth import rank_by_count
 from torchrg.regions.splits import connected_points
@@ -300,9 +301,7 @@ class _Graph(NamedTuple):
 
 def _median_spacing(positions: Tensor, neighbors: Neighbors) -> float:
     """Return the median point spacing, assuming evenly spread points."""
-    last = neighbors.indices[:, -1].long()
-    reach = (positions[last].double() - positions.double()).norm(dim=1).median()
-    return float(reach) / _RADIUS_SPACINGS
+    return float(neighborhood_radii(positions.double(), neighbors).median()) / _RADIUS_SPACINGS
 
 
 def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
