@@ -47,10 +47,13 @@ _MIN_FACET_COSINE = math.cos(math.radians(25.0))
 """Minimum cosine of the angle between either of two facets and their joint plane. Facets of ten
 points come closest to it; the two sides of a thin board differ by 90 degrees."""
 
-_MAX_TILT, _MAX_FACET_TILT = 1.0, 2 / 3
+_MAX_FACET_TILT = 2 / 3
 """Maximum RMS distance, in tolerances, that tilting to the joint plane adds to the points of a
-region, and of a facet. Otherwise one plane across a 5 cm step would explain two shelves. White
-noise tilts small regions more."""
+facet. Otherwise one plane across a 5 cm step would explain two shelves."""
+
+_MAX_FACET_STEP = 2.0
+"""Maximum distance of the mean of a facet to the joint plane, in median reaches of the regions. A
+warp bends a surface, but does not double it, as a table top and its underside do."""
 
 
 class Adjacency(Protocol):
@@ -253,15 +256,17 @@ def merge_facets(
     thickness does not show how far it may be from the surface. Two regions are merged, smallest
     distance first, if the RMS distance of each to their joint plane is at most ``tolerance`` (in
     coordinate units). The joint plane must be tilted by at most 25 degrees against both, since a
-    strip narrower than the tolerance is close to any adjacent plane. The tilt alone must not move
-    the points of either by more than two thirds of the tolerance, or the tolerance if surfaces are
-    not ``faceted``. The facets of a bend are thus merged only if they are nearly coplanar. For
-    ``contacts`` and labels see :func:`merge_coplanar`.
+    strip narrower than the tolerance is close to any adjacent plane. If surfaces are ``faceted``,
+    the tilt alone must not move the points of either by more than two thirds of the tolerance, so
+    the facets of a bend are merged only if they are nearly coplanar. Nor may the mean of either
+    move by more than the noise of nearby points explains. For ``contacts`` and labels see
+    :func:`merge_coplanar`.
     """
-    scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
-    moments = _region_moments(planes)._replace(scale=scale, noise=noise)
-    max_tilt = (_MAX_FACET_TILT if faceted else _MAX_TILT) * tolerance
-    return _merge(labels, contacts, moments, 1.0, max_tilt=max_tilt)
+    moments, limit = _region_moments(planes), torch.full_like(planes.floor, tolerance)
+    moments, bounds = moments._replace(scale=limit, noise=0 * limit), (torch.inf, torch.inf)
+    if faceted:
+        bounds = _MAX_FACET_TILT * tolerance, _MAX_FACET_STEP * float(planes.reach.median())
+    return _merge(labels, contacts, moments, 1.0, bounds)
 
 
 class _Moments(NamedTuple):
@@ -314,10 +319,9 @@ def _merge(
     contacts: tuple[Tensor, Tensor],
     moments: _Moments,
     tolerance: float,
-    *,
-    max_tilt: float | None = None,
+    bounds: tuple[float, float] | None = None,
 ) -> Tensor:
-    """Merge regions in contact within both limits of their misfit."""
+    """Merge regions in contact whose :func:`_misfit` is at most ``tolerance``."""
     pairs = contacts[0][contacts[1] >= MIN_CONTACTS].cpu()
     groups = _Moments(*(values.cpu().clone() for values in moments))
     adjacent: list[set[int]] = [set() for _ in groups.weight]
@@ -327,7 +331,7 @@ def _merge(
     def offer(pairs: Tensor) -> None:
         pairs = pairs.sort(dim=1).values
         first, second = (groups.select(side) for side in pairs.unbind(dim=1))
-        misfits = _misfit(first, second, _combined(first, second), max_tilt)
+        misfits = _misfit(first, second, _combined(first, second), bounds)
         for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
             adjacent[a].add(b)
             adjacent[b].add(a)
@@ -371,10 +375,13 @@ def _combined(a: _Moments, b: _Moments) -> _Moments:
     return _Moments(weight, mean, covariance, scale, noise, values[:, 0], axes[:, :, 0])
 
 
-def _misfit(a: _Moments, b: _Moments, both: _Moments, max_tilt: float | None = None) -> Tensor:
+def _misfit(
+    a: _Moments, b: _Moments, both: _Moments, bounds: tuple[float, float] | None = None
+) -> Tensor:
     """Return the larger of both regions' RMS distances to the joint plane, in their own scales.
 
-    With ``max_tilt`` it is infinite if the joint plane is tilted too far against either region's.
+    With ``bounds`` it is infinite if the joint plane is tilted too far against the plane of either
+    region, or too far from its mean: the maximum RMS distance by the tilt, and that of the mean.
     """
     misfits, normal = [], both.normal
     for side, other in ((a, b), (b, a)):
@@ -383,10 +390,10 @@ def _misfit(a: _Moments, b: _Moments, both: _Moments, max_tilt: float | None = N
         rms = (variance.clamp(min=0) + shift * shift).sqrt()
         lent = torch.where(other.weight > side.weight, other.noise, 0.0)
         misfits.append(torch.where(rms > 0, rms / torch.maximum(side.scale, lent), 0.0))
-        if max_tilt is not None:
-            tilted = (side.normal * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
-            tilted |= variance - side.min_variance > max_tilt**2
-            misfits[-1].masked_fill_(tilted, torch.inf)
+        if bounds is not None:
+            apart = (side.normal * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
+            apart |= variance - side.min_variance > bounds[0] ** 2
+            misfits[-1].masked_fill_(apart | (shift.abs() > bounds[1]), torch.inf)
     return torch.maximum(*misfits)
 
 
