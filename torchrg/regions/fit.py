@@ -42,8 +42,6 @@ _MAX_FACET_RMS = 1.5
 _MIN_HEIGHT = 0.2
 """An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. A region
 thinner than 0.2 a w is a plane with noisy normals."""
-
-
 _MAX_RMS, _MAX_RMS_OF_FEW = 0.2, 0.1
 """Maximum RMS distance of flat regions to their plane, as a fraction of their length: a cube has
 0.29, clutter in rooms up to 0.19, a slab a third as thick as long 0.1. The second limit is for

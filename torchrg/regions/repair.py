@@ -23,34 +23,25 @@ _NORMAL_AGREEMENT = 0.3
 """Fraction of ``max_angle_deg``. A region below ``min_size`` is kept before boundary assignment if
 the RMS angle of its normals is smaller. About half of a small surface is boundary. Other small
 regions are clutter."""
-
 _MAX_PASSES = 10
 """Maximum number of boundary passes. Each pass revisits the neighbors of changed points, so narrow
 strips are filled from their ends."""
-
 _ROUNDING = 0.01
 """Distance differences below this many thicknesses are ignored."""
-
 _MIN_STEP = 1.5
 """Minimum distance of two levels, in thicknesses; closer planes are parts of one surface."""
-
 _LEVEL_REACH = 3.0
 """Maximum distance of a point to its level, in thicknesses of the nearer plane."""
-
 _MIN_ONE_SIDED = 0.5
 """A region ends at another plane if the mean signed distance of its points to that plane is at
 least this fraction of the mean absolute distance. It is near 0 for a region that continues behind
 it."""
-
-
 _MIN_FACET_COSINE = math.cos(math.radians(25.0))
 """Minimum cosine of the angle between either of two facets and their joint plane. Facets of ten
 points come closest to it; the two sides of a thin board differ by 90 degrees."""
-
 _MAX_FACET_TILT = 2 / 3
 """Maximum RMS distance, in tolerances, that tilting to the joint plane adds to the points of a
 facet. Otherwise one plane across a 5 cm step would explain two shelves."""
-
 _MAX_FACET_STEP = 2.0
 """Maximum distance of the mean of a facet to the joint plane, in median reaches of the regions. A
 warp bends a surface, but does not double it, as a table top and its underside do."""
