@@ -11,7 +11,7 @@ from tests.regions.growing_clouds import papers_growing
 from torchrg.errors import ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.growth import curvature_limit, grow_fifo, rank_by_size
+from torchrg.regions.growth import curvature_limit, grow_fifo, rank_by_count, rank_by_size
 from torchrg.structures import Neighbors
 
 CLASSIC = papers_growing(seed_rule="curvature", connectivity=None, coplanarity=False, min_size=1)
@@ -75,6 +75,7 @@ def test_regions_smaller_than_min_size_are_not_labelled():
 def test_labels_descend_by_size_then_by_first_point():
     labels = rank_by_size(torch.tensor([7, 7, 2, 2, 5, 5, 5, -1]), 2)
     assert labels.tolist() == [1, 1, 2, 2, 0, 0, 0, -1]
+    assert rank_by_count(torch.tensor([0, 1, 1, -1])).tolist() == [1, 0, -1]
 
 
 def test_points_without_finite_normal_or_curvature_do_not_join():

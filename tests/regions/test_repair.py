@@ -285,6 +285,24 @@ def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, facet
     assert len(found.unique()) == faces
 
 
+@pytest.mark.parametrize(
+    ("thickness", "warp", "reach", "faces"),
+    [(0.04, 0.0, 0.006, 2), (0.04, 0.0, 0.012, 1), (0.0, 0.02, 0.006, 1)],
+)
+def test_a_warp_bends_a_face_and_the_two_sides_of_a_plate_stay_two(thickness, warp, reach, faces):
+    rng = np.random.default_rng(20)
+    points = sheet(rng, 3000)
+    left = points[:, 0] < 0.5
+    # The halves of a wave are bent the other way, and side by side; the sides of a plate overlap.
+    points[:, 2] += warp * np.sin(2 * np.pi * points[:, 0])
+    points += np.outer(left, [0.5 * (thickness > 0), 0, thickness])
+    cloud, order = flat_cloud(points)
+    labels = torch.from_numpy(left)[order].long()
+    planes = fit_regions(cloud._replace(reach=torch.full((3000,), reach)), labels, OFF)
+    contacts = torch.tensor([[0, 1]]), torch.tensor([MIN_CONTACTS])
+    assert len(merge_facets(labels, contacts, planes, tolerance=0.03).unique()) == faces
+
+
 def scattered(rng, count, angle_deg):
     """Upward normals that are off by some degrees along both axes."""
     slopes = np.tan(np.radians(angle_deg)) * rng.normal(size=(count, 2))

@@ -116,16 +116,12 @@ class KnnAdjacency:
         columns, valid = slice(1, NUM_CONTACTS + 1), neighbors.valid
         valid = None if valid is None else valid[:, columns]
         self.neighbors = Neighbors(neighbors.indices[:, columns], valid)
+        self._points = neighbors.indices[:, :1]
 
     def neighbor_rows(self, rows: Rows) -> Tensor:
         """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
         near, counted = self.neighbors.select(rows)
-        if counted is None:
-            return near
-        indices = rows
-        if isinstance(indices, slice):
-            indices = torch.arange(len(self.neighbors.indices), device=near.device)[indices]
-        return torch.where(counted, near, indices[:, None].to(near.dtype))
+        return near if counted is None else torch.where(counted, near, self._points[rows])
 
     def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
         """Return the candidates that have a changed neighbor."""

@@ -147,10 +147,8 @@ def accept_edges(
     connected neighbors, valid only where the first holds. The second is None without ``connect``,
     which tests the connectivity of the edges in a mask.
     """
-    ids = rows
-    if isinstance(ids, slice):
-        ids = torch.arange(ids.start, ids.stop, device=cloud.points.device)
     near, signed = cloud.neighbors.select(rows), cloud.signed_normals
+    ids = near.indices[:, 0].long()
     max_angle_deg = cloud.angle_fraction * config.max_angle_deg
     angle = distance = None
     if max_angle_deg < 90 or signed:
@@ -161,7 +159,7 @@ def accept_edges(
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
         limits = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
         (joins,) = kernels.call(
-            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids.long(), *limits, signed
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids, *limits, signed
         )
     else:
         joins = are_valid(near, ids, cloud.valid)
