@@ -168,7 +168,7 @@ def render_cloud(
     *,
     normals: Points | None = None,
     labels: Labels | None = None,
-    view: View = "cutaway",
+    view: "View | PinholeCamera" = "cutaway",
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     azimuth_deg: float | None = None,
     elevation_deg: float | None = None,
@@ -176,7 +176,7 @@ def render_cloud(
     height: int | None = None,
     supersampling: int = 2,
 ) -> Tensor:
-    """Render a cloud from an automatically chosen camera.
+    """Render a cloud from a camera, chosen automatically or given.
 
     ``"cutaway"`` looks from outside, without the ceiling and the walls that face the viewer;
     ``"above"`` looks down, without the ceiling; ``"outside"`` shows everything; ``"sensor"`` looks
@@ -194,8 +194,9 @@ def render_cloud(
             Default: voxel normals.
         labels: Plane of each point, shape ``(N,)``, integers, negative for none, from which walls
             and ceilings are found. Default: the voxels are segmented.
-        view: See above.
-        up: Up direction; ignored for ``"sensor"``.
+        view: See above; or a batch of one kornia camera, with the size of the image, such as from
+            :func:`torchrg.render.make_camera`. Points behind a camera are omitted.
+        up: Up direction; ignored for ``"sensor"`` and a given camera, as are the angles.
         azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction of
             most walls nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
@@ -224,17 +225,25 @@ def render_cloud(
     if labels is not None:
         (planes,) = check_labels("render_cloud", labels=labels)
         check_shapes("render_cloud", points=(cloud, "N 3"), labels=(planes, "N"))
-    check_choices("render_cloud", view=(view, View))
+    if isinstance(view, str):
+        check_choices("render_cloud", view=(view, View))
+    else:
+        width, height = int(view.width), int(view.height)
     upward = unit_direction("render_cloud", up)
-    _check_sizes("render_cloud", _MAX_SIDE, width=width, height=height)
-    _check_sizes("render_cloud", _MAX_SUPERSAMPLING, supersampling=supersampling)
+    limits = {"width": _MAX_SIDE, "height": _MAX_SIDE, "supersampling": _MAX_SUPERSAMPLING}
+    for (name, limit), value in zip(limits.items(), (width, height, supersampling), strict=True):
+        if value is not None and not 1 <= value <= limit:
+            raise ConfigError(f"render_cloud: expected {name} from 1 to {limit:,}, got {value!r}.")
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
-        return _white(height or round(0.75 * width), width, cloud.device)
+        shape = (height or round(0.75 * width), width, 3)
+        return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
     planes = None if planes is None else planes[surface.rows]
     near = surface.spacing <= _OUTLIER_SPACING * surface.spacing.median()
     is_shown = torch.ones_like(near)
-    if view == "sensor":
+    if not isinstance(view, str):
+        camera = view
+    elif view == "sensor":
         camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
     else:
         upward = upward.to(surface.points)
@@ -249,53 +258,6 @@ def render_cloud(
     return draw_picture(
         camera, surface, is_shown, paint, slant, labels=planes, supersampling=supersampling
     )
-
-
-def render_points(
-    points: Points,
-    colors: Tensor | NDArray[np.uint8],
-    camera: "PinholeCamera",
-    *,
-    normals: Points | None = None,
-    supersampling: int = 2,
-) -> Tensor:
-    """Render a cloud from a given camera; see :func:`render_cloud`.
-
-    Args:
-        points: Points, shape ``(N, 3)``; points with NaN or Inf, or behind the camera, are omitted.
-        colors: Shape ``(N, 3)``, uint8.
-        camera: A batch of one kornia camera, with the size of the image; for example from
-            :func:`torchrg.render.make_camera`.
-        normals: See :func:`render_cloud`.
-        supersampling: See :func:`render_cloud`.
-
-    Returns:
-        The image, shape ``(height, width, 3)``, uint8.
-
-    Raises:
-        ShapeError: If a shape or dtype is invalid.
-        ConfigError: If ``supersampling`` is not from 1 to 16.
-
-    Example:
-        >>> from torchrg.render import make_camera
-        >>> camera = make_camera(torch.eye(4), 10.0, (2.0, 1.0), 5, 3)
-        >>> red = torch.tensor([[255, 0, 0]], dtype=torch.uint8)
-        >>> picture = render_points(torch.tensor([[0.1, 0.0, 1.0]]), red, camera, supersampling=1)
-        >>> picture[1, 2:4].tolist()
-        [[255, 255, 255], [207, 0, 0]]
-    """
-    cloud, paint, slant = _check_cloud("render_points", points, colors, normals)
-    _check_sizes("render_points", _MAX_SUPERSAMPLING, supersampling=supersampling)
-    surface = sample_surface(cloud)
-    if len(surface.rows) == 0:
-        return _white(int(camera.height), int(camera.width), cloud.device)
-    is_shown = torch.ones_like(surface.rows, dtype=torch.bool)
-    return draw_picture(camera, surface, is_shown, paint, slant, supersampling=supersampling)
-
-
-def _white(height: int, width: int, device: torch.device) -> Tensor:
-    """Return a white image."""
-    return torch.full((height, width, 3), 255, dtype=torch.uint8, device=device)
 
 
 def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:
@@ -361,10 +323,3 @@ def _check_cloud(
         dtype = str(paint.dtype).removeprefix("torch.")
         raise ShapeError(f"{caller}: expected colors of uint8, got {dtype}; scale them to 0..255.")
     return cloud, paint, None if slant is None else slant.detach()
-
-
-def _check_sizes(caller: str, limit: int, **settings: int | None) -> None:
-    """Raise ConfigError unless numbers of pixels are from 1 to ``limit``."""
-    for name, value in settings.items():
-        if value is not None and not 1 <= value <= limit:
-            raise ConfigError(f"{caller}: expected {name} from 1 to {limit:,}, got {value!r}.")
