@@ -150,6 +150,17 @@ def is_not_ignored(ground_truth: Tensor, ignore: int | None) -> Tensor:
     return ground_truth != ignore
 
 
+def is_first(groups: Tensor, *keys: Tensor) -> Tensor:
+    """Mark the first row of each group, ordered by the keys, shape ``(E,)``."""
+    order = torch.arange(len(groups), device=groups.device)
+    for key in (*reversed(keys), groups):
+        order = order[key[order].argsort(stable=True)]
+    ordered = groups[order]
+    begins = torch.ones_like(ordered, dtype=torch.bool)
+    begins[1:] = ordered[1:] != ordered[:-1]
+    return torch.empty_like(begins).index_put((order,), begins)
+
+
 def fraction(count: float, whole: float) -> float:
     """Return ``count / whole``, or 0 if ``whole`` is 0."""
     return count / whole if whole else 0.0

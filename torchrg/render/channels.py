@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.metrics.contingency import check_labels, contingency_table
+from torchrg.metrics.contingency import check_labels, contingency_table, is_first
 from torchrg.metrics.labels import match_regions
 from torchrg.render.colors import UNLABELED_GRAY, color_curvature, color_normals, color_sharp
 from torchrg.structures import UNLABELED
@@ -173,11 +173,9 @@ def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
     pairs = match_regions(table)
     partner = torch.full_like(table.region_labels, UNLABELED - 1)
     partner[table.regions[pairs]] = table.face_labels[table.faces[pairs]]
-    # Overlaps sorted by region, largest first; the first of each region is its main plane.
-    order = np.lexsort((-table.overlaps.numpy(), table.regions.numpy()))
-    rows, first = np.unique(table.regions.numpy()[order], return_index=True)
+    largest = is_first(table.regions, -table.overlaps, table.faces)
     main = torch.full_like(table.region_labels, UNLABELED - 1)
-    main[rows] = table.face_labels[table.faces[order[first]]]
+    main[table.regions[largest]] = table.face_labels[table.faces[largest]]
     outcome = torch.full_like(regions, 3)
     labeled = regions != UNLABELED
     indices = torch.searchsorted(table.region_labels, regions[labeled])
