@@ -9,7 +9,6 @@ in every layout, because programs that read raw bytes expect that.
 import io
 import json
 import pickle
-import pickletools
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -508,25 +507,10 @@ class _OldPickler(pickle.Pickler):
         super().__init__(self._memory, protocol)
 
     def dump(self, obj: Any) -> None:  # noqa: ANN401
-        """Pickle an object."""
+        """Pickle an object; its protocol names a function on a line of its own."""
         super().dump(obj)
-        self._file.write(_with_old_names(self._memory.getvalue()))
+        self._file.write(self._memory.getvalue().replace(b"cnumpy._core.", b"cnumpy.core."))
 
 
 _OLD_PICKLE = types.ModuleType("pickle")
 _OLD_PICKLE.Pickler = _OldPickler  # type: ignore[attr-defined]
-
-
-def _with_old_names(pickled: bytes) -> bytes:
-    r"""Replace NumPy's module names in a protocol 2 pickle by those from before version 2.
-
-    Example:
-        >>> _with_old_names(b"cnumpy._core.multiarray\n_reconstruct\n.")
-        b'cnumpy.core.multiarray\n_reconstruct\n.'
-    """
-    parts, start, new = [], 0, b"numpy._core."
-    for opcode, argument, at in pickletools.genops(pickled):
-        if opcode.name == "GLOBAL" and str(argument).startswith(new.decode()) and at is not None:
-            parts += [pickled[start : at + 1], b"numpy.core."]
-            start = at + 1 + len(new)
-    return b"".join([*parts, pickled[start:]])
