@@ -163,7 +163,7 @@ def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
     scan = job.scan._replace(name=name)
     source = job.source.__class__(job.source.data)
     object.__setattr__(source, "list_scans", lambda out: [scan])
-    with pytest.raises(FormatError, match="expected a scan name without"):
+    with pytest.raises(FormatError, match="expected a name inside OUT, got"):
         list_jobs(source, tmp_path / "out")
 
 

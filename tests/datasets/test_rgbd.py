@@ -249,7 +249,7 @@ def test_wrong_frames_are_refused(tmp_path):
     path = tmp_path / "a.png"
     with pytest.raises(ShapeError, match=r"RGBDFrame: expected intrinsics of shape \(3, 3\)"):
         RGBDFrame(path, torch.eye(4), 1000.0)
-    with pytest.raises(ConfigError, match="expected depth_scale > 0, the depth units per"):
+    with pytest.raises(ConfigError, match="expected depth_scale > 0 units per"):
         RGBDFrame(path, torch.eye(3), 0.0)
     with pytest.raises(ConfigError, match="expected distinct frame names, got 'a' twice"):
         RGBDFrames([RGBDFrame(path, torch.eye(3), 1.0, "a")] * 2)
@@ -260,8 +260,8 @@ def test_wrong_frames_are_refused(tmp_path):
     [
         ("depth.txt", b"nan depth/1.0.png\n", "expected finite times, got nan"),
         ("groundtruth.txt", b"inf 0 0 0 0 0 0 1\n", "expected finite times, got inf"),
-        ("rgb.txt", b"1.0 rgb/\xe9.png\n", r"byte 8: expected text in UTF-8, got b'\\xe9'"),
-        ("rgb.txt", b"1.0 rgb/\0.png\n", r"byte 8: expected text in UTF-8, got b'\\x00'"),
+        ("rgb.txt", b"1.0 rgb/\xe9.png\n", r"byte 8: expected UTF-8, got b'\\xe9'"),
+        ("rgb.txt", b"1.0 rgb/\0.png\n", r"byte 8: expected UTF-8, got b'\\x00'"),
     ],
 )
 def test_lists_that_are_none_are_refused_by_file_and_place(tum, name, content, message):

@@ -256,7 +256,7 @@ def test_truncated_file_names_the_byte(tmp_path):
         (("vertex 3", "vertex -3"), "line 4: expected a line of a PLY header"),
         (("vertex 3", "vertex 1e3"), "line 4: expected a line of a PLY header"),
         (("float y", "quad y"), "line 6: expected a line of a PLY header, got 'property quad y'"),
-        (("float y", "float x"), "line 6: expected distinct names, got 'x' twice; rename one"),
+        (("float y", "float x"), "line 6: expected one 'x', got two; rename one"),
         (("float y", "list float int y"), "line 6: expected a line of a PLY header"),
         (("vertex 3", "point 3"), "expected an element vertex with properties, got elements point"),
         (("float y", "float why"), "expected fields x, y, z, got 'x', 'why', 'z', 'red'"),

@@ -254,7 +254,7 @@ def test_other_numbers_become_floating_point_that_holds_them(tmp_path, number, k
 @pytest.mark.parametrize("number", ["c8", "bool", "U3", "M8[s]"])
 def test_other_types_of_coordinates_are_refused(tmp_path, number):
     np.savez(tmp_path / "a.npz", points=np.zeros((4, 3), number))
-    with pytest.raises(FormatError, match=r"a\.npz: expected real numbers as coordinates, got"):
+    with pytest.raises(FormatError, match=r"a\.npz: expected real coordinates, got"):
         read_cloud(tmp_path / "a.npz")
 
 
@@ -284,7 +284,7 @@ def test_truth_values_and_wide_integers_are_kept_by_value(tmp_path, make_cloud):
         ("cube", np.zeros((2, 2, 2)), r"expected field cube of shape \(N,\) or \(N, C\)"),
         ("none", np.zeros((2, 0)), r"expected field none of shape \(N,\) or \(N, C\)"),
         ("x", np.zeros(2), "duplicate field name 'x'"),
-        ("color", np.zeros((2, 3)), "expected field color of uint8 or uint16, got float64"),
+        ("color", np.zeros((2, 3)), "expected uint8 or uint16 color, got float64"),
         ("_", np.zeros(2), "a field cannot be named '_'; rename it"),
     ],
 )

@@ -79,9 +79,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
         ) from None
     except (OSError, NotImplementedError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise FormatError(
-            f"{folder / LOCK}: cannot be locked: {reason}; choose one on another disk."
-        ) from error
+        raise FormatError(f"{folder}: cannot be locked: {reason}; use another disk.") from error
     try:
         yield
     finally:
@@ -164,9 +162,7 @@ def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
     for name in (scan.name for scan in scans):
         key = normalize_file_name(name)
         if name.startswith("/") or ".." in name.split("/"):
-            raise FormatError(
-                f"{root}: expected a scan name without '..' and leading /, got {name!r}; rename it."
-            )
+            raise FormatError(f"{root}: expected a name inside OUT, got {name!r}; rename it.")
         if key in owners:
             raise FormatError(
                 f"{root}: expected distinct scan names, got {owners[key]} and {name}, which are "

@@ -195,9 +195,7 @@ class RGBDSource(Source):
         with collecting_notes() as notes:
             depth = frame.read_depth()
         if not bool((depth > 0).any()):
-            raise FormatError(
-                f"{frame.depth}: expected pixels with depth, got none; remove this frame."
-            )
+            raise FormatError(f"{frame.depth}: expected pixels with depth, got none; remove it.")
         begin("planes")
         seg = segment_depth(
             depth, frame.intrinsics, self.settings, pose=frame.pose, orient=self.orient

@@ -63,9 +63,7 @@ def run(argv: list[str]) -> int:
 def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None:
     """Raise if the transform cannot be written, or there are several inputs."""
     if len(arguments.inputs) > 1:
-        raise ConfigError(
-            f"expected one input with --matrix, got {len(arguments.inputs)}; align them one by one."
-        )
+        raise ConfigError(f"expected one input with --matrix, got {len(outputs)}; align each.")
     if path.suffix.lower() not in (".npy", ".txt"):
         raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
     check_distinct([path], [*arguments.inputs, *outputs])

@@ -44,7 +44,7 @@ from torchrg.config import DepthConfig, SuperpointsConfig
 from torchrg.datasets import S3DIS, FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.datasets.folder import SceneDataset
 from torchrg.datasets.provenance import read_record
-from torchrg.datasets.s3dis import find_areas
+from torchrg.datasets.s3dis import ClassOrder, find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
 from torchrg.io.files import (
@@ -186,7 +186,7 @@ class S3DISArguments(CloudArguments):
 
     areas: tuple[int, ...] = ()
     """Area numbers. Default: all areas in ROOT."""
-    class_order: Literal["pointcept", "spt"] = "pointcept"
+    class_order: ClassOrder = "pointcept"
     """Class order of segment.npy. Other layouts always use pointcept."""
 
     def data(self, root: Path) -> SceneDataset:

@@ -243,16 +243,12 @@ def _read_cloud(path: Path, known: Pinhole | None) -> tuple[Cloud, Tensor, Tenso
     """
     cloud = read_cloud(path)
     if cloud.grid_shape is None:
-        raise FormatError(
-            f"{path}: not an organized point cloud (its height is 1); use torchrg segment."
-        )
+        raise FormatError(f"{path}: not an organized cloud (its height is 1); use torchrg segment.")
     height, width = cloud.grid_shape
     points = torch.from_numpy(cloud.coordinates).view(height, width, 3)
     camera = find_intrinsics(points) if known is None else known.matrix((width, height), f"{path}")
     if camera is None:
-        raise FormatError(
-            f"{path}: expected points in the coordinates of a pinhole camera; use torchrg segment."
-        )
+        raise FormatError(f"{path}: expected points of a pinhole camera; use torchrg segment.")
     off = 0.0 if known is None else reprojection_error(points, camera)
     if off > _MAX_MISFIT * max(height, width):
         raise FormatError(

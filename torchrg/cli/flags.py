@@ -221,17 +221,13 @@ def read_noted(path: Path, columns: str | None) -> Result:
 def check_viewpoint(viewpoint: tuple[float, float, float] | None, orient: str) -> None:
     """Raise if a viewpoint is passed without --orient viewpoint."""
     if viewpoint is not None and orient != "viewpoint":
-        raise ConfigError(
-            f"expected --viewpoint X Y Z with --orient viewpoint, got --orient {orient}; add it."
-        )
+        raise ConfigError(f"expected --viewpoint with --orient viewpoint, got {orient}; add it.")
 
 
 def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) -> None:
     """Raise if column names are passed but every file stores its own."""
     if columns is not None and not any(map(takes_columns, paths)):
-        raise ConfigError(
-            "expected text or .npy input for --columns, got files with named columns."
-        )
+        raise ConfigError("expected text or .npy input for --columns, got files that name columns.")
 
 
 def check_superpoints(config: SuperpointsConfig, level: int, *, is_on: bool) -> None:

@@ -71,9 +71,7 @@ def check_distinct(results: Sequence[Path], inputs: Sequence[Path]) -> None:
     for path in results:
         output = str(path.resolve())
         if not taken.isdisjoint((output, normalize_file_name(output))) or _file_id(path) in files:
-            raise FormatError(
-                f"{path}: would overwrite an input or another result; choose another output path."
-            )
+            raise FormatError(f"{path}: would overwrite an input or another result; rename it.")
         taken.add(normalize_file_name(output))
 
 
@@ -100,9 +98,7 @@ def sidecar_paths(
             check_sidecar(output, suffixes=suffixes)
             return [output]
         if output.suffix.lower() in suffixes:
-            raise FormatError(
-                f"{output}: expected a directory for {len(results)} files, got a file name."
-            )
+            raise FormatError(f"{output}: expected a directory for several files, got a file.")
     create_folder(output)
     paths = [output / f"{path.stem}{suffixes[0]}" for path in results]
     for path in paths:

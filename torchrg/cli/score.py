@@ -139,10 +139,8 @@ def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> S
         needed = (predicted, ours, "superpoint"), (ground_truth, theirs, "labels")
         for path, cloud, field in needed:
             if field not in cloud.fields:
-                named = ", ".join(cloud.fields) or "points alone"
-                raise FormatError(
-                    f"{path}: missing {field}, required by --superpoints; has {named}."
-                )
+                has = ", ".join(cloud.fields) or "points alone"
+                raise FormatError(f"{path}: missing {field}, required by --superpoints; has {has}.")
         indices = score_partition(
             ours.fields["superpoint"],
             theirs.fields["labels"],

@@ -95,9 +95,7 @@ def run(argv: list[str]) -> int:
 def _write_picture(arguments: Arguments, result: Result) -> str:
     """Write an image, or two side by side, and return its description."""
     if arguments.ground_truth is not None:
-        raise ConfigError(
-            f"expected --ground-truth with a viewer, got {arguments.out}; use --out PAGE.html."
-        )
+        raise ConfigError(f"expected --ground-truth with a viewer, got {arguments.out}; use .html.")
     halves = [_render(arguments, result)]
     if arguments.compare is not None:
         halves.append(_render(arguments, read_noted(arguments.compare, arguments.columns), result))

@@ -152,9 +152,7 @@ def _name_numbers(path: Path, numbers: list[float]) -> Entries:
 def _colmap_camera(path: Path, rows: list[str]) -> Entries:
     """Return the camera in COLMAP's ``cameras.txt``, with nerfstudio's names."""
     if len(rows) > 1:
-        raise FormatError(
-            f"{path}: expected one camera, got {len(rows):,}; pass --intrinsics fx,fy,cx,cy."
-        )
+        raise FormatError(f"{path}: expected one camera, got {len(rows):,}; pass --intrinsics.")
     _, model, *words = rows[0].split()
     with wrap_errors(f"{path}: expected numbers after {model}, got: ", ValueError):
         width, height, *numbers = map(float, words)

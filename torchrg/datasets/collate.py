@@ -64,9 +64,7 @@ def collate_offset(
             )
     for key in (coord, *unique):
         if key not in keys:
-            raise ShapeError(
-                f"collate_offset: expected samples with {key!r}, got {', '.join(keys) or 'none'}."
-            )
+            raise ShapeError(f"collate_offset: expected {key!r}, got {', '.join(keys) or 'none'}.")
     ends = [torch.as_tensor(s.get("offset", [len(s[coord])])) for s in samples]
     counts = [end.diff(prepend=end.new_zeros(1)).to(ends[0].device) for end in ends]
     batch = {key: _join(key, [s[key] for s in samples]) for key in keys if key != "offset"}

@@ -214,9 +214,7 @@ class FolderOfClouds(SceneDataset):
         warn_skipped(self.root, [*others], "files without points")
         paths = [path for path in paths if path not in others]
         if not paths:
-            raise FormatError(
-                f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
-            )
+            raise FormatError(f"{root}: expected files ending in {' '.join(suffixes)}, got none.")
         self.scenes = [self._scene(path) for path in paths]
         first: dict[str, Path] = {}
         for name, path, *_ in self.scenes:
@@ -295,9 +293,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     """
     paths = [path for path in find_files(local_path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
-        raise FormatError(
-            f"{folder}: expected folders with coord.npy, got none; pass the folder of an area."
-        )
+        raise FormatError(f"{folder}: expected folders with coord.npy, got none; pass an area.")
     scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
     for key in {"instance", "plane", "superpoint"} & set(scenes[0]):
         first = 0

@@ -224,6 +224,4 @@ def _check_inputs(target: Path, arrays: Mapping[str, Array], inputs: set[str]) -
         values = map_array(path)
         check_rows(path, values, arrays[name].shape[:1])
         if name == "coord" and not np.array_equal(values.astype(np.float32), arrays[name]):
-            raise FormatError(
-                f"{path}: expected the points of this scene, got others; write to another folder."
-            )
+            raise FormatError(f"{path}: expected the same points, got others; use another folder.")

@@ -176,9 +176,7 @@ def _read_npy(source: Path) -> Array:
     """Return the array of a ``.npy`` file, shape ``(H, W)``; floating point as float64."""
     values = drop_channel(read_array(source))
     if values.ndim != 2 or values.size == 0:
-        raise FormatError(
-            f"{source}: expected depth of shape (H, W), got {values.shape} and {values.dtype}."
-        )
+        raise FormatError(f"{source}: expected depth of shape (H, W), got {values.shape}.")
     return values.astype(np.float64) if values.dtype.kind == "f" else values
 
 
@@ -290,9 +288,7 @@ def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
     wrong = next((row for row in rows if len(row) != num_words), [])
     if wrong or not rows:
         got = repr(" ".join(wrong)[:60]) if wrong else "none"
-        raise FormatError(
-            f"{path}: expected {what} in each row, got {got}; the file may be corrupt."
-        )
+        raise FormatError(f"{path}: expected {what} in each row, got {got}; it may be corrupt.")
     return rows
 
 

@@ -281,9 +281,7 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
     for frame in _list_frames(folder, "depth/*", "rgb/*"):
         record = records.get(frame.name)
         if not isinstance(record, dict):
-            raise FormatError(
-                f"{path}: expected an entry for {frame.name}, which has depth, got none."
-            )
+            raise FormatError(f"{path}: expected an entry for {frame.name}, got none.")
         camera = parse_camera(path, _SCANNETPP_COLOR | record)
         has_pose = record.get("aligned_pose") is not None
         pose = parse_matrix(path, record, "aligned_pose", 4) if has_pose else None

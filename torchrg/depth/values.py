@@ -46,9 +46,7 @@ def check_conversion(caller: str, depth_scale: float, depth_kind: DepthKind) -> 
     """Raise ConfigError if ``depth_scale`` is not positive or ``depth_kind`` is unknown."""
     check_choices(caller, depth_kind=(depth_kind, DepthKind))
     if not 0 < depth_scale < float("inf"):
-        raise ConfigError(
-            f"{caller}: expected depth_scale > 0, the depth units per meter, got {depth_scale}."
-        )
+        raise ConfigError(f"{caller}: expected depth_scale > 0 units per meter, got {depth_scale}.")
 
 
 def convert_depth(

@@ -56,9 +56,7 @@ def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str
             values = narrow_integers(values, ("i4",))
         for column_name, column in _split_field(name, values, field_names).items():
             if column_name in columns:
-                raise FormatError(
-                    f"{path}: duplicate field name {column_name!r}; rename one of the fields."
-                )
+                raise FormatError(f"{path}: duplicate field name {column_name!r}; rename one.")
             columns[column_name] = column
     return columns
 
@@ -90,9 +88,7 @@ def _to_storable(path: Path, name: str, values: Array, field_names: FieldNames) 
             "remove it or write .npz."
         )
     if name == "color" and values.dtype.kind == "f":
-        raise FormatError(
-            f"{path}: expected field color of uint8 or uint16, got {values.dtype}; convert it."
-        )
+        raise FormatError(f"{path}: expected uint8 or uint16 color, got {values.dtype}; cast it.")
     if name == "color" and values.shape[1:] == (3,):
         color, _ = read_colors(path, values)
         return color if field_names.color_bits == 16 else narrow_colors(color)

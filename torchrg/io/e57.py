@@ -114,9 +114,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     ):
         headers = [file.get_header(i) for i in range(file.scan_count)]
         if not headers:
-            raise FormatError(
-                f"{path}: expected at least one scan, got none; check the source of the file."
-            )
+            raise FormatError(f"{path}: expected at least one scan, got none; check its source.")
         counts = [header.point_count for header in headers]
         content = f"{sum(counts):,} points"
         num_values = sum(header.point_count * len(header.point_fields) for header in headers)
@@ -341,9 +339,7 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
         spherical = [block.pop(axis).astype("d") for axis in _SPHERICAL]
         points = to_cartesian(np.stack(spherical, axis=1))
     else:
-        raise FormatError(
-            f"{path}: expected points with {', '.join(_AXES)}, got {', '.join(block) or 'none'}."
-        )
+        raise FormatError(f"{path}: expected {', '.join(_AXES)}, got {', '.join(block) or 'none'}.")
     for name in _STATES:
         if name in block:
             points[block.pop(name) != 0] = np.nan

@@ -76,9 +76,7 @@ def assemble_cloud(
         names = [axis if is_lower else axis.upper() for axis in "xyz"]
         if not all(name in remaining for name in names):
             present = ", ".join(map(ascii, remaining)) or "none"
-            raise FormatError(
-                f"{path}: expected fields x, y, z, got {present}; rename or add them."
-            )
+            raise FormatError(f"{path}: expected fields x, y, z, got {present}; add or rename.")
         axes = [remaining.pop(name) for name in names]
         if any(axis.ndim != 1 for axis in axes):
             shapes = ", ".join(map(_row_shape, axes))
@@ -150,18 +148,12 @@ def convert_coordinates(path: Path, coordinates: Array) -> NDArray[np.floating]:
 def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
     """Check that an array of this shape and type can hold coordinates."""
     if len(shape) != 2 or shape[1] != 3:
-        repair = "transpose" if len(shape) == 2 and shape[0] == 3 else "reshape"
-        raise FormatError(
-            f"{path}: expected coordinates of shape (N, 3), got {shape}; {repair} them."
-        )
+        fix = "transpose" if len(shape) == 2 and shape[0] == 3 else "reshape"
+        raise FormatError(f"{path}: expected coordinates of shape (N, 3), got {shape}; {fix} them.")
     if dtype.kind not in "fiu":
-        raise FormatError(
-            f"{path}: expected real numbers as coordinates, got {dtype}; convert them to float64."
-        )
+        raise FormatError(f"{path}: expected real coordinates, got {dtype}; use float64.")
     if shape[0] == 0:
-        raise FormatError(
-            f"{path}: expected at least one point, got none; check the source of the file."
-        )
+        raise FormatError(f"{path}: expected at least one point, got none; check its source.")
 
 
 def backup_name(name: str) -> str:

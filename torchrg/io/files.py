@@ -286,9 +286,7 @@ def decode_file(path: Path) -> str:
         byte = error.start
     if byte >= 0:
         found = "UTF-16" if content[:2] in _UTF_16_MARKS else repr(content[byte : byte + 1])
-        raise FormatError(
-            f"{path}: byte {byte}: expected text in UTF-8, got {found}; save it as UTF-8."
-        )
+        raise FormatError(f"{path}: byte {byte}: expected UTF-8, got {found}; save it as UTF-8.")
     return text
 
 

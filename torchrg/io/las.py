@@ -156,9 +156,7 @@ def _open_reader(laspy: ModuleType, path: Path) -> Iterator[Any]:
         # A panic of lazrs (written in Rust) is not an Exception and cannot be imported.
         if type(error).__name__ != "PanicException":
             raise
-        raise FormatError(
-            f"{path}: cannot decompress its points: {first_line(error)}; {_REPAIR}."
-        ) from error
+        raise FormatError(f"{path}: cannot decompress: {first_line(error)}; {_REPAIR}.") from error
 
 
 def check_las(path: Path, cloud: Cloud | None) -> None:

@@ -140,13 +140,11 @@ def _check_systems(clouds: Sequence[Cloud]) -> list[str]:
     return []
 
 
-def _check_equal(facts: Sequence[tuple[str, object]], what: str, repair: str) -> None:
+def _check_equal(facts: Sequence[tuple[str, object]], what: str, fix: str) -> None:
     """Raise FormatError if the values of two files differ."""
-    for source, fact in facts[1:]:
+    for name, fact in facts[1:]:
         if fact != facts[0][1]:
-            raise FormatError(
-                f"{source}: expected the {what} of {facts[0][0]}, got another; {repair}."
-            )
+            raise FormatError(f"{name}: expected the {what} of {facts[0][0]}, got another; {fix}.")
 
 
 def _system(cloud: Cloud) -> object:

@@ -218,9 +218,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
                     "the file again."
                 )
         if name in names:
-            raise FormatError(
-                f"{path}: line {number}: expected distinct names, got {name!r} twice; rename one."
-            )
+            raise FormatError(f"{path}: line {number}: expected one {name!r}, got two; rename one.")
     elements = [element for element in elements if element.properties]
     return _Header(_BYTE_ORDERS[formats[-1]], elements, number, stream.tell())
 

@@ -131,9 +131,7 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
     for name, tensor in tensors.items():
         if tensor.dtype not in INTEGERS:
             dtype = str(tensor.dtype).removeprefix("torch.")
-            raise ShapeError(
-                f"{caller}: expected integer {name}, got {dtype}; convert with .long()."
-            )
+            raise ShapeError(f"{caller}: expected integer {name}, got {dtype}; use .long().")
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
     return [tensor.long() for tensor in tensors.values()]
 

@@ -203,9 +203,7 @@ def color_curvature(curvature: Values, *, max_curvature: float = 0.1) -> Tensor:
     tensor = as_tensor("color_curvature", "curvature", curvature)
     check_floating("color_curvature", curvature=tensor)
     if not max_curvature > 0:
-        raise ConfigError(
-            f"color_curvature: expected max_curvature to be positive, got {max_curvature!r}."
-        )
+        raise ConfigError(f"color_curvature: expected max_curvature > 0, got {max_curvature!r}.")
     position = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
     before = position.long().clamp(max=len(_RAMP) - 2)
     ramp = tensor.new_tensor(_RAMP)

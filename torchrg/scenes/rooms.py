@@ -321,7 +321,5 @@ def scanner_positions(
                 positions.append(position)
                 break
     if len(positions) < layout.num_viewpoints:
-        raise ConfigError(
-            "build_room: expected free space for a scanner, got none; enlarge the room."
-        )
+        raise ConfigError("build_room: expected free space for a scanner, got none; enlarge it.")
     return np.stack(positions)

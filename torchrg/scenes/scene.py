@@ -142,9 +142,7 @@ def sample_scene(
             f"sample_scene: expected num_points from 1 to {MAX_POINTS:,}, got {num_points}."
         )
     if not 0 <= noise <= FARTHEST:
-        raise ConfigError(
-            f"sample_scene: expected noise from 0 to {FARTHEST:g} meters, got {noise}."
-        )
+        raise ConfigError(f"sample_scene: expected noise from 0 to {FARTHEST:g} m, got {noise}.")
     check_choices("sample_scene", noise_direction=(noise_direction, NoiseDirection))
     rng = seeded_generator(seed, POSITIONS)
     points, normals, labels = _sample_faces(model, num_points, rng)

@@ -260,9 +260,7 @@ class FusedFrames(NamedTuple):
             ShapeError: If ``values`` does not have one row per point.
         """
         if len(values) != len(self.coord):
-            raise ShapeError(
-                f"to_frames: expected values of {len(self.coord)} points, got {len(values)}."
-            )
+            raise ShapeError(f"to_frames: expected {len(self.coord)} values, got {len(values)}.")
         each = expand_to_points(values, self.inverse)
         images = [values.new_full((*seen.shape, *values.shape[1:]), fill) for seen in self.seen]
         parts = torch.split(each, [int(seen.sum()) for seen in self.seen])

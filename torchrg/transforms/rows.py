@@ -182,9 +182,7 @@ def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
     if entries.get("offset") is not None:
         ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
         if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:
-            raise ConfigError(
-                f"expected offset to ascend to the number of points ({num_points}), got {ends}."
-            )
+            raise ConfigError(f"expected offset to ascend to {num_points} points, got {ends}.")
         return ends
     if entries.get("batch") is not None:
         batch = torch.as_tensor(entries["batch"])
