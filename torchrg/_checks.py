@@ -69,8 +69,7 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
             )
         if tensor.layout is not torch.strided:
             raise ShapeError(
-                f"{caller}: expected {name} to be dense, got a sparse tensor; pass "
-                f"{name}.to_dense()."
+                f"{caller}: expected dense {name}, got a sparse tensor; pass {name}.to_dense()."
             )
     kinds = [str(tensor.dtype).removeprefix("torch.") for tensor in tensors.values()]
     if len(set(kinds)) > 1:
@@ -177,8 +176,7 @@ def is_concrete(*tensors: Tensor | None) -> bool:
 def raise_forward_mode(caller: str) -> NoReturn:
     """Raise for ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
     raise NotImplementedError(
-        f"{caller}: supports reverse mode only; use torch.func.jacrev, vjp or grad instead of "
-        "jacfwd, jvp or hessian."
+        f"{caller}: supports reverse mode only; use jacrev, vjp or grad of torch.func."
     )
 
 

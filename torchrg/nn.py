@@ -113,8 +113,7 @@ class Eigh(_Function[Eigen]):
         tensor = matrices.covariance if isinstance(matrices, RobustFit) else matrices
         if self.method == "jacobi" and tensor.shape[-2:] != (3, 3):
             raise ShapeError(
-                f"Eigh: expected matrices of shape (*, 3, 3), got {tuple(tensor.shape)}; use "
-                'Eigh("linalg").'
+                f'Eigh: expected shape (*, 3, 3), got {tuple(tensor.shape)}; use Eigh("linalg").'
             )
         return Eigen(*(eigh3(tensor) if self.method == "jacobi" else torch.linalg.eigh(tensor)))
 
@@ -315,8 +314,7 @@ class PatchNormals(nn.Module):
         self.method, self.settings = method, settings
         if method == "irls" and not settings.get("noise", 0) > 0:
             raise ConfigError(
-                "PatchNormals: expected noise > 0 with method='irls', got none; pass noise=, in "
-                "units of the points."
+                "PatchNormals: expected noise > 0 for irls, in units of points, got none; pass it."
             )
         try:
             self.fit(torch.empty(0, 4, 3))

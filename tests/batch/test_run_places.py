@@ -75,11 +75,11 @@ def test_scans_that_differ_in_the_suffix_alone_are_refused(root, convert, refuse
         (["straße.npy", "STRASSE.npy"], "expected distinct scan names, got"),
         (
             ["report.json.npy"],
-            "a scan cannot be named report.json, because OUT/report.json is a file",
+            "a scan cannot be named report.json, like OUT/report.json",
         ),
         (
             ["Report.JSON/x.npy"],
-            "a scan cannot be named Report.JSON/x, because OUT/report.json is a file",
+            "a scan cannot be named Report.JSON/x, like OUT/report.json",
         ),
     ],
 )

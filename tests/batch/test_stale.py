@@ -166,14 +166,14 @@ def test_what_a_user_changed_or_added_is_never_removed(root, out, convert, layou
         for flags in ([], ["--dry-run"], ["--only", "val/*"]):
             done = convert(*command, *flags)
             assert done.code == 2
-            assert f"{path}: was changed or not written by torchrg" in done.error
+            assert f"{path}: is not as torchrg wrote it" in done.error
             assert f"its scan is val/{MOVED} now; move it.\n" in done.error
             assert files_of(out) == held
         path.unlink() if before is None else path.write_bytes(before)
     changed.unlink()
     changed.symlink_to(out.parent / "other")
     (out.parent / "other").write_bytes(whole)
-    assert f"{changed}: was changed or not" in convert(*command).error
+    assert f"{changed}: is not as torchrg" in convert(*command).error
     changed.unlink()
     assert convert(*command).code == 0
     assert not folder.exists()
@@ -367,7 +367,7 @@ def test_copies_are_no_new_names(tmp_path, out, convert):
 
 def test_another_layout_goes_to_another_directory(root, out, run, convert):
     assert convert("scannet", root, out, "--layout", "mask3d").code == 0
-    before, message = files_of(out), "expected results in layout npy, got mask3d; choose another "
+    before, message = files_of(out), "expected results in layout npy, got mask3d; remove them"
     for flags in ([], ["--force"], ["--prune"], ["--dry-run"]):
         done = convert("scannet", root, out, "--layout", "npy", *flags)
         assert (done.code, done.error.count("\n")) == (2, 1)
@@ -425,7 +425,7 @@ def test_other_directories_are_left_alone_and_other_kinds_are_refused(tmp_path, 
     save_rooms(tmp_path / "more", "x.npy")
     assert convert("folder", tmp_path / "more", out / "more").code == 0
     error = convert("scannet", root, out).error
-    assert f"{out}/a: expected results of convert scannet, got folder; choose another" in error
+    assert f"{out}/a: expected results of convert scannet, got folder; remove them" in error
     (tmp_path / "in" / "b.npy").unlink()
     (out / "more" / "x" / RECORD).write_text("{")
     assert convert("folder", tmp_path / "in", out, "--prune").code == 0
@@ -447,7 +447,7 @@ def test_a_folder_of_results_may_be_a_link(root, out, tmp_path, convert):
     (out / "val" / LAST).symlink_to(tmp_path / "last")
     move(root, train=SCANS, val=[])
     assert (
-        f"{out}/val/{LAST}: was changed or not written by torchrg"
+        f"{out}/val/{LAST}: is not as torchrg wrote it"
         in convert("scannet", root, out).error
     )
     assert (tmp_path / "last" / RECORD).exists()
@@ -496,7 +496,7 @@ def test_records_of_other_versions_end_in_no_loss(root, out, convert, change):
     elif "inputs" in change:
         assert f"{path.parent}: no scan in {root} belongs" in done.error
     else:
-        assert "npy: was changed or not written by torchrg" in done.error
+        assert "npy: is not as torchrg wrote it" in done.error
         assert results_of(out) == before
 
 

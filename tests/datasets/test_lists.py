@@ -156,13 +156,13 @@ def test_databases_of_others_are_refused_before_any_work(root, tmp_path, capsys,
     command = ["convert", "scannet", str(root), str(out), "--layout", "mask3d", *flags]
     assert main(command) == 2
     captured = capsys.readouterr()
-    assert "train_database.yaml: is of another data set or program; move it" in captured.err
+    assert "train_database.yaml: is of other origin; move it" in captured.err
     assert (captured.err.count("\n"), captured.out) == (1, "")
     assert [path.name for path in out.iterdir()] == ["train_database.yaml"]
 
 
 def test_data_sets_with_other_classes_share_no_directory(converted):
-    with pytest.raises(FormatError, match=r"label_database\.yaml: is of another data set"):
+    with pytest.raises(FormatError, match=r"label_database\.yaml: is of other origin"):
         check_lists("mask3d", "S3DIS", converted["mask3d"])
     check_lists("mask3d", "ScanNet", converted["mask3d"])
     check_lists("mmdet3d", "S3DIS", converted["mask3d"])

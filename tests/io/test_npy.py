@@ -190,9 +190,9 @@ def array_bytes(shape, descr="'<f8'", data=b""):
     [
         (array_bytes((10**12, 3)), r"byte \d+: expected 24,000,000,000,000 bytes for the array of"),
         (array_bytes((4, 3), data=b"0" * 95), r"byte \d+: expected 96 bytes .*, got 95; the file"),
-        (array_bytes((-4, 3)), r"byte 0: invalid shape or type in the array: \(-4, 3\)"),
-        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: invalid shape or type in the array"),
-        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: invalid shape or type in the array"),
+        (array_bytes((-4, 3)), r"byte 0: wrong shape or type in the array: \(-4, 3\)"),
+        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: wrong shape or type in the array"),
+        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: wrong shape or type in the array"),
         (array_bytes((4, 2), data=b"0" * 64), r"expected shape \(N, 3\) or wider, got"),
         (array_bytes((), data=b"0" * 8), r"expected shape \(N, 3\) or wider, got \(\)"),
         (array_bytes((0, 3)), "expected at least one point, got none"),

@@ -131,8 +131,7 @@ def _check_address(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), _CONNECT_SECONDS).close()
     except (OSError, OverflowError) as error:
         raise ConfigError(
-            f"Ray address {address}: no cluster there: {first_line(error)}; start one with "
-            f"ray start --head --port {port}."
+            f"Ray {address}: no cluster: {first_line(error)}; run ray start --head --port {port}."
         ) from error
 
 

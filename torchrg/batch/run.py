@@ -74,8 +74,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
         lock.acquire(timeout=LOCK_TIMEOUT_SECONDS)
     except filelock.Timeout:
         raise FormatError(
-            f"{folder}: locked by another torchrg process; wait for it, stop it, or choose another "
-            "directory."
+            f"{folder}: locked by another torchrg process; wait for it, stop it, or choose another."
         ) from None
     except (OSError, NotImplementedError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -171,8 +170,7 @@ def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
         owners[key] = name
         if (first := key.partition("/")[0]) in batch_files:
             raise FormatError(
-                f"{root}: a scan cannot be named {name}, because OUT/{batch_files[first]} is a "
-                "file of the command; rename it."
+                f"{root}: a scan cannot be named {name}, like OUT/{batch_files[first]}; rename it."
             )
 
 

@@ -319,8 +319,7 @@ def _check(arguments: Arguments) -> None:
     table = arguments.table or PLANES_FILE
     if Path(table).name != table or Path(table).suffix not in TABLE_SUFFIXES or table == RECORD:
         raise ConfigError(
-            "expected --table to be a file name ending in .csv or .json, got "
-            f"{table}; use planes.csv."
+            f"expected --table to be a name ending in .csv or .json, got {table}; use planes.csv."
         )
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address with --engine ray, got --engine local; add it.")
@@ -336,8 +335,7 @@ def _check(arguments: Arguments) -> None:
             )
         if arguments.pages is not None and arguments.layout != "pointcept":
             raise ConfigError(
-                f"expected --pages with --layout pointcept, got --layout {arguments.layout}; "
-                "leave one of them out."
+                f"expected --pages with --layout pointcept, got {arguments.layout}; omit one."
             )
 
 

@@ -252,8 +252,7 @@ def _read_cloud(path: Path, known: Pinhole | None) -> tuple[Cloud, Tensor, Tenso
     off = 0.0 if known is None else reprojection_error(points, camera)
     if off > _MAX_MISFIT * max(height, width):
         raise FormatError(
-            f"{path}: --intrinsics do not match the points: half of them are {off:.3g} pixels or "
-            "more off; leave it out."
+            f"{path}: --intrinsics do not match the points: half are {off:.3g} pixels off; omit it."
         )
     depth = points[..., 2]
     return cloud, torch.where(depth.isfinite(), depth, 0.0), camera

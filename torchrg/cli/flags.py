@@ -265,8 +265,7 @@ def parse_intrinsics(text: str | None) -> Pinhole | None:
         with print_warnings():
             return read_camera(Path(text))
     raise ConfigError(
-        "expected --intrinsics fx,fy,cx,cy (four numbers without spaces) or a camera file, got "
-        f"{text!r}."
+        f"expected --intrinsics fx,fy,cx,cy (no spaces) or a camera file, got {text!r}."
     )
 
 
@@ -285,7 +284,6 @@ def limit_in_bytes(limit_memory: float | None, default: int = 0) -> int:
         return default
     if not 0 < limit_memory <= _MAX_GIGABYTES:
         raise ConfigError(
-            f"expected --limit-memory above 0 and at most {_MAX_GIGABYTES:,} GB, got "
-            f"{limit_memory}."
+            f"expected --limit-memory above 0, at most {_MAX_GIGABYTES:,} GB, got {limit_memory}."
         )
     return int(limit_memory * 1e9)

@@ -46,8 +46,7 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         return [out]
     if ending and ending in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(
-            f"{out}: expected a directory for {len(inputs)} inputs, got a file name; pass a "
-            "directory."
+            f"{out}: expected a directory for {len(inputs)} inputs, got a file; pass a directory."
         )
     results = [out / f"{path.stem}{suffix}" for path in inputs]
     first: dict[str, Path] = {}
@@ -111,8 +110,7 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
         raise FormatError(
-            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; write one of these "
-            "and convert it."
+            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; convert it."
         )
     check_writable(path)
     if is_viewer(path):

@@ -124,8 +124,7 @@ def run(argv: list[str]) -> int:
         arguments = dataclasses.replace(arguments, superpoints=True)
     if arguments.level and arguments.layout is None:
         raise ConfigError(
-            "expected --layout with --level, got none; leave --level out, since other files "
-            "contain all levels."
+            "expected --layout with --level, got none; omit it, as other files contain all levels."
         )
     flags.check_superpoints(arguments.partition, arguments.level, is_on=arguments.superpoints)
     if arguments.layout is not None:

@@ -102,8 +102,7 @@ def read_camera(path: Path) -> Pinhole:
     record = read_entries(path)
     if isinstance(record.get("frames"), list) and "fl_x" not in record:
         raise FormatError(
-            f"{path}: expected one camera, got one per frame, or none; pass the folder of the file "
-            "to torchrg convert rgbd."
+            f"{path}: expected one camera, got one per frame; pass its folder to convert rgbd."
         )
     return parse_camera(path, record)
 
@@ -204,8 +203,7 @@ def parse_camera(path: Path, record: Entries) -> Pinhole:
     models = (name if value in (True, 1) else str(value) for name, value in values)
     if model := next(filter(_NO_PINHOLE.search, models), ""):
         raise FormatError(
-            f"{path}: expected images of a pinhole camera, got {model}; undistort them, as the "
-            "image_undistorter of COLMAP does."
+            f"{path}: expected a pinhole camera, got {model}; undistort images, as COLMAP does."
         )
     fx, fy, cx, cy = _read_pinhole(path, record)
     if distorted := _distortions(record):

@@ -91,8 +91,7 @@ def check_owned(folder: Path, names: Iterable[str], record: Record | None) -> No
         path = Path(os.path.normpath(folder / name))
         if name not in owned and os.path.lexists(path):
             raise FormatError(
-                f"{path}: was not written by torchrg for this scan; move it, or choose another "
-                "directory."
+                f"{path}: was not written by torchrg for this scan; move it, or choose another."
             )
 
 
@@ -106,8 +105,7 @@ def check_source(folder: Path, record: Record, source: Record) -> None:
     ):
         if old != new and old is not None and new is not None:
             raise FormatError(
-                f"{folder}: expected results {what} {new}, got {old}; choose another directory, or "
-                "remove them."
+                f"{folder}: expected results {what} {new}, got {old}; remove them, or use another."
             )
 
 

@@ -131,8 +131,7 @@ class RGBDFrames(SceneDataset):
         is_path = isinstance(frames, os.PathLike)
         if is_path or not all(isinstance(frame, RGBDFrame) for frame in frames):
             raise ConfigError(
-                f"RGBDFrames: expected a list of RGBDFrame, got {frames!r:.60}; use "
-                "RGBDFrames.from_folder for a folder."
+                f"RGBDFrames: expected a list of RGBDFrame, got {frames!r:.60}; use from_folder."
             )
         self.transform = transform
         self.scenes = [SceneFiles(f.name, f.depth, f.files, item=f) for f in frames]
@@ -291,8 +290,7 @@ def _find_frames(
                 if chosen is None:
                     missing, example = "intrinsics", "fx,fy,cx,cy or a camera file"
                 raise ConfigError(
-                    f"{frame.depth}: expected {missing}, which depth images do not store; pass it, "
-                    f"{example}."
+                    f"{frame.depth}: expected {missing}, which images lack; pass it, {example}."
                 )
             if not camera and not files:
                 numbers = ",".join(f"{number:g}" for number in chosen[:4])

@@ -376,8 +376,7 @@ def _groups(
     segments = _read_list(path, "segIndices")
     if len(segments) != count:
         raise FormatError(
-            f"{path}: expected a segment for each of {count:,} vertices, got {len(segments):,}; "
-            "the file may be corrupt."
+            f"{path}: expected {count:,} segments, got {len(segments):,}; the file may be corrupt."
         )
     vertex_segments = _to_int64(path, "segIndices", segments)
     known, path = np.unique(vertex_segments), files["groups"]

@@ -247,8 +247,7 @@ def _check_pages(path: Path, size: int) -> None:
             content, checksum = page[:_CONTENT_BYTES], page[_CONTENT_BYTES:]
             if crc32c.value(content) != int.from_bytes(checksum, "big"):
                 raise FormatError(
-                    f"{path}: byte {start}: the checksum of this page does not match; the file is "
-                    "corrupt, copy or write it again."
+                    f"{path}: byte {start}: the checksum of a page does not match; copy it again."
                 )
 
 
@@ -288,8 +287,7 @@ def _read_pose(path: Path, header: Any) -> ScanPose:  # noqa: ANN401
     length = math.hypot(*rotation)
     if length and not 1 / _MAX_ROTATION <= length <= _MAX_ROTATION:
         raise FormatError(
-            f"{path}: expected a unit quaternion in scan {name!r}, got norm {length:.3g}; "
-            "correct the pose or write the file again."
+            f"{path}: expected a unit quaternion in {name!r}, got norm {length:.3g}; correct it."
         )
     if not all(abs(value) <= FARTHEST for value in translation):
         raise FormatError(

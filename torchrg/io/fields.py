@@ -81,8 +81,7 @@ def assemble_cloud(
         if any(axis.ndim != 1 for axis in axes):
             shapes = ", ".join(map(_row_shape, axes))
             raise FormatError(
-                f"{path}: expected x, y, z of one number per point, got {shapes}; flatten "
-                "or rename them."
+                f"{path}: expected x, y, z of one number per point, got {shapes}; flatten them."
             )
         values = _stack(path, axes)
     else:
@@ -265,8 +264,7 @@ def _stack(path: Path, columns: list[Array]) -> Array:
     except TypeError as error:
         kinds = ", ".join(str(column.dtype) for column in columns)
         raise FormatError(
-            f"{path}: expected columns of one type to combine, got {kinds}; convert them to "
-            "numbers."
+            f"{path}: expected columns of one type to combine, got {kinds}; convert to numbers."
         ) from error
     stacked = np.empty((len(columns[0]), len(columns)), dtype)
     for i, column in enumerate(columns):
@@ -287,8 +285,7 @@ def _convert_labels(path: Path, labels: Array) -> NDArray[np.int64]:
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
     if not are_integers(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
         raise FormatError(
-            f"{path}: expected labels to be 64-bit integers, got fractions or larger values; "
-            "rename or remove that field."
+            f"{path}: expected 64-bit integer labels, got fractions or larger; rename or drop them."
         )
     if flat.dtype.kind == "f" and largest >= MAX_EXACT_INTEGER:
         raise FormatError(

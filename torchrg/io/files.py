@@ -176,8 +176,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     for item in (target.parent, target):
         if item.exists() and not os.access(item, os.W_OK):
             raise FormatError(
-                f"{path}: cannot be written: {item} is read-only; write to another folder, or make "
-                "it writable."
+                f"{path}: cannot be written: {item} is read-only; make it writable, or use another."
             )
 
 
@@ -259,8 +258,7 @@ def check_file(path: Path) -> int:
         ) from error
     if stat.S_ISDIR(status.st_mode):
         raise FormatError(
-            f"{path}: expected a file, got a directory; name a file inside it, or run torchrg "
-            "convert folder."
+            f"{path}: expected a file, got a directory; name a file in it, or run convert folder."
         )
     if status.st_size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; copy or write it again.")

@@ -262,8 +262,7 @@ def _add_dimensions(
         name = f"{name}{_WIDE_SUFFIX}" if is_wide else name
         if name in ("X", "Y", "Z") or len(name.encode()) > 32:
             raise FormatError(
-                f"{path}: expected names of at most 32 bytes other than X, Y, Z, got {name!r}; "
-                "rename the field."
+                f"{path}: expected names of at most 32 bytes, not X, Y, Z, got {name!r}; rename it."
             )
         if name not in standard:
             description = _WIDE_DESCRIPTION if is_wide else ""

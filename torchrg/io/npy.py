@@ -278,8 +278,7 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
     layouts, members = {}, archive.infolist()
     if len(members) > _MAX_ARRAYS:
         raise FormatError(
-            f"{path}: expected at most {_MAX_ARRAYS:,} arrays, got {len(members):,}; remove the "
-            "arrays that are not per point."
+            f"{path}: expected at most {_MAX_ARRAYS:,} arrays, got {len(members):,}; remove some."
         )
     # Overlapping members of a small file could expand to any size.
     packed = sum(member.compress_size for member in members)
@@ -337,8 +336,7 @@ def _check_array(path: Path, stream: IO[bytes], size: int, content: str) -> _Lay
         )
     if min(shape, default=0) < 0 or dtype.itemsize == 0:
         raise FormatError(
-            f"{path}: byte 0: invalid shape or type in {content}: {shape} of {dtype}; "
-            "write it again."
+            f"{path}: byte 0: wrong shape or type in {content}: {shape} of {dtype}; write it again."
         )
     num_bytes, start = math.prod(shape) * dtype.itemsize, head.tell()
     check_available(path, start, num_bytes, f"{content} of shape {shape}", available=size - start)

@@ -214,8 +214,7 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
                 elements[-1].properties.append(_Property(name, _READ_TYPES[code]))
             case _:
                 raise FormatError(
-                    f"{path}: line {number}: expected a line of a PLY header, got {shown}; write "
-                    "the file again."
+                    f"{path}: line {number}: expected a PLY header, got {shown}; write it again."
                 )
         if name in names:
             raise FormatError(f"{path}: line {number}: expected one {name!r}, got two; rename one.")

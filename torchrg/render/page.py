@@ -212,8 +212,7 @@ def read_library() -> str:
     source = Path(str(module.__file__)).parent / _LIBRARY
     if not source.is_file():
         raise MissingDependencyError(
-            f"pydeck with {_LIBRARY} is needed to create viewers; install it with: "
-            "pip install --upgrade 'torchrg[view]'"
+            f"pydeck with {_LIBRARY} is needed for viewers; pip install --upgrade 'torchrg[view]'"
         )
     return source.read_text(encoding="utf-8")
 

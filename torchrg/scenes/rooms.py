@@ -275,8 +275,7 @@ def _take(cells: list[T], where: str) -> T:
     """Take the next free position."""
     if not cells:
         raise ConfigError(
-            f"build_room: expected enough space on the {where}, got too many objects; enlarge the "
-            "room."
+            f"build_room: expected enough space on the {where}, got too many objects; enlarge it."
         )
     return cells.pop()
 

@@ -63,8 +63,7 @@ def check_sample(caller: str, sample: Sample, example: str) -> None:
     is_data = callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__")
     if not (isinstance(sample, Mapping) or is_data):
         raise ConfigError(
-            f"{caller}: expected a sample that is a dict or a PyG Data, got "
-            f"{type(sample).__name__}; pass {example}."
+            f"{caller}: expected a dict or a PyG Data, got {type(sample).__name__}; pass {example}."
         )
 
 
@@ -149,8 +148,7 @@ def select_points(
     for key, repair in _INDEX_KEYS.items():
         if entries.get(key) is not None:
             raise ConfigError(
-                f"{caller}: cannot remove points from a sample with {key}; apply the transform "
-                f"{repair}."
+                f"{caller}: cannot remove points from samples with {key}; apply it {repair}."
             )
     in_rows, ambiguous = _classify_keys(entries, num_points, skip)
     if ambiguous:
@@ -188,8 +186,7 @@ def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
         batch = torch.as_tensor(entries["batch"])
         if len(batch) != num_points or bool((batch.diff() < 0).any()):
             raise ConfigError(
-                f"expected batch to ascend over {num_points} points, got {len(batch)} entries; "
-                "sort the points by cloud."
+                f"expected batch to ascend over {num_points}, got {len(batch)}; sort by cloud."
             )
         min_clouds = 0 if entries.get("ptr") is None else len(entries["ptr"]) - 1
         counts: list[int] = torch.bincount(batch, minlength=min_clouds).cumsum(0).tolist()
