@@ -15,8 +15,7 @@ gc.disable()
 sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):
-    # Python puts the working directory first; modules there must not be imported, except torchrg
-    # itself.
+    # Python puts the working directory first; modules there must not be imported.
     sys.path[:1] = sys.path[:1] if __file__ == f"{sys.path[0]}/torchrg/__main__.py" else []
 
 try:

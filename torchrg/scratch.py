@@ -61,8 +61,7 @@ def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     keep ``/tmp`` in memory.
 
     Raises:
-        FormatError: If the disk is too full, or the folder is not writable; before the array is
-            used.
+        FormatError: If the disk is too full, or the folder is not writable.
 
     Example:
         >>> import torchrg

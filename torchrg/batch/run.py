@@ -57,8 +57,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
     """Lock an existing output directory for one command at a time.
 
     It is an operating system lock, released when the process ends, even on a crash; workers end
-    with their command. On network file systems it works if they support locking: see the package
-    filelock.
+    with their command. On network file systems it works if they support locking.
 
     Raises:
         FormatError: If another command holds the lock, or the lock file cannot be written.

@@ -76,8 +76,7 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
         jobs: All scans of the data set.
 
     Raises:
-        FormatError: If the directory contains another data set, kind or layout, or a corrupt
-            record.
+        FormatError: If there is another data set, kind or layout, or a corrupt record.
     """
     out, source = jobs[0].out, jobs[0].source
     names, found, described = {job.name for job in jobs}, find_records(out), source.describe()

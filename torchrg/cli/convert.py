@@ -76,8 +76,7 @@ class Arguments:
     """Output directory of one data set in one layout, with one folder per scan; created if missing.
     Finished scans are skipped."""
     workers: int | None = None
-    """Number of scans processed at a time. Default: one per core; on a cluster, as the memory
-    allows."""
+    """Number of scans processed at a time. Default: one per core; on a cluster, by memory."""
     engine: Literal["local", "ray"] = "local"
     """Execution: processes on this machine (local), or tasks on a Ray cluster (ray; pip install
     'torchrg[ray]')."""

@@ -136,8 +136,7 @@ Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3
 def _base_settings(options: Mapping[str, Any]) -> PipelineConfig:
     """Return the settings of the preset or file, with the options that concern several settings.
 
-    The up axis is z unless the file sets another. With --table, polygons are traced if shapely is
-    installed.
+    The up axis is z unless the file sets another. --table traces polygons if shapely is installed.
     """
     source = options.get("config") or options.get("preset", DEFAULT_PRESET)
     changes = {name: options[name] for name in ("angle_deg",) if options.get(name) is not None}

@@ -35,8 +35,7 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
     ``suffix`` is empty, each result is a directory.
 
     Raises:
-        FormatError: If there is no input, two results have the same name, or a result cannot be
-            written.
+        FormatError: If there is no input, two results share a name, or one cannot be written.
     """
     if not inputs:
         raise FormatError("expected at least one input file, got none.")

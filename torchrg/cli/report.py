@@ -8,8 +8,7 @@ from torchrg.batch.task import TaskReport
 from torchrg.cli.ending import printable
 
 _SECONDS_PER_SCAN = 0.03
-"""Time for a scan of 40 points on one core of an AMD EPYC, in seconds: hashing and flushing
-files."""
+"""Time for a scan of 40 points on one core of an AMD EPYC, in seconds: hashing, flushing."""
 _MIN_NEXT_UNIT = 100
 """Durations from this many seconds or minutes on are printed in the next larger unit."""
 MAX_ROWS = 300

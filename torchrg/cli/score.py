@@ -48,15 +48,13 @@ class Arguments:
     """
 
     predicted: Annotated[Path, Argument("PREDICTED", is_positional=True)]
-    """Scan with labels or normals, as written by torchrg segment or convert, or a folder of
-    scans."""
+    """Scan with labels or normals, of torchrg segment or convert, or a folder of scans."""
     ground_truth: Annotated[Path, Argument("TRUTH", is_positional=True)]
     """File with ground-truth labels or normals, or a folder with one such file per result."""
     match_distance: float | None = None
     """Match each ground-truth point to the nearest predicted point within this distance, in units
     of the cloud. Every ground-truth point counts once; without a match it counts as unlabeled.
-    Unmatched predicted points are ignored. Default: points are compared row by row and must be the
-    same."""
+    Unmatched predicted points are ignored. Default: the points must be the same, row by row."""
     superpoints: bool = False
     """Also evaluate superpoints against the ground-truth labels."""
     ignore: int | None = None
@@ -66,8 +64,7 @@ class Arguments:
     """Maximum distance between matching superpoint and ground-truth boundaries, in units of the
     cloud. Default: the median distance to the 8th nearest neighbor."""
     json: bool = False
-    """Print a JSON object instead of text; for folders with the keys "scans" (scores per scan) and
-    "mean"."""
+    """Print a JSON object instead of text; for folders with the keys "scans" and "mean"."""
     columns: ColumnsFlag = None
 
 

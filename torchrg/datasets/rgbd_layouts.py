@@ -100,8 +100,7 @@ class FrameLayout(NamedTuple):
 def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of TUM RGB-D listed in ``depth.txt``.
 
-    Color (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are the nearest in time, or
-    None.
+    Color (``rgb.txt``) and pose (``groundtruth.txt``) are the nearest in time, or None.
     """
     lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
     times, images = read_timed(lists[0])

@@ -30,14 +30,12 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Convention:
         Camera axes are x to the right, y down, z forward; ``depth`` is z, not the length of the
-        ray. The center of the first pixel is at (0, 0). A negative focal length flips an axis, as
-        in ICL-NUIM.
+        ray. The center of the first pixel is at (0, 0). Negative focal lengths flip an axis.
 
     Args:
         depth: Shape ``(B, H, W)``, floating point, in any unit.
         intrinsics: Camera matrices, shape ``(B, 3, 3)``; see :func:`read_intrinsics`.
-        poses: Camera-to-world matrices, shape ``(B, 4, 4)``. Default: points are in camera
-            coordinates.
+        poses: Camera-to-world matrices, shape ``(B, 4, 4)``. Default: camera coordinates.
 
     Returns:
         Points, shape ``(B, H, W, 3)``, in the unit of ``depth`` and in its dtype, or in that of the

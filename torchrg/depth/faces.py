@@ -34,8 +34,7 @@ _STRIDE = 4
 _MIN_LINES = 2
 """Minimum number of sampled rows and columns that connect two regions."""
 _MAX_OFFSET = 0.5
-"""Maximum distance of the center of the smaller region from the plane of the larger one, in
-thicknesses."""
+"""Maximum distance of a smaller region's center from the plane of the larger, in thicknesses."""
 _MIN_NEARER = 0.5
 """Minimum fraction of the pixels between two regions in front of their plane. The remaining ones
 may lie on it or have no depth, as in the shadow of a nearer object."""

@@ -245,8 +245,7 @@ def move_to_creases(
     regions form a crease if their centers are on opposite sides of the intersection line, each off
     the other's plane. A pixel on the other side then joins the other region if it is on its plane.
     It must be next to a pixel of that region straight behind it, as seen from the crease.
-    Boundaries thus move towards the crease, never along it. Neighbors of changed pixels are
-    revisited.
+    Boundaries thus move towards the crease, never along it. Their neighbors are revisited.
 
     ``reach`` is the maximum distance of a point on the plane along the last coordinate, ``(M,)``.
     """

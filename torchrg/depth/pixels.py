@@ -139,8 +139,7 @@ def _join(
 def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
     """Return the slope variance of windows with the given rows and columns, ``(2, n)``.
 
-    For least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, averaged over the
-    axes.
+    For least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, their mean.
     """
     rows, columns = sides.unbind()
     count = rows * columns
@@ -150,8 +149,7 @@ def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
 def contain(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
     """Return a mask of windows that contain pixels, by row-major index; ``width`` is in pixels.
 
-    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` the row and column of their
-    centers.
+    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` row and column of centers.
     """
     (rows, columns), (row, column) = sides.unbind(), middles.unbind()
     down, right = (pixels // width - row).abs(), (pixels % width - column).abs()

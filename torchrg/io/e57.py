@@ -61,8 +61,7 @@ _Block = dict[str, Array]
 class ScanPose(NamedTuple):
     """Name and pose of a scan in an E57 file.
 
-    The rotation is a quaternion w x y z of any norm (zero: identity), applied before the
-    translation.
+    The rotation is a quaternion w x y z of any norm (zero: identity), applied first.
     """
 
     name: str = ""

@@ -163,8 +163,7 @@ def hash_file(path: Path) -> str:
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check that a path can be written, before long work.
 
-    The folder exists and is writable. An existing target is a writable file, not a directory or
-    device.
+    The folder exists and is writable. An existing target is a writable file, no device.
     """
     target = Path(os.path.realpath(path))
     if target.is_dir():

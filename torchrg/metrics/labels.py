@@ -63,12 +63,10 @@ def score_labels(
 
     Arguments, errors and the handling of unlabeled points are as in
     :func:`torchrg.metrics.contingency_table`: a point without a face lowers the precision of its
-    region, a point without a region the recall of its face. The paper shows regions of at least 50
-    points.
+    region, a point without a region the recall of its face. The paper shows regions from 50 points.
 
     Returns:
-        The indices. Means and fractions over nothing are 0; the counts distinguish this from an
-        actual 0.
+        The indices. Means and fractions over nothing are 0; the counts show this.
 
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate

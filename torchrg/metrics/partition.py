@@ -83,8 +83,7 @@ def score_partition(
         The metrics. Fractions of nothing are 0.
 
     Raises:
-        ShapeError: If the labels are not integers, the points not floating point, or lengths
-            differ.
+        ShapeError: If labels are no integers, points not floating point, or lengths differ.
         ConfigError: If ``boundary_distance`` is not positive.
 
     References:

@@ -35,8 +35,7 @@ OUTCOMES = {
 }
 """Outcomes of a point against ground truth: color and meaning."""
 _OCTAHEDRON_STEPS = 254
-"""Steps along the sides of the octahedral map: about one degree. Even, so that the axes are
-exact."""
+"""Steps along the sides of the octahedral map: about a degree. Even, for exact axes."""
 _DIRECTION_BITS = 6
 """Bits per coordinate of the octahedral map that select a color."""
 _CURVATURE_END = 0.1

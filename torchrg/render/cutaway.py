@@ -27,8 +27,7 @@ MIN_FACING = {"cutaway": 0.1, "above": 0.7}
 """Minimum cosine between the outward direction of a side and the direction to the viewer for the
 side to be hidden, by view. From above only nearly horizontal sides obstruct the view."""
 MAX_SIDES = 7
-"""Maximum number of outer sides: bits of a byte, without the last one, which hides planes in a
-viewer."""
+"""Maximum number of outer sides: bits of a byte but the last, which hides planes in a viewer."""
 _MAX_WALLS = 60
 """Maximum number of candidate walls and ceilings, the largest ones; bounds the memory."""
 _ANGLE_DEG = 4.0
@@ -43,13 +42,11 @@ _MIN_INSIDE_FRACTION = 0.05
 _THICKNESS = 1.5
 """Distance to a wall, in voxel edges plus twice its noise, up to which voxels belong to it."""
 _CEILING_DEPTH = 0.15
-"""Depth below a ceiling that is hidden with it, as a fraction of the cloud height, for lamps and
-beams."""
+"""Depth hidden with a ceiling, as a fraction of the cloud height, for lamps and beams."""
 _MAX_PIXELS = 500
 """Maximum side of the image for measuring how much a view shows, in pixels."""
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
-"""Candidate azimuths, in degrees. None is perpendicular to a wall, so both walls of a corner are
-visible."""
+"""Candidate azimuths, in degrees. None is perpendicular to a wall: both of a corner are visible."""
 
 
 class Sides(NamedTuple):

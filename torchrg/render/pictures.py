@@ -43,8 +43,7 @@ _SMALL_RADIUS, _MAX_RADIUS = 8.0, 64.0
 """Maximum radii of a disc in pixels: for small images, and for any image, since the time grows with
 the square of the radius."""
 _MAX_SIDE, _MAX_SUPERSAMPLING = 2**13, 16
-"""Maximum number of pixels per side (an 8K screen), and of subpixels per pixel and axis; bounds the
-memory."""
+"""Maximum pixels per side (an 8K screen), and subpixels per pixel and axis; bound the memory."""
 _MAX_SUBPIXELS = 2**26
 """Maximum number of subpixels of an image, 70 bytes each while it is drawn."""
 _GAP_RADIUS = 0.6
@@ -184,8 +183,7 @@ def render_cloud(
 
     Convention:
         Points are drawn as discs with the radius of the local spacing, tilted by their normals. The
-        image does not depend on the order of the points nor, except for rounding, on unit and
-        origin.
+        image depends neither on the order of the points nor, but for rounding, on unit and origin.
 
     Args:
         points: Points, shape ``(N, 3)``; points with NaN or Inf are omitted.

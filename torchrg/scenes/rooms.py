@@ -40,8 +40,7 @@ _AISLE = 0.75
 _DOORWAY_AISLE = 1.6
 """Minimum distance from the center of a doorway to objects on walls, in meters."""
 _DOORWAY_SPACE = 1.9
-"""Minimum distance from the center of a doorway to objects on the floor, in meters, for an open
-door."""
+"""Minimum distance from a doorway's center to objects on the floor, in meters, for a door."""
 _TRIES = 1000
 """Maximum number of attempts to create an object without a face in the plane of another."""
 _PARALLEL = 1 - 0.02**2 / 2

@@ -148,8 +148,7 @@ class Planes(_Movable):
         area: Area covered by the points on the plane, shape ``(M,)``.
         count: Number of points, including duplicates, shape ``(M,)``, int64.
         rms: RMS distance of the points to the plane, shape ``(M,)``.
-        extent: Long and short side of the minimum bounding rectangle of the projected points, shape
-            ``(M, 2)``.
+        extent: Long and short side of the points' minimum bounding rectangle, shape ``(M, 2)``.
         axes: Unit directions of those sides, shape ``(M, 2, 3)``.
         center: Center of that rectangle, shape ``(M, 3)``.
         curved: Mask of smooth but nonplanar regions (a column, a bent wall), shape ``(M,)``, bool.

@@ -29,8 +29,7 @@ _CELL = 32
 """Side of the cells of the sample, in spacings of a uniform surface. Seven of eight points are away
 from the boundary of their cell, outside of which the nearest point may be."""
 _MIN_PLACEHOLDERS = 10
-"""Number of points at 0 0 0 from which they count as pixels without depth. Fewer may be measured
-there."""
+"""Points at 0 0 0 from which they count as pixels without depth. Fewer may be measured."""
 _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791])
 """Factors of the cell hash: M. Teschner et al. Optimized spatial hashing for collision detection of
 deformable objects. VMV, 2003."""

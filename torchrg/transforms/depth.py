@@ -229,8 +229,7 @@ class FusedFrames(NamedTuple):
     """Cloud fused from several depth frames.
 
     Attributes:
-        coord: Points in world coordinates, shape ``(N, 3)``, float64: the pixels with depth, or one
-            per voxel.
+        coord: Points in world coordinates, shape ``(N, 3)``, float64: pixels with depth, or voxels.
         color: Colors, shape ``(N, 3)``, uint8; None if any frame has no color.
         frame: Frame index of each point, shape ``(N,)``, int64.
         pixel: Row-major pixel index of each point in its frame, shape ``(N,)``, int64.
