@@ -5,8 +5,7 @@ import os
 import sys
 from types import ModuleType
 
-# OpenBLAS starts a thread per core, which torchrg never uses, and interrupts the process if one
-# cannot start.
+# OpenBLAS starts a thread per core, which torchrg never uses, and fails if one cannot start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Garbage collection during the import of torch takes a fifth of the startup time. Commands and
 # workers enable it again.

@@ -34,8 +34,7 @@ ROWS_AT_ONCE = 65536
 TYPICAL_WIDTH = 64
 """Number of values per row, such as neighbors, up to which the numbers above apply."""
 _MIN_ROWS = 4096
-"""Minimum number of rows per thread: at a few tenths of a microsecond each they outweigh its
-start."""
+"""Minimum rows per thread: at a few tenths of a microsecond each they outweigh its start."""
 _RETAINED_BYTES = 31 * 2**20
 """Just below 32 MiB, the largest freed block that raises the trim threshold of glibc."""
 

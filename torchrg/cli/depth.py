@@ -38,8 +38,7 @@ color them differently. Coloring from all pixels would take as long as segmentat
 _NOT_IMAGES = ("planes", "points", "neighbors", "sampling", "num_copies")
 """Fields of an image segmentation that are not images."""
 _MAX_MISFIT = 0.01
-"""Maximum median reprojection distance of points for a camera to fit a cloud, as a fraction of the
-longer image side."""
+"""Maximum median reprojection error of a camera that fits, as a fraction of the longer side."""
 _MIN_BYTES_PER_PIXEL = 300
 """Lower bound of the memory for segmentation, in bytes per pixel."""
 
@@ -61,8 +60,7 @@ class Arguments:
     """
 
     inputs: Annotated[tuple[Path, ...], Argument("IMAGE", is_positional=True)]
-    """Depth images (16-bit .png or .pgm, or .npy), folders with one depth image, or organized
-    clouds (.pcd)."""
+    """Depth images (16-bit .png, .pgm, or .npy), folders with one, or organized clouds (.pcd)."""
     out: Path
     """Output file: .png for labels, or a point cloud format. With several inputs, or a folder, an
     output directory: each image gets a folder with coord, normal, curvature and plane as .npy, and

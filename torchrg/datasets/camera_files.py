@@ -96,8 +96,7 @@ def read_camera(path: Path) -> Pinhole:
         FormatError: If the file is missing, or contains no camera.
 
     Warns:
-        DepthWarning: If the lens distorts images, which torchrg does not correct, or a focal length
-            is negative.
+        DepthWarning: If the lens distorts images, or a focal length is negative.
     """
     record = read_entries(path)
     if isinstance(record.get("frames"), list) and "fl_x" not in record:
@@ -297,8 +296,7 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
         FormatError: If a camera file is corrupt.
 
     Warns:
-        DepthWarning: If another file of the same folder has another camera, or the file is outside
-            ``root``.
+        DepthWarning: If another file there has another camera, or the file is outside ``root``.
     """
     # Links are not resolved: the parents of a recording are those in its path.
     start, top = (Path(os.path.abspath(path)) for path in (folder, root))  # noqa: PTH100

@@ -283,8 +283,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     Returns:
         Results of :func:`torchrg.datasets.read_pointcept_scene`, concatenated in natural order:
         ``(N, ...)``, with ``offset`` ``(B,)``, the end row of each scene, and ``name``, a list.
-        IDs in ``instance``, ``plane`` and ``superpoint`` are offset to be unique across scenes; -1
-        is unchanged.
+        IDs in ``instance``, ``plane`` and ``superpoint`` are offset to be unique; -1 is unchanged.
 
     Raises:
         FormatError: If the folder is missing, contains no scene, or a file is corrupt.

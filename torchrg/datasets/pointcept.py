@@ -102,8 +102,7 @@ def write_pointcept_scene(
             ``normal``: the normals of the segmentation.
         segmentation: Result of :func:`torchrg.segment_planes` for ``coord``.
         superpoint: Superpoint of each point, shape ``(N,)``. Default: not written.
-        origin: Origin of ``coord``, for the plane table. Default: ``coord`` is in the coordinates
-            of the data set.
+        origin: Origin of ``coord``, for the plane table. Default: that of the data set.
 
     Returns:
         Names of the files written.

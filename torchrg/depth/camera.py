@@ -199,8 +199,7 @@ def unproject_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = Non
 def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     """Return a camera matrix ``(3, 3)``, float64, from focal lengths and optical axis in pixels.
 
-    ``fx`` and ``cx`` are along rows, ``fy`` and ``cy`` along columns; the center of the first pixel
-    is 0.
+    ``fx`` and ``cx`` are along rows, ``fy`` and ``cy`` along columns; the first center is 0.
 
     Raises:
         ConfigError: If a focal length is 0, or a value is not within 1e12.

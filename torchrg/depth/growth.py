@@ -46,8 +46,7 @@ class InverseCloud(NamedTuple):
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
     the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are float64, in
-    columns; ``noise`` ``(H * W,)`` is the noise of the last coordinate; ``seen`` ``(H, W)`` masks
-    pixels with depth.
+    columns; ``noise`` ``(H * W,)`` is that of the last coordinate; ``seen`` ``(H, W)`` masks depth.
     """
 
     points: Tensor

@@ -135,8 +135,7 @@ def assemble_table(
 def convert_coordinates(path: Path, coordinates: Array) -> NDArray[np.floating]:
     """Return coordinates as float32 or float64 in native byte order.
 
-    Integers of at most 16 bits and half precision become float32, which is exact; other numbers
-    become float64.
+    Integers of at most 16 bits and half precision become float32, which is exact; others float64.
     """
     check_coordinates(path, coordinates.shape, coordinates.dtype)
     dtype = coordinates.dtype

@@ -27,8 +27,7 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
         A field is kept if all clouds have it with the same shape and kind of numbers, and colors
         with the same bit depth. Coordinates are float64 if any are. Header entries are kept if
         equal in all files. For LAS files the header with the finest scale is kept if the dimensions
-        agree and its grid covers all points; for E57 files all scans are kept. The notes list the
-        dropped data.
+        agree and its grid covers all points; for E57 files all scans are kept. Notes list the rest.
 
     Args:
         clouds: At least one cloud; all must use the same frame and unit.

@@ -54,8 +54,7 @@ def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
     Returns:
         ``plane_normal`` and so on, with M rows; ``plane_kind`` as text; ``adjacency_pairs``,
         ``adjacency_boundary_length`` and ``adjacency_dihedral_deg``; polygons as ``outline_points``
-        (concatenated rings), ``outline_ring_sizes`` (their lengths) and ``outline_ring_planes``
-        (their plane IDs).
+        (all rings), ``outline_ring_sizes`` (lengths) and ``outline_ring_planes`` (plane IDs).
     """
 
     def moved(positions: Tensor) -> NDArray[np.float64]:

@@ -108,8 +108,7 @@ def _is_mesh(element: "_Element") -> bool:
 def write_ply(path: Path, cloud: Cloud) -> None:
     """Write a little-endian file; identical clouds give byte-identical files.
 
-    Coordinates keep their precision. 64-bit integers become 32-bit integers, or ``double`` if that
-    represents them.
+    Coordinates keep their precision. 64-bit integers become 32-bit ones, or ``double`` if exact.
     """
     columns = flatten_cloud(path, cloud, FieldNames())
     check_exact(path, columns)

@@ -1,7 +1,6 @@
 """Segmentation results: a cloud with its labels, planes and superpoints.
 
-Written by :func:`torchrg.write_cloud`, ``torchrg convert`` and ``torchrg depth``; read by
-:func:`read_result`.
+:func:`torchrg.write_cloud` and commands write them, :func:`read_result` reads them.
 """
 
 from __future__ import annotations
@@ -152,8 +151,7 @@ class Result:
         """Convert to a sample for data loaders and transforms.
 
         Contains ``coord`` ``(N, 3)``, float32, relative to ``origin`` ``(1, 3)``, float64, and if
-        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint`` and the table
-        ``planes``.
+        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint``, ``planes``.
 
         Example:
             >>> sample = Result(Cloud(np.zeros((2, 3)), {"labels": np.array([0, -1])})).to_dict()

@@ -38,8 +38,7 @@ _SAMPLE_BYTES = 1 << 16
 _COMMENTS = ("#", "//", "BEGIN", "END")
 """Beginnings of lines without points. Words alone separate the scans of a file."""
 _WINDOWS_NAN = re.compile(r"1[.,]#[A-Z]+[0-9]*|nan\([a-z]*\)", re.IGNORECASE)
-"""Numbers that are not finite, as printed by the C library of Windows: ``-1.#IND``, ``1.#QNAN0``,
-``-nan(ind)``."""
+"""Numbers that are not finite, as Windows prints them: ``-1.#IND``, ``1.#QNAN0``, ``-nan(ind)``."""
 _COLMAP = "POINT3D_ID, X, Y, Z"
 """Comment above the points in COLMAP's ``points3D.txt``, whose rows list images."""
 

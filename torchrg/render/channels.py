@@ -72,8 +72,7 @@ def make_channels(
     """Yield the available color channels, in the order of :data:`COLOR_MODES`.
 
     Args:
-        fields: Fields of n points; see :class:`torchrg.Cloud`. Labels and superpoints
-            are consecutive.
+        fields: Fields of n points; see :class:`torchrg.Cloud`. IDs are consecutive.
         ground_truth: Ground-truth ``labels`` or ``normals`` of the same points.
         palettes: Results of :func:`torchrg.render.colors.palette_of_planes` for the available modes
             of ``plane`` and ``superpoint``, with rows of the n points.
@@ -157,8 +156,7 @@ def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
 
     Returns:
         Shape ``(N,)``, int64: 0 if the region matches the point's plane, 1 if it is another region
-        with that plane as its largest part, 2 if it consists mostly of other planes, 3 if the point
-        is unlabeled.
+        with that plane as its largest part, 2 if it is mostly of other planes, 3 if unlabeled.
 
     Raises:
         ShapeError: If a shape or dtype is invalid.

@@ -201,8 +201,7 @@ def render_cloud(
         elevation_deg: Elevation of the camera, in degrees. Default: 35, from above 90.
         width: Width in pixels, at most 8,192; with few enough subpixels, about 4,800 at the
             default supersampling.
-        height: Height in pixels, at most 8,192. Default: fitted to the cloud, from a quarter of the
-            width to the width.
+        height: Height in pixels, at most 8,192. Default: fitted, from a quarter of the width on.
         supersampling: Subpixels per pixel and axis, which are averaged.
 
     Returns:

@@ -23,8 +23,7 @@ _OVERHANG = 2.0
 """Maximum depth difference, in radii of a disc, at which a disc may wrongly hide another: both may
 extend one radius beyond an edge."""
 _DOME = 0.1
-"""Curvature of discs, as depth of the rim in radii, so that among coplanar discs the one with the
-nearest center wins."""
+"""Curvature of discs, as depth of the rim in radii: of coplanar discs, the nearest center wins."""
 _FLAT = 0.1
 """Tolerance in depth, in radii of a disc, since noise moves the centers of one surface off the
 planes of its discs. With 0 more pixels of noisy boxes get the color of another surface."""

@@ -265,8 +265,7 @@ class Segmentation(_Movable):
     """Plane segmentation: per-point labels and normals, and the plane table.
 
     Attributes:
-        labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or
-            :data:`UNLABELED`.
+        labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or -1.
         normals: Unit normals, shape ``(N, 3)``; zero where not ``valid``.
         curvature: Surface variation in [0, 1/3], shape ``(N,)``; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(N,)``, bool.

@@ -16,8 +16,7 @@ from torch import Tensor
 from torchrg.errors import PrecisionWarning, UnitWarning, warn
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
-"""Rounding steps, in spacings of the points, above which there is a note: for float32, and for the
-scale of a file."""
+"""Rounding steps above which there is a note, in spacings: for float32, and for a file's scale."""
 _MAX_FINE_STEP = 1e-3
 """Rounding step, in spacings of a uniform surface, up to which no search is needed: for it to be
 too coarse, half of the points would have to be a hundred times closer."""

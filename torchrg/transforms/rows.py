@@ -118,8 +118,7 @@ def _classify_keys(
 def check_lengths(caller: str, entries: Entries, num_points: int) -> None:
     """Raise ConfigError if a per-point entry has a wrong number of rows.
 
-    Checked are listed entries, and names that Pointcept and torchrg use, unless the entry has the
-    shape of an image.
+    Checked are listed entries, and names of Pointcept and torchrg, unless the entry is an image.
     """
     listed = get_list(entries) or []
     for key in {**dict.fromkeys(listed), **dict.fromkeys((*POINTCEPT_KEYS, *TORCHRG_KEYS))}:
