@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -243,11 +244,10 @@ class BatchReport:
     @property
     def stage_seconds(self) -> dict[str, float]:
         """Total seconds per stage of the scans converted now."""
-        total: dict[str, float] = {}
+        total = Counter[str]()
         for scan in self.with_status("converted"):
-            for stage, seconds in scan.seconds.items():
-                total[stage] = total.get(stage, 0.0) + seconds
-        return total
+            total.update(scan.seconds)
+        return dict(total)
 
     @property
     def num_points(self) -> int:

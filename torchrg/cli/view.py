@@ -33,7 +33,6 @@ from torchrg.structures.colors import narrow_colors
 
 ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
 PageColorBy = Literal[ColorBy, "error", "normal-error"]
-Direction = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def _render(arguments: Arguments, result: Result, first: Result | None = None) -
     reference = None
     if first and np.array_equal(cloud.coordinates, first.cloud.coordinates, equal_nan=True):
         reference = first.fields.get("labels")
-    up = _direction(arguments.up or "z")
+    up = arguments.up or "z"
     return render_cloud(
         cloud.points,
         _colors(cloud, arguments.color, up, reference),
@@ -138,7 +137,7 @@ def _write_page(arguments: Arguments, result: Result) -> str:
         ground_truth=None if ground_truth is None else ground_truth.cloud,
         color=arguments.color,
         view=arguments.view,
-        up=None if arguments.up is None else _direction(arguments.up),
+        up=arguments.up,
         azimuth_deg=arguments.azimuth_deg,
         max_points=arguments.max_points,
         unit=arguments.unit,
@@ -148,9 +147,7 @@ def _write_page(arguments: Arguments, result: Result) -> str:
     return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
 
 
-def _colors(
-    cloud: Cloud, color: PageColorBy | None, up: Direction, reference: Tensor | None
-) -> Tensor:
+def _colors(cloud: Cloud, color: PageColorBy | None, up: Up, reference: Tensor | None) -> Tensor:
     """Return the color of each point; raise ConfigError if the cloud lacks the quantity."""
     present = [name for name in get_args(ColorBy) if COLOR_MODES[name][1] in cloud.fields]
     if color is None:
@@ -173,10 +170,3 @@ def _colors(
     if color == "sharp":
         return color_sharp(values)
     return torch.from_numpy(narrow_colors(cloud.fields["color"]))
-
-
-def _direction(axis: Up) -> Direction:
-    """Return the unit vector of an axis."""
-    sign = -1.0 if axis.startswith("-") else 1.0
-    x, y, z = (sign * (letter == axis[-1]) for letter in "xyz")
-    return x, y, z

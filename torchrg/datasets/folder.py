@@ -293,12 +293,8 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     if not paths:
         raise FormatError(f"{folder}: expected folders with coord.npy, got none; pass an area.")
     scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
-    for key in {"instance", "plane", "superpoint"} & set(scenes[0]):
-        first = 0
-        for labels in (scene[key] for scene in scenes if key in scene):
-            labels[labels >= 0] += first
-            first = int(labels.max()) + 1 if (labels >= 0).any() else first
-    return collate_offset(scenes)
+    unique = [key for key in ("instance", "plane", "superpoint") if key in scenes[0]]
+    return collate_offset(scenes, unique=unique)
 
 
 def is_other(path: Path) -> bool:

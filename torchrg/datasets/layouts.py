@@ -43,7 +43,7 @@ _CENTERED = 127.5
 SPLIT_NAMES = {"train": "train", "val": "validation", "test": "test"}
 """Mask3D's names of splits."""
 _MAX_OBJECTS = 999
-"""Maximum objects per scan in Mask3D: ground truth is 1000 times the class plus the ID, from one."""
+"""Maximum objects per scan in Mask3D: ground truth is 1000 times the class plus ID, from one."""
 _MAX_EXACT = 2**24
 """Limit up to which float32 represents every integer."""
 VERSION = 2

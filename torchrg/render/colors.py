@@ -1,5 +1,7 @@
 """Perceptually distinct colors for planes, normals, curvature and sharp points."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -146,7 +148,7 @@ _REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
 """Red, green and blue of regular points (light gray) and of sharp ones (red)."""
 
 
-def color_normals(normals: Points, *, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Tensor:
+def color_normals(normals: Points, *, up: Sequence[float] | str = "z") -> Tensor:
     """Color normals by direction; opposite normals get the same color.
 
     Horizontal surfaces are light gray. Vertical surfaces are colored by the direction they face,
@@ -154,7 +156,7 @@ def color_normals(normals: Points, *, up: tuple[float, float, float] = (0.0, 0.0
 
     Args:
         normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero if unknown.
-        up: Up direction.
+        up: Up direction: three numbers, or the name of an axis.
 
     Returns:
         Shape ``(*, 3)``, uint8; gray for unknown normals.

@@ -15,7 +15,7 @@ import json
 import math
 import os
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -88,7 +88,7 @@ def make_page(
     title: str | None = None,
     color: str | None = None,
     view: View = "cutaway",
-    up: tuple[float, float, float] | None = None,
+    up: Sequence[float] | str | None = None,
     azimuth_deg: float | None = None,
     max_points: int = MAX_SHOWN_POINTS,
     unit: str | None = None,
@@ -108,7 +108,7 @@ def make_page(
         color: Initial color mode, a key of :data:`torchrg.render.channels.COLOR_MODES`.
             Default: the first available one.
         view: Initial camera, see :func:`torchrg.render.render_cloud`.
-        up: Up direction. Default: z; -y for the view ``"sensor"``.
+        up: Up direction, as in :func:`torchrg.render.render_cloud`. Default: z; -y for a sensor.
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
         max_points: Maximum number of points per cloud; larger clouds are randomly downsampled, with
             a note in the viewer.
@@ -164,9 +164,11 @@ def make_page(
     return Page(text, tuple(scene["shown"] for scene in scenes))
 
 
-def _guess_unit(cloud: Cloud, up: tuple[float, float, float]) -> str:
+def _guess_unit(cloud: Cloud, up: Sequence[float] | str) -> str:
     """Return the unit of a cloud, estimated from its height."""
-    heights = cloud.coordinates[cloud.finite].astype(float) @ np.array(up) / np.linalg.norm(up)
+    heights = (
+        cloud.coordinates[cloud.finite].astype(float) @ unit_direction("make_page", up).numpy()
+    )
     height = np.ptp(heights) if len(heights) else 0.0
     return "m" if _ROOM_HEIGHTS[0] <= height <= _ROOM_HEIGHTS[1] else "units"
 
@@ -174,10 +176,10 @@ def _guess_unit(cloud: Cloud, up: tuple[float, float, float]) -> str:
 def _check_settings(
     cloud: Cloud,
     ground_truth: Cloud | None,
-    up: tuple[float, float, float] | None,
+    up: Sequence[float] | str | None,
     view: View,
     max_points: int,
-) -> tuple[float, float, float]:
+) -> Sequence[float] | str:
     """Return the up direction; raise if a setting is invalid."""
     check_choices("make_page", view=(view, View))
     if max_points < 1:
@@ -189,7 +191,7 @@ def _check_settings(
             f"{ground_truth.source or 'make_page'}: expected ground truth for {len(cloud):,} "
             f"points, got {len(ground_truth):,}; pass the same points in the same order."
         )
-    return up or ((0.0, -1.0, 0.0) if view == "sensor" else (0.0, 0.0, 1.0))
+    return up or ("-y" if view == "sensor" else "z")
 
 
 def write_page(path: str | os.PathLike[str], page: Page) -> None:

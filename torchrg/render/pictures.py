@@ -2,7 +2,7 @@
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -168,7 +168,7 @@ def render_cloud(
     normals: Points | None = None,
     labels: Labels | None = None,
     view: "View | PinholeCamera" = "cutaway",
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    up: Sequence[float] | str = "z",
     azimuth_deg: float | None = None,
     elevation_deg: float | None = None,
     width: int = 1400,
@@ -194,7 +194,7 @@ def render_cloud(
             and ceilings are found. Default: the voxels are segmented.
         view: See above; or a batch of one kornia camera, with the size of the image, such as from
             :func:`torchrg.render.make_camera`. Points behind a camera are omitted.
-        up: Up direction; ignored for ``"sensor"`` and a given camera, as are the angles.
+        up: Up direction, three numbers or the name of an axis; ignored for ``"sensor"`` and a given camera, as are the angles.
         azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction of
             most walls nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
