@@ -166,9 +166,8 @@ def make_page(
 
 def _guess_unit(cloud: Cloud, up: Sequence[float] | str) -> str:
     """Return the unit of a cloud, estimated from its height."""
-    heights = (
-        cloud.coordinates[cloud.finite].astype(float) @ unit_direction("make_page", up).numpy()
-    )
+    axis = unit_direction("make_page", up).numpy()
+    heights = cloud.coordinates[cloud.finite].astype(float) @ axis
     height = np.ptp(heights) if len(heights) else 0.0
     return "m" if _ROOM_HEIGHTS[0] <= height <= _ROOM_HEIGHTS[1] else "units"
 
@@ -184,8 +183,6 @@ def _check_settings(
     check_choices("make_page", view=(view, View))
     if max_points < 1:
         raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
-    if up is not None:
-        unit_direction("make_page", up)
     if ground_truth is not None and len(ground_truth) != len(cloud):
         raise ConfigError(
             f"{ground_truth.source or 'make_page'}: expected ground truth for {len(cloud):,} "

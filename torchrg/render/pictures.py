@@ -194,7 +194,8 @@ def render_cloud(
             and ceilings are found. Default: the voxels are segmented.
         view: See above; or a batch of one kornia camera, with the size of the image, such as from
             :func:`torchrg.render.make_camera`. Points behind a camera are omitted.
-        up: Up direction, three numbers or the name of an axis; ignored for ``"sensor"`` and a given camera, as are the angles.
+        up: Up direction, three numbers or the name of an axis. It and the angles are ignored for
+            ``"sensor"`` and for a given camera.
         azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction of
             most walls nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
