@@ -136,7 +136,7 @@ def test_a_scan_that_failed_keeps_its_table(job_of_a_room, tmp_path, room, monke
     # A new table is known as torchrg's when the conversion is killed then.
     np.save(path, room(400).points)
     with monkeypatch.context() as patch:
-        patch.setattr("torchrg.batch.scans.remove_unwritten", interrupt)
+        patch.setattr("torchrg.datasets.provenance.remove_unwritten", interrupt)
         with pytest.raises(KeyboardInterrupt):
             convert_scan(job)
     other = dataclasses.replace(job, source=dataclasses.replace(job.source, table=None))

@@ -13,18 +13,8 @@ from typing import ClassVar
 from torchrg.batch.memory import scan_memory
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
+from torchrg.datasets import provenance
 from torchrg.datasets.folder import SceneDataset, SceneFiles
-from torchrg.datasets.provenance import (
-    Record,
-    check_owned,
-    check_source,
-    claim_files,
-    describe_versions,
-    owned_files,
-    read_record,
-    remove_unwritten,
-    write_record,
-)
 from torchrg.io.files import check_writable, fingerprint, remove_leftovers, sync_folder
 from torchrg.io.result import PLANES_FILE, RECORD, write_table
 
@@ -56,13 +46,13 @@ class Source:
         """The directory of the data set."""
         return self.data.root
 
-    def __getstate__(self) -> Record:
+    def __getstate__(self) -> provenance.Record:
         """Return the state for other processes, without scenes: each job has its own."""
         data = copy.copy(self.data)
         data.scenes = []
         return vars(self) | {"data": data}
 
-    def describe(self) -> Record:
+    def describe(self) -> provenance.Record:
         """Return the type of the source and its options that affect results, for JSON."""
         raise NotImplementedError
 
@@ -122,14 +112,14 @@ class Job:
         root = self.source.root
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
-    def describe(self) -> Record:
+    def describe(self) -> provenance.Record:
         """Return what determines the results, as JSON values; OSError if an input is unreadable."""
         config, table = asdict(self.source.settings), self.source.table
         # It never changes results, so lowering it after a memory error must not reconvert scans.
         config.pop("chunk_size", None)
         inputs = [(self.input_name(path), path) for path in self.scan.files]
         return {
-            "versions": describe_versions(),
+            "versions": provenance.describe_versions(),
             "config": config,
             "source": self.source.describe() | ({"table": table} if table else {}),
             "inputs": [{"name": name} | fingerprint(path) for name, path in inputs],
@@ -141,7 +131,7 @@ class Job:
         """Remove temporary files of a killed process, and a claim on no file."""
         if self.folder.is_dir():
             remove_leftovers(self.folder)
-            if (read_record(self.folder) or {}).get("claims") == {}:
+            if (provenance.read_record(self.folder) or {}).get("claims") == {}:
                 (self.folder / RECORD).unlink()
 
 
@@ -151,7 +141,7 @@ def convert_scan(job: Job) -> TaskReport:
     The record of an earlier run becomes a claim first, and the new one is written last, so that a
     record of outputs implies complete files.
     """
-    is_ours = not os.path.lexists(job.folder) or read_record(job.folder) is not None
+    is_ours = not os.path.lexists(job.folder) or provenance.read_record(job.folder) is not None
     report = report_on(job.name, partial(_convert, job))
     if report.status == "failed":
         with contextlib.suppress(OSError):
@@ -171,20 +161,22 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         if path == job.out:
             break
     check_writable(folder / RECORD)
-    earlier = read_record(folder, strict=True)
-    check_owned(folder, [RECORD, *([] if table is None else [table])], earlier)
+    earlier = provenance.read_record(folder, strict=True)
+    provenance.check_owned(folder, [RECORD, *([] if table is None else [table])], earlier)
     if earlier is not None:
-        check_source(folder, earlier, description["source"])
+        provenance.check_source(folder, earlier, description["source"])
         description |= {key: earlier[key] for key in earlier.keys() & {"pages"}}
     job.clean()
-    write_record(folder, description | {"claims": owned_files(earlier)})
+    provenance.write_record(folder, description | {"claims": provenance.owned_files(earlier)})
     report = job.source.convert(job.scan, folder, begin)
     if table is not None:
-        write_record(folder, claim_files(read_record(folder) or description, [table]))
+        provenance.write_record(
+            folder, provenance.claim_files(provenance.read_record(folder) or description, [table])
+        )
         write_table(folder / table, json.loads((folder / PLANES_FILE).read_text("utf-8")))
         report = replace(report, files=(*report.files, table))
     begin("record")
-    changed = remove_unwritten(job.out, folder, earlier, report.files)
+    changed = provenance.remove_unwritten(job.out, folder, earlier, report.files)
     notes = [f"{name} is kept, as it was changed since torchrg wrote it" for name in changed]
     report = replace(report, warnings=(*report.warnings, *notes))
     results = {
@@ -195,12 +187,15 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         "measured": report.measured,
         "outputs": {name: fingerprint(folder / name) for name in report.files},
     }
-    write_record(folder, description | results)
+    provenance.write_record(folder, description | results)
     return report
 
 
 def claim_pages(job: Job, folder: Path) -> None:
     """Add a folder of pages to the record of a complete scan, before they are written."""
-    record, pages = read_record(job.folder), os.path.relpath(os.path.realpath(folder), job.out)
+    record, pages = (
+        provenance.read_record(job.folder),
+        os.path.relpath(os.path.realpath(folder), job.out),
+    )
     if record is not None and pages not in (known := record.get("pages", [])):
-        write_record(job.folder, record | {"pages": sorted([*known, pages])})
+        provenance.write_record(job.folder, record | {"pages": sorted([*known, pages])})

@@ -27,17 +27,8 @@ from torchrg.batch.scans import Job, Source, claim_pages
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.batch.stale import StaleResult, check_stale, find_stale, remove_empty, remove_stale
 from torchrg.batch.task import Reports
-from torchrg.cli import flags
+from torchrg.cli import ending, flags
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import (
-    INTERRUPTED,
-    SOME_FAILED,
-    USAGE_ERROR,
-    fail,
-    print_lines,
-    print_warnings,
-    warn,
-)
 from torchrg.cli.loop import Progress, print_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig
@@ -270,7 +261,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, check the plan, convert, and print a report."""
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
-        raise SystemExit(0 if argv else USAGE_ERROR)
+        raise SystemExit(0 if argv else ending.USAGE_ERROR)
     kind, *remaining = argv
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
@@ -280,7 +271,7 @@ def run(argv: list[str]) -> int:
     listing = tqdm(
         desc=f"listing the scans in {root}", bar_format="{desc}", leave=False, disable=None
     )
-    with listing, print_warnings():
+    with listing, ending.print_warnings():
         scans = list_jobs(arguments.source(root), out)
     jobs = match_jobs(scans, arguments.only)
     if arguments.dry_run:
@@ -289,7 +280,7 @@ def run(argv: list[str]) -> int:
         print(format_plan(plan))
         for result in stale:
             if result.paths and (result.scan is not None or arguments.prune):
-                print_lines(f"remove {result.name}: {result.reason}")
+                ending.print_lines(f"remove {result.name}: {result.reason}")
         print(format_costs(plan, *resources, arguments.seconds_per_million))
         check_stale(stale, root, prune=arguments.prune)
         check_free_space(plan)
@@ -362,13 +353,13 @@ def _remove_stale(stale: list[StaleResult], scans: list[Job]) -> None:
     for result in stale:
         remove_stale(result)
         if result.paths:
-            print_lines(f"{result.folder}: removed: {result.reason}")
+            ending.print_lines(f"{result.folder}: removed: {result.reason}")
     for folder in {folder for result in stale for folder in result.page_folders}:
         try:
             if (folder / INDEX).is_file():
                 _index_pages(folder, scans)
         except (TorchrgError, OSError) as error:
-            warn(f"{folder / INDEX}: may list removed scans: {error}")
+            ending.warn(f"{folder / INDEX}: may list removed scans: {error}")
 
 
 def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
@@ -377,7 +368,7 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     jobs, workers, limit = plan.to_convert, arguments.workers, _memory_limit(arguments)
     for job in jobs:
         if job.memory > limit:
-            warn(
+            ending.warn(
                 f"{job.name}: about {job.scan.num_points:,} points may exceed the memory limit of "
                 f"{limit / 1e9:.1f} GB; it runs alone."
             )
@@ -407,11 +398,11 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
         plan.jobs[0].source.write_lists(out)
     code = _finish(report, out, unit=arguments.unit)
     if unreported:
-        code = fail(unreported, code=code or USAGE_ERROR)
+        code = ending.fail(unreported, code=code or ending.USAGE_ERROR)
     pages = _page_folder(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
-        print_lines(f"pages -> {_index_pages(pages, scans)}")
+        ending.print_lines(f"pages -> {_index_pages(pages, scans)}")
     return code
 
 
@@ -430,7 +421,7 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
             claim_pages(job, folder)
             write_entry(folder, job.name, read_result(job.folder))
         except (TorchrgError, OSError) as error:
-            warn(f"{job.name}: no page: {error}")
+            ending.warn(f"{job.name}: no page: {error}")
 
 
 def _index_pages(folder: Path, scans: list[Job]) -> Path:
@@ -457,10 +448,12 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     state = f"{num_complete:,} of {len(report.scans):,} scans are complete"
     hint = "Rerun the same command to resume."
     if report.disk_full:
-        return fail(f"{out}: the disk is full; {state}. Free space. {hint}", code=SOME_FAILED)
+        return ending.fail(
+            f"{out}: the disk is full; {state}. Free space. {hint}", code=ending.SOME_FAILED
+        )
     if report.interrupted:
-        return fail(f"interrupted; {state}. {hint}", code=INTERRUPTED)
+        return ending.fail(f"interrupted; {state}. {hint}", code=ending.INTERRUPTED)
     if num_complete < len(report.scans):
-        return fail(f"{state}; see {out / REPORT}.", code=SOME_FAILED)
-    print_lines(f"{state} -> {out}")
+        return ending.fail(f"{state}; see {out / REPORT}.", code=ending.SOME_FAILED)
+    ending.print_lines(f"{state} -> {out}")
     return 0

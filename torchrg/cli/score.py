@@ -10,21 +10,13 @@ from typing import Annotated, TypeAlias
 import numpy as np
 from tqdm import tqdm
 
+from torchrg import metrics
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_warnings, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import list_some
-from torchrg.metrics import (
-    METRICS,
-    Index,
-    differing_rows,
-    match_points,
-    score_labels,
-    score_normals,
-    score_partition,
-)
 from torchrg.structures import UNLABELED, Cloud
 
 Scores: TypeAlias = dict[str, dict[str, float | None]]
@@ -97,7 +89,7 @@ def run(argv: list[str]) -> int:
     for part, values in scores.items():
         print(part)
         for name, value in values.items():
-            print(f"  {name:<22}{_format(value, METRICS.get(part, {}).get(name))}")
+            print(f"  {name:<22}{_format(value, metrics.METRICS.get(part, {}).get(name))}")
     return 0
 
 
@@ -129,7 +121,7 @@ def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> S
     else:
         distance = arguments.match_distance
         ours, scores["match"] = _match_nearest(distance, predicted, ground_truth, ours, theirs)
-    for part, score in (("labels", score_labels), ("normals", score_normals)):
+    for part, score in (("labels", metrics.score_labels), ("normals", metrics.score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
@@ -138,7 +130,7 @@ def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> S
             if field not in cloud.fields:
                 has = ", ".join(cloud.fields) or "points alone"
                 raise FormatError(f"{path}: missing {field}, required by --superpoints; has {has}.")
-        indices = score_partition(
+        indices = metrics.score_partition(
             ours.fields["superpoint"],
             theirs.fields["labels"],
             ours.points,
@@ -162,7 +154,7 @@ def _check_rows(predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud)
             f"{len(ours):,}; to compare each point with the nearest one within D, "
             "pass --match-distance D."
         )
-    rows = differing_rows(ours, theirs)
+    rows = metrics.differing_rows(ours, theirs)
     if len(rows):
         points = (cloud.coordinates[rows[0]] for cloud in (ours, theirs))
         got, expected = (" ".join(f"{value:.9g}" for value in point) for point in points)
@@ -177,7 +169,7 @@ def _match_nearest(
     distance: float, predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud
 ) -> tuple[Cloud, dict[str, float | None]]:
     """Transfer the results to the nearest ground-truth points, and count unmatched points."""
-    rows = match_points(ours, theirs, distance)
+    rows = metrics.match_points(ours, theirs, distance)
     is_matched = rows >= 0
     num_lost = int(np.count_nonzero(~is_matched))
     if num_lost == len(rows):
@@ -222,7 +214,7 @@ def _mean(scans: Mapping[str, Scores]) -> Scores:
     return means
 
 
-def _format(value: float | None, index: Index | None) -> str:
+def _format(value: float | None, index: metrics.Index | None) -> str:
     """Format a value with its unit; fractions are printed in percent."""
     unit = "" if index is None else index.unit
     if value is None:

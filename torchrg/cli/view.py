@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchrg import render
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
@@ -16,16 +17,6 @@ from torchrg.cli.loop import check_sidecar, is_viewer
 from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.io.result import Result
-from torchrg.render import (
-    color_curvature,
-    color_normals,
-    color_planes,
-    color_sharp,
-    make_page,
-    render_cloud,
-    write_page,
-    write_png,
-)
 from torchrg.render.channels import COLOR_MODES
 from torchrg.render.page import MAX_SHOWN_POINTS
 from torchrg.structures import Cloud
@@ -102,7 +93,7 @@ def _write_picture(arguments: Arguments, result: Result) -> str:
     level = [
         functional.pad(half, (0, 0, 0, 0, 0, height - len(half)), value=255) for half in halves
     ]
-    write_png(arguments.out, torch.cat(level, dim=1))
+    render.write_png(arguments.out, torch.cat(level, dim=1))
     return f"{sum(half.shape[1] for half in halves)} x {height} pixels"
 
 
@@ -113,7 +104,7 @@ def _render(arguments: Arguments, result: Result, first: Result | None = None) -
     if first and np.array_equal(cloud.coordinates, first.cloud.coordinates, equal_nan=True):
         reference = first.fields.get("labels")
     up = arguments.up or "z"
-    return render_cloud(
+    return render.render_cloud(
         cloud.points,
         _colors(cloud, arguments.color, up, reference),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
@@ -131,7 +122,7 @@ def _write_page(arguments: Arguments, result: Result) -> str:
         None if path is None else read_noted(path, arguments.columns)
         for path in (arguments.compare, arguments.ground_truth)
     )
-    page = make_page(
+    page = render.make_page(
         result,
         compare=compare,
         ground_truth=None if ground_truth is None else ground_truth.cloud,
@@ -142,7 +133,7 @@ def _write_page(arguments: Arguments, result: Result) -> str:
         max_points=arguments.max_points,
         unit=arguments.unit,
     )
-    write_page(arguments.out, page)
+    render.write_page(arguments.out, page)
     shown = " and ".join(f"{number:,}" for number in page.num_points)
     return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
 
@@ -162,11 +153,13 @@ def _colors(cloud: Cloud, color: PageColorBy | None, up: Up, reference: Tensor |
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)
     values = torch.from_numpy(cloud.fields[COLOR_MODES[color][1]])
     if color in ("plane", "superpoint"):
-        return color_planes(values, cloud.points, reference=reference if color == "plane" else None)
+        return render.color_planes(
+            values, cloud.points, reference=reference if color == "plane" else None
+        )
     if color == "normal":
-        return color_normals(values, up=up)
+        return render.color_normals(values, up=up)
     if color == "curvature":
-        return color_curvature(values)
+        return render.color_curvature(values)
     if color == "sharp":
-        return color_sharp(values)
+        return render.color_sharp(values)
     return torch.from_numpy(narrow_colors(cloud.fields["color"]))

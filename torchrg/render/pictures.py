@@ -15,16 +15,9 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path, wrap_errors
 from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
+from torchrg.render import raster
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides
-from torchrg.render.raster import (
-    DepthBuffer,
-    Discs,
-    close_gaps,
-    depth_and_colors,
-    light_colors,
-    shade_hollows,
-)
 from torchrg.render.surface import VisibleSurface, sample_surface
 from torchrg.structures.points import Labels, Points
 
@@ -81,11 +74,11 @@ def draw_picture(
     indices = is_shown.nonzero().squeeze(-1)
     radius, length = _median_radius(project, surface.points, lengths, indices)
     widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
-    buffer = DepthBuffer(
+    buffer = raster.DepthBuffer(
         width * supersampling, height * supersampling, max_radius=widest, device=indices.device
     )
 
-    def discs_of(chunk: Tensor) -> Discs:
+    def discs_of(chunk: Tensor) -> raster.Discs:
         rows = surface.rows[chunk]
         slant = surface.normals_at(chunk) if normals is None else normals[rows]
         position, floor = surface.points[chunk], supersampling / 2
@@ -98,8 +91,10 @@ def draw_picture(
     for chunk in parts:
         buffer.paint(discs_of(chunk))
     reach = max(1, round(_GAP_RADIUS * min(radius, widest)))
-    depth, paint = depth_and_colors(close_gaps(buffer.keys(), reach=reach, thickness=length))
-    brightness = shade_hollows(
+    depth, paint = raster.depth_and_colors(
+        raster.close_gaps(buffer.keys(), reach=reach, thickness=length)
+    )
+    brightness = raster.shade_hollows(
         _reduce(depth, supersampling, torch.maximum),
         focal=project.focal / supersampling,
         radius=max(1.0, radius / supersampling),
@@ -129,7 +124,7 @@ def _discs(
     lengths: Tensor,
     *,
     floor: float,
-) -> Discs:
+) -> raster.Discs:
     """Return shaded discs of radii ``lengths``, in units of the cloud, at least ``floor`` pixels.
 
     Points behind the camera are dropped.
@@ -144,10 +139,10 @@ def _discs(
     along = (normals * positions).sum(dim=-1) * inverse
     min_cosine = torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE)
     along = torch.where(along.abs() < _MIN_COSINE, min_cosine, along)
-    return Discs(
+    return raster.Discs(
         pixels,
         inverse,
-        light_colors(colors, normals, positions),
+        raster.light_colors(colors, normals, positions),
         (lengths * inverse * project.focal).clamp(min=floor),
         # n . X = const gives 1 / z = n . ray / const, with the gradient n_xy / focal in pixels.
         slopes=normals[:, :2] * (inverse / (along * project.focal))[:, None],
