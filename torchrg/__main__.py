@@ -7,8 +7,7 @@ from types import ModuleType
 
 # OpenBLAS starts a thread per core, which torchrg never uses, and fails if one cannot start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Garbage collection during the import of torch takes a fifth of the startup time. Commands and
-# workers enable it again.
+# Garbage collection during the import of torch takes a fifth of the startup. It is enabled later.
 gc.disable()
 # Commands do not use the meta device, whose registrations take a quarter of the import of torch.
 sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))

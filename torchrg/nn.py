@@ -14,8 +14,7 @@ torch.Size([8, 2])
 
 Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, then to :class:`Eigh` and
 :class:`Normal`; :class:`PatchNormals` combines these steps for any estimator. A robust fit
-describes the majority, even points on a line; with ``min_dimension=2`` lines are excluded, since
-normals need planes.
+describes the majority, even on a line; normals need planes: pass ``min_dimension=2``.
 """
 
 from collections.abc import Callable

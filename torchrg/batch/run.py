@@ -47,8 +47,7 @@ REPORT = "report.json"
 LOCK = ".torchrg.lock"
 """Name of the lock file in the output directory; it remains there, empty."""
 _BYTES_PER_SCAN = 32_768
-"""Disk space of a scan's files beyond their content: its tables, and half a 4 KiB block for each of
-six to eight files."""
+"""Disk space of a scan beyond its arrays: tables, and half a block of 4 KiB for each file."""
 LOCK_TIMEOUT_SECONDS = 5.0
 """Timeout for the lock, in seconds: an interrupted command ends its workers by then."""
 

@@ -157,8 +157,7 @@ class RGBDSource(Source):
 
     Files per frame, all of its height and width: ``coord`` ``(H, W, 3)``, ``normal``
     ``(H, W, 3)``, ``curvature`` and ``plane`` ``(H, W)`` as ``.npy``, and ``planes.json``.
-    Coordinates are in the world if the pose is known, else in the camera; pixels without depth are
-    zero, with plane -1.
+    Coordinates are in the world if the pose is known, else in the camera; zero without depth.
 
     Args:
         data: The frames of a folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.

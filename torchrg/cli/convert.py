@@ -52,8 +52,7 @@ from torchrg.render.page import read_library
 
 _Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
 _MEMORY_FRACTION = 0.8
-"""Fraction of the available memory for all scans by default; the remainder is for the parent
-process and other programs."""
+"""Fraction of the available memory for all scans by default; other programs get the remainder."""
 _Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]
 
 

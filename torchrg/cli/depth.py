@@ -49,8 +49,7 @@ class Arguments:
 
     Writes the plane labels as a 16-bit PNG (0: no plane, 1: first plane) with a colored image and a
     plane table (.json) next to it, or as a point cloud. With an output directory, each image gets a
-    folder with the same files as torchrg convert rgbd, which converts sequences and whole folders.
-    Results are in camera coordinates.
+    folder with the files of torchrg convert rgbd, for sequences. Results are in camera coordinates.
 
     Examples:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png

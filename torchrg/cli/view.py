@@ -43,8 +43,7 @@ class Arguments:
     file: Annotated[Path, Argument("FILE", is_positional=True)]
     """Point cloud or result."""
     out: Path
-    """Output image (.png) or interactive viewer (.html; pip install 'torchrg[view]'). A viewer is a
-    single file that works offline."""
+    """Output image (.png) or viewer (.html, one offline file; pip install 'torchrg[view]')."""
     color: PageColorBy | None = None
     """Quantity shown as color; in a viewer, the initial one. Default: the planes, or the first
     quantity in the file. error and normal-error require --ground-truth and a viewer."""

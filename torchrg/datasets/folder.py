@@ -169,10 +169,8 @@ class FolderOfClouds(SceneDataset):
 
     Args:
         root: The folder.
-        suffixes: Suffixes of cloud files. Default: :data:`torchrg.io.FOLDER_SUFFIXES`, all
-            readable formats except ``.csv``.
-        columns: Column names of text files and plain ``.npy`` arrays; see
-            :func:`torchrg.read_cloud`.
+        suffixes: Suffixes of cloud files. Default: all formats except ``.csv``.
+        columns: Column names of text and ``.npy``; see :func:`torchrg.read_cloud`.
         transform: Applied to each sample.
 
     Attributes:

@@ -58,8 +58,7 @@ class LayoutScan:
         name: Stem of its files.
         listed: ``train``, ``val`` or ``test``, empty if the data set defines no split.
         folder: Path in its own data set, which some programs keep.
-        dataset: The data set that defines classes and objects, a key of a row of :data:`LAYOUTS`;
-            ``"ScanNet"`` without any.
+        dataset: The data set of classes and objects, a key in :data:`LAYOUTS`, else ``"ScanNet"``.
         coord: Coordinates, shape ``(N, 3)``, float32.
         normal: Unit normals, shape ``(N, 3)``.
         superpoint: Superpoint of each point, shape ``(N,)``, int64.

@@ -227,8 +227,7 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
 def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of ARKitScenes: ``lowres_depth/<video>_<seconds>.png``.
 
-    Cameras are files of the same name, with times that may differ by a millisecond; poses are in
-    ``lowres_wide.traj``.
+    Cameras are files of the same name, up to a millisecond; poses are in ``lowres_wide.traj``.
     """
     frames = [*_list_frames(folder, "lowres_depth/*", "lowres_wide/*")]
     with wrap_errors(

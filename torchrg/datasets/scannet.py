@@ -83,8 +83,7 @@ class ScanNet(SceneDataset):
     float64 is the rigid transform that makes the scan upright. With annotations: ``segment``
     ``(N,)`` int64, an index into ``classes``, and ``instance`` ``(N,)`` int64, the object ID; -1
     for none. If the table ``scannetv2-labels.combined.tsv`` is next to the lists, also
-    ``segment200``, an index into :data:`IDS_200`. ScanNet++ vertices of several objects are
-    assigned to the smallest.
+    ``segment200``, an index into :data:`IDS_200`. In ScanNet++ the smallest object counts.
 
     Args:
         root: The folder that contains ``scans`` or ``data``, or the scans themselves.

@@ -1,7 +1,6 @@
 """Regions of a depth image that belong to one surface.
 
-Strips along rounded edges are merged into the adjacent surface; coplanar regions separated only by
-a nearer object count as adjacent.
+Strips along rounded edges join the adjacent surface; coplanar regions may meet behind an object.
 """
 
 from collections.abc import Iterable, Iterator

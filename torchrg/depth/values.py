@@ -59,8 +59,7 @@ def convert_depth(
     """Convert stored depth to meters along the optical axis, with 0 for missing depth.
 
     ``stored`` ``(*, H, W)`` has any memory layout; float64 stays, integers become float32.
-    ``intrinsics`` ``(*, 3, 3)`` are needed only for distances along the ray. ``caller`` is the
-    function or file for messages.
+    ``intrinsics`` ``(*, 3, 3)`` are for distances along the ray, ``caller`` for messages.
 
     Warns:
         DepthWarning: If the median depth is below 5 cm or above 20 m.

@@ -3,8 +3,7 @@
 Read as ``labels``: ``label``; as ``normals``: ``nx ny nz``, ``normal_x ...``, ``NormalX ...``,
 ``normal``; as ``color``: ``red green blue``, ``diffuse_red ...``, ``r g b``, ``rgb``, ``colors``,
 ``rf gf bf``; as ``intensity``: ``intensities``. Case and CloudCompare's prefix ``scalar_`` are
-ignored. ``name_0``, ``name_1``, ... of one type become one multi-column field ``name``. All other
-names are unchanged.
+ignored. ``name_0``, ``name_1``, ... of one type become one field. Other names are unchanged.
 """
 
 import re
@@ -51,8 +50,7 @@ SKIPPED = "_"
 _SHOWN_NAMES = 8
 """Maximum number of column names listed in a note."""
 MAX_EXACT_INTEGER = 2**53
-"""Limit below which float64, and thus text, represents integers exactly. The limit itself may be a
-rounded integer."""
+"""Limit below which float64, and thus text, has exact integers; it may itself be a rounded one."""
 
 
 def assemble_cloud(

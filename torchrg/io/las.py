@@ -53,8 +53,7 @@ _REPAIR = "convert it to .las with LASzip or PDAL, or copy it again"
 _POINTWISE, _MAX_LAZ_VERSION = 1, 3
 """LASzip's compressor without chunks, and the latest compression version that lazrs reads."""
 _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
-"""Offsets in LASzip's record of the chunk size in points, and of the number of items. An item is a
-type, a size and a version."""
+"""Offsets in LASzip's record of the chunk size, and of the number of items: type, size, version."""
 _UNDOCUMENTED = "Un-registered ExtraBytes"
 """Description that laspy gives to undocumented extra bytes."""
 _RANGE_BITS = 0b110

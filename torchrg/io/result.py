@@ -70,8 +70,7 @@ _KINDS = {
 _MAX_SAMPLED_POINTS = 100_000
 """Number of points of a random sample from which adjacent planes are found if unknown."""
 _NUM_NEIGHBORS = 50
-"""Number of neighbors, equal to the default for normals, so that a cloud that is not sampled gets
-the same adjacency as its result."""
+"""Number of neighbors: the default for normals, so that small clouds get their own adjacency."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,8 +99,7 @@ def choose_colors(
     """Choose a palette row for each plane greedily, the largest plane first.
 
     Each chosen color repels later ones with the inverse square of its distance in Lab: the color of
-    an adjacent plane, in ``pairs`` ``(E, 2)``, with its weight, others weakly. Nonnegative entries
-    of ``fixed`` are kept.
+    an adjacent plane, in ``pairs`` ``(E, 2)``, with its weight, others weakly. ``fixed`` ones stay.
 
     Example:
         >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))

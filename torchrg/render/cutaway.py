@@ -31,8 +31,7 @@ MAX_SIDES = 7
 _MAX_WALLS = 60
 """Maximum number of candidate walls and ceilings, the largest ones; bounds the memory."""
 _ANGLE_DEG = 4.0
-"""Maximum angle for region growing on voxels, in degrees. Voxels have little noise; with more,
-ceilings grow into walls."""
+"""Maximum angle for region growing on voxels, in degrees. With more, ceilings grow into walls."""
 _MIN_SIDE_COSINE = 0.9
 """Minimum cosine between the directions of walls that are hidden together."""
 _MAX_BEYOND_FRACTION = 0.03

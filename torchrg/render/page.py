@@ -105,15 +105,12 @@ def make_page(
             matching planes have the same color.
         ground_truth: Cloud of the same points with ``labels`` or ``normals``, to show errors.
         title: Title. Default: the names of the files.
-        color: Initial color mode, a key of :data:`torchrg.render.channels.COLOR_MODES`.
-            Default: the first available one.
+        color: Initial mode, of :data:`torchrg.render.channels.COLOR_MODES`. Default: the first.
         view: Initial camera, see :func:`torchrg.render.render_cloud`.
         up: Up direction, as in :func:`torchrg.render.render_cloud`. Default: z; -y for a sensor.
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
-        max_points: Maximum number of points per cloud; larger clouds are randomly downsampled, with
-            a note in the viewer.
-        unit: Unit of the coordinates, for lengths and areas. Default: "m" if the cloud is as high
-            as a room in meters, else "units".
+        max_points: Maximum number of points per cloud; larger ones are sampled, with a note.
+        unit: Unit of the coordinates. Default: "m" if the cloud is as high as a room in meters.
 
     Returns:
         The viewer.
@@ -305,8 +302,7 @@ def _initial_direction(
 def _pack(arrays: Mapping[str, NDArray[np.generic]]) -> tuple[list[dict[str, object]], str]:
     """Return the layout of arrays, and all arrays as one text; see ``unpack`` in ``page.js``.
 
-    Columns are split into byte planes, low bytes first. Positions, which lie along a curve, are
-    stored as differences.
+    Columns are split into byte planes, low bytes first, positions as differences.
     """
     manifest, planes = [], []
     for name, array in arrays.items():

@@ -33,8 +33,7 @@ _MAX_RADIUS_RATIO = 4
 _RADIUS_FRACTION = 0.02
 """Maximum radius of a disc, as a fraction of the image width; bounds the drawing time."""
 _SMALL_RADIUS, _MAX_RADIUS = 8.0, 64.0
-"""Maximum radii of a disc in pixels: for small images, and for any image, since the time grows with
-the square of the radius."""
+"""Maximum radii of a disc in pixels, for small and for any images; their squares bound the time."""
 _MAX_SIDE, _MAX_SUPERSAMPLING = 2**13, 16
 """Maximum pixels per side (an 8K screen), and subpixels per pixel and axis; bound the memory."""
 _MAX_SUBPIXELS = 2**26
@@ -44,8 +43,7 @@ _GAP_RADIUS = 0.6
 _MIN_COSINE = 0.05
 """Minimum cosine of the viewing angle of a disc (87 degrees), beyond which slopes diverge."""
 _OUTLIER_SPACING = 6
-"""Distance to the neighbors, in median spacings, beyond which points are outliers that do not
-affect the image section."""
+"""Distance to the neighbors, in median spacings, beyond which points do not affect the section."""
 
 
 def draw_picture(

@@ -20,8 +20,7 @@ _WHITE = 0xFFFFFF
 _DEPTH_BITS = 32
 """Number of bits of a key below the depth."""
 _OVERHANG = 2.0
-"""Maximum depth difference, in radii of a disc, at which a disc may wrongly hide another: both may
-extend one radius beyond an edge."""
+"""Maximum depth difference, in disc radii, at which a disc may wrongly hide another at an edge."""
 _DOME = 0.1
 """Curvature of discs, as depth of the rim in radii: of coplanar discs, the nearest center wins."""
 _FLAT = 0.1

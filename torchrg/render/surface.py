@@ -86,8 +86,7 @@ class VisibleSurface(NamedTuple):
 def sample_surface(points: Tensor) -> VisibleSurface:
     """Sort the finite points of a cloud into voxels, and measure density and normals.
 
-    The result does not depend on the order of the points: means are computed from integer steps,
-    which add up exactly.
+    The result does not depend on the order of the points: sums of integers are exact.
     """
     rows = points.isfinite().all(dim=-1).nonzero().squeeze(-1)
     finite = points[rows].detach()

@@ -152,7 +152,6 @@ class Planes(_Movable):
         axes: Unit directions of those sides, shape ``(M, 2, 3)``.
         center: Center of that rectangle, shape ``(M, 3)``.
         curved: Mask of smooth but nonplanar regions (a column, a bent wall), shape ``(M,)``, bool.
-            Their plane is only a best fit.
         kind: Class of each plane as an index of :data:`PLANE_KINDS`, shape ``(M,)``, int64. Unless
             an up axis was set, :func:`torchrg.segment_planes` classifies on first access, with z
             up. None for depth images with an unknown up axis.

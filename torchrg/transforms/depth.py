@@ -28,8 +28,7 @@ class DepthTransform(SampleTransform):
 
     Args:
         depth_scale: Depth units per meter, 1000 for millimeters. Default: 1, meters.
-        depth_kind: "z" for depth along the optical axis, "ray" for distances from the camera
-            center. Default: "z".
+        depth_kind: "z" for depth, "ray" for distances from the camera center. Default: "z".
         keys: Other names for some entries.
     """
 
