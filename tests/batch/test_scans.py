@@ -7,9 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import RECORD, convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
 from torchrg.config import load_config
 from torchrg.datasets import FolderOfClouds

@@ -12,9 +12,8 @@ import yaml
 from tests.batch.test_interruptions import results_of
 from tests.datasets.s3dis_tree import write_clean_room
 from tests.datasets.scannet_tree import write_scan, write_tables
-from torchrg.batch.records import RECORD
 from torchrg.batch.run import LOCK, REPORT, list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import RECORD, convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.batch.stale import check_stale, find_stale, remove_stale
 from torchrg.config import load_config
@@ -446,10 +445,7 @@ def test_a_folder_of_results_may_be_a_link(root, out, tmp_path, convert):
     shutil.move(out / "val" / LAST, tmp_path / "last")
     (out / "val" / LAST).symlink_to(tmp_path / "last")
     move(root, train=SCANS, val=[])
-    assert (
-        f"{out}/val/{LAST}: is not as torchrg wrote it"
-        in convert("scannet", root, out).error
-    )
+    assert f"{out}/val/{LAST}: is not as torchrg wrote it" in convert("scannet", root, out).error
     assert (tmp_path / "last" / RECORD).exists()
 
 

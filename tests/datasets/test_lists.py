@@ -13,9 +13,8 @@ import yaml
 
 from tests.datasets.scannet_tree import write_scan, write_tables
 from torchrg import load_config
-from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
 from torchrg.datasets import ScanNet

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import filelock
 
-from torchrg.batch.records import reason_to_convert
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Source, reason_to_convert
 from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.provenance import Record, describe_versions, read_record

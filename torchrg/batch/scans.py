@@ -15,11 +15,15 @@ from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
 from torchrg.datasets import provenance
 from torchrg.datasets.folder import SceneDataset, SceneFiles
+from torchrg.errors import FormatError
 from torchrg.io.files import check_writable, fingerprint, remove_leftovers, sync_folder
 from torchrg.io.result import PLANES_FILE, RECORD, write_table
 
 __all__ = ["Job", "Source", "convert_scan"]
 __dir__ = __all__.copy
+
+_RESULTS = {"points": int, "regions": int, "repairs": list, "warnings": list}
+"""Types of the record entries that reports repeat."""
 
 
 class Source:
@@ -133,6 +137,34 @@ class Job:
             remove_leftovers(self.folder)
             if (provenance.read_record(self.folder) or {}).get("claims") == {}:
                 (self.folder / RECORD).unlink()
+
+
+def reason_to_convert(job: Job) -> str:
+    """Return why a scan must be converted, or "" if it is up to date.
+
+    ``"new"`` without a complete record; else the first of version, settings, options, input or
+    results that differs from the record, or that the record is damaged.
+    """
+    record = provenance.read_record(job.folder)
+    if record is None or "outputs" not in record:
+        return "new"
+    try:
+        description = json.loads(json.dumps(job.describe()))
+    except (OSError, FormatError):
+        return "input cannot be read"
+    changes = {"versions": "version", "config": "settings", "source": "options", "inputs": "input"}
+    for key, name in changes.items():
+        if record.get(key) != description[key]:
+            return f"{name} changed"
+    if not all(isinstance(record.get(name), kind) for name, kind in _RESULTS.items()):
+        return "record damaged"
+    for name, stored in record["outputs"].items():
+        try:
+            if fingerprint(job.folder / name) != stored:
+                return f"{name} changed"
+        except OSError:
+            return f"{name} missing"
+    return ""
 
 
 def convert_scan(job: Job) -> TaskReport:

@@ -14,7 +14,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from torchrg.batch.records import RECORD
 from torchrg.batch.run import LOCK, read_root
 from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
@@ -29,7 +28,7 @@ from torchrg.io.files import (
     remove_leftovers,
     sync_folder,
 )
-from torchrg.io.result import PAGE_SUFFIXES
+from torchrg.io.result import PAGE_SUFFIXES, RECORD
 
 __all__ = ["StaleResult", "check_stale", "find_stale", "remove_stale"]
 __dir__ = __all__.copy

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.batch.records import describe_run
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import STAGES, check_distinct, note_input, output_paths, run_each, stage_bar
+from torchrg.datasets.provenance import describe_run
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import atomic_path, check_writable

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from torchrg.batch.memory import available_memory
-from torchrg.batch.records import describe_run
 from torchrg.batch.sources import write_frame
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import check_distinct, note_input, output_paths, run_each, sidecar_paths
 from torchrg.datasets import RGBDFrame, RGBDFrames
+from torchrg.datasets.provenance import describe_run
 from torchrg.datasets.rgbd import scale_camera
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, refuse_form
 from torchrg.depth import DepthConfig, find_intrinsics, segment_depth

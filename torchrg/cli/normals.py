@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
-from torchrg.batch.records import describe_run
 from torchrg.cli import flags, loop
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, warn
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
+from torchrg.datasets.provenance import describe_run
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.fields import add_result_fields

@@ -14,7 +14,6 @@ import torch
 
 from torchrg import scratch
 from torchrg.batch.memory import available_memory, scan_memory
-from torchrg.batch.records import describe_run
 from torchrg.batch.run import lock_folder
 from torchrg.batch.stale import find_records
 from torchrg.cli import flags, loop
@@ -30,7 +29,7 @@ from torchrg.datasets.layouts import (
     write_scan,
 )
 from torchrg.datasets.lists import check_lists, write_lists
-from torchrg.datasets.provenance import Record, check_source
+from torchrg.datasets.provenance import Record, check_source, describe_run
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud

@@ -241,7 +241,7 @@ class Pinhole(NamedTuple):
             pixel outside the centers of the outermost pixels: ``cx + 0.5`` scales with ``fx``.
 
         Raises:
-            ConfigError: If the aspect ratio differs by over a pixel, or the optical axis is outside.
+            ConfigError: If the aspect ratio differs by over a pixel, or the axis is outside.
         """
         fx, fy, cx, cy, calibrated, _ = self
         if size is None:
