@@ -40,8 +40,7 @@ class Arguments(flags.PlaneSettings):
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     matrix: Path | None = None
-    """File for the rigid transform of a single input: .npy (4 x 4 array) or .txt (axisAlignment
-    line of ScanNet)."""
+    """File for the transform of one input: .npy (4 x 4 array) or .txt (ScanNet's axisAlignment)."""
     segment: bool = False
     """Also write labels, normals, curvature and the plane table, as torchrg segment does."""
     threads: flags.ThreadsFlag = None

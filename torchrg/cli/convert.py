@@ -63,13 +63,11 @@ class Arguments:
     root: Annotated[Path, Argument("ROOT", is_positional=True)]
     """Directory of the data set, read only."""
     out: Annotated[Path, Argument("OUT", is_positional=True)]
-    """Output directory of one data set in one layout, with one folder per scan; created if missing.
-    Finished scans are skipped."""
+    """Output directory of one data set in one layout; finished scans are skipped."""
     workers: int | None = None
     """Number of scans processed at a time. Default: one per core; on a cluster, by memory."""
     engine: Literal["local", "ray"] = "local"
-    """Execution: processes on this machine (local), or tasks on a Ray cluster (ray; pip install
-    'torchrg[ray]')."""
+    """Execution: processes on this machine (local), or on Ray (ray; pip install 'torchrg[ray]')."""
     ray_address: str | None = None
     """Address of the Ray cluster; auto: the cluster of this machine. ROOT and OUT must have the
     same paths on every node. Default: starts a cluster for this command."""
@@ -79,8 +77,7 @@ class Arguments:
     """Also write the plane table under this file name to the folder of each scan, as torchrg
     segment --table does; for example planes.csv. planes.json is always written."""
     only: str | None = None
-    """Shell pattern for the names of the scans to convert, such as "Area_5/*". Results of scans
-    missing from ROOT are kept."""
+    """Shell pattern of scans to convert, such as "Area_5/*". Results of missing scans are kept."""
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False

@@ -72,8 +72,7 @@ class Arguments(flags.PlaneSettings):
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     picture: Path | None = None
-    """Also render the planes as an image (.png) or an interactive viewer (.html). With several
-    inputs, a directory of images."""
+    """Also render the planes as an image (.png) or viewer (.html); for several, a directory."""
     table: flags.TableFlag = None
     pages: bool = False
     """Also write an interactive viewer for each image, and an index.html linking to them. Requires

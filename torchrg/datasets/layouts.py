@@ -56,7 +56,7 @@ class LayoutScan:
 
     Attributes:
         name: Stem of its files.
-        listed: ``train``, ``val`` or ``test``, empty if the data set defines no split.
+        declared_split: ``train``, ``val`` or ``test``, empty if the data set defines no split.
         folder: Path in its own data set, which some programs keep.
         dataset: The data set of classes and objects, a key in :data:`LAYOUTS`, else ``"ScanNet"``.
         coord: Coordinates, shape ``(N, 3)``, float32.
@@ -146,10 +146,7 @@ def check_stems(layout: str, paths: Mapping[str, str]) -> None:
         stem = _mask3d_name(stem) if layout == "mask3d" else stem
         other = owners.setdefault(normalize_file_name(stem), name)
         if other != name:
-            raise FormatError(
-                f"file name collision in layout {layout}: {other} and {name} both use {stem}; "
-                "rename one, or choose layout pointcept."
-            )
+            raise FormatError(f"layout {layout}: {other} and {name} both use {stem}; rename one.")
 
 
 def note_on_origin(layout: str, cloud: Cloud) -> tuple[str, ...]:

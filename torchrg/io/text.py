@@ -184,8 +184,7 @@ def _parse(
 ) -> Array:
     """Parse a block of lines; an error names the first wrong line.
 
-    Without a dialect, white space separates numbers and there are no comments. Skipped columns may
-    contain words.
+    Without a dialect, blanks separate numbers, without comments. Skipped columns may hold words.
     """
     delimiter, decimal, comments = (*dialect, _COMMENTS[0]) if dialect else (None, ".", None)
     converters: dict[int | str, Callable[[str], float]] | None

@@ -29,8 +29,7 @@ class VisibleSurface(NamedTuple):
         rows: Row of each point in the cloud, shape ``(n,)``, int64.
         points: Coordinates relative to ``origin``, shape ``(n, 3)``, float32.
         origin: Lower corner of the bounding box, shape ``(3,)``, float64.
-        spacing: Distance of each point to its neighbors on the surface, shape ``(n,)``; 0 if all
-            points coincide.
+        spacing: Distance of points to their neighbors on the surface, ``(n,)``; 0 if all coincide.
         voxel_of: Voxel of each point, shape ``(n,)``.
         first: First point of each voxel, shape ``(V,)``.
         centers: Means of the points, shape ``(V, 3)``, float32, relative to ``origin``.
