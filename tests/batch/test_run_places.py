@@ -113,13 +113,13 @@ def test_the_command_refuses_them_before_any_work(root, refused):
     save(root, "a/b_c.npy", "a_b/c.npy", "other.npy")
     for flags in (["--dry-run"], ["--only", "other"], []):
         error = refused("--layout", "npy", *flags)
-        assert "in layout npy: a/b_c and a_b/c both use a_b_c; rename one" in error
+        assert "layout npy: a/b_c and a_b/c both use a_b_c; rename one" in error
 
 
 def test_short_names_of_mask3d_are_compared_too(root, tmp_path, convert, refused, run):
     save(root, "scene0011_00.npy", "0011_00.npy")
     error = refused("--layout", "mask3d")
-    assert "in layout mask3d: 0011_00 and scene0011_00 both use 0011_00" in error
+    assert "layout mask3d: 0011_00 and scene0011_00 both use 0011_00" in error
     assert convert("--layout", "npy", "--dry-run").code == 0
     out = tmp_path / "out"
     done = run("segment", *root.iterdir(), "--out", out, "--layout", "mask3d")

@@ -366,7 +366,7 @@ def test_copies_are_no_new_names(tmp_path, out, convert):
 
 def test_another_layout_goes_to_another_directory(root, out, run, convert):
     assert convert("scannet", root, out, "--layout", "mask3d").code == 0
-    before, message = files_of(out), "expected results in layout npy, got mask3d; remove them"
+    before, message = files_of(out), "expected results in layout npy, got mask3d; choose another "
     for flags in ([], ["--force"], ["--prune"], ["--dry-run"]):
         done = convert("scannet", root, out, "--layout", "npy", *flags)
         assert (done.code, done.error.count("\n")) == (2, 1)
@@ -424,7 +424,7 @@ def test_other_directories_are_left_alone_and_other_kinds_are_refused(tmp_path, 
     save_rooms(tmp_path / "more", "x.npy")
     assert convert("folder", tmp_path / "more", out / "more").code == 0
     error = convert("scannet", root, out).error
-    assert f"{out}/a: expected results of convert scannet, got folder; remove them" in error
+    assert f"{out}/a: expected results of convert scannet, got folder; choose another" in error
     (tmp_path / "in" / "b.npy").unlink()
     (out / "more" / "x" / RECORD).write_text("{")
     assert convert("folder", tmp_path / "in", out, "--prune").code == 0

@@ -215,7 +215,7 @@ def test_other_captures_say_what_they_lack(tmp_path):
         ("arkitscenes", "lowres_wide.traj: expected time rx ry rz tx ty tz in each row"),
         (
             "scannetpp",
-            "pose_intrinsic_imu.json: expected an entry for frame_000010, which has depth",
+            "pose_intrinsic_imu.json: expected an entry for frame_000010, got none",
         ),
         ("replica", "cam_params.json: cannot be read: No such file"),
         ("3rscan", "000000.depth.pgm: expected intrinsics, which images lack; pass"),

@@ -219,7 +219,8 @@ class FolderOfClouds(SceneDataset):
             if first.setdefault(name, path) != path:
                 one, other = (file.relative_to(self.root) for file in (first[name], path))
                 raise FormatError(
-                    f"{root}: expected one file per scan, got {one} and {other}; rename one."
+                    f"{root}: expected one file per scan, got {one} and {other}; move or rename "
+                    "one, or select files by suffix."
                 )
 
     def _scene(self, path: Path) -> SceneFiles:

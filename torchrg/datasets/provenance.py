@@ -117,7 +117,7 @@ def check_source(folder: Path, record: Record, source: Record) -> None:
     ):
         if old != new and old is not None and new is not None:
             raise FormatError(
-                f"{folder}: expected results {what} {new}, got {old}; remove them, or use another."
+                f"{folder}: expected results {what} {new}, got {old}; choose another directory."
             )
 
 

@@ -123,7 +123,8 @@ class RGBDFrames(SceneDataset):
         is_path = isinstance(frames, os.PathLike)
         if is_path or not all(isinstance(frame, RGBDFrame) for frame in frames):
             raise ConfigError(
-                f"RGBDFrames: expected a list of RGBDFrame, got {frames!r:.60}; use from_folder."
+                f"RGBDFrames: expected a list of RGBDFrame, got {frames!r:.60}; use "
+                "RGBDFrames.from_folder for a folder."
             )
         self.transform = transform
         self.scenes = [SceneFiles(f.name, f.depth, f.files, item=f) for f in frames]

@@ -211,7 +211,7 @@ def render_cloud(
         >>> picture.shape[1:], picture.amin().item() < 100, picture[0, 0].tolist()
         (torch.Size([40, 3]), True, [255, 255, 255])
     """
-    cloud, paint, slant = _check_cloud("render_cloud", points, colors, normals)
+    cloud, paint, slant = _check_cloud(points, colors, normals)
     planes = None
     if labels is not None:
         (planes,) = check_labels("render_cloud", labels=labels)
@@ -299,18 +299,22 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic])
 
 
 def _check_cloud(
-    caller: str,
-    points: Points,
-    colors: Tensor | NDArray[np.uint8],
-    normals: Points | None,
+    points: Points, colors: Tensor | NDArray[np.uint8], normals: Points | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return the arguments as tensors, after checking shapes and dtypes."""
-    cloud, paint = as_tensor(caller, "points", points), as_tensor(caller, "colors", colors)
-    slant = None if normals is None else as_tensor(caller, "normals", normals)
-    check_shapes(caller, points=(cloud, "N 3"), colors=(paint, "N 3"), normals=(slant, "N 3"))
-    check_floating(caller, points=cloud)
-    check_floating(caller, normals=slant)
+    cloud, paint = (
+        as_tensor("render_cloud", "points", points),
+        as_tensor("render_cloud", "colors", colors),
+    )
+    slant = None if normals is None else as_tensor("render_cloud", "normals", normals)
+    check_shapes(
+        "render_cloud", points=(cloud, "N 3"), colors=(paint, "N 3"), normals=(slant, "N 3")
+    )
+    check_floating("render_cloud", points=cloud)
+    check_floating("render_cloud", normals=slant)
     if paint.dtype != torch.uint8:
         dtype = str(paint.dtype).removeprefix("torch.")
-        raise ShapeError(f"{caller}: expected colors of uint8, got {dtype}; scale them to 0..255.")
+        raise ShapeError(
+            f"render_cloud: expected colors of uint8, got {dtype}; scale them to 0..255."
+        )
     return cloud, paint, None if slant is None else slant.detach()
