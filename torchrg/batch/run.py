@@ -181,8 +181,7 @@ def make_plan(
 ) -> Plan:
     """Determine the scans to convert with :func:`reason_to_convert`.
 
-    Each of ``threads`` checks one scan at a time; ``on_scan`` is called after each check. ``force``
-    selects all scans.
+    Each of ``threads`` checks one scan at a time, then calls ``on_scan``. ``force`` selects all.
     """
 
     def check(job: Job) -> str:

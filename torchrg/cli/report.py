@@ -53,8 +53,7 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     """Format a report: one row per scan, notes, then the totals.
 
-    With more than :data:`MAX_ROWS` scans, only failures are listed. ``unit`` is the name of a scan
-    in the throughput.
+    With more than :data:`MAX_ROWS` scans, only failures are listed. ``unit`` names a scan.
     """
     stages = list(report.stage_seconds)
     shown = report.scans if len(report.scans) <= MAX_ROWS else report.with_status("failed")

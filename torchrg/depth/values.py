@@ -26,8 +26,7 @@ _SAMPLED = 20_000
 def has_depth(depth: Tensor) -> Tensor:
     """Return a mask of pixels with depth, in the shape of ``depth``.
 
-    Depth is finite and positive. The largest value of an integer type, and that of 16 bits in any
-    type, stands for missing depth.
+    Depth is finite and positive; the largest integer of its type and of 16 bits mean none.
     """
     largest, values = _MAX_16_BIT, depth
     if not depth.is_floating_point():

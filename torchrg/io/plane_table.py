@@ -148,8 +148,7 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
 
     Args:
         planes: The table.
-        origin: Origin of its coordinates in the coordinates of the data set, shape ``(3,)``.
-            Default: the same origin.
+        origin: Origin of its coordinates in those of the data set, ``(3,)``. Default: zero.
 
     Returns:
         ``planes``: for each plane its ``id`` (the value in ``plane.npy``) and the columns of

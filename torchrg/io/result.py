@@ -81,8 +81,7 @@ class Result:
         cloud: The points. Its fields include the known results: ``labels``, ``normals``,
             ``curvature``, the masks ``sharp`` and ``valid``, and ``superpoint``, with coarser
             levels as ``superpoint_1`` and so on.
-        table: Plane table relative to :attr:`Cloud.origin`; its rows are the labels, ascending.
-            Default: no table.
+        table: Plane table relative to :attr:`Cloud.origin`; rows by label. Default: none.
         plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
         provenance: Record of how the result was made.
         neighbors: See :attr:`torchrg.structures.Segmentation.neighbors`.
@@ -189,8 +188,7 @@ class Result:
     def planes(self) -> Planes | None:
         """The plane table; None without labels.
 
-        Missing data is computed once from the labels: the whole table for labels of other programs,
-        the adjacency for images.
+        Missing data is computed once from the labels: the table, or adjacency for images.
         """
         table = self.table
         if "labels" not in self.fields or (table is not None and table.adjacency is not None):

@@ -47,8 +47,7 @@ class PlaneMetric(Metric):
 
     Args:
         index: A part of :data:`torchrg.metrics.METRICS`, for a dict, or a metric, such as ``"f1"``.
-        **settings: Settings of the evaluation function, such as ``min_size=50``, and of
-            :class:`torchmetrics.Metric`.
+        **settings: Settings of the evaluation, such as ``min_size=50``, and of ``Metric``.
 
     Attributes:
         part: The part of ``METRICS``.

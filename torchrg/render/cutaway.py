@@ -79,8 +79,7 @@ def find_sides(surface: VisibleSurface, labels: Tensor | None, up: Tensor) -> Si
 
     Args:
         surface: Surface of at least one finite point.
-        labels: Plane of each of its n points, shape ``(n,)``, or negative. Default: from a
-            segmentation of the voxels.
+        labels: Plane of each of its n points, shape ``(n,)``, or negative. Default: from voxels.
         up: Up direction, a unit vector of shape ``(3,)``.
     """
     centers = surface.centers

@@ -181,8 +181,7 @@ def render_cloud(
     Args:
         points: Points, shape ``(N, 3)``; points with NaN or Inf are omitted.
         colors: Shape ``(N, 3)``, uint8.
-        normals: Normals for tilt and shading, of arbitrary sign, shape ``(N, 3)``; zero if unknown.
-            Default: voxel normals.
+        normals: Normals of any sign, shape ``(N, 3)``; zero if unknown. Default: voxel normals.
         labels: Plane of each point, shape ``(N,)``, integers, negative for none, from which walls
             and ceilings are found. Default: the voxels are segmented.
         view: See above; or a batch of one kornia camera, with the size of the image, such as from
@@ -193,8 +192,7 @@ def render_cloud(
             most walls nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
         elevation_deg: Elevation of the camera, in degrees. Default: 35, from above 90.
-        width: Width in pixels, at most 8,192; with few enough subpixels, about 4,800 at the
-            default supersampling.
+        width: Width in pixels, at most 8,192; about 4,800 at the default supersampling.
         height: Height in pixels, at most 8,192. Default: fitted, from a quarter of the width on.
         supersampling: Subpixels per pixel and axis, which are averaged.
 
@@ -302,19 +300,13 @@ def _check_cloud(
     points: Points, colors: Tensor | NDArray[np.uint8], normals: Points | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return the arguments as tensors, after checking shapes and dtypes."""
-    cloud, paint = (
-        as_tensor("render_cloud", "points", points),
-        as_tensor("render_cloud", "colors", colors),
-    )
-    slant = None if normals is None else as_tensor("render_cloud", "normals", normals)
-    check_shapes(
-        "render_cloud", points=(cloud, "N 3"), colors=(paint, "N 3"), normals=(slant, "N 3")
-    )
-    check_floating("render_cloud", points=cloud)
-    check_floating("render_cloud", normals=slant)
+    caller = "render_cloud"
+    cloud, paint = as_tensor(caller, "points", points), as_tensor(caller, "colors", colors)
+    slant = None if normals is None else as_tensor(caller, "normals", normals)
+    check_shapes(caller, points=(cloud, "N 3"), colors=(paint, "N 3"), normals=(slant, "N 3"))
+    check_floating(caller, points=cloud)
+    check_floating(caller, normals=slant)
     if paint.dtype != torch.uint8:
         dtype = str(paint.dtype).removeprefix("torch.")
-        raise ShapeError(
-            f"render_cloud: expected colors of uint8, got {dtype}; scale them to 0..255."
-        )
+        raise ShapeError(f"{caller}: expected colors of uint8, got {dtype}; scale them to 0..255.")
     return cloud, paint, None if slant is None else slant.detach()

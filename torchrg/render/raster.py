@@ -47,8 +47,7 @@ _MAX_SHADE_RADIUS = 4.0
 class Discs(NamedTuple):
     """Surface discs in an image.
 
-    The inverse depth of a plane is linear in image coordinates, so a disc is defined by the value
-    at its center and two slopes.
+    Inverse depth of a plane is linear in the image: a value at the center, and two slopes.
 
     Attributes:
         pixels: Column and row of the centers, shape ``(N, 2)``; integers are pixel centers. Discs
