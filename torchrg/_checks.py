@@ -64,7 +64,7 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
             raise ShapeError(f"{caller}: expected {name} of float32 or float64, got {dtype}{fix}.")
         if tensor.is_nested:
             raise ShapeError(
-                f"{caller}: expected {name} to be dense, got a nested tensor; pass "
+                f"{caller}: expected dense {name}, got a nested tensor; pass "
                 f"torch.nested.to_padded_tensor({name}, 0.0), and a mask of the valid entries."
             )
         if tensor.layout is not torch.strided:

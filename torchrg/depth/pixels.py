@@ -25,7 +25,7 @@ class Pixels(NamedTuple):
 
     ``curvature`` is the fraction of a window's variance perpendicular to its plane; ``noise`` is
     the noise of inverse depth in large windows. ``valid`` marks pixels that have a plane; normals
-    and curvature are 0 elsewhere. ``right`` and ``down`` mark pixels on one surface with the next.
+    and curvature are 0 otherwise. ``right`` and ``down`` mark pixels on one surface with the next.
     """
 
     normals: Tensor
