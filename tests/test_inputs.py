@@ -108,7 +108,7 @@ def test_half_precision_is_refused_with_the_repair(name, half):
 def test_sparse_tensors_are_refused_with_the_repair(name):
     if name == "irls":
         name = "pca"
-    with pytest.raises(ShapeError, match=r"to be dense, got a sparse tensor; pass \w+.to_dense"):
+    with pytest.raises(ShapeError, match=r"dense \w+, got a sparse tensor; pass \w+.to_dense"):
         CALLS[name](argument(name).to_sparse())
 
 

@@ -106,7 +106,7 @@ def test_normals_of_patches_by_every_estimator(rng, method):
         (lambda: modules.DetMM(tuned_for="nope"), "tuned_for to be one of shape, location"),
         (lambda: modules.Qn(dim=0.5), "Qn: expected dim to be an integer, got 0.5"),
         (lambda: modules.PatchNormals("svd"), "method to be one of pca, jet, irls, .*, got 'svd'"),
-        (lambda: modules.PatchNormals("irls"), "expected noise > 0 with method='irls'"),
+        (lambda: modules.PatchNormals("irls"), "expected noise > 0 for irls"),
         (lambda: modules.PatchNormals("detmcd", start="paper"), "unexpected keyword .* 'start'"),
         (lambda: modules.PatchNormals("detmm", quantile=2), "quantile above 0 and below 1, got 2"),
     ],

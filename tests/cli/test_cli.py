@@ -99,7 +99,7 @@ def mistakes(tmp_path, monkeypatch):
     [
         ("none.pcd", [], "none.pcd"),
         ("folder.pcd", [], "directory"),
-        ("short.xlsx", [], "ends in one of"),
+        ("short.xlsx", [], "ending in one of"),
         ("short.pcd", [], "short.pcd"),
         ("short.ply", [], "short.ply"),
         ("huge.pcd", [], "huge.pcd"),
@@ -119,7 +119,7 @@ def mistakes(tmp_path, monkeypatch):
         ("ROOM", ["--voxel", "0"], "--voxel > 0"),
         ("ROOM", ["--threads", "0"], "--threads from 1 to 1,024"),
         ("ROOM", ["--voxel", "nan"], "expected --voxel to be a number"),
-        ("ROOM", ["--out", "seg.docx"], "ends in one of"),
+        ("ROOM", ["--out", "seg.docx"], "ending in one of"),
         ("ROOM", ["--out", "no/such/seg.npz"], "not found; create it first"),
     ],
 )

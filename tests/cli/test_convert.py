@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from tests.batch.test_interruptions import results_of
 from tests.datasets.s3dis_tree import write_clean_room
-from torchrg.batch.records import RECORD
 from torchrg.batch.run import lock_folder
+from torchrg.batch.scans import RECORD
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
 from torchrg.cli.loop import Progress

@@ -234,11 +234,11 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
     for arguments, message in (
         ([frame], "frame.png: missing --intrinsics fx,fy,cx,cy, required"),
         ([frame, *CAMERA[:2]], "frame.png: missing --depth-scale, required"),
-        ([frame, "--intrinsics", "1,2,3", *CAMERA[2:]], "four numbers without spaces"),
+        ([frame, "--intrinsics", "1,2,3", *CAMERA[2:]], "fx,fy,cx,cy (no spaces)"),
         ([frame, frame, *CAMERA], "expected a directory for 2 inputs"),
         ([frame, *CAMERA[:4], "--threads", "0"], "expected --threads from 1 to 1,024, got 0"),
-        ([tmp_path / "list.pcd"], "not an organized point cloud"),
-        ([tmp_path / "turned.pcd"], "expected points in the coordinates of a pinhole camera"),
+        ([tmp_path / "list.pcd"], "not an organized cloud"),
+        ([tmp_path / "turned.pcd"], "expected points of a pinhole camera"),
         ([tmp_path / "bad.npy", *CAMERA], "bad.npy: expected an array of numbers, got: "),
         (
             [tmp_path / "huge.png", *CAMERA],

@@ -147,7 +147,7 @@ def test_a_table_without_a_place_is_refused_before_the_work(scans, tmp_path, run
 )
 def test_convert_refuses_a_table_outside_the_folder_of_a_scan(scans, tmp_path, run, table):
     reported = run("convert", "folder", scans[0], tmp_path / "out", "--table", table)
-    assert "expected --table to be a file name ending in .csv or .json" in reported.error
+    assert "expected --table to be a name ending in .csv or .json" in reported.error
     assert not (tmp_path / "out").exists()
 
 

@@ -120,7 +120,7 @@ def test_a_folder_of_links_is_a_data_set(root, tmp_path):
 
 def test_suffixes_can_be_chosen(root):
     assert names_of(FolderOfClouds(root, suffixes=[".ply"])) == ["scan_10"]
-    with pytest.raises(FormatError, match=r"expected files that end in one of \.e57, got none"):
+    with pytest.raises(FormatError, match=r"expected files ending in \.e57, got none"):
         FolderOfClouds(root, suffixes=[".e57"])
 
 

@@ -17,9 +17,8 @@ import torch
 from tests.datasets.s3dis_tree import digest
 from tests.datasets.scannet_tree import ALIGNMENT, WORDS, write_scan, write_tables
 from torchrg import load_config, make_superpoints, segment_planes
-from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
 from torchrg.cli.flags import Layout

@@ -13,9 +13,8 @@ import yaml
 
 from tests.datasets.scannet_tree import write_scan, write_tables
 from torchrg import load_config
-from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
 from torchrg.cli import main
 from torchrg.datasets import ScanNet
@@ -156,13 +155,13 @@ def test_databases_of_others_are_refused_before_any_work(root, tmp_path, capsys,
     command = ["convert", "scannet", str(root), str(out), "--layout", "mask3d", *flags]
     assert main(command) == 2
     captured = capsys.readouterr()
-    assert "train_database.yaml: is of another data set or program; move it" in captured.err
+    assert "train_database.yaml: is of other origin; move it" in captured.err
     assert (captured.err.count("\n"), captured.out) == (1, "")
     assert [path.name for path in out.iterdir()] == ["train_database.yaml"]
 
 
 def test_data_sets_with_other_classes_share_no_directory(converted):
-    with pytest.raises(FormatError, match=r"label_database\.yaml: is of another data set"):
+    with pytest.raises(FormatError, match=r"label_database\.yaml: is of other origin"):
         check_lists("mask3d", "S3DIS", converted["mask3d"])
     check_lists("mask3d", "ScanNet", converted["mask3d"])
     check_lists("mmdet3d", "S3DIS", converted["mask3d"])

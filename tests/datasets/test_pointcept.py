@@ -186,7 +186,7 @@ def test_normals_of_the_sample_are_written(sample, seg, tmp_path):
 
 def test_other_points_are_refused(foreign, sample, seg):
     before = digest(foreign)
-    with pytest.raises(FormatError, match="expected the points of this scene, got others"):
+    with pytest.raises(FormatError, match="expected the same points, got others"):
         write_pointcept_scene(foreign, {**sample, "coord": sample["coord"] + 1e-3}, seg)
     few = segment_planes(sample["coord"][:100], CLASSIC)
     with pytest.raises(FormatError, match="expected 100 rows, got shape"):
@@ -232,7 +232,7 @@ def test_pickles_and_wrong_sizes_are_never_loaded(foreign):
     with pytest.raises(FormatError, match=r"coord\.npy: expected shape \(N, 3\)"):
         read_pointcept_scene(foreign)
     (foreign / "coord.npy").unlink()
-    with pytest.raises(FormatError, match=r"expected coord\.npy in this folder"):
+    with pytest.raises(FormatError, match=r"expected coord\.npy, got none"):
         read_pointcept_scene(foreign)
 
 

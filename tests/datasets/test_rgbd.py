@@ -95,7 +95,7 @@ def test_tum_frames_are_matched_in_time(tum):
 
 def test_the_camera_of_tum_is_not_guessed(tum):
     other = tum.rename(tum.parent / "desk")
-    with pytest.raises(ConfigError, match=r"1.0.png: expected intrinsics, which depth images do"):
+    with pytest.raises(ConfigError, match=r"1.0.png: expected intrinsics, which images lack"):
         RGBDFrames.from_folder(other, "tum")
     data = RGBDFrames.from_folder(other, "tum", intrinsics=CAMERA.float(), depth_scale=1000)
     assert data[0]["depth"].max() == 5
@@ -175,7 +175,7 @@ def test_any_folder_of_images_needs_its_camera(tmp_path):
         ({"intrinsics": CAMERA}, "depth_scale"),
         ({"depth_scale": 1.0}, "intrinsics"),
     ):
-        with pytest.raises(ConfigError, match=f"expected {missing}, which depth images do not"):
+        with pytest.raises(ConfigError, match=f"expected {missing}, which images lack"):
             RGBDFrames.from_folder(tmp_path, "images", **given)
     data = RGBDFrames.from_folder(tmp_path, "images", intrinsics=CAMERA, depth_scale=1)
     assert [scene.name for scene in data.scenes] == ["b/9", "b/10"]
@@ -238,7 +238,7 @@ def test_wrong_folders_are_refused(tmp_path):
     with pytest.raises(FormatError, match="expected depth images"):
         RGBDFrames.from_folder(tmp_path, "images", intrinsics=camera, depth_scale=1)
     write_depth(tmp_path / "depth" / "0.png", 1500)
-    with pytest.raises(ConfigError, match=r"expected intrinsics, which depth images do not store"):
+    with pytest.raises(ConfigError, match=r"expected intrinsics, which images lack"):
         RGBDFrames.from_folder(tmp_path, "scannet")
     write_text(tmp_path / "intrinsic" / "intrinsic_depth.txt", "1 2 3\n")
     with pytest.raises(FormatError, match=r"_depth.txt: expected a matrix of .*, got 3 numbers"):
@@ -249,7 +249,7 @@ def test_wrong_frames_are_refused(tmp_path):
     path = tmp_path / "a.png"
     with pytest.raises(ShapeError, match=r"RGBDFrame: expected intrinsics of shape \(3, 3\)"):
         RGBDFrame(path, torch.eye(4), 1000.0)
-    with pytest.raises(ConfigError, match="expected depth_scale > 0, the depth units per"):
+    with pytest.raises(ConfigError, match="expected depth_scale > 0 units per"):
         RGBDFrame(path, torch.eye(3), 0.0)
     with pytest.raises(ConfigError, match="expected distinct frame names, got 'a' twice"):
         RGBDFrames([RGBDFrame(path, torch.eye(3), 1.0, "a")] * 2)
@@ -260,8 +260,8 @@ def test_wrong_frames_are_refused(tmp_path):
     [
         ("depth.txt", b"nan depth/1.0.png\n", "expected finite times, got nan"),
         ("groundtruth.txt", b"inf 0 0 0 0 0 0 1\n", "expected finite times, got inf"),
-        ("rgb.txt", b"1.0 rgb/\xe9.png\n", r"byte 8: expected text in UTF-8, got b'\\xe9'"),
-        ("rgb.txt", b"1.0 rgb/\0.png\n", r"byte 8: expected text in UTF-8, got b'\\x00'"),
+        ("rgb.txt", b"1.0 rgb/\xe9.png\n", r"byte 8: expected UTF-8, got b'\\xe9'"),
+        ("rgb.txt", b"1.0 rgb/\0.png\n", r"byte 8: expected UTF-8, got b'\\x00'"),
     ],
 )
 def test_lists_that_are_none_are_refused_by_file_and_place(tum, name, content, message):

@@ -228,7 +228,7 @@ def test_images_of_several_cameras_have_the_nearest(tmp_path):
     assert [float(frame.intrinsics[0, 0]) for frame in frames] == [30, 40]
     assert frames[1].files == (tmp_path / "b/depth/0.png", tmp_path / "b/camera.json")
     (tmp_path / "b" / "camera.json").unlink()
-    with pytest.raises(ConfigError, match=r"b/depth/0.png: expected intrinsics, which depth"):
+    with pytest.raises(ConfigError, match=r"b/depth/0.png: expected intrinsics, which images"):
         RGBDFrames.from_folder(tmp_path, depth_scale=1000.0)
 
 

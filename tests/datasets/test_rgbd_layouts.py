@@ -133,7 +133,7 @@ def with_a_huge_number(shared):
     ("spoil", "message"),
     [
         (without_camera, "expected a camera, as fl_x, fl_y, cx, cy or a matrix, got only fl_y"),
-        (with_fisheye, "expected images of a pinhole camera, got OPENCV_FISHEYE; undistort"),
+        (with_fisheye, "expected a pinhole camera, got OPENCV_FISHEYE; undistort"),
         (without_depth, "expected a list of frames, each with depth_file_path; add the depth"),
         (without_frames, "expected a list of frames"),
         (with_wide_images, "as its camera's, or in their ratio, got 128 x 96; pass the camera"),
@@ -195,9 +195,7 @@ def test_an_image_of_replica_beyond_its_poses_has_none(tmp_path):
 def test_the_unit_of_floating_point_is_not_guessed(tmp_path, run):
     root = write_nerfstudio(tmp_path / "capture", ".npy", 1.0)
     error = run("convert", "rgbd", root, tmp_path / "out").error
-    assert (
-        "frame_00000.npy: expected depth_scale, which depth images do not store; pass it" in error
-    )
+    assert "frame_00000.npy: expected depth_scale, which images lack; pass it" in error
     data = RGBDFrames.from_folder(root, depth_scale=1.0)
     np.testing.assert_allclose(points_of(data[1]), FRAMES[1].points, atol=1e-5)
 
@@ -217,10 +215,10 @@ def test_other_captures_say_what_they_lack(tmp_path):
         ("arkitscenes", "lowres_wide.traj: expected time rx ry rz tx ty tz in each row"),
         (
             "scannetpp",
-            "pose_intrinsic_imu.json: expected an entry for frame_000010, which has depth",
+            "pose_intrinsic_imu.json: expected an entry for frame_000010, got none",
         ),
         ("replica", "cam_params.json: cannot be read: No such file"),
-        ("3rscan", "000000.depth.pgm: expected intrinsics, which depth images do not store; pass"),
+        ("3rscan", "000000.depth.pgm: expected intrinsics, which images lack; pass"),
     ):
         with pytest.raises((FormatError, ConfigError), match=message):
             RGBDFrames.from_folder(roots[name])

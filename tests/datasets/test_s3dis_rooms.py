@@ -125,7 +125,7 @@ def test_rooms_without_objects_are_refused(room):
     with pytest.raises(FormatError, match="expected a folder Annotations"):
         read_room(room)
     write_objects(room, {"notes.txt": b"1 2 3 4 5 6"})
-    with pytest.raises(FormatError, match=r"expected objects as CLASS_NUMBER\.txt"):
+    with pytest.raises(FormatError, match=r"expected CLASS_NUMBER\.txt"):
         read_room(room)
 
 

@@ -79,7 +79,7 @@ def test_arrays_that_are_no_points_are_refused(tmp_path):
     wrong = {
         "a.npy": (pose, "expected points, got a 4 x 4 pose matrix"),
         "b.npy": (POINTS.T.repeat(9, axis=1), "got 3 rows of 36 numbers; transpose them"),
-        "c.npy": (np.full((9, 6), "x"), "expected real numbers as coordinates, got <U1"),
+        "c.npy": (np.full((9, 6), "x"), "expected real coordinates, got <U1"),
     }
     for name, (values, message) in wrong.items():
         np.save(tmp_path / name, values)
@@ -190,11 +190,11 @@ def array_bytes(shape, descr="'<f8'", data=b""):
     [
         (array_bytes((10**12, 3)), r"byte \d+: expected 24,000,000,000,000 bytes for the array of"),
         (array_bytes((4, 3), data=b"0" * 95), r"byte \d+: expected 96 bytes .*, got 95; the file"),
-        (array_bytes((-4, 3)), r"byte 0: invalid shape or type in the array: \(-4, 3\)"),
-        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: invalid shape or type in the array"),
-        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: invalid shape or type in the array"),
-        (array_bytes((4, 2), data=b"0" * 64), r"expected an array of shape \(N, 3\) or wider, got"),
-        (array_bytes((), data=b"0" * 8), r"expected an array of shape \(N, 3\) or wider, got \(\)"),
+        (array_bytes((-4, 3)), r"byte 0: wrong shape or type in the array: \(-4, 3\)"),
+        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: wrong shape or type in the array"),
+        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: wrong shape or type in the array"),
+        (array_bytes((4, 2), data=b"0" * 64), r"expected shape \(N, 3\) or wider, got"),
+        (array_bytes((), data=b"0" * 8), r"expected shape \(N, 3\) or wider, got \(\)"),
         (array_bytes((0, 3)), "expected at least one point, got none"),
         (array_bytes((4, 3), "'|O'", b"0" * 96), "the array contains pickled Python objects"),
         (array_bytes((4, 3), "'<q9'"), "byte 0: expected the header of a NumPy array"),

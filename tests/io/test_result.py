@@ -380,7 +380,7 @@ def test_segmentations_of_other_points_and_other_files_are_refused(tmp_path, clo
         Result.from_segmentation(Cloud(np.eye(3)), seg)
     with pytest.raises(FormatError, match=r"file not found"):
         torchrg.read_result(tmp_path / "gone.npz")
-    with pytest.raises(FormatError, match=r"expected coord\.npy in this folder, got none"):
+    with pytest.raises(FormatError, match=r"expected coord\.npy, got none"):
         torchrg.read_result(tmp_path)
 
 

@@ -254,7 +254,7 @@ def test_other_numbers_become_floating_point_that_holds_them(tmp_path, number, k
 @pytest.mark.parametrize("number", ["c8", "bool", "U3", "M8[s]"])
 def test_other_types_of_coordinates_are_refused(tmp_path, number):
     np.savez(tmp_path / "a.npz", points=np.zeros((4, 3), number))
-    with pytest.raises(FormatError, match=r"a\.npz: expected real numbers as coordinates, got"):
+    with pytest.raises(FormatError, match=r"a\.npz: expected real coordinates, got"):
         read_cloud(tmp_path / "a.npz")
 
 
@@ -277,14 +277,14 @@ def test_truth_values_and_wide_integers_are_kept_by_value(tmp_path, make_cloud):
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
-        ("tag", np.array(["a", "b"]), "expected field tag to be real numbers"),
-        ("wave", np.zeros(2, complex), "expected field wave to be real numbers"),
-        ("long", np.zeros(2, np.longdouble), "expected field long to be real numbers"),
+        ("tag", np.array(["a", "b"]), "expected tag of real numbers"),
+        ("wave", np.zeros(2, complex), "expected wave of real numbers"),
+        ("long", np.zeros(2, np.longdouble), "expected long of real numbers"),
         ("short", np.zeros(1), r"expected field short of shape \(2, \.\.\.\), got \(1,\)"),
-        ("cube", np.zeros((2, 2, 2)), r"expected field cube of shape \(N,\) or \(N, C\)"),
-        ("none", np.zeros((2, 0)), r"expected field none of shape \(N,\) or \(N, C\)"),
+        ("cube", np.zeros((2, 2, 2)), r"expected cube of shape \(N,\) or \(N, C\)"),
+        ("none", np.zeros((2, 0)), r"expected none of shape \(N,\) or \(N, C\)"),
         ("x", np.zeros(2), "duplicate field name 'x'"),
-        ("color", np.zeros((2, 3)), "expected field color of uint8 or uint16, got float64"),
+        ("color", np.zeros((2, 3)), "expected uint8 or uint16 color, got float64"),
         ("_", np.zeros(2), "a field cannot be named '_'; rename it"),
     ],
 )
@@ -326,7 +326,7 @@ def test_suffix_in_capitals_is_the_same(tmp_path, make_cloud, assert_same):
 def test_unknown_suffix_lists_the_known_ones(tmp_path, call, kinds):
     (tmp_path / "a.abc").write_bytes(b"solid")
     known = re.escape(f"{' '.join(kinds)}, got '.abc'")
-    with pytest.raises(FormatError, match=rf"a\.abc: expected a file that ends in one of {known}"):
+    with pytest.raises(FormatError, match=rf"a\.abc: expected a file ending in one of {known}"):
         call(tmp_path / "a.abc")
 
 
@@ -360,9 +360,9 @@ def test_formats_of_one_direction_say_so(tmp_path, make_cloud):
         with pytest.raises(FormatError, match=message):
             call(tmp_path / "a.e57")
     write_cloud(tmp_path / "a.vg", make_cloud())
-    with pytest.raises(FormatError, match=r"a\.vg: expected a file that ends in one of .*'\.vg'"):
+    with pytest.raises(FormatError, match=r"a\.vg: expected a file ending in one of .*'\.vg'"):
         read_cloud(tmp_path / "a.vg")
-    with pytest.raises(FormatError, match=r"a\.bvg: expected a file that ends in one of"):
+    with pytest.raises(FormatError, match=r"a\.bvg: expected a file ending in one of"):
         check_output(tmp_path / "a.bvg")
 
 

@@ -326,9 +326,9 @@ def test_written_text_says_what_its_columns_are(tmp_path):
         ),
         (
             "x y z label\n0 1 2 0.5\n",
-            "expected labels to be 64-bit integers, got fractions or larger values; rename",
+            "expected 64-bit integer labels, got fractions or larger; rename",
         ),
-        ("x y z label\n0 1 2 1e30\n", "expected labels to be 64-bit integers"),
+        ("x y z label\n0 1 2 1e30\n", "expected 64-bit integer labels"),
     ],
 )
 def test_broken_text_names_the_line(tmp_path, text, message):

@@ -130,7 +130,7 @@ def test_arguments_are_left_alone():
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        (torch.zeros(4), "integer labels, got float32; convert with .long"),
+        (torch.zeros(4), "integer labels, got float32; use .long"),
         (torch.zeros(4, dtype=torch.bool), "integer labels, got bool"),
         (np.zeros(4), "integer labels, got float64"),
         (torch.zeros(3, dtype=torch.int64), r"truth of shape \(N\) with N=3, got \(4,\)"),

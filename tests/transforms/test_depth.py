@@ -209,7 +209,7 @@ def test_what_cannot_be_fused_is_refused(frames):
         fuse_depth([sample, {key: sample[key] for key in ("depth", "intrinsics")}])
     with pytest.raises(ShapeError, match="one by one"):
         fuse_depth([batch_of(frames)])
-    with pytest.raises(ShapeError, match="expected values of 6912 points, got 3"):
+    with pytest.raises(ShapeError, match="expected 6912 values, got 3"):
         fuse_depth([sample]).to_frames(torch.zeros(3))
 
 

@@ -56,8 +56,7 @@ def segment_depth(
         intrinsics: Camera matrix, shape ``(3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; see
             :func:`torchrg.depth.camera.depth_to_points`.
         config: A depth configuration, or a dictionary. Default: :class:`DepthConfig`.
-        pose: Camera-to-world matrix, shape ``(4, 4)``, for normals and planes in world coordinates.
-            Default: camera coordinates.
+        pose: Camera-to-world matrix, shape ``(4, 4)``. Default: results in camera coordinates.
         orient: Normal orientation: towards the camera for "auto", "viewpoint" and "none", otherwise
             as in :func:`torchrg.normals.orient_normals`. Default: "auto".
         depth_scale: Depth units per meter, 1000 for millimeters. Default: 1, meters.

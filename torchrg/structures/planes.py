@@ -166,12 +166,10 @@ class Planes(_Movable):
         area: Area covered by the points on the plane, shape ``(M,)``.
         count: Number of points, including duplicates, shape ``(M,)``, int64.
         rms: RMS distance of the points to the plane, shape ``(M,)``.
-        extent: Long and short side of the minimum bounding rectangle of the projected points, shape
-            ``(M, 2)``.
+        extent: Long and short side of the points' minimum bounding rectangle, shape ``(M, 2)``.
         axes: Unit directions of those sides, shape ``(M, 2, 3)``.
         center: Center of that rectangle, shape ``(M, 3)``.
         curved: Mask of smooth but nonplanar regions (a column, a bent wall), shape ``(M,)``, bool.
-            Their plane is only a best fit.
         kind: Class of each plane as an index of :data:`PLANE_KINDS`, shape ``(M,)``, int64. Unless
             an up axis was set, :func:`torchrg.segment_planes` classifies on first access, with z
             up. None for depth images with an unknown up axis.
@@ -273,8 +271,7 @@ class Segmentation(_Movable):
     """Plane segmentation: per-point labels and normals, and the plane table.
 
     Attributes:
-        labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or
-            :data:`UNLABELED`.
+        labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or -1.
         normals: Unit normals, shape ``(N, 3)``; zero where not ``valid``.
         curvature: Surface variation in [0, 1/3], shape ``(N,)``; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(N,)``, bool.

@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 
 from torchrg import version
-from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import make_plan
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import RECORD, convert_scan, reason_to_convert
 from torchrg.config import load_config
 
 
