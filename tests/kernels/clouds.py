@@ -30,7 +30,7 @@ def definitions():
 def clouds():
     """Points by name: made, exact, collinear, doubled, tiny, huge and far ones."""
     generator = torch.Generator().manual_seed(0)
-    room = make_room(num_points=3000, noise=0.003, seed=3).points
+    room = make_room(num_points=1500, noise=0.003, seed=3).points
     line = torch.zeros(300, 3)
     line[:, 0] = torch.rand(300, generator=generator)
     bent = room[:1000].clone()
@@ -40,7 +40,7 @@ def clouds():
         "grid": torch.cartesian_prod(torch.arange(12.0), torch.arange(12.0), torch.arange(2.0)),
         "line": line,
         "bent": bent,
-        "doubled": room[:1500].repeat(2, 1),
+        "doubled": room[:750].repeat(2, 1),
         "tiny": room[:1000] * 1e-18,
         "huge": room[:1000] * 1e15,
         "far": room[:1000] + 500.0,

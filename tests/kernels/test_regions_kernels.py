@@ -17,20 +17,20 @@ from torchrg.structures import Sampling
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 
 CLOUDS = clouds()
-ROOM = make_room(num_points=9000, noise=0.003, seed=4).points
+ROOM = make_room(num_points=5000, noise=0.003, seed=4).points
 MANY = {
     "room": ROOM,
     "tiny": ROOM * 1e-18,
     "huge": ROOM * 1e10,
     "far": ROOM.double() + 5e6,
     "grid": torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0), torch.arange(4.0)),
-    "doubled": torch.cat([ROOM[:4000], ROOM[:3000], ROOM[:2000]]),
+    "doubled": torch.cat([ROOM[:2500], ROOM[:1500], ROOM[:1000]]),
     "outliers": torch.cat([ROOM, 1e5 * torch.eye(3)]),
     "line": torch.linspace(0, 1, 5000)[:, None] * torch.tensor([1.0, 0, 0]),
 }
 
 
-@pytest.mark.parametrize("k", [1, 2, 30, 120])
+@pytest.mark.parametrize("k", [1, 30, 120])
 @pytest.mark.parametrize("name", MANY)
 def test_neighbors_are_those_of_the_definition(name, k):
     found = search_knn(MANY[name], k).indices
@@ -39,7 +39,7 @@ def test_neighbors_are_those_of_the_definition(name, k):
 
 
 def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition():
-    batch, ends = torch.cat([ROOM, ROOM[:3000] + 1]), torch.tensor([9000, 12000])
+    batch, ends = torch.cat([ROOM, ROOM[:2000] + 1]), torch.tensor([5000, 7000])
     ordered = ROOM[canonical_order(ROOM)]
     found = search_knn(batch, 20, offset=ends), search_knn(ordered, 20, canonical=True)
     with definitions():
@@ -49,7 +49,7 @@ def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("k", [1, 9, 50, 64])
+@pytest.mark.parametrize("k", [1, 9, 64])
 @pytest.mark.parametrize("name", CLOUDS)
 def test_shared_neighbors_are_those_of_the_definition(name, k, masked):
     near = lists(CLOUDS[name], k, masked)

