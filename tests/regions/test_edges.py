@@ -66,12 +66,6 @@ def test_faces_of_a_plate_join_only_without_planes_to_be_on():
     labels = grow_regions(*cloud, config, residual_rms=rms)
     assert labels.max() == 1
     assert torch.equal(labels == labels[0], face == face[0])
-    order = torch.randperm(600, generator=rng)
-    again = search_knn(points[order], 30)
-    shuffled = grow_regions(
-        points[order], cloud[1], cloud[2], again, config, residual_rms=rms[order]
-    )
-    assert torch.equal(shuffled, labels[order])
     with pytest.raises(ConfigError, match="grow_regions: expected residual_rms"):
         grow_regions(*cloud, config)
     with pytest.raises(ShapeError, match=r"expected residual_rms of shape \(N\)"):

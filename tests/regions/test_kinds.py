@@ -1,6 +1,5 @@
 """Classes of planes are the same through every door, and another up axis is a warning."""
 
-import copy
 import gc
 import pickle
 import warnings
@@ -15,7 +14,7 @@ from torchrg.io.result import read_result
 from torchrg.scenes import make_room
 from torchrg.structures import PLANE_KINDS
 
-POINTS = make_room(8000, noise=0.003, seed=0).points
+POINTS = make_room(4000, noise=0.003, seed=0).points
 TURNED = torch.stack([POINTS[:, 0], POINTS[:, 2], -POINTS[:, 1]], dim=1)
 YAWED = TURNED @ torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
 ANSWER = segment_planes(POINTS, "classic", **{"planes.up": "z"}).planes.kind
@@ -37,9 +36,6 @@ def written(seg, tmp_path):
 DOORS = {
     "column": lambda seg, _: seg.planes.kind,
     "rows": lambda seg, _: torch.tensor([PLANE_KINDS.index(plane.kind) for plane in seg.planes]),
-    "to": lambda seg, _: seg.to("cpu").planes.kind,
-    "pickle": lambda seg, _: pickle.loads(pickle.dumps(seg)).planes.kind,
-    "copy": lambda seg, _: copy.deepcopy(seg).planes.kind,
     "select": lambda seg, _: select_planes(seg).planes.kind,
     "table": lambda seg, _: torch.tensor(
         [PLANE_KINDS.index(row["kind"]) for row in describe_planes(seg.planes)["planes"]]
@@ -79,7 +75,7 @@ def test_another_axis_that_is_up_is_told():
         segment_planes(POINTS, "classic", **{"planes.up": "y"})
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("size", [(6, 5, 2.7), (2, 12, 3), (12, 2.2, 2.5)])
 def test_rooms_and_corridors_with_z_up_are_not_told(seed, size):
     generator = torch.Generator().manual_seed(seed)
