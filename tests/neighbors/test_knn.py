@@ -31,14 +31,6 @@ def test_neighbors_are_those_of_brute_force(levels):
         assert search_knn(points, k).indices.tolist() == brute_force(points, k)
 
 
-def test_neighbors_do_not_depend_on_the_order(rng):
-    points = (torch.rand(400, 3, generator=rng) * 6).round()
-    points = points.unique(dim=0)
-    shuffled = torch.randperm(len(points), generator=rng)
-    plain = search_knn(points, 12).indices.long()
-    assert torch.equal(shuffled[search_knn(points[shuffled], 12).indices.long()], plain[shuffled])
-
-
 def test_chunks_and_threads_change_nothing(rng, monkeypatch, set_threads):
     points = torch.rand(3000, 3, generator=rng)
     whole = search_knn(points, 9).indices

@@ -90,22 +90,6 @@ def test_the_call_of_other_programs_gives_what_they_expect(mesh):
     assert sizes[-1] > 0
 
 
-def test_superpoints_are_connected_along_the_edges(mesh):
-    vertices, faces, _ = mesh
-    superpoint = segmentator.segment_mesh(vertices, faces, config=CLASSIC).numpy()
-    owner = np.arange(len(vertices))
-    edges = np.concatenate([faces[:, [i, i - 1]].numpy() for i in range(3)])
-    edges = edges[superpoint[edges[:, 0]] == superpoint[edges[:, 1]]]
-    for _ in range(len(vertices)):
-        low = np.minimum(owner[edges[:, 0]], owner[edges[:, 1]])
-        before = owner.copy()
-        np.minimum.at(owner, edges[:, 0], low)
-        np.minimum.at(owner, edges[:, 1], low)
-        if np.array_equal(before, owner):
-            break
-    assert len(np.unique(owner)) == superpoint.max() + 1
-
-
 def test_they_are_about_as_many_as_segmentators(mesh):
     vertices, faces, labels = mesh
     theirs = torch.unique(literal_segments(vertices, faces), return_inverse=True)[1]
