@@ -3,40 +3,10 @@
 import pytest
 import torch
 
-from tests.kernels.clouds import both, clouds, lists, needs_library
-from torchrg.linalg import unsigned_angle_deg
-from torchrg.normals.consensus.noise import _measure_neighborhoods, _neighbor_quantiles
-from torchrg.normals.pca import fit_points_pca
+from tests.kernels.clouds import both, needs_library
 from torchrg.robust.scale import _majority_difference
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
-
-CLOUDS = clouds()
-
-
-@pytest.fixture(params=CLOUDS)
-def name(request):
-    return request.param
-
-
-@pytest.fixture
-def points(name):
-    return CLOUDS[name]
-
-
-@pytest.fixture(params=[False, True], ids=["all", "masked"])
-def masked(request):
-    return request.param
-
-
-def assert_close(found, expected, unit, tolerance=1e-5):
-    """Compare values, infinite ones and all, to a share of a unit for each row."""
-    infinite = ~expected.isfinite()
-    assert torch.equal(found[infinite], expected[infinite])
-    error = torch.where(infinite, 0.0, (found - expected).abs())
-    while unit.dim() < error.dim():
-        unit = unit[:, None]
-    assert (error <= tolerance * unit).all(), (error / unit).max()
 
 
 def special_rows(n):
@@ -59,44 +29,3 @@ def special_rows(n):
 def test_differences_are_those_of_the_definition_to_the_bit(n):
     found, expected = both(_majority_difference, special_rows(n))
     assert torch.equal(found.nan_to_num(nan=-1.0), expected.nan_to_num(nan=-1.0))
-
-
-def test_planes_of_all_neighbors_are_those_of_the_definition(name, points, masked):
-    near = lists(points, 50, masked)
-    found, expected = both(fit_points_pca, points, near)
-    assert torch.equal(found.valid, expected.valid)
-    values = torch.stack([expected.curvature, found.curvature])
-    assert (values[0] - values[1]).abs().max() < 1e-5
-    radius = (points[near.indices.long()] - points[:, None]).norm(dim=2).amax(dim=1)
-    assert_close(found.residual_rms, expected.residual_rms, radius)
-    # Where two directions are as thin as one another nothing tells them apart.
-    clear = expected.valid & (expected.curvature < 0.2)
-    angle = unsigned_angle_deg(found.normals, expected.normals)
-    assert not (angle[clear] > 0.05).any()
-
-
-def test_survey_is_that_of_the_definition(points, masked):
-    near = lists(points, 50, masked)
-    fit = fit_points_pca(points, near)
-    found, expected = both(_measure_neighborhoods, points, near, fit.normals, fit.valid)
-    radius = torch.where(expected[1] > 0, expected[1], 1.0)
-    for place in (0, 1, 2):
-        assert_close(found[place], expected[place], radius)
-    for place in (5, 6):
-        # Of neighbors spread equally along two directions any plane across them is the thinnest.
-        equal = (found[place] - expected[place]).abs() <= 1e-5 * radius
-        equal |= found[place].isinf() & expected[place].isinf()
-        assert equal.float().mean() > 0.95
-    # The deviations from two layers, and where places repeat.
-    assert torch.equal(found[3], expected[3])
-    assert torch.equal(found[4], expected[4])
-
-
-def test_quantiles_of_neighbors_are_those_of_the_definition_to_the_bit(points, masked):
-    near = lists(points, 50, masked)
-    values = torch.randn(len(points), 3, generator=torch.Generator().manual_seed(2))
-    values[::3, :2] = values[0, :2]
-    values[::7, 1:] = torch.inf
-    for quantile in (0.1, 0.35, 1.0):
-        found, expected = both(_neighbor_quantiles, values, near, quantile)
-        assert torch.equal(found, expected)
