@@ -101,6 +101,7 @@ def test_chunks_and_threads_change_nothing(scene, config, set_threads):
         assert torch.equal(other.labels, plain.labels)
         assert torch.equal(other.normals, plain.normals)
         assert torch.equal(other.curvature, plain.curvature)
+        assert_same_planes(other.planes, plain.planes)
 
 
 def test_unit_and_origin_change_nothing_in_double_precision(scene, config):

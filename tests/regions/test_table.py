@@ -149,21 +149,6 @@ def test_rows_do_not_depend_on_the_order_of_the_points(rng):
         assert torch.allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
-def test_threads_change_nothing(set_threads):
-    generator = np.random.default_rng(6)
-    points = torch.cat([rectangle(generator, 3000, 2.0, 1.0, noise=0.01)[0] for _ in range(3)])
-    labels = torch.arange(3).repeat_interleave(3000)
-    neighbors = search_knn(points, 10)
-    tables = []
-    for num_threads in (1, 3):
-        set_threads(num_threads)
-        tables.append(summarize_planes(points, points, labels, neighbors=neighbors))
-    for a, b in zip(*map(columns_of, tables), strict=True):
-        assert torch.equal(a, b)
-    for a, b in zip(tables[0].adjacency, tables[1].adjacency, strict=True):
-        assert torch.equal(a, b)
-
-
 @pytest.mark.parametrize(("bend_deg", "curved"), [(26.0, False), (30.0, True)])
 def test_a_bend_is_curved_from_three_to_four_times_the_spread_on(bend_deg, curved):
     angle = torch.deg2rad(torch.linspace(0, bend_deg, 500))

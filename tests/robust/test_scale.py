@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.kernels.clouds import both, needs_library
 from tests.robust.oracle_cases import load_oracles
 from torchrg.errors import ShapeError
 from torchrg.robust import mad, median, qn, qn_exceeds, tau
@@ -68,7 +69,7 @@ def test_qn_is_its_definition_with_ties_and_mixed_magnitudes(values):
 
 def rows_of_all_kinds(n, dtype, rng):
     """Return rows with ties, several magnitudes, infinities, NaN and negative zeros."""
-    rows = torch.randn(9, n, generator=rng, dtype=dtype)
+    rows = torch.randn(11, n, generator=rng, dtype=dtype)
     rows[1] = rows[1].mul(3).round()
     rows[2, : n // 2 + 1] = 3.0
     rows[3] *= 10.0 ** (torch.arange(n, dtype=dtype) % 12)
@@ -77,13 +78,22 @@ def rows_of_all_kinds(n, dtype, rng):
     rows[6, n // 2] = torch.nan
     rows[7] = rows[7].mul(40).round() * torch.finfo(dtype).smallest_normal / 4
     rows[8] = rows[8].sign() * 0.0
+    rows[9] = 0.9 * torch.finfo(dtype).max * rows[9].sign()
+    rows[10] *= 1e-42
     return rows
+
+
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("n", [2, 3, 4, 7, 8, 9, 15, 16, 17, 50, 51, 300])
+def test_kernels_find_qn_of_the_definition_to_the_bit(n, rng):
+    found, expected = both(qn, rows_of_all_kinds(n, torch.float32, rng))
+    assert torch.equal(found.nan_to_num(nan=-1.0), expected.nan_to_num(nan=-1.0))
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 8, 9, 31, 32, 33, 100, 401, 402, 1200])
 def test_qn_by_counting_pairs_is_that_by_listing_them(n, dtype, rng, monkeypatch):
     rows = rows_of_all_kinds(n, dtype, rng).requires_grad_()
-    mask = torch.rand(rows.shape, generator=rng) < torch.linspace(0.5, 1, 9)[:, None]
+    mask = torch.rand(rows.shape, generator=rng) < torch.linspace(0.5, 1, 11)[:, None]
     found = []
     for longest in (1, 1200):
         monkeypatch.setattr("torchrg.robust.scale._MAX_LISTED_VALUES", longest)
