@@ -106,7 +106,7 @@ def test_chunks_and_threads_change_nothing(scene, config, set_threads):
 
 def test_unit_and_origin_change_nothing_in_double_precision(scene, config):
     # Coordinates on a grid of 2^-20 m are moved without rounding.
-    points = (scene.points.double() * 2**20).round() / 2**20
+    points = (scene.points[::2].double() * 2**20).round() / 2**20
     plain = segment_planes(points.numpy(), config)
     for other, unit in ((points * 1000, 1000), (points + torch.tensor([5e5, 4e6, 100.0]), 1)):
         moved = segment_planes(other, config)

