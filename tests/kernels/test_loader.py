@@ -83,7 +83,7 @@ def count_taken(count):
 
 def test_no_arguments_crash_a_kernel():
     code = (
-        "from tests.kernels.test_loader import count_taken; print(min(count_taken(800).values()))"
+        "from tests.kernels.test_loader import count_taken; print(min(count_taken(400).values()))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -10,27 +10,26 @@ from torchrg.config import load_config
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions.adjacency import find_region_pairs
 from torchrg.regions.growth import grow
-from torchrg.regions.shared_neighbors import SharedNeighbors
 from torchrg.scenes import make_room
 from torchrg.structures import Sampling
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 
 CLOUDS = clouds()
-ROOM = make_room(num_points=9000, noise=0.003, seed=4).points
+ROOM = make_room(num_points=5000, noise=0.003, seed=4).points
 MANY = {
     "room": ROOM,
     "tiny": ROOM * 1e-18,
     "huge": ROOM * 1e10,
     "far": ROOM.double() + 5e6,
     "grid": torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0), torch.arange(4.0)),
-    "doubled": torch.cat([ROOM[:4000], ROOM[:3000], ROOM[:2000]]),
+    "doubled": torch.cat([ROOM[:2500], ROOM[:1500], ROOM[:1000]]),
     "outliers": torch.cat([ROOM, 1e5 * torch.eye(3)]),
     "line": torch.linspace(0, 1, 5000)[:, None] * torch.tensor([1.0, 0, 0]),
 }
 
 
-@pytest.mark.parametrize("k", [1, 2, 30, 120])
+@pytest.mark.parametrize("k", [1, 30, 120])
 @pytest.mark.parametrize("name", MANY)
 def test_neighbors_are_those_of_the_definition(name, k):
     found = search_knn(MANY[name], k).indices
@@ -39,7 +38,7 @@ def test_neighbors_are_those_of_the_definition(name, k):
 
 
 def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition():
-    batch, ends = torch.cat([ROOM, ROOM[:3000] + 1]), torch.tensor([9000, 12000])
+    batch, ends = torch.cat([ROOM, ROOM[:2000] + 1]), torch.tensor([5000, 7000])
     ordered = ROOM[canonical_order(ROOM)]
     found = search_knn(batch, 20, offset=ends), search_knn(ordered, 20, canonical=True)
     with definitions():
@@ -48,36 +47,25 @@ def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition
         assert torch.equal(one.indices, other.indices)
 
 
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("k", [1, 9, 50, 64])
+PRESETS = ("classic", "paper", "consensus")
+
+
+@pytest.mark.parametrize("k", [9, 64, 70])
 @pytest.mark.parametrize("name", CLOUDS)
-def test_shared_neighbors_are_those_of_the_definition(name, k, masked):
-    near = lists(CLOUDS[name], k, masked)
-    num_points, width = near.indices.shape
-    draws = torch.rand(num_points, width, generator=torch.Generator().manual_seed(2))
-    asked = near.mask() & (draws < 0.8)
-    some = slice(100, 250)
-    for least, rows in ((1, some), (width // 3, slice(0, num_points)), (width, some)):
-        shared = SharedNeighbors(near, least)
-        found = shared.connected(rows, asked[rows])
-        with definitions():
-            assert torch.equal(found, shared.connected(rows, asked[rows]))
-
-
-@pytest.mark.parametrize("k", [9, 50, 70])
-@pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
-@pytest.mark.parametrize("name", ["room", "grid", "doubled"])
-def test_regions_are_those_of_the_definition(name, preset, k):
+def test_regions_are_those_of_the_definition(name, k):
+    preset = PRESETS[(list(CLOUDS).index(name) + k) % 3]
     config = load_config(preset).with_sampling(Sampling()).growing
-    late = {"connectivity": 0.3, "connectivity_scope": "seed"}
-    by_region = {
-        "curvature_scope": "neighborhood",
-        "connectivity": 0.2,
-        "connectivity_scope": "region",
-    }
-    for changes in ({}, {"min_size": 5}, {"seed_rule": "increment"}, late, by_region):
+    by_region = {"curvature_scope": "neighborhood", "connectivity_scope": "region"}
+    for changes in (
+        {},
+        {"min_size": 5},
+        {"seed_rule": "increment", "max_distance": 0.3, "max_angle_deg": 90.0},
+        {"connectivity": 0.3, "connectivity_scope": "seed"},
+        {"connectivity": 0.2, **by_region},
+        {"connectivity": 1.0, **by_region},
+    ):
         settings = dataclasses.replace(config, **changes)
-        cloud = growing_cloud(CLOUDS[name], k, masked=k == 9, reach=3.0)
+        cloud = growing_cloud(CLOUDS[name], k, k == 9, reach=3.0, signed_normals=k == 64)
         found = grow(cloud, settings, 700)
         with definitions():
             expected = grow(cloud, settings, 700)

@@ -171,7 +171,7 @@ def test_surfaces_are_connected_over_edges(rng):
 
 @pytest.fixture(scope="module")
 def furnished():
-    room = make_room(12_000, 0.003, 4)
+    room = make_room(8_000, 0.003, 4)
     rows = finite_rows(room.points)
     return room.points[rows].float(), room.normals[rows].float()
 
@@ -186,16 +186,14 @@ def test_a_stray_point_far_off_changes_little(furnished):
 
 
 @pytest.mark.parametrize("side", ["interior", "consistent"])
-def test_threads_and_disks_and_longer_lists_change_nothing(furnished, tmp_path, monkeypatch, side):
+def test_threads_and_disks_and_longer_lists_change_nothing(
+    furnished, tmp_path, monkeypatch, set_threads, side
+):
     points, normals = furnished
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            results.append(orient_normals(points, normals, orient=side))
-    finally:
-        torch.set_num_threads(before)
+    for threads in (3, 1):
+        set_threads(threads)
+        results.append(orient_normals(points, normals, orient=side))
     monkeypatch.setattr(scratch, "_MIN_BYTES", 0)
     with scratch.on_disk(tmp_path):
         results.append(orient_normals(points, normals, orient=side))

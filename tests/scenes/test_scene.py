@@ -70,8 +70,5 @@ def test_points_are_in_random_order():
 def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         make_room(**{"num_points": 100, **settings})
-
-
-def test_unknown_directions_of_noise_are_refused():
     with pytest.raises(ConfigError, match="noise_direction to be one of normal, isotropic, got"):
         sample_scene(build_room(), 100, noise_direction="up")
