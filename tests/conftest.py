@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from tests import pretend
+from torchrg.batch.scans import convert_scan
 from torchrg.cli import main
 from torchrg.io import write_cloud
 from torchrg.scenes import make_room
@@ -140,6 +141,23 @@ class Run(NamedTuple):
         assert self.code != 0, self.out
         assert self.err.count("\n") == 1, self.err
         return self.err
+
+
+def convert_here(jobs, *, workers, memory_limit):
+    """Stand for the engine of ``torchrg convert``: scans one by one, in this process."""
+    return (convert_scan(job) for job in jobs)
+
+
+@pytest.fixture
+def in_workers():
+    """For tests whose subject are the worker processes of ``torchrg convert``."""
+
+
+@pytest.fixture(autouse=True)
+def _without_workers(request, monkeypatch):
+    """Let commands convert in this process: a worker takes seconds to load torch."""
+    if "in_workers" not in request.fixturenames:
+        monkeypatch.setattr("torchrg.cli.convert.run_local", convert_here)
 
 
 @pytest.fixture

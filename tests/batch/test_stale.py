@@ -14,7 +14,6 @@ from tests.datasets.s3dis_tree import write_clean_room
 from tests.datasets.scannet_tree import write_scan, write_tables
 from torchrg.batch.records import RECORD
 from torchrg.batch.run import LOCK, REPORT, list_jobs
-from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource
 from torchrg.batch.stale import check_stale, find_stale, remove_stale
 from torchrg.config import load_config
@@ -55,13 +54,8 @@ def out(tmp_path):
 
 
 @pytest.fixture
-def convert(run, monkeypatch):
-    """``convert(kind, root, out, ...)``: the command, which converts in this process."""
-
-    def convert_here(jobs, *, workers, memory_limit):
-        return (convert_scan(job) for job in jobs)
-
-    monkeypatch.setattr("torchrg.cli.convert.run_local", convert_here)
+def convert(run):
+    """``convert(kind, root, out, ...)``: the command."""
     return lambda *arguments: run("convert", *arguments, "--preset", "classic")
 
 

@@ -65,6 +65,7 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
     assert [row["count"] for row in table["planes"]] == seg.planes.count.tolist()
 
 
+@pytest.mark.usefixtures("in_workers")
 def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, convert):
     done = convert("folder", rooms, tmp_path / "out", "--workers", 1, "--limit-memory", 0.1)
     assert done.err.count("may exceed the memory limit of 0.1 GB; it runs alone") == 2
