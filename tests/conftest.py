@@ -54,16 +54,18 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def on_cuda():
+    """Return the parameter of tests on CUDA, which are skipped without it."""
+    skip = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+    return pytest.param("cuda", marks=[pytest.mark.cuda, skip])
+
+
 def pytest_generate_tests(metafunc):
+    asked, cuda = metafunc.config.getoption("--device"), on_cuda()
     if "device" in metafunc.fixturenames:
-        asked = metafunc.config.getoption("--device")
-        names = ["cpu", "cuda"] if asked == "all" else [asked]
-        marks = [pytest.mark.cuda]
-        if not torch.cuda.is_available():
-            marks.append(pytest.mark.skip(reason="no CUDA device"))
-        metafunc.parametrize(
-            "device", [pytest.param(n, marks=marks if n == "cuda" else []) for n in names]
-        )
+        metafunc.parametrize("device", {"all": ["cpu", cuda], "cuda": [cuda]}.get(asked, [asked]))
+    if "accelerator" in metafunc.fixturenames:  # For what is compared with the CPU.
+        metafunc.parametrize("accelerator", [asked if asked == "pretend" else cuda])
     if "dtype" in metafunc.fixturenames:
         metafunc.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
 

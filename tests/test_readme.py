@@ -62,7 +62,7 @@ torchrg.load_config({"growing.absorb": "no"})
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+@pytest.mark.parametrize("method", ["spawn", pytest.param("forkserver", marks=pytest.mark.slow)])
 def test_loader_block_runs_as_a_script(method, tmp_path):
     (block,) = (block for block in blocks_of("python") if "DataLoader(" in block)
     start = f"import multiprocessing\nmultiprocessing.set_start_method({method!r}, force=True)\n"
