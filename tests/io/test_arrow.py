@@ -12,21 +12,8 @@ from torchrg.io.arrow import parse_numbers
 
 MARKS = [" ", "\t", "  ", ",", ", ", ";"]
 NUMBERS = ["nan", "-nan", "NaN", "inf", "-inf", "Infinity", "+1", "1e400", "5.", ".5", "-0", "007"]
-NO_NUMBERS = [
-    "",
-    "x",
-    "nan(1)",
-    "1e",
-    "1 2",
-    "0x10",
-    "1_0",
-    "1,5",
-    "--1",
-    "1.2.3",
-    '"1"',
-    "1d5",
-    "-",
-]
+NO_NUMBERS = ["", "x", "nan(1)", "1e", "1 2", "0x10", "1_0", "1,5", "--1", "1.2.3", "1d5", "-"]
+NO_NUMBERS.append('"1"')
 
 
 def broken_text(rng):
@@ -58,9 +45,8 @@ def broken_text(rng):
             "# a",
             "// a",
             "7",
-            " ".join(rows[0]),
-            ";".join(rows[0]),
             "\0",
+            *map(str.join, " ;", [rows[0]] * 2),
         ]
         lines.insert(rng.randrange(len(lines)), rng.choice(extra))
     if rng.random() < 0.1:
