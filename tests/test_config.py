@@ -412,10 +412,7 @@ def test_sections_and_other_settings_come_by_dictionary_too():
             "SegmentPlanes: expected normals.k to be an integer, got '3.5'",
         ),
         (lambda: segment_planes(torch.zeros(3, 3), preset="classic"), "as the first argument"),
-        (
-            lambda: estimate_normals(torch.zeros(3, 3), radius=0.1),
-            "radius.*max_distance bounds",
-        ),
+        (lambda: estimate_normals(torch.zeros(3, 3), radius=0.1), "radius.*max_distance bounds"),
         (lambda: make_superpoints(torch.zeros(3, 3), n=10), "numbers of superpoints are counts"),
         (lambda: MakeSuperpoints("classic"), "a SuperpointsConfig or a dictionary, got str"),
         (

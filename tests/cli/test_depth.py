@@ -240,10 +240,7 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
         ([tmp_path / "list.pcd"], "not an organized point cloud"),
         ([tmp_path / "turned.pcd"], "expected points in the coordinates of a pinhole camera"),
         ([tmp_path / "bad.npy", *CAMERA], "bad.npy: expected an array of numbers, got: "),
-        (
-            [tmp_path / "huge.png", *CAMERA],
-            "huge.png: not enough memory for 90,000,000,000 pix",
-        ),
+        ([tmp_path / "huge.png", *CAMERA], "huge.png: not enough memory for 90,000,000,000 pix"),
         ([frame, twin, *CAMERA, "--out", tmp_path / "out"], "has the same name as"),
     ):
         assert message in run("depth", "--out", tmp_path / "a.png", *arguments).error
@@ -258,10 +255,7 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
         ("cam.K", "[[50. 0. 39.5]\n [0. 50. 29.5]\n [0. 0. 1.]]"),
         ("camera", "50 50 39.5 29.5"),
         ("frame.pincam", "80 60 50 50 39.5 29.5"),
-        (
-            "info.txt",
-            "m_depthShift=1000\nm_calibrationDepthIntrinsic=50 0 39.5 0 50 29.5 0 0 1",
-        ),
+        ("info.txt", "m_depthShift=1000\nm_calibrationDepthIntrinsic=50 0 39.5 0 50 29.5 0 0 1"),
         ("cameras.txt", "1 SIMPLE_PINHOLE 160 120 100 80 60\n"),
     ],
 )

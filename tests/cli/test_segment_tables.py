@@ -126,10 +126,7 @@ def test_convert_keeps_its_tables_and_never_replaces_those_of_others(scans, tmp_
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        (
-            "planes.txt",
-            "planes.txt: expected a file ending in .csv or .json, got '.txt'",
-        ),
+        ("planes.txt", "planes.txt: expected a file ending in .csv or .json, got '.txt'"),
         ("no/planes.csv", "not found; create it first"),
         ("out.npz", "expected a file ending in .csv or .json, got '."),
         ("room.xyz", "expected a file ending in .csv or .json, got '."),

@@ -81,21 +81,9 @@ def test_a_lens_that_bends_lines_is_told(tmp_path):
         ("a.yaml", "", "expected names with values, got NoneType"),
         ("a.json", "[1, 2]", "expected a matrix of 3 x 3, 3 x 4 or 4 x 4, fx fy cx cy, or width"),
         ("a.json", '["a"]', "expected names with values, got list"),
-        (
-            "a.json",
-            '{"fov": 60}',
-            "or a matrix, got only fov; add it, or pass --intrinsics",
-        ),
-        (
-            "a.json",
-            '{"frames": [{"fl_x": 1}]}',
-            "expected one camera, got one per frame, or none; pass",
-        ),
-        (
-            "a.json",
-            '{"intrinsic_matrix": [1, 2]}',
-            "expected intrinsic_matrix to be a matrix, got",
-        ),
+        ("a.json", '{"fov": 60}', "or a matrix, got only fov; add it, or pass --intrinsics"),
+        ("a.json", '{"frames": [{"fl_x": 1}]}', "expected one camera, got one per frame, or none;"),
+        ("a.json", '{"intrinsic_matrix": [1, 2]}', "expected intrinsic_matrix to be a matrix, got"),
         ("a.json", '{"intrinsic_matrix": [[1], [2, 3]]}', "to be a matrix, got"),
         ("a.json", f'{{"K": {10**400}}}', "expected K to be a matrix, got 1000"),
         ("a.json", '{"K": [1, 0, 0, 0, 0, 0, 0, 0, 1]}', "expected intrinsics of rows"),
@@ -192,9 +180,7 @@ def test_depth_units_are_units_per_meter_or_meters_per_unit(tmp_path, name, valu
 def test_cameras_that_are_no_pinhole_are_refused(tmp_path, more):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps({**NAMED, **more}))
-    with pytest.raises(
-        FormatError, match=r"expected images of a pinhole camera, got .*; undistort"
-    ):
+    with pytest.raises(FormatError, match=r"expected images of a pinhole camera, got .*;"):
         read_camera(path)
     (name,) = more
     path.write_text(json.dumps({**NAMED, name: False}))

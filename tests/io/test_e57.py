@@ -279,10 +279,7 @@ def test_poses_are_read_by_name_in_any_order(tmp_path, order):
         ((1e300, 1e300, 0, 0), "a unit quaternion in scan"),
         ((5e-324, 0, 0, 0), "a unit quaternion in scan"),
         ((0.1, 0, 0.1, 0), "a unit quaternion in scan '', got norm 0.141"),
-        (
-            (1, 0, 0, 0, 0, -1e13, 0),
-            r"a translation of scan '' within 1e\+12, got -1e\+13; correct",
-        ),
+        ((1, 0, 0, 0, 0, -1e13, 0), r"a translation of scan '' within 1e\+12, got -1e\+13;"),
     ],
 )
 def test_poses_that_are_no_places_are_refused(tmp_path, pose, message):

@@ -127,10 +127,7 @@ def test_presets_are_taken_by_name_wherever_a_configuration_is(preset):
         (lambda: EstimateNormals(methd="pca"), "unknown setting 'methd'; the nearest is method"),
         (lambda: EstimateNormals(k=2.5), "EstimateNormals: expected k to be an integer, got 2.5"),
         (lambda: EstimateNormals("clasic"), "a preset, one of .*classic, .* got 'clasic'"),
-        (
-            lambda: EstimateNormals(GrowingConfig()),
-            "EstimateNormals: expected config to be",
-        ),
+        (lambda: EstimateNormals(GrowingConfig()), "EstimateNormals: expected config to be"),
         (
             lambda: GrowRegions(max_angle=5),
             "GrowRegions: unknown setting 'max_angle'; the nearest is max_angle_deg",
