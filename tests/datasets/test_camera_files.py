@@ -51,10 +51,6 @@ NERFSTUDIO = {"fl_x": 525, "fl_y": 526, "cx": 320, "cy": 240, "w": 640, "h": 480
         ("parameters.json", {"extrinsic": [], "intrinsic": {**SIZE, "intrinsic_matrix": COLUMNS}}),
         ("rows.json", {**SIZE, "intrinsic_matrix": ROWS}),
         ("transforms.json", NERFSTUDIO),
-        (
-            "cam_params.json",
-            {"camera": {"w": 640, "h": 480, "fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5}},
-        ),
         ("calibration.yaml", CALIBRATION),
         ("info.YML", MESSAGE),
         ("ros1.yaml", {**SIZE, "K": FLAT}),
@@ -101,11 +97,6 @@ def test_files_without_a_camera_are_refused(tmp_path, name, content, message):
     path.write_text(content)
     with pytest.raises((FormatError, ConfigError), match=f"{name}: .*{message}"):
         read_camera(path)
-
-
-def test_a_camera_file_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(FormatError, match=r"a\.json: cannot be read: No such file"):
-        read_camera(tmp_path / "a.json")
 
 
 def test_a_pixel_of_a_smaller_image_looks_through_the_middle_of_those_it_stands_for():

@@ -234,9 +234,3 @@ def test_pickles_and_wrong_sizes_are_never_loaded(foreign):
     (foreign / "coord.npy").unlink()
     with pytest.raises(FormatError, match=r"expected coord\.npy in this folder"):
         read_pointcept_scene(foreign)
-
-
-def test_a_folder_that_cannot_be_made_is_named(sample, seg, tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(FormatError, match="cannot be created"):
-        write_pointcept_scene(tmp_path / "file" / "room", sample, seg)

@@ -21,7 +21,13 @@ from torchrg.normals import estimate_normals
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.regions import grow_regions
 from torchrg.scenes import make_room
-from torchrg.transforms import EstimateNormals, GrowRegions, MakeSuperpoints, SegmentPlanes
+from torchrg.transforms import (
+    EstimateNormals,
+    GrowRegions,
+    MakeSuperpoints,
+    SegmentDepth,
+    SegmentPlanes,
+)
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +55,6 @@ def test_keys_can_be_renamed(coord):
     keys = {"coord": "pos", "plane": "superpoint"}
     sample = SegmentPlanes("classic", keys=keys)({"pos": coord})
     assert set(sample) == {"pos", "superpoint", "normal", "curvature"}
-
-
-def test_transforms_survive_pickling(coord):
-    transform = SegmentPlanes("classic", keys={"coord": "pos"})
-    copy = pickle.loads(pickle.dumps(transform))
-    assert torch.equal(copy({"pos": coord})["plane"], transform({"pos": coord})["plane"])
 
 
 def test_points_that_are_not_finite_are_left_out(coord):
@@ -164,6 +164,10 @@ def test_wrong_settings_are_refused_at_once_and_in_one_line(make, message):
         (GrowRegions(k=30), "GrowRegions(GrowingConfig(), k=30)"),
         (MakeSuperpoints(), "MakeSuperpoints(SuperpointsConfig())"),
         (MakeSuperpoints(white=1.0), "MakeSuperpoints(SuperpointsConfig(), white=1.0)"),
+        (
+            SegmentDepth(min_size=7, orient="up"),
+            "SegmentDepth(DepthConfig(min_size=7), orient='up')",
+        ),
     ],
 )
 def test_transforms_are_shown_in_one_line(module, line):
