@@ -42,38 +42,6 @@ def test_fortran_order_and_foreign_bytes_are_read(tmp_path):
     assert cloud.coordinates.dtype == np.dtype("=f4")
 
 
-@pytest.mark.parametrize(
-    ("rest", "names"),
-    [
-        (np.zeros((4, 0)), set()),
-        (np.full((4, 1), 0.5), {"intensity"}),
-        (np.full((4, 2), 0.5), {"column_4", "column_5"}),
-        (np.tile([255.0, 0, 7], (4, 1)), {"color"}),
-        (np.tile([0.6, 0, -0.8], (4, 1)), {"normals"}),
-        (np.tile([0.0, 0, 1], (4, 1)), {"normals"}),
-        (np.zeros((4, 3)), {"color"}),
-        (np.full((4, 3), 1e200), {"column_4", "column_5", "column_6"}),
-        (np.full((4, 3), 0.3), {"column_4", "column_5", "column_6"}),
-        (np.tile([255.0, 0, 7, 0.5], (4, 1)), {"color", "column_7"}),
-        (np.tile([256.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
-        (np.tile([-1640.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
-        (np.tile([0.5, 0.6, 0, -0.8], (4, 1)), {"column_4", "normals"}),
-        (np.tile([0.6, 0, -0.8, 3], (4, 1)), {"normals", "column_7"}),
-        # Intensity and color, or color and label: values do not tell.
-        (np.tile([255.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
-        (np.tile([0.5, 0, 7, 0.5], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
-    ],
-)
-def test_columns_without_names_are_told_by_their_values(tmp_path, rest, names):
-    table = np.hstack([POINTS, rest])
-    np.save(tmp_path / "a.npy", table)
-    cloud = read_cloud(tmp_path / "a.npy")
-    np.testing.assert_array_equal(cloud.coordinates, POINTS)
-    assert cloud.fields.keys() == names
-    np.savetxt(tmp_path / "a.txt", table)
-    assert read_cloud(tmp_path / "a.txt").fields.keys() == names
-
-
 def test_arrays_that_are_no_points_are_refused(tmp_path):
     pose = np.array([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
     wrong = {
