@@ -128,11 +128,6 @@ def test_output_that_closes_keeps_the_code_and_the_report(rooms, tmp_path, monke
     }  # fmt: skip
 
 
-def test_a_finished_set_has_nothing_to_do(rooms, converted, convert):
-    for flags in ([], ["--dry-run"]):
-        assert "nothing to do\n" in convert("folder", rooms, converted, *flags).out
-
-
 def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, convert, monkeypatch):
     monkeypatch.setattr("torchrg.batch.run.LOCK_TIMEOUT_SECONDS", 0)
     with lock_folder(tmp_path):

@@ -19,11 +19,9 @@ CLASSIC = ("--preset", "classic")
 
 
 @pytest.fixture(scope="module")
-def scans(tmp_path_factory):
+def scans(room, tmp_path_factory):
     """A folder with a room at UTM coordinates and fields of objects; its objects ``(N,)``."""
-    from tests.conftest import copied_room
-
-    made, folder = copied_room(5000), tmp_path_factory.mktemp("scans")
+    made, folder = room(5000), tmp_path_factory.mktemp("scans")
     objects = (made.points[:, 0] / 2.5).long().numpy()
     fields = {
         "instance": objects.astype(np.int32),
