@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from tests.calls import CLASSIC, calls, public_functions, segmented_room
-from torchrg import scenes
 from torchrg.transforms import SegmentPlanes
 
 NUM_POINTS = 33_000
@@ -58,17 +57,6 @@ def test_every_public_function_returns_in_a_forked_child(two_threads):
     assert not is_hung, f"waits after {done[-1:]}"
     assert child.exitcode == 0
     assert done == [*calls(NUM_POINTS)]
-
-
-def count_planes(seed):
-    room = scenes.make_room(NUM_POINTS, noise=0.003, seed=seed)
-    return int(SegmentPlanes(CLASSIC)({"coord": room.points})["plane"].max()) + 1
-
-
-def test_a_forked_pool_returns_what_the_parent_does(two_threads):
-    expected = [count_planes(seed) for seed in (0, 1)]
-    with multiprocessing.get_context("fork").Pool(2) as pool:
-        assert pool.map_async(count_planes, (0, 1)).get(SECONDS_UNTIL_HUNG) == expected
 
 
 def test_hugging_face_maps_in_two_processes(two_threads):
