@@ -11,7 +11,6 @@ from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import load_config
 from torchrg.datasets import FolderOfClouds, RGBDFrames
 from torchrg.depth import DepthConfig
-from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, FormatError
 from torchrg.scenes import make_room
 
@@ -167,14 +166,6 @@ def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
         list_jobs(source, tmp_path / "out")
 
 
-def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
-    for name in ("1.npy", "1.png"):
-        (root / name).touch()
-    camera = Pinhole(5.0, 5.0, 2.0, 1.0)
-    with pytest.raises(ConfigError, match=r"got '1' twice, for .*1.npy and .*1.png; move or"):
-        RGBDFrames.from_folder(root, "images", intrinsics=camera, depth_scale=1000)
-
-
 @pytest.mark.filterwarnings("ignore:.*using the built-in camera")
 def test_a_recording_is_found_once_and_links_are_told(root, tmp_path):
     for name in ("seq-01", "seq-02"):
@@ -205,16 +196,3 @@ def test_results_are_never_read_as_scans_through_a_link_or_from_above(root, tmp_
     # The scan in/in/hall.npy would get the folder in/hall below the directory above.
     with pytest.raises(ConfigError, match="so that no result is read as a scan"):
         list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path)
-
-
-def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, convert):
-    save(root, "in/a.npy")
-    (root / "in" / "loop").symlink_to("..")
-    (root / "in" / "second").symlink_to("..")
-    done = convert("--dry-run")
-    assert done.err.startswith(f"torchrg: warning: {root}: skipped in/loop and 1 more")
-    assert done.err.count("\n") == 1
-    assert "1 scans to convert" in done.out
-    with pytest.warns(UserWarning, match="skipped in/loop"):
-        jobs = list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path / "out")
-    assert [job.scan.name for job in jobs] == ["in/a"]

@@ -53,12 +53,6 @@ def test_results_that_changed_or_are_gone_are_noticed(job):
     assert reason_to_convert(job) == "result.txt missing"
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"outputs": 3}', "\x00"])
-def test_a_damaged_record_is_none(job, text):
-    (job.folder / RECORD).write_text(text)
-    assert reason_to_convert(job) == "new"
-
-
 @pytest.mark.parametrize(
     "change", [{"points": "x"}, {"regions": None}, {"repairs": 3}, {"warnings": {}}]
 )

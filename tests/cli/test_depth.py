@@ -176,25 +176,6 @@ def test_a_folder_of_several_is_refused_with_the_command_for_it(tmp_path, frame,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.png", "next.png"]
 
 
-def test_a_camera_file_is_as_good_as_its_numbers(tmp_path, frame, depth, run):
-    camera = {
-        "width": 160,
-        "height": 120,
-        "intrinsic_matrix": [100, 0, 0, 0, 100, 0, 79.5, 59.5, 1],
-    }
-    (tmp_path / "camera.json").write_text(json.dumps(camera))
-    given = ["--intrinsics", tmp_path / "camera.json", *CAMERA[2:]]
-    assert run("depth", frame, *given, "--out", tmp_path / "a.npz").code == 0
-    # Half the size: the middle of the first pixel was at the corner between the first four.
-    numbers = ["--intrinsics", "50,50,39.5,29.5", *CAMERA[2:]]
-    assert run("depth", frame, *numbers, "--out", tmp_path / "b.npz").code == 0
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    write_cloud(tmp_path / "a.pcd", Cloud(points_of(depth).numpy(), grid_shape=(60, 80)))
-    assert run("depth", tmp_path / "a.pcd", *given[:2], "--out", tmp_path / "c.npz").code == 0
-    with np.load(tmp_path / "c.npz") as result:
-        assert json.loads(str(result["provenance"]))["intrinsics"] == "50,50,39.5,29.5"
-
-
 @pytest.mark.parametrize("suffix", [".bag", ".mkv", ".r3d", ".exr"])
 def test_recordings_are_refused_with_what_converts_them(tmp_path, suffix, run):
     source, tools = tmp_path / f"walk{suffix}", {".exr": "OpenEXR", ".r3d": "pyliblzfse"}
@@ -240,10 +221,7 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
         ([tmp_path / "list.pcd"], "not an organized cloud"),
         ([tmp_path / "turned.pcd"], "expected points of a pinhole camera"),
         ([tmp_path / "bad.npy", *CAMERA], "bad.npy: expected an array of numbers, got: "),
-        (
-            [tmp_path / "huge.png", *CAMERA],
-            "huge.png: not enough memory for 90,000,000,000 pix",
-        ),
+        ([tmp_path / "huge.png", *CAMERA], "huge.png: not enough memory for 90,000,000,000 pix"),
         ([frame, twin, *CAMERA, "--out", tmp_path / "out"], "has the same name as"),
     ):
         assert message in run("depth", "--out", tmp_path / "a.png", *arguments).error
@@ -258,11 +236,14 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
         ("cam.K", "[[50. 0. 39.5]\n [0. 50. 29.5]\n [0. 0. 1.]]"),
         ("camera", "50 50 39.5 29.5"),
         ("frame.pincam", "80 60 50 50 39.5 29.5"),
-        (
-            "info.txt",
-            "m_depthShift=1000\nm_calibrationDepthIntrinsic=50 0 39.5 0 50 29.5 0 0 1",
-        ),
+        ("info.txt", "m_depthShift=1000\nm_calibrationDepthIntrinsic=50 0 39.5 0 50 29.5 0 0 1"),
         ("cameras.txt", "1 SIMPLE_PINHOLE 160 120 100 80 60\n"),
+        # Twice the size: the middle of four pixels there is the middle of one here.
+        (
+            "camera.json",
+            '{"width": 160, "height": 120, "intrinsic_matrix": '
+            "[100, 0, 0, 0, 100, 0, 79.5, 59.5, 1]}",
+        ),
     ],
 )
 def test_a_matrix_file_is_a_camera(tmp_path, frame, run, name, content):
@@ -301,7 +282,7 @@ def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, 
         jobs = list_jobs(source, tmp_path / "out")
     (note,) = convert_scan(jobs[0]).warnings
     assert reported in note
-    with pytest.warns(DepthWarning, match="expected a median depth"):
+    with pytest.warns(DepthWarning, match=reported):
         _ = data[0]
 
 
@@ -358,14 +339,6 @@ def test_missing_pixels_and_rays_are_converted_at_every_door(tmp_path, depth, ru
     np.testing.assert_array_equal(np.load(tmp_path / "c/0/plane.npy"), expected)
     record = json.loads((tmp_path / "c/0/provenance.json").read_text())
     assert record["measured"]["pose"] == "camera"
-
-
-@pytest.mark.parametrize("suffix", [".tif", ".jpg", ".pfm", ".raw", ""])
-def test_other_forms_of_images_are_answered_with_those_that_are_read(tmp_path, run, suffix):
-    (tmp_path / f"image{suffix}").write_bytes(b"no depth")
-    error = run("depth", tmp_path / f"image{suffix}", *CAMERA, "--out", tmp_path / "a.png").error
-    assert f"expected a depth image that ends in one of .png .npy .pgm, got '{suffix}'" in error
-    assert "convert it to a 16-bit .png, or save its values with numpy.save" in error
 
 
 def test_a_panorama_is_doubted(tmp_path, run):

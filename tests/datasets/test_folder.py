@@ -153,15 +153,6 @@ def test_folders_of_pointcept_are_clouds(tmp_path):
     assert data[0]["segment"].tolist() == [0, 0, 0]
 
 
-def test_the_transform_is_called(root):
-    assert FolderOfClouds(root, transform=lambda sample: len(sample["coord"]))[1] == 3
-
-
-def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(FormatError, match="no such folder"):
-        FolderOfClouds(tmp_path / "scans")
-
-
 def raise_of_third(sample):
     if sample["name"] == "scan_9":
         raise IndexError("no rows")

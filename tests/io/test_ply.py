@@ -232,14 +232,6 @@ def test_promised_points_are_compared_with_the_file(tmp_path, order, count):
         read_cloud(save(tmp_path / "a.ply", header, body))
 
 
-def test_truncated_file_names_the_byte(tmp_path):
-    header = HEADER.format(order="binary_little_endian")
-    path = save(tmp_path / "a.ply", header, binary_body("<")[:-1])
-    message = rf"a\.ply: byte {len(header)}: expected 51 bytes for 3 records of vertex, got 50; "
-    with pytest.raises(FormatError, match=message):
-        read_cloud(path)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -298,10 +298,7 @@ def test_written_text_says_what_its_columns_are(tmp_path):
         ("0,1,2\n3 4 5\n", "line 2: expected 3 numbers, got '3 4 5'; separate all numbers with c"),
         ("0 1 2\n3;4;5\n", "line 2: expected 3 numbers, got '3;4;5'; separate all .* with blanks"),
         ("2\n1\n0 0 0\n", "line 2: expected a point after the point count, got a second count"),
-        (
-            "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n",
-            "expected points, got a 4 x 4 pose matrix; pass the point cloud file",
-        ),
+        ("1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n", "expected points, got a 4 x 4 pose matrix; pass"),
         (
             f"{'1 ' * 900}\n{'2 ' * 900}\n# z\n{'3 ' * 900}\n",
             "expected one row per point, got 3 rows of 900 numbers; transpose them",

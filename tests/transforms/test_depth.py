@@ -1,6 +1,5 @@
 """Depth images as clouds, one by one, in batches, and fused."""
 
-import pickle
 from pathlib import Path
 
 import pytest
@@ -141,16 +140,6 @@ def test_samples_are_not_changed_and_keys_can_be_renamed(frames):
     assert all(torch.equal(sample[key], value) for key, value in before.items())
     assert "instance" in renamed
     assert "plane" not in renamed
-
-
-def test_modules_can_be_pickled(frames):
-    sample = sample_of(frames[0])
-    for module in (SegmentDepth(), DepthToCloud()):
-        again = pickle.loads(pickle.dumps(module))
-        for key, value in module(sample).items():
-            assert torch.equal(again(sample)[key], value)
-    shown = "SegmentDepth(DepthConfig(min_size=7), orient='up')"
-    assert repr(SegmentDepth(min_size=7, orient="up")) == shown
 
 
 def test_wrong_samples_are_refused(frames):
