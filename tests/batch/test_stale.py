@@ -154,14 +154,14 @@ def test_what_a_user_changed_or_added_is_never_removed(root, out, convert, layou
         for flags in ([], ["--dry-run"], ["--only", "val/*"]):
             done = convert(*command, *flags)
             assert done.code == 2
-            assert f"{path}: is not as torchrg wrote it" in done.error
+            assert f"{path}: was changed or not written by torchrg" in done.error
             assert f"its scan is val/{MOVED} now; move it.\n" in done.error
             assert files_of(out) == held
         path.unlink() if before is None else path.write_bytes(before)
     changed.unlink()
     changed.symlink_to(out.parent / "other")
     (out.parent / "other").write_bytes(whole)
-    assert f"{changed}: is not as torchrg" in convert(*command).error
+    assert f"{changed}: was changed or not written" in convert(*command).error
     changed.unlink()
     assert convert(*command).code == 0
     assert not folder.exists()
@@ -434,7 +434,10 @@ def test_a_folder_of_results_may_be_a_link(root, out, tmp_path, convert):
     shutil.move(out / "val" / LAST, tmp_path / "last")
     (out / "val" / LAST).symlink_to(tmp_path / "last")
     move(root, train=SCANS, val=[])
-    assert f"{out}/val/{LAST}: is not as torchrg wrote it" in convert("scannet", root, out).error
+    assert (
+        f"{out}/val/{LAST}: was changed or not written by torchrg"
+        in convert("scannet", root, out).error
+    )
     assert (tmp_path / "last" / RECORD).exists()
 
 
@@ -486,5 +489,5 @@ def test_records_of_other_versions_end_in_no_loss(root, out, convert, change):
     elif "inputs" in change:
         assert f"{path.parent}: no scan in {root} belongs" in done.error
     else:
-        assert "npy: is not as torchrg wrote it" in done.error
+        assert "npy: was changed or not written by torchrg" in done.error
         assert results_of(out) == before

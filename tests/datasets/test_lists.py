@@ -151,13 +151,15 @@ def test_databases_of_others_are_refused_before_any_work(root, tmp_path, run, fl
     out.mkdir()
     (out / "train_database.yaml").write_text("- theirs\n")
     done = run("convert", "scannet", root, out, "--layout", "mask3d", *flags)
-    assert "train_database.yaml: is of other origin; move it" in done.error
+    assert "train_database.yaml: is of another data set or program; move it" in done.error
     assert (done.code, done.out) == (2, "")
     assert [path.name for path in out.iterdir()] == ["train_database.yaml"]
 
 
 def test_data_sets_with_other_classes_share_no_directory(converted):
-    with pytest.raises(FormatError, match=r"label_database\.yaml: is of other origin"):
+    with pytest.raises(
+        FormatError, match=r"label_database\.yaml: is of another data set or program"
+    ):
         check_lists("mask3d", "S3DIS", converted["mask3d"])
     check_lists("mask3d", "ScanNet", converted["mask3d"])
     check_lists("mmdet3d", "S3DIS", converted["mask3d"])

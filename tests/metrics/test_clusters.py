@@ -167,7 +167,7 @@ def test_input_that_does_not_fit_is_refused(normals, labels, message):
     [
         ("min_size", 0, ">= 1"),
         ("sample_size", 1, ">= 2"),
-        ("max_angle_deg", -1.0, r"in 0..90"),
+        ("max_angle_deg", -1.0, r"in \[0, 90\]"),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, value, requirement):

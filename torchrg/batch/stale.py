@@ -136,7 +136,9 @@ def check_stale(results: Sequence[StaleResult], root: Path, *, prune: bool) -> N
         )
     for result in results:
         if (path := _changed_file(result)) is not None:
-            raise FormatError(f"{path}: is not as torchrg wrote it, and {result.reason}; move it.")
+            raise FormatError(
+                f"{path}: was changed or not written by torchrg, and {result.reason}; move it."
+            )
 
 
 def remove_stale(result: StaleResult) -> None:

@@ -71,7 +71,7 @@ def check_distinct(results: Sequence[Path], inputs: Sequence[Path]) -> None:
     for path in results:
         output = str(path.resolve())
         if not taken.isdisjoint((output, normalize_file_name(output))) or _file_id(path) in files:
-            raise FormatError(f"{path}: would overwrite an input or another result; rename it.")
+            raise FormatError(f"{path}: would overwrite an input or a result; choose another.")
         taken.add(normalize_file_name(output))
 
 
@@ -111,7 +111,7 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
         raise FormatError(
-            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; convert it."
+            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; write one."
         )
     check_writable(path)
     if is_viewer(path):

@@ -36,7 +36,8 @@ def check_lists(layout: str, dataset: str, out: Path) -> None:
     for name in contents(dict.fromkeys(folders, ())):
         if (out / name).exists():
             raise FormatError(
-                f"{out / name}: is of other origin; move it, or choose another directory."
+                f"{out / name}: is of another data set or program; move it, or use another "
+                "directory."
             )
 
 

@@ -115,7 +115,7 @@ def check_exact(path: Path, columns: NamedColumns) -> None:
         is_integer = column.dtype.kind in "iu"
         if is_integer and max(-int(column.min()), int(column.max())) >= MAX_EXACT_INTEGER:
             raise FormatError(
-                f"{path}: field {name} contains integers beyond 2^53, which it rounds; write .npz."
+                f"{path}: {name} has integers above 2^53, which would be rounded; write .npz."
             )
 
 

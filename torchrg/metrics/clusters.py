@@ -125,7 +125,9 @@ def score_clusters(
         if value < minimum:
             raise ConfigError(f"score_clusters: expected {name} >= {minimum}, got {value!r}.")
     if not 0 <= max_angle_deg <= 90:
-        raise ConfigError(f"score_clusters: expected max_angle_deg in 0..90, got {max_angle_deg}.")
+        raise ConfigError(
+            f"score_clusters: expected max_angle_deg in [0, 90], got {max_angle_deg!r}."
+        )
     directions, clusters, invalid = _labeled_directions(normals, labels, min_size)
     centers, turned = find_centers(directions, clusters)
     if distinct_directions:
