@@ -253,3 +253,9 @@ def test_a_given_camera_checks_the_other_arguments():
         render_cloud(points, colors, view=front_camera(), supersampling=0)
     with pytest.raises(ShapeError, match="render_cloud: expected colors"):
         render_cloud(points, colors[:2], view=front_camera())
+
+
+def test_an_up_direction_may_name_an_axis(room):
+    points, colors, _ = room
+    named = render_cloud(points, colors, width=60, up="-y")
+    assert torch.equal(named, render_cloud(points, colors, width=60, up=(0.0, -1.0, 0.0)))
