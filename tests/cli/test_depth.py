@@ -24,6 +24,8 @@ from torchrg.structures import Cloud
 
 CAMERA = ["--intrinsics", "50,50,39.5,29.5", "--depth-scale", "1000", "--threads", "1"]
 INTRINSICS = make_intrinsics(50.0, 50.0, 39.5, 29.5)
+LARGER = {"width": 160, "height": 120, "fx": 100, "fy": 100, "cx": 79.5, "cy": 59.5}
+"""The same camera of images of twice the size: four pixels of them have the middle of one here."""
 
 
 def points_of(depth, camera=INTRINSICS):
@@ -238,12 +240,7 @@ def test_wrong_use_is_one_line(tmp_path, frame, depth, run):
         ("frame.pincam", "80 60 50 50 39.5 29.5"),
         ("info.txt", "m_depthShift=1000\nm_calibrationDepthIntrinsic=50 0 39.5 0 50 29.5 0 0 1"),
         ("cameras.txt", "1 SIMPLE_PINHOLE 160 120 100 80 60\n"),
-        # Twice the size: the middle of four pixels there is the middle of one here.
-        (
-            "camera.json",
-            '{"width": 160, "height": 120, "intrinsic_matrix": '
-            "[100, 0, 0, 0, 100, 0, 79.5, 59.5, 1]}",
-        ),
+        ("camera.json", json.dumps(LARGER)),
     ],
 )
 def test_a_matrix_file_is_a_camera(tmp_path, frame, run, name, content):
@@ -289,7 +286,9 @@ def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, 
 def test_a_cloud_is_checked_against_a_camera_that_is_given(tmp_path, depth, run):
     source, out = tmp_path / "scan.pcd", ["--out", tmp_path / "out.png"]
     write_cloud(source, Cloud(points_of(depth).numpy(), grid_shape=(60, 80)))
-    assert run("depth", source, *CAMERA[:2], *out).err == ""
+    (tmp_path / "camera.json").write_text(json.dumps(LARGER))
+    for camera in (CAMERA[1], tmp_path / "camera.json"):
+        assert run("depth", source, "--intrinsics", camera, *out).err == ""
     for camera in ("55,55,39.5,29.5", "50,50,36,29.5", "50,-50,39.5,29.5"):
         error = run("depth", source, "--intrinsics", camera, *out).err.splitlines()[-1]
         assert "scan.pcd: --intrinsics do not match the points" in error
