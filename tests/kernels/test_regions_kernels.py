@@ -1,6 +1,7 @@
 """Neighbors and growth by kernels are those of the definitions to the bit."""
 
 import dataclasses
+import itertools
 
 import pytest
 import torch
@@ -50,8 +51,10 @@ def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition
 PRESETS = ("classic", "paper", "consensus")
 
 
-@pytest.mark.parametrize("k", [9, 64, 70])
-@pytest.mark.parametrize("name", CLOUDS)
+@pytest.mark.parametrize(
+    ("name", "k"),
+    [*itertools.product(CLOUDS, [9, 64]), ("room", 70), ("grid", 70), ("doubled", 70)],
+)
 def test_regions_are_those_of_the_definition(name, k):
     preset = PRESETS[(list(CLOUDS).index(name) + k) % 3]
     config = load_config(preset).with_sampling(Sampling()).growing
