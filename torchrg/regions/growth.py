@@ -23,7 +23,7 @@ from torchrg.neighbors.order import ascending_rows
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
-from torchrg.regions.repair import keep_regions, merge_facets, refine_regions
+from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
 from torchrg.structures import UNLABELED, Neighbors
 from torchrg.structures.points import Colors, Points, Values
@@ -165,7 +165,9 @@ def label_regions(
         labels = labels if split is labels else rank_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = rank_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
-    return keep_regions(labels, ~find_solid_regions(cloud, labels))
+    solid = find_solid_regions(cloud, labels)
+    kept = torch.cat([~solid, solid.new_zeros(1)])
+    return rank_by_size(labels.where(kept[labels], UNLABELED), 1)
 
 
 def checked_cloud(

@@ -102,8 +102,8 @@ def refine_regions(
         labels = assign_levels(cloud, labels, planes)
         if config.facet_tolerance is not None:
             # A gap narrower than a neighborhood may divide a faceted surface. With white noise,
-            # growth crosses it on one plane: what is still apart, as cushions side by side, are
-            # faces of their own. Results of rooms are equal with 4 to 16 neighbors.
+            # growth crosses it on one plane: regions still apart, such as cushions side by side,
+            # are surfaces of their own. Results of rooms are equal with 4 to 16 neighbors.
             near = cloud.neighbors if faceted else adjacency.neighbors
             contacts, tolerance = find_region_pairs(labels, near), float(config.facet_tolerance)
             labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
