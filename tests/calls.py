@@ -135,7 +135,7 @@ def calls(num_points):
         (metrics, ("adjusted_rand_index", "match_regions", "segmentation_covering"), table),
     ):
         made |= {name: partial(getattr(module, name), argument) for name in names}
-    for name in {*nn.__all__} - {"Eigh", "Eigen", "Normal"}:
+    for name in sorted({*nn.__all__} - {"Eigh", "Eigen", "Normal"}):
         made[name] = partial(getattr(nn, name)(), few)
     for name in steps.__all__:
         if name[0].isupper():

@@ -54,11 +54,6 @@ def parts_of(found):
     return [found]
 
 
-# Both make tensors where the default says.
-for faulty in ("partition_points", "collate_offset"):
-    EVERYTHING[faulty] = pytest.param(EVERYTHING[faulty], marks=pytest.mark.xfail)
-
-
 @pytest.mark.parametrize("call", EVERYTHING.values(), ids=EVERYTHING)
 def test_the_default_device_changes_no_result(call):
     with torch.device("meta"):

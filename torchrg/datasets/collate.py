@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from torchrg._checks import as_tensor
+from torchrg._checks import as_tensor, default_device_cpu
 from torchrg.errors import ShapeError
 from torchrg.transforms.rows import LIST_KEY, Entries, SampleDict, get_list
 from torchrg.transforms.sample import NeighborSearch
 
 
+@default_device_cpu()
 def collate_offset(
     samples: Sequence[Entries],
     *,

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrg import kernels
+from torchrg._checks import eager_only
 from torchrg._parallel import ROWS_AT_ONCE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import SuperpointsConfig, is_terraced
 from torchrg.linalg.angles import sq_chords
@@ -63,6 +64,7 @@ _MIN_SIZE_RATIO = 16
 they hardly change it. Otherwise a floor would take one speck per round."""
 
 
+@eager_only
 def partition_points(
     points: Tensor,
     normals: Tensor,
