@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from tests.kernels.clouds import definitions
 from tests.normals.test_orient import box_room, shuffled_signs
 from torchrg.neighbors import search_knn
 from torchrg.normals import orient_normals
-from torchrg.normals.free_space import _free_paths, cell_width, vote_free_side
+from torchrg.normals.free_space import _free_gaps, _free_paths, cell_width, vote_free_side
 
 
 def walked_path(occupied, cell, steps):
@@ -27,18 +28,33 @@ def test_free_paths_are_those_of_a_walk_through_a_dense_grid():
     rng = np.random.default_rng(2)
     occupied = rng.random((7, 5, 9)) < 0.15
     at = np.stack(np.nonzero(occupied))
-    at = at - at.min(axis=1, keepdims=True)
+    at = (at - at.min(axis=1, keepdims=True)).astype(np.int32)
     occupied = np.zeros(at.max(axis=1) + 1, dtype=bool)
     occupied[tuple(at)] = True
     for steps in product((-1, 0, 1), repeat=3):
         if steps <= (0, 0, 0):
             continue
         stride = math.sqrt(sum(map(abs, steps)))
-        for found, sign in zip(_free_paths(at, steps, stride), (1, -1), strict=True):
+        some = np.arange(at.shape[1])
+        for found, sign in zip(_free_paths(at, some, steps, stride), (1, -1), strict=True):
             for cell, worth in zip(at.T, found, strict=True):
                 count, weight = walked_path(occupied, cell, sign * np.array(steps))
                 expected = weight * count * stride / (count * stride + 8)
                 assert worth == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("sides", [(7, 5, 9), (300, 300, 40), (2**19, 2**19, 2**19)])
+def test_kernel_of_free_gaps_equals_the_definition(sides):
+    rng = np.random.default_rng(3)
+    cells = np.unique(np.stack([rng.integers(0, side, 5000) for side in sides]), axis=1)
+    cells = (cells - cells.min(axis=1, keepdims=True)).astype(np.int32)
+    for steps in product((-1, 0, 1), repeat=3):
+        if steps > (0, 0, 0):
+            found = _free_gaps(cells, steps)
+            with definitions():
+                expected = _free_gaps(cells, steps)
+            for values, others in zip(found, expected, strict=True):
+                assert np.array_equal(values, others)
 
 
 @pytest.fixture(scope="module")
