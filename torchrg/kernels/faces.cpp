@@ -58,7 +58,7 @@ KERNEL find_links(int64_t num_points, int64_t k, int64_t num_rows, int64_t num_r
       if (!(square > 0)) square = 1;
       cosine -= 2 * here * there / square;
       const float bend = 1 - size_of(cosine) + (here * here + there * there) / square;
-      if (bend > limit) continue;
+      if (!(bend <= limit)) continue;
       starts[link] = int32_t(start), ends[link] = neighbor;
       cosines[link] = cosine, bends[link++] = bend;
     }

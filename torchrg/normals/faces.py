@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, map_tasks, nonzero_rows
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, nonzero_rows
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
@@ -62,7 +62,7 @@ def find_faces(
     faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
     rows = nonzero_rows(labels >= 0)
     label, axes = labels[rows].long(), axes.to(points)
-    cosine = _project(normals, rows, axes, label)
+    cosine = dot(normals[rows], axes[label])
     side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
     is_on_plane = is_thin[label] & (cosine.abs() > _MIN_COSINE)
     rows = rows[is_on_plane]
@@ -116,7 +116,7 @@ def _split_plates(
     def mean(values: Tensor) -> Tensor:
         return torch.bincount(faces, values, minlength=len(axes)) / counts
 
-    middle = _project(points, rows, axes, faces).double()
+    middle = dot(points[rows], axes[faces]).double()
     middle -= mean(middle)[faces]
     for _ in range(2):
         reach = (_MAX_HEIGHT_FACTOR * mean(middle.abs()))[faces]
@@ -126,17 +126,6 @@ def _split_plates(
     is_thin = squares <= max_thickness * max_thickness
     is_plate = is_thin & (mean(middle.abs()) ** 2 > _MIN_TWO_SIDED * squares)
     return ((middle > 0) & is_plate[faces]).long(), is_thin
-
-
-def _project(vectors: Tensor, rows: Tensor, axes: Tensor, faces: Tensor) -> Tensor:
-    """Return the coordinates ``(n,)`` of some of the vectors along the axes of their faces."""
-    parts = map_chunks(
-        lambda part: dot(vectors[rows[part]], axes[faces[part]]),
-        len(rows),
-        ROWS_AT_ONCE,
-        vectors.device,
-    )
-    return torch.cat(parts)
 
 
 def _join_patches(
@@ -205,21 +194,19 @@ def _find_links(
     ranks: list[int],
     groups: Tensor | None = None,
     max_bend: float = math.inf,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Return links from rows ``(n,)`` to their neighbors at some ranks: ends, cosine and bend.
 
     The cosine is that of the normals, one of them mirrored. With ``groups`` ``(N,)``, int32, only
     links to another group, not negative, are returned; bends are at most ``max_bend``.
     """
-    columns = torch.tensor(ranks, dtype=torch.int64)
     if kernels.serve(points, normals, near, groups) and near.is_contiguous():
-        ends = [torch.empty(len(rows) * len(ranks), dtype=torch.int32) for _ in range(2)]
-        found = [*ends, *(torch.empty(len(ends[0]), dtype=torch.float32) for _ in range(2))]
+        size, columns = len(rows) * len(ranks), torch.tensor(ranks, dtype=torch.int64)
+        found = [torch.empty(size, dtype=d) for d in (torch.int32,) * 2 + (torch.float32,) * 2]
         lists = points, normals, near, rows, columns, groups, max_bend
         (count,) = kernels.call("find_links", *lists, *found)
         scratch.release()
-        first, second, cosine, bend = (values[: int(count)].clone() for values in found)
-        return first, second, cosine, bend
+        return tuple(values[: int(count)].clone() for values in found)
     starts, ends = rows.repeat_interleave(len(ranks)), gather_lists(near, rows, ranks).view(-1)
     cosine, here, there, squares = (points.new_zeros(len(starts)) for _ in range(4))
     for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):

@@ -150,14 +150,13 @@ def _free_gaps(at: NDArray[np.int32], steps: tuple[int, ...]) -> tuple[NDArray[n
     if kernels.serve():
         size = 2 ** (2 * at.shape[1] + 8).bit_length()
         table = torch.empty(size, dtype=torch.int64), torch.empty(size, dtype=torch.int32)
-        ahead, behind = kernels.call("free_gaps", torch.from_numpy(at), *steps, *table)
-        return ahead.numpy(), behind.numpy()
-    sides = (at.max(axis=1) + 1).tolist()
+        found = kernels.call("free_gaps", torch.from_numpy(at), *steps, *table)
+        return tuple(gaps.numpy() for gaps in found)
     a = next(axis for axis in range(3) if steps[axis])
     b, c = (axis for axis in range(3) if axis != a)
-    first, second = (at[axis] - steps[axis] * at[a] + sides[a] for axis in (b, c))
-    lines = first.astype(np.int64) * (sides[c] + 2 * sides[a]) + second
-    order = np.argsort(lines * sides[a] + at[a])
+    first, second = (at[axis] - steps[axis] * at[a] for axis in (b, c))
+    # Cells are ascending, and the sort is stable: the cells of a line remain ascending.
+    order = np.lexsort((second, first))
     first, second, along = first[order], second[order], at[a][order]
     is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
     gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)

@@ -1,7 +1,6 @@
 """Region adjacency: pairs of planes that meet, boundary lengths and angles."""
 
 import math
-from array import array
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -257,10 +256,11 @@ def _mark_boundary(
 
 def _crosses(labels: Tensor, rows: Rows, near: Neighbors, columns: slice) -> Tensor:
     """Return a mask of the neighbors of points in another region."""
-    near = Neighbors(*(None if part is None else part[:, columns] for part in near))
+    valid = None if near.valid is None else near.valid[:, columns]
+    near = Neighbors(near.indices[:, columns], valid)
     other = near.gather(labels)
     crosses = (other != labels[rows, None]) & (other >= 0)
-    return crosses if near.valid is None else crosses & near.valid
+    return crosses if valid is None else crosses & valid
 
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
@@ -278,7 +278,6 @@ def _edge_vectors(points: Tensor, contacts: _Contacts) -> Tensor:
 def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing: Tensor) -> Tensor:
     """Return the length of each pair's line covered by edge midpoints, shape ``(E,)``."""
     origin = points[:1].double()
-    cells = array("q"), array("q")
 
     def find_cells(contacts: _Contacts) -> tuple[Tensor, ...]:
         if kernels.serve(points, contacts.source):
@@ -288,7 +287,7 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
             edges = contacts.source, contacts.target, contacts.pair
             lines = along.double(), spacing, _MAX_CELL, slots
             (count,) = kernels.call("line_cells", points, *edges, *lines, *out)
-            return tuple(values[: int(count)] for values in out)
+            return tuple(values[: int(count)].clone() for values in out)
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
@@ -296,11 +295,7 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
         cell = position.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
         return unique_cells(contacts.pair, cell)
 
-    for found in edges.map_contacts(find_cells):
-        for indices, values in zip(cells, found, strict=True):
-            indices.frombytes(values.cpu().numpy().tobytes())
-    columns = (torch.from_numpy(np.array(indices)).to(points.device) for indices in cells)
-    pair, cell = unique_cells(*columns)
+    pair, cell = unique_cells(*map(torch.cat, zip(*edges.map_contacts(find_cells), strict=True)))
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
     steps = torch.bincount(pair[1:][is_next], minlength=len(spacing))

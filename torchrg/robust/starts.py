@@ -124,8 +124,8 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
     bounded = [map_values(np.tanh, torch.tanh, column) for column in columns]
     scores = lengths.new_tensor(_score_table(len(lengths)))
     if is_in_kernels(columns):
-        tables = *columns, *bounded, lengths, scores, qn_factor(len(lengths))
-        (matrices,) = kernels.call("scatter_matrices", *tables)
+        tables, factor = (*columns, *bounded, lengths, scores), qn_factor(len(lengths))
+        (matrices,) = kernels.call("scatter_matrices", *tables, factor)
         lanes = torch.nonzero(matrices[-1].isnan().flatten(1).any(dim=1)).squeeze(1)
         if len(lanes):
             matrices[-1, lanes] = _pairwise_qn(take_lanes(columns, lanes))
