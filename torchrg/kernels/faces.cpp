@@ -31,11 +31,9 @@ struct Forest {
 
 // faces._find_links: links of rows to neighbors at some ranks, which are in another group and bend
 // by at most the limit; agreement of their normals, and bend.
-KERNEL find_links(int64_t num_points, int64_t k, int64_t num_rows, int64_t num_ranks,
-                  int64_t num_links, Floats points, Floats normals, Ints near, Longs rows,
-                  Longs ranks, Ints groups, double max_bend, int32_t* starts, int32_t* ends,
-                  float* cosines, float* bends, int64_t* count) {
-  if (num_links < num_rows * num_ranks) return TOO_WIDE;
+KERNEL find_links(int64_t num_points, int64_t k, int64_t num_rows, int64_t num_ranks, Floats points,
+                  Floats normals, Ints near, Longs rows, Longs ranks, Ints groups, double max_bend,
+                  int32_t* starts, int32_t* ends, float* cosines, float* bends, int64_t* count) {
   for (int64_t r = 0; r < num_ranks; r++)
     if (ranks[r] < 0 || ranks[r] >= k) return TOO_WIDE;
   const float limit = float(max_bend);
@@ -70,8 +68,8 @@ KERNEL find_links(int64_t num_points, int64_t k, int64_t num_rows, int64_t num_r
 // faces._split_plates: side of each point of a plate, and thin faces.
 KERNEL split_plates(int64_t num_points, int64_t num_rows, int64_t num_faces, Floats points,
                     Longs rows, Longs faces, Floats axes, double max_square, double max_height,
-                    double min_two_sided, int64_t* counts, double* means, double* squares,
-                    double* heights, bool* sides, bool* are_thin) {
+                    double min_two_sided, bool* sides, bool* are_thin, double* heights,
+                    double* means, double* squares, int64_t* counts) {
   for (int64_t i = 0; i < num_rows; i++) {
     const int64_t face = faces[i], row = rows[i];
     if (face < 0 || face >= num_faces || row < 0 || row >= num_points) return NO_SUCH_ROW;
@@ -129,7 +127,7 @@ KERNEL free_gaps(int64_t num_cells, int64_t num_slots, Ints cells, int64_t x, in
   for (int64_t cell = 0; cell < num_cells; cell++) {
     const int64_t position = along[cell], row = first[cell] - steps[b] * position,
                   column = second[cell] - steps[c] * position;
-    const int64_t line = row * (int64_t(1) << 32) + column;
+    const int64_t line = int64_t((uint64_t(row) << 32) + uint64_t(column));
     const uint64_t block = uint64_t(row) * 0x9E3779B97F4A7C15u ^ uint64_t(column >> 3);
     uint64_t slot = (block * 0xD6E8FEB86659FD93u >> 24 << 3 | uint64_t(column & 7)) & mask;
     while (last[slot] >= 0 && lines[slot] != line) slot = (slot + 9) & mask;

@@ -72,10 +72,10 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
 }
 
 // adjacency._mark_boundary: which rows have a neighbor of another region in some columns. Counts
-// the edges of each pair of regions in a table (R, R), if there is one; threads may share it.
-KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_pairs, Ints labels, Ints indices,
+// the edges of each pair of regions in a table (R, R), which may be empty; threads may share it.
+KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_regions, Ints labels, Ints indices,
                      Flagged mask, int64_t first, int64_t last, int64_t low, int64_t high,
-                     int64_t num_regions, int64_t* counts, bool* meets) {
+                     int64_t* counts, bool* meets) {
   if (first < 0 || last > num_points || low < 0 || high > k) return TOO_WIDE;
   for (int64_t i = first; i < last; i++) {
     const int32_t *list = indices + i * k, label = labels[i];
@@ -90,9 +90,9 @@ KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_pairs, Ints labe
       const int32_t other = labels[list[j]];
       if (other == label || other < 0 || (mask && !mask[i * k + j])) continue;
       meets[i] = true;
-      if (label < 0 || num_pairs == 0) break;
+      if (label < 0 || num_regions == 0) break;
+      if (larger(label, other) >= num_regions) return TOO_WIDE;
       const int64_t pair = smaller(label, other) * num_regions + larger(label, other);
-      if (pair < 0 || pair >= num_pairs) return TOO_WIDE;
       __atomic_fetch_add(counts + pair, 1, __ATOMIC_RELAXED);
     }
   }
@@ -100,12 +100,12 @@ KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_pairs, Ints labe
 }
 
 // adjacency._RegionEdges._find: edges of rows to other regions, in order, with the keys of their
-// pairs. The outputs hold one edge for each neighbor.
-KERNEL crossing_edges(int64_t num_points, int64_t k, int64_t num_rows, int64_t num_edges,
-                      Ints labels, Ints indices, Flagged mask, Ints rows, int64_t low, int64_t high,
-                      int64_t num_regions, int32_t* sources, int32_t* targets, int32_t* columns,
-                      int64_t* keys, int64_t* count) {
-  if (low < 0 || high > k || num_edges < num_rows * (high - low)) return TOO_WIDE;
+// pairs.
+KERNEL crossing_edges(int64_t num_points, int64_t k, int64_t num_rows, Ints labels, Ints indices,
+                      Flagged mask, Ints rows, int64_t low, int64_t high, int64_t num_regions,
+                      int32_t* sources, int32_t* targets, int32_t* columns, int64_t* keys,
+                      int64_t* count) {
+  if (low < 0 || high > k) return TOO_WIDE;
   int64_t found = 0;
   for (int64_t r = 0; r < num_rows; r++) {
     const int32_t i = rows[r];
@@ -123,7 +123,7 @@ KERNEL crossing_edges(int64_t num_points, int64_t k, int64_t num_rows, int64_t n
   return DONE;
 }
 
-// adjacency._find_cells: distinct cells of the lines of pairs that contain the middle of an edge.
+// adjacency._length_on_line: distinct cells of the lines of pairs that contain the middle of an edge.
 // `slots` is a hash table of indices of found cells.
 KERNEL line_cells(int64_t num_points, int64_t num_edges, int64_t num_pairs, int64_t num_slots,
                   Floats points, Ints sources, Ints targets, Longs pairs, const double* along,

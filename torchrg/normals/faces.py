@@ -106,10 +106,8 @@ def _split_plates(
     The points ``rows`` ``(n,)`` are on ``faces`` ``(n,)``, rows of the ``axes`` ``(M, 3)``.
     """
     if kernels.serve(points, axes):
-        sums = [torch.empty(len(axes), dtype=torch.float64) for _ in range(2)]
         limits = max_thickness * max_thickness, _MAX_HEIGHT_FACTOR, _MIN_TWO_SIDED
-        work = torch.empty(len(axes), dtype=torch.int64), *sums, sums[0].new_empty(len(rows))
-        side, is_thin = kernels.call("split_plates", points, rows, faces, axes, *limits, *work)
+        side, is_thin, *_ = kernels.call("split_plates", points, rows, faces, axes, *limits)
         return side.long(), is_thin
     counts = torch.bincount(faces, minlength=len(axes)).clamp(min=1)
 
@@ -201,12 +199,11 @@ def _find_links(
     links to another group, not negative, are returned; bends are at most ``max_bend``.
     """
     if kernels.serve(points, normals, near, groups) and near.is_contiguous():
-        size, columns = len(rows) * len(ranks), torch.tensor(ranks, dtype=torch.int64)
-        found = [torch.empty(size, dtype=d) for d in (torch.int32,) * 2 + (torch.float32,) * 2]
-        lists = points, normals, near, rows, columns, groups, max_bend
-        (count,) = kernels.call("find_links", *lists, *found)
+        columns = torch.tensor(ranks, dtype=torch.int64)
+        lists = points, normals, near, rows, columns, groups
+        *found, count = kernels.call("find_links", *lists, max_bend)
         scratch.release()
-        return tuple(values[: int(count)].clone() for values in found)
+        return tuple(values.view(-1)[: int(count)].clone() for values in found)
     starts, ends = rows.repeat_interleave(len(ranks)), gather_lists(near, rows, ranks).view(-1)
     cosine, here, there, squares = (points.new_zeros(len(starts)) for _ in range(4))
     for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):

@@ -139,7 +139,8 @@ class KnnAdjacency:
 
     def boundary(self, labels: Tensor) -> Tensor:
         """Return the points with a nearest neighbor in another region, also unlabeled points."""
-        return nonzero_rows(_mark_boundary(labels.to(torch.int32), self._all, _NEAREST))
+        no_table = labels.new_empty((0, 0), dtype=torch.int64)
+        return nonzero_rows(_mark_boundary(labels.to(torch.int32), self._all, _NEAREST, no_table))
 
 
 def find_region_pairs(
@@ -175,12 +176,12 @@ class _RegionEdges:
         self._num_regions = max(int(labels.max()) + 1, 1) if len(labels) else 1
         self._at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
         # More possible pairs than points are too many for a table.
-        size = self._num_regions**2 if self._num_regions**2 <= len(labels) else 0
-        table = labels.new_zeros(size, dtype=torch.int64)
-        meets = _mark_boundary(self._labels, neighbors, columns, self._num_regions, table)
+        size = self._num_regions if self._num_regions**2 <= len(labels) else 0
+        table = labels.new_zeros((size, size), dtype=torch.int64)
+        meets = _mark_boundary(self._labels, neighbors, columns, table)
         self._rows = nonzero_rows(meets & (self._labels >= 0)).to(torch.int32)
         self._keys = nonzero_rows(table)
-        self.counts = table[self._keys]
+        self.counts = table.flatten()[self._keys]
         if len(self._rows) and not len(self._keys):
             chunks = torch.split(self._rows, self._at_once)
             keys = torch.cat([self._find(rows)[3].clone() for rows in chunks])
@@ -193,12 +194,10 @@ class _RegionEdges:
         low, high, _ = self._columns.indices(self._neighbors.indices.shape[1])
         width = max(high - low, 1)
         if _are_served(self._labels, self._neighbors):
-            edges = [rows.new_empty(len(rows) * width) for _ in range(3)]
-            edges.append(torch.empty(len(rows) * width, dtype=torch.int64))
             where = self._labels, *self._neighbors, rows, low, high, self._num_regions
-            (count,) = kernels.call("crossing_edges", *where, *edges)
+            *edges, count = kernels.call("crossing_edges", *where)
             scratch.release()
-            return [values[: int(count)] for values in edges]
+            return [values.view(-1)[: int(count)] for values in edges]
         near = self._neighbors.select(rows)
         scratch.release()
         chosen = nonzero_rows(_crosses(self._labels, rows, near, self._columns))
@@ -226,24 +225,17 @@ def _are_served(labels: Tensor, neighbors: Neighbors) -> bool:
     return kernels.serve(labels, *present) and all(part.is_contiguous() for part in present)
 
 
-def _mark_boundary(
-    labels: Tensor,
-    neighbors: Neighbors,
-    columns: slice,
-    num_regions: int = 0,
-    table: Tensor | None = None,
-) -> Tensor:
+def _mark_boundary(labels: Tensor, neighbors: Neighbors, columns: slice, table: Tensor) -> Tensor:
     """Return which points have a neighbor in another region, ``(N,)``; labels are int32.
 
-    Kernels also count the edges of pairs of regions in a table of ``num_regions`` squared.
+    Kernels also count the edges of each pair of regions in a ``table`` ``(R, R)``, if not empty.
     """
     meets = torch.empty_like(labels, dtype=torch.bool)
-    table = meets.new_empty(0, dtype=torch.int64) if table is None else table
 
     def mark(chunk: slice) -> None:
         if _are_served(labels, neighbors):
             low, high, _ = columns.indices(neighbors.indices.shape[1])
-            where = chunk.start, chunk.stop, low, high, num_regions
+            where = chunk.start, chunk.stop, low, high
             kernels.call("mark_boundary", labels, *neighbors, *where, table, meets)
         else:
             near = neighbors.select(chunk)
@@ -281,13 +273,11 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
 
     def find_cells(contacts: _Contacts) -> tuple[Tensor, ...]:
         if kernels.serve(points, contacts.source):
-            num_edges = len(contacts.pair)
-            slots = torch.empty(2 ** (2 * num_edges).bit_length(), dtype=torch.int32)
-            out = [torch.empty(num_edges, dtype=torch.int64) for _ in range(2)]
+            slots = torch.empty(2 ** (2 * len(contacts.pair)).bit_length(), dtype=torch.int32)
             edges = contacts.source, contacts.target, contacts.pair
             lines = along.double(), spacing, _MAX_CELL, slots
-            (count,) = kernels.call("line_cells", points, *edges, *lines, *out)
-            return tuple(values[: int(count)].clone() for values in out)
+            *found, count = kernels.call("line_cells", points, *edges, *lines)
+            return tuple(values[: int(count)].clone() for values in found)
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
