@@ -5,8 +5,9 @@
 
 namespace {
 
-constexpr int QUICK_PASSES = 3;      // counting passes, at half the cost of the other passes
-constexpr float QUARTERS = 0.3336f;  // normal data: Qn's difference / interquartile range
+constexpr int QUICK_PASSES = 4;   // counting passes, at half the cost of the other passes
+constexpr int FREE_PASSES = 9;    // passes after which every second one bisects
+constexpr float TYPICAL = 0.42f;  // Qn's difference / length of the shortest half
 
 // One coordinate of the points of eight patches.
 struct Column {
@@ -91,37 +92,37 @@ INLINE Around look_around(const Column& rows, int n, Lanes pivot) {
 
 // The C(h, 2)-th smallest difference of each lane of sorted rows; NaN if one may be infinite.
 //
-// Bisection: differences below the pivot are too small (low), the remaining ones are not (high).
+// Regula falsi (Illinois): differences up to `low` are too few, those up to `high` enough, such as
+// the length of the shortest half. Counts are `missing` and in `excess` there.
 Lanes majority_difference(const Column& rows, int n) {
   const int lags = n / 2, rank = lags * (lags + 1) / 2;
-  const Lanes num_all = all(lags * n - rank), wanted = all(rank - 0.5f);
-  Lanes low{}, high = rows[n - 1] - rows[0], num_low{}, num_high = num_all;
-  const auto inside = [&](Lanes value) { return (value > low) & (value < high); };
-  Lanes pivot = (rows[3 * n / 4] - rows[n / 4]) * QUARTERS;
-  pivot = where(inside(pivot), pivot, high * 0.5f);
-  Lanes result = where(high < INFINITE, Lanes{}, all(__builtin_nanf("")));
-  Flags open = (high > 0) & (high < INFINITE);
+  const Lanes wanted = all(rank - 0.5f), spread = rows[n - 1] - rows[0];
+  Lanes low{}, high = spread, missing = wanted, excess = wanted;
+  for (int i = 0; i + lags < n; i++) high = smaller(high, rows[i + lags] - rows[i]);
+  Lanes pivot = high * TYPICAL;
+  Lanes result = where(spread < INFINITE, Lanes{}, all(__builtin_nanf("")));
+  Flags open = (high > 0) & (spread < INFINITE), was_few{}, was_many{};
   bool looks = false;
   for (int turn = 0; is_any(open); turn++) {
     looks |= turn >= QUICK_PASSES;
     const Around found =
         looks ? look_around<true>(rows, n, pivot) : look_around<false>(rows, n, pivot);
-    const Flags few = found.count < wanted, next_to = magnitude(found.count - wanted) < 1;
+    const Lanes gap = found.count - wanted;
+    const Flags few = gap < 0, next_to = magnitude(gap) < 1;
     const Flags ends = where(few, found.above >= high, found.below <= low);
     const Lanes end = where(few, where(next_to, found.above, high), found.below);
     const Flags done = open & (looks ? next_to | ends : ends & ~next_to);
     result = where(done, end, result), open = open & ~done;
-    const Flags moves = open & ~next_to;
+    const Flags moves = open & ~next_to, moves_low = moves & few, moves_high = moves & ~few;
     looks = !is_any(moves);
-    low = where(moves & few, pivot, low), num_low = where(moves & few, found.count, num_low);
-    high = where(moves & ~few, found.below, high);
-    num_high = where(moves & ~few, found.count, num_high);
-    // Small differences are evenly spaced, large ones sparse.
-    const Flags is_sparse = (num_high >= num_all) & (num_low > 0);
-    const Lanes share = (wanted - num_low) / larger(num_high - num_low, all(1));
-    Lanes next = where(is_sparse, low * wanted / num_low, low + (high - low) * share);
-    const bool in_turn = turn > 2 * QUICK_PASSES && turn % 2;
-    if (in_turn) next = low;
+    low = where(moves_low, pivot, low), high = where(moves_high, found.below, high);
+    // The limit that stays twice counts half.
+    missing = where(moves_low, -gap, where(moves_high & was_many, missing * 0.5f, missing));
+    excess = where(moves_high, gap, where(moves_low & was_few, excess * 0.5f, excess));
+    was_few = where(moves, few, was_few), was_many = where(moves, ~few, was_many);
+    const auto inside = [&](Lanes value) { return (value > low) & (value < high); };
+    Lanes next = low + (high - low) * (missing / (missing + excess));
+    if (turn > FREE_PASSES && turn % 2) next = low;
     next = where(inside(next), next, low + (high - low) * 0.5f);
     pivot = where(moves, where(inside(next), next, low), pivot);
   }
