@@ -184,9 +184,9 @@ void rank_points(const Column& values, int n, Column& ranks) {
 
 // lanes.fit_ellipsoid and lanes.sq_distances of weighted points.
 INLINE void fit_lanes(const Points& points, const Column& weights, int n, Lanes size, Lanes floor,
-                      Points& rest, Column& distances, Lanes (&squares)[3]) {
+                      Points& residuals, Column& distances, Lanes (&squares)[3]) {
   const Column &x = points.columns[0], &y = points.columns[1], &z = points.columns[2];
-  Column &u = rest.columns[0], &v = rest.columns[1], &w = rest.columns[2];
+  Column &u = residuals.columns[0], &v = residuals.columns[1], &w = residuals.columns[2];
   Lanes a{}, b{}, c{}, xx{}, xy{}, xz{}, yy{}, yz{}, zz{};
   for (int k = 0; k < n; k++) {
     const Lanes weight = weights[k];
@@ -411,7 +411,7 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
                    Floats floor, int64_t initial_size, int64_t size, int64_t max_steps,
                    float* final, double* best) {
   if (n < 1 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
-  static thread_local Points points, rest;
+  static thread_local Points points, residuals;
   static thread_local Column members, distances, marks;
   Job jobs[LANES];
   float floors[LANES] = {}, sizes[LANES] = {};
@@ -431,7 +431,7 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
   for (int l = 0; l < LANES; l++) enter(l);
   while (active > 0) {
     Lanes squares[3], common{};
-    fit_lanes(points, members, int(n), load(sizes), load(floors), rest, distances, squares);
+    fit_lanes(points, members, int(n), load(sizes), load(floors), residuals, distances, squares);
     mark_smallest(distances, int(n), int(size), marks);
     for (int k = 0; k < n; k++) common += marks[k] * members[k];
     for (int l = 0; l < LANES; l++) {

@@ -42,6 +42,8 @@ _NUM_MORE, _NUM_BEST_MORE = 24, 4
 """The same for ``starts="more"``: random starts, and those concentrated to convergence."""
 _NUM_RESAMPLED, _NUM_SUBSETS = 2, 4
 """Number of best sets from which ``starts="more"`` draws further starts, and of draws from each."""
+_LANES_IN_CACHE = 8192
+"""Number of random starts processed at a time, so that their data fits into the cache."""
 
 
 class _Settings(NamedTuple):
@@ -292,11 +294,13 @@ def _search_random(
     """Concentrate random sets of P + 1 points twice, and the best of them to convergence."""
     num_points, set_size = len(columns[0]), len(columns) + 1
     sets = elemental_sets(num_points, set_size, num_starts, seed).to(floor.device)
-    marks = columns[0].new_zeros(len(sets), num_points).scatter_(1, sets, 1.0)
-    initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
-    quick = _concentrate(columns, initial, set_size, size, floor, max_steps=1)
-    best = _distinct_best(quick, num_best)
-    return _concentrate(columns, best.members, size, size, floor)
+    best: list[_Concentrated] = []
+    for part in torch.split(sets, max(_LANES_IN_CACHE // len(floor), 1)):
+        marks = columns[0].new_zeros(len(part), num_points).scatter_(1, part, 1.0)
+        initial = marks.t()[:, :, None].expand(-1, -1, len(floor))
+        quick = _concentrate(columns, initial, set_size, size, floor, max_steps=1)
+        best = [_distinct_best(_join(*best, quick), num_best)]
+    return _concentrate(columns, best[0].members, size, size, floor)
 
 
 def _search_more(columns: list[Tensor], floor: Tensor, size: int) -> _Concentrated:
