@@ -82,7 +82,8 @@ def _mark_cells(
     for axis in range(3):
         codes *= _MAX_CELLS
         codes += ((points[:, axis] - low[axis]) / width).long()
-    cells = np.unique(torch.unique_consecutive(codes).numpy())
+    cells = np.sort(torch.unique_consecutive(codes).numpy())
+    cells = cells[np.append(True, cells[1:] != cells[:-1])]
     x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
     at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell]).astype(np.int32)
     return at, np.searchsorted(cells, codes[rows].numpy())
