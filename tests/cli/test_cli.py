@@ -136,7 +136,7 @@ def test_no_result_takes_the_place_of_an_input(room_file, tmp_path, monkeypatch,
     for out in ("room é.npz", ".", "linked.npz"):
         done = run(*command, *several, "room é.npz", "--out", out)
         assert done.code == 2
-        assert "would overwrite an input or another result" in done.error
+        assert "would overwrite an input or a result" in done.error
     assert Path("room é.npz").read_bytes() == before
 
 

@@ -194,8 +194,8 @@ def test_results_that_would_replace_an_image_are_refused(tmp_path, frame, run):
     other.write_bytes(frame.read_bytes())
     before = contents(tmp_path)
     for inputs, out, message in (
-        ([frame], frame, "frame.png: would overwrite an input or another result"),
-        ([other], frame, "frame_planes.png: would overwrite an input or another result"),
+        ([frame], frame, "frame.png: would overwrite an input or a result"),
+        ([other], frame, "frame_planes.png: would overwrite an input or a result"),
     ):
         assert message in run("depth", *inputs, *CAMERA, "--out", out).error
     assert contents(tmp_path) == before

@@ -51,7 +51,7 @@ def lengths_of_image(height, width, num_narrow):
 
 def any_call(draw, name):
     """Call a kernel with lengths of 0 to 70; return whether it took the arguments."""
-    lengths = {letter: draw.choice(LENGTHS) for letter in "NnkpcCwhmqMPLAeErRF"}
+    lengths = {letter: draw.choice(LENGTHS) for letter in "NnkpcCwhmqMPLAeErRFKST"}
     lengths["c"] = draw.choice([10, lengths["c"]])
     if "hw]" in SIGNATURES[name] and draw.random() < 0.7:
         lengths |= lengths_of_image(lengths["h"], lengths["w"], lengths["n"])

@@ -6,10 +6,10 @@ import itertools
 import pytest
 import torch
 
-from tests.kernels.clouds import clouds, definitions, growing_cloud, lists, needs_library
+from tests.kernels.clouds import both, clouds, definitions, growing_cloud, lists, needs_library
 from torchrg.config import load_config
 from torchrg.neighbors import canonical_order, search_knn
-from torchrg.regions.adjacency import find_region_pairs
+from torchrg.regions.adjacency import KnnAdjacency, find_adjacency, find_region_pairs
 from torchrg.regions.growth import grow
 from torchrg.scenes import make_room
 from torchrg.structures import Sampling
@@ -80,12 +80,22 @@ def test_regions_are_those_of_the_definition(name, k):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_rows_at_a_border_are_those_of_the_definition(masked):
+@pytest.mark.parametrize("slabs_per_meter", [3, 300])
+def test_adjacency_is_that_of_the_definition(masked, slabs_per_meter):
     near = lists(ROOM, 20, masked)
-    labels = (ROOM[:, 0] - ROOM[:, 0].min()).mul(3).long() - 2  # Slabs: most rows are inside one.
-    found = find_region_pairs(labels, near)
-    with definitions():
-        expected = find_region_pairs(labels, near)
-    assert len(found[0]) > 10
-    for one, other in zip(found, expected, strict=True):
-        assert torch.equal(one, other)
+    # Most rows are inside thick slabs; thin ones have more possible pairs than there are points.
+    labels = (ROOM[:, 0] - ROOM[:, 0].min()).mul(slabs_per_meter).long() - 2
+    count = int(labels.max()) + 1
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    curved = torch.arange(count) % 5 == 0
+    arguments = ROOM, labels, near, normal, torch.full((count,), 0.01)
+    for found, expected in (
+        both(find_region_pairs, labels, near),
+        both(KnnAdjacency(near).contacts, labels),
+        both(find_adjacency, *arguments, curved=curved),
+    ):
+        assert len(found[0]) > 5
+        for one, other in zip(found, expected, strict=True):
+            assert torch.equal(one, other)
+    assert torch.equal(*both(KnnAdjacency(near).boundary, labels))

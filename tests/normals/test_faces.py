@@ -11,7 +11,7 @@ from torchrg import scratch
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.order import finite_rows
 from torchrg.normals import orient_normals
-from torchrg.normals.faces import _compare, _Components, find_faces, find_surfaces
+from torchrg.normals.faces import _Components, _find_links, _split_plates, find_faces, find_surfaces
 from torchrg.normals.orient import turn_faces
 from torchrg.scenes import make_room
 
@@ -86,10 +86,28 @@ def test_kernel_of_links_equals_the_definition(rng):
     points[:9] = points[0]
     normals = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=rng), dim=1)
     rows = torch.arange(0, len(points), 2)
-    arguments = points, normals, rows, search_knn(points, 7).indices[rows]
-    found = _compare(*arguments)
+    groups = torch.randint(-1, 3, (len(points),), generator=rng, dtype=torch.int32)
+    for more in ([], [groups], [groups, 0.4]):
+        arguments = points, normals, search_knn(points, 7).indices, rows, [2, 4, 6], *more
+        found = _find_links(*arguments)
+        with definitions():
+            expected = _find_links(*arguments)
+        assert len(found[0]) > 100
+        for values, others in zip(found, expected, strict=True):
+            assert torch.equal(values, others)
+
+
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("thickness", [0.0, 0.02, 1.0])
+def test_kernel_of_plates_equals_the_definition(rng, thickness):
+    points = make_room(3000, noise=0.003, seed=0).points
+    rows = torch.arange(0, len(points), 2)
+    faces = torch.randint(0, 7, (len(rows),), generator=rng)
+    axes = torch.nn.functional.normalize(torch.randn(9, 3, generator=rng), dim=1)
+    points[rows] -= (points[rows] * axes[faces]).sum(dim=1, keepdim=True) * axes[faces] * 0.99
+    found = _split_plates(points, rows, faces, axes, thickness)
     with definitions():
-        expected = _compare(*arguments)
+        expected = _split_plates(points, rows, faces, axes, thickness)
     for values, others in zip(found, expected, strict=True):
         assert torch.equal(values, others)
 

@@ -2,13 +2,29 @@
 
 from itertools import product
 
+import numpy as np
 import pytest
 import torch
 
+from tests.kernels.clouds import definitions
 from tests.normals.test_orient import box_room, shuffled_signs
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals import orient_normals
-from torchrg.normals.free_space import cell_width, vote_free_side
+from torchrg.normals.free_space import _free_gaps, cell_width, vote_free_side
+
+
+@pytest.mark.parametrize("sides", [(7, 5, 9), (300, 300, 40), (2**19, 2**19, 2**19)])
+def test_kernel_of_free_gaps_equals_the_definition(sides):
+    rng = np.random.default_rng(3)
+    cells = np.unique(np.stack([rng.integers(0, side, 5000) for side in sides]), axis=1)
+    cells = (cells - cells.min(axis=1, keepdims=True)).astype(np.int32)
+    for steps in product((-1, 0, 1), repeat=3):
+        if steps > (0, 0, 0):
+            found = _free_gaps(cells, steps)
+            with definitions():
+                expected = _free_gaps(cells, steps)
+            for values, others in zip(found, expected, strict=True):
+                assert np.array_equal(values, others)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows
+from torchrg._parallel import ROWS_IN_CACHE, map_chunks, nonzero_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
@@ -104,8 +104,9 @@ def refine_regions(
             # A gap narrower than a neighborhood may divide a faceted surface. With white noise,
             # growth crosses it on one plane: regions still apart, such as cushions side by side,
             # are surfaces of their own. Results of rooms are equal with 4 to 16 neighbors.
-            near = cloud.neighbors if faceted else adjacency.neighbors
-            contacts, tolerance = find_region_pairs(labels, near), float(config.facet_tolerance)
+            all_pairs = find_region_pairs(labels, cloud.neighbors) if faceted else None
+            contacts = all_pairs or adjacency.contacts(labels)
+            tolerance = float(config.facet_tolerance)
             labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
     return labels
 
@@ -434,7 +435,7 @@ def _reassign(
     """
     adjacency = KnnAdjacency(cloud.neighbors)
     labels = labels.clone()
-    rows = _boundary_points(labels, adjacency)
+    rows = adjacency.boundary(labels)
     for _ in range(_MAX_PASSES):
         rows = rows[movable[labels[rows]]]
         near = adjacency.neighbor_rows(rows)
@@ -480,19 +481,6 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
         return label.index_copy(0, both[moved], other[both[moved]])
 
     return _reassign(cloud, labels, flat, choose)
-
-
-def _boundary_points(labels: Tensor, adjacency: KnnAdjacency) -> Tensor:
-    """Return the boundary points: points with a nearest neighbor of another label."""
-    # int32 indexing is three times faster.
-    narrow = labels.to(torch.int32)
-
-    def find(chunk: slice) -> Tensor:
-        near = Neighbors(adjacency.neighbor_rows(chunk)).gather(narrow)
-        rows: Tensor = chunk.start + nonzero_rows((near != narrow[chunk, None]).any(dim=1))
-        return rows
-
-    return torch.cat(map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device))
 
 
 def _choose_regions(
