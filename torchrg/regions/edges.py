@@ -108,11 +108,7 @@ def _write_bits(target: NDArray[np.uint8], flags: Tensor) -> None:
 
 
 def _become_seeds(
-    cloud: GrowingInput,
-    config: GrowingConfig,
-    rows: slice,
-    limit: Tensor,
-    connected: Tensor | None,
+    cloud: GrowingInput, config: GrowingConfig, rows: slice, limit: Tensor, connected: Tensor | None
 ) -> Tensor:
     """Return a mask of the edges that make the neighbor a seed, shape ``(n, K)``."""
     target = cloud.neighbors.gather(cloud.curvature, rows)
@@ -227,11 +223,7 @@ def within_reach(
 
 
 def are_coplanar(
-    cloud: GrowingInput,
-    rows: Rows,
-    mask: Tensor,
-    compared: Tensor | None,
-    floor_fraction: float,
+    cloud: GrowingInput, rows: Rows, mask: Tensor, compared: Tensor | None, floor_fraction: float
 ) -> Tensor:
     """Return a mask of the candidate neighbors on the point's plane, eq. (11).
 

@@ -212,11 +212,7 @@ def _pairs_to_merge(
 
 
 def merge_coplanar(
-    labels: Tensor,
-    contacts: tuple[Tensor, Tensor],
-    planes: RegionPlanes,
-    *,
-    tolerance: float,
+    labels: Tensor, contacts: tuple[Tensor, Tensor], planes: RegionPlanes, *, tolerance: float
 ) -> Tensor:
     """Greedily merge adjacent coplanar regions, best fit first.
 
