@@ -45,6 +45,8 @@ WORK = {
     ),
 }
 """Rows of the time table: the contender of each column."""
+PROGRAMS = ("PCL", "Open3D")
+"""Programs of the time table."""
 KINDS = {
     "room": "synthetic rooms, seven noise levels and densities",
     "SynPEB": "SynPEB, simulated scan",
@@ -72,7 +74,8 @@ FEW = 300
 PARTITIONED = ("office_parts", "depth frames fused")
 """Clouds whose superpoints are shown."""
 ORDERS = ("random", "sorted")
-"""Point orders of the room: random, and along a space-filling curve."""
+"""Point orders of the room: random, and along a space-filling curve, which stands for the order of
+a scanner: neighboring points are stored close to each other."""
 
 Figures = dict[str, Any]
 
@@ -145,16 +148,46 @@ def to_section(figures: Figures) -> str:
         [title, f"{ours:.2f}", *[""] * len(PEERS), f"{peer:.2f}"]
         for title, (ours, peer) in figures["superpoints"].items()
     ]
+    in_scan_order = [f"{program}, scan order" for program in PROGRAMS]
     return "\n\n".join(
         [
             "Time for the normals and planes of a million points, relative to torchrg, on "
-            f"{made['processor']} (`bench.py peers`, {made['commit']}):",
-            markdown(["task", "torchrg", "PCL", "Open3D", "PCL, sorted", "Open3D, sorted"], times),
+            f"{made['processor']} (`bench.py peers`, {made['commit']}). In scan order, neighboring "
+            f"points are stored close to each other. {_slower(times)}",
+            markdown(["task", "torchrg", *PROGRAMS, *in_scan_order], times),
             "Fraction of ground-truth planes detected at IoU 0.5 (`bench.py accuracy`); superpoint "
-            f"rows: points whose superpoint matches their object, for {FEW} superpoints:",
+            f"rows: points whose superpoint matches their object, for {FEW} superpoints. "
+            f"{_worse(figures['quality'])}",
             markdown(["data", "torchrg", *PEERS, "cut pursuit"], quality),
         ]
     )
+
+
+def _slower(times: list[list[str]]) -> str:
+    """Return which programs take less time than torchrg, and for what, in one sentence."""
+    heads = [*PROGRAMS, *(f"{program} in scan order" for program in PROGRAMS)]
+    faster: dict[str, list[str]] = {}
+    for work, _, *cells in times:
+        for head, cell in zip(heads, cells, strict=True):
+            if float(cell) < 1:
+                faster.setdefault(head, []).append(work)
+    return _listed("Faster than torchrg", faster)
+
+
+def _worse(quality: Figures) -> str:
+    """Return which programs are more accurate than torchrg, and for what, in one sentence."""
+    better: dict[str, list[str]] = {}
+    for title, (ours, *others) in quality.items():
+        for peer, theirs in zip(PEERS, others, strict=True):
+            if theirs > ours:
+                better.setdefault(peer, []).append(title.partition(":")[0])
+    return _listed("More accurate than torchrg", better)
+
+
+def _listed(claim: str, better: dict[str, list[str]]) -> str:
+    """Return a claim with its programs and tasks."""
+    parts = [f"{name} ({'; '.join(dict.fromkeys(tasks))})" for name, tasks in better.items()]
+    return f"{claim}: {', '.join(parts) or 'none'}."
 
 
 def insert(readme: str, figures: Figures) -> str:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from tests import pretend
+from torchrg.batch.scans import convert_scan
 from torchrg.cli import main
 from torchrg.io import write_cloud
 from torchrg.scenes import make_room
@@ -53,16 +54,18 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def on_cuda():
+    """Return the parameter of tests on CUDA, which are skipped without it."""
+    skip = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+    return pytest.param("cuda", marks=[pytest.mark.cuda, skip])
+
+
 def pytest_generate_tests(metafunc):
+    asked, cuda = metafunc.config.getoption("--device"), on_cuda()
     if "device" in metafunc.fixturenames:
-        asked = metafunc.config.getoption("--device")
-        names = ["cpu", "cuda"] if asked == "all" else [asked]
-        marks = [pytest.mark.cuda]
-        if not torch.cuda.is_available():
-            marks.append(pytest.mark.skip(reason="no CUDA device"))
-        metafunc.parametrize(
-            "device", [pytest.param(n, marks=marks if n == "cuda" else []) for n in names]
-        )
+        metafunc.parametrize("device", {"all": ["cpu", cuda], "cuda": [cuda]}.get(asked, [asked]))
+    if "accelerator" in metafunc.fixturenames:  # For what is compared with the CPU.
+        metafunc.parametrize("accelerator", [asked if asked == "pretend" else cuda])
     if "dtype" in metafunc.fixturenames:
         metafunc.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
 
@@ -140,6 +143,23 @@ class Run(NamedTuple):
         assert self.code != 0, self.out
         assert self.err.count("\n") == 1, self.err
         return self.err
+
+
+def convert_here(jobs, *, workers, memory_limit):
+    """Stand for the engine of ``torchrg convert``: scans one by one, in this process."""
+    return (convert_scan(job) for job in jobs)
+
+
+@pytest.fixture
+def in_workers():
+    """For tests whose subject are the worker processes of ``torchrg convert``."""
+
+
+@pytest.fixture(autouse=True)
+def _without_workers(request, monkeypatch):
+    """Let commands convert in this process: a worker takes seconds to load torch."""
+    if "in_workers" not in request.fixturenames:
+        monkeypatch.setattr("torchrg.cli.convert.run_local", convert_here)
 
 
 @pytest.fixture

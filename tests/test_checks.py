@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-import torchrg
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
-from torchrg.linalg import covariance
-from torchrg.robust.scale import median
 
 
 def test_letters_are_shared_between_arguments():
@@ -73,21 +70,3 @@ def test_masks_of_other_types_are_refused_with_the_repair(mask, kind):
     repair = f"f: expected mask to be a tensor of bool, got {kind}; pass torch.as_tensor"
     with pytest.raises(ShapeError, match=repair):
         check_shapes("f", points=(torch.zeros(8, 3), "N 3"), mask=(mask, "N"))
-
-
-@pytest.mark.parametrize("kind", [torch.float32, torch.int64, torch.uint8])
-def test_masks_of_numbers_are_refused_with_the_repair(kind):
-    x = torch.randn(4, 9, 3, generator=torch.Generator().manual_seed(0))
-    mask = torch.ones(4, 9, dtype=kind)
-    calls = (
-        lambda mask: torchrg.nn.DetMCD()(x, mask),
-        lambda mask: torchrg.nn.FastMCD()(x, mask),
-        lambda mask: torchrg.nn.PatchNormals("pca")(x, mask),
-        lambda mask: torchrg.nn.Qn()(x[..., 0], mask),
-        lambda mask: median(x[..., 0], mask=mask),
-        lambda mask: covariance(x, mask),
-    )
-    for call in calls:
-        with pytest.raises(ShapeError, match="expected mask to be a tensor of bool, got "):
-            call(mask)
-        call(mask.bool())

@@ -6,7 +6,6 @@ import types
 from operator import attrgetter
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -57,15 +56,6 @@ def test_presets_are_those_of_the_contract():
     assert (paper.max_angle_deg, paper.connectivity, paper.plane_reach) == (5.0, 0.75, None)
 
 
-def test_a_file_holds_differences_only(tmp_path):
-    path = tmp_path / "my.yaml"
-    path.write_text("growing: {max_angle_deg: 7}\n")
-    expected = dataclasses.replace(GrowingConfig(), max_angle_deg=7.0)
-    assert load_config(path) == PipelineConfig(growing=expected)
-    path.write_text("")
-    assert load_config(path) == PipelineConfig()
-
-
 def angles_of(config):
     return config.normals.sharp_angle_deg, config.growing.max_angle_deg
 
@@ -85,11 +75,6 @@ def test_one_angle_moves_sharp_points_and_growth_unless_they_are_named(tmp_path,
     path.write_text(text)
     assert angles_of(load_config(path)) == angles
     assert angles_of(load_config(path).with_angle(4)) == (4, 4)
-
-
-def test_an_angle_beyond_a_right_one_is_refused():
-    with pytest.raises(ConfigError, match=r"expected angle_deg in \[0, 90\], got 90.5"):
-        PipelineConfig().with_angle(90.5)
 
 
 @pytest.mark.parametrize(
@@ -133,16 +118,6 @@ def test_wrong_files_are_refused(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message) as info:
         load_config(path)
     assert str(info.value).startswith(str(path))
-
-
-def test_unknown_preset_lists_the_known_ones():
-    with pytest.raises(ConfigError, match=r"one of algorithm2, .* got 'clasic'"):
-        load_config("clasic")
-
-
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read: No such file"):
-        load_config(tmp_path / "none.yaml")
 
 
 @pytest.mark.parametrize(
@@ -231,56 +206,6 @@ def test_every_setting_takes_its_value_in_words_and_refuses_others_at_every_door
                 ask(wrong)
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "given", "value"),
-    [
-        (GrowingConfig, "absorb", "no", False),
-        (GrowingConfig, "cut_bridges", np.False_, False),
-        (GrowingConfig, "faceted", "off", False),
-        (GrowingConfig, "min_size", np.int64(50), 50),
-        (GrowingConfig, "min_size", torch.tensor(50), 50),
-        (GrowingConfig, "max_angle_deg", np.float32(8), 8.0),
-        (GrowingConfig, "max_angle_deg", 8, 8.0),
-        (GrowingConfig, "plane_reach", "1e-3", 1e-3),
-        (GrowingConfig, "plane_reach", "null", None),
-        (SuperpointsConfig, "counts", 100, (100,)),
-        (SuperpointsConfig, "counts", "300, 100", (300, 100)),
-        (SuperpointsConfig, "strengths", np.array([1, 2.5]), (1.0, 2.5)),
-        (SuperpointsConfig, "strengths", torch.tensor([1, 2.5]), (1.0, 2.5)),
-        (PipelineConfig, "kinds", ["wall", "floor"], ("wall", "floor")),
-        (PipelineConfig, "kinds", "wall,floor", ("wall", "floor")),
-        (PipelineConfig, "kinds", np.str_("wall"), ("wall",)),
-        (PipelineConfig, "normals", {"k": 30}, NormalsConfig(k=30)),
-    ],
-)
-def test_values_become_those_of_their_type_in_constructors_and_dictionaries(
-    kind, name, given, value
-):
-    for made in (kind(**{name: given}), settings_of("f", kind, {name: given})):
-        assert getattr(made, name) == value
-        assert type(getattr(made, name)) is type(value)
-
-
-@pytest.mark.parametrize("value", [1, 0, "1", 1.0, None, "maybe", ["no"]])
-def test_a_switch_is_on_or_off_and_nothing_between(value):
-    with pytest.raises(ConfigError, match="GrowingConfig: expected absorb to be true or false"):
-        GrowingConfig(absorb=value)
-    with pytest.raises(
-        ConfigError, match=r"load_config: expected growing\.absorb to be true or fal"
-    ):
-        load_config({"growing.absorb": value})
-
-
-def changes(settings, base):
-    """Return what differs, by section and name."""
-    return {
-        f"{section}.{name}": value
-        for section in ("normals", "growing", "planes")
-        for name, value in vars(getattr(settings, section)).items()
-        if value != getattr(getattr(base, section), name)
-    }
-
-
 @pytest.mark.parametrize("name", ["s3dis", "scannet", "laser", "rgbd"])
 def test_presets_for_a_kind_of_data_say_what_took_their_place(name, tmp_path):
     for ask in (load_config, lambda name: load_config(base_file(tmp_path, name))):
@@ -306,10 +231,10 @@ DESK = Sampling(0.7, variation=0.25, exactness=0.1, density=3e5, height=0.25, de
         # A square of a 13th of 2.7 m has 173 of 4,000 points, of a 27th 7 of 700 and 70 of 7,000.
         (FACETS, "local", 0.0113, True, 173),
         # Warp is no mesh: neither exact nor evenly spaced.
-        (FACETS._replace(exactness=0.0), "local", 0.0169, True, 40),
-        (FACETS._replace(exactness=0.15), "local", 0.0141, True, 95),
+        (FACETS._replace(exactness=0.0), "local", 0.0281, True, 40),
+        (FACETS._replace(exactness=0.15), "local", 0.0197, True, 95),
         (FACETS._replace(exactness=0.0, variation=0.3), "local", 0.0113, True, 40),
-        (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0284, True, 50),
+        (FACETS._replace(height=27.0, exactness=0.0), "local", 0.0473, True, 50),
         (VERTICES, "regional", 0.00506, True, 20),
         (VERTICES._replace(whiteness=0.55), "regional", 0.00506, True, 20),
         (VERTICES._replace(exactness=0.04), "regional", 0.00506, False, 20),
@@ -346,14 +271,15 @@ def test_settings_that_are_numbers_stay():
     assert "growing.min_size" not in config.measured(FACETS)["settings"]
 
 
-def test_a_file_holds_differences_to_its_base(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("base: consensus\ngrowing: {min_size: 7}\nchunk_size: 99\n")
-    settings = load_config(path)
-    assert changes(settings, load_config("consensus")) == {"growing.min_size": 7}
-    assert settings.chunk_size == 99
-    path.write_text("base: paper\n")
-    assert load_config(path) == load_config("paper")
+@pytest.mark.parametrize("base", ["consensus", "paper", ""])
+def test_a_file_holds_differences_to_its_base(tmp_path, base):
+    path, line = tmp_path / "mine.yaml", f"base: {base}\n" if base else ""
+    path.write_text(line)
+    plain = load_config(path)
+    assert plain == load_config(base or None)
+    path.write_text(f"{line}growing: {{min_size: 7}}\nchunk_size: 99\n")
+    growing = dataclasses.replace(plain.growing, min_size=7)
+    assert load_config(path) == dataclasses.replace(plain, growing=growing, chunk_size=99)
 
 
 @pytest.mark.parametrize(
@@ -392,6 +318,7 @@ def test_sections_and_other_settings_come_by_dictionary_too():
         (0.0, 0.003), min_size=9
     )
     assert load_config(growing=GrowingConfig(min_size=9)).growing.min_size == 9
+    assert PipelineConfig(normals={"k": 30}).normals == NormalsConfig(k=30)
     assert angles_of(load_config("paper", angle_deg=8)) == (8, 8)
 
 
@@ -412,10 +339,7 @@ def test_sections_and_other_settings_come_by_dictionary_too():
             "SegmentPlanes: expected normals.k to be an integer, got '3.5'",
         ),
         (lambda: segment_planes(torch.zeros(3, 3), preset="classic"), "as the first argument"),
-        (
-            lambda: estimate_normals(torch.zeros(3, 3), radius=0.1),
-            "radius.*max_distance bounds",
-        ),
+        (lambda: estimate_normals(torch.zeros(3, 3), radius=0.1), "radius.*max_distance bounds"),
         (lambda: make_superpoints(torch.zeros(3, 3), n=10), "numbers of superpoints are counts"),
         (lambda: MakeSuperpoints("classic"), "a SuperpointsConfig or a dictionary, got str"),
         (

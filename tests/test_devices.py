@@ -1,7 +1,8 @@
 """Functions of patches and the pipeline on a device give what they give on the CPU.
 
 The tests of CUDA carry the marker ``cuda`` and are skipped where there is no device; none was at
-hand when they were written. On ``--device pretend`` they run without one.
+hand when they were written. On ``--device pretend`` they run without one. What is compared with the
+CPU asks for an ``accelerator``.
 """
 
 import subprocess
@@ -24,10 +25,10 @@ from torchrg.transforms import SegmentDepth
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_results_are_those_of_the_cpu(name, device):
+def test_results_are_those_of_the_cpu(name, accelerator):
     expected = CALLS[name](argument(name))
-    found = CALLS[name](argument(name).to(device))
-    assert found.device.type == torch.device(device).type
+    found = CALLS[name](argument(name).to(accelerator))
+    assert found.device.type == torch.device(accelerator).type
     assert found.dtype == expected.dtype
     if not found.is_floating_point():
         assert torch.equal(found.cpu(), expected)
@@ -38,31 +39,31 @@ def test_results_are_those_of_the_cpu(name, device):
 
 
 @pytest.mark.parametrize("name", [name for name in PATCHES if name != "irls"])
-def test_gradients_stay_on_their_device(name, device):
-    patches = argument(name).to(device).requires_grad_()
+def test_gradients_stay_on_their_device(name, accelerator):
+    patches = argument(name).to(accelerator).requires_grad_()
     (PATCHES[name](patches) ** 2).sum().backward()
     assert patches.grad.device == patches.device
     assert patches.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("method", sorted(ESTIMATORS.keys() - {"consensus", "irls"}))
-def test_gradients_of_clouds_stay_on_their_device(method, device):
-    points = argument("cloud").to(device).requires_grad_()
+def test_gradients_of_clouds_stay_on_their_device(method, accelerator):
+    points = argument("cloud").to(accelerator).requires_grad_()
     torchrg.estimate_normals(points, method=method, k=10).curvature.sum().backward()
     assert points.grad.device == points.device
     assert points.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("preset", ["classic", "paper", "consensus"])
-def test_planes_are_those_of_the_cpu(preset, device):
+def test_planes_are_those_of_the_cpu(preset, accelerator):
     room = torchrg.scenes.make_room(num_points=4000, noise=0.003, seed=0)
     expected = torchrg.segment_planes(room.points, preset)
-    found = torchrg.segment_planes(room.points.to(device), preset)
-    assert found.labels.device.type == torch.device(device).type
+    found = torchrg.segment_planes(room.points.to(accelerator), preset)
+    assert found.labels.device.type == torch.device(accelerator).type
     assert (found.labels.cpu() == expected.labels).double().mean() > 0.98
 
 
-def test_scores_are_those_of_the_cpu(device, rng):
+def test_scores_are_those_of_the_cpu(accelerator, rng):
     labels, truth = torch.randint(-1, 9, (2, 500), generator=rng)
     normals, other = torch.randn(2, 500, 3, generator=rng, dtype=torch.float64)
     for score, arguments in (
@@ -70,15 +71,15 @@ def test_scores_are_those_of_the_cpu(device, rng):
         (score_clusters, (normals, labels)),
         (score_normals, (normals, other)),
     ):
-        found = score(*(argument.to(device) for argument in arguments))
+        found = score(*(argument.to(accelerator) for argument in arguments))
         assert found == pytest.approx(score(*arguments), rel=1e-9)
 
 
-def test_depth_is_that_of_the_cpu(device):
+def test_depth_is_that_of_the_cpu(accelerator):
     camera = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
     depth = torch.full((1, 30, 40), 2.0)
     depth[..., 20:] = 3.0
-    sample = {"depth": depth.to(device), "intrinsics": camera.to(device)}
+    sample = {"depth": depth.to(accelerator), "intrinsics": camera.to(accelerator)}
     expected = SegmentDepth()({"depth": depth, "intrinsics": camera})["plane"]
     assert torch.equal(SegmentDepth()(sample)["plane"].cpu(), expected)
 
@@ -129,18 +130,18 @@ def test_gradients_of_opaque_functions_are_those_of_the_cpu(name, differentiate,
     assert torch.allclose(found.cpu(), expected, atol=1e-6)
 
 
-def test_jacobians_of_opaque_functions_are_those_of_the_cpu(device):
+def test_jacobians_of_opaque_functions_are_those_of_the_cpu(accelerator):
     x = argument("qn")[0]
     expected = torch.func.jacrev(torchrg.robust.qn)(x)
-    found = torch.func.jacrev(torchrg.robust.qn)(x.to(device))
+    found = torch.func.jacrev(torchrg.robust.qn)(x.to(accelerator))
     assert torch.allclose(found.cpu(), expected, atol=1e-6)
 
 
 @pytest.fixture
-def seen(room, device):
-    """Points of a room on the CPU and on the device, and their integer classes."""
+def seen(room, accelerator):
+    """Points of a room on the CPU and on the accelerator, and their integer classes."""
     scene = room(3000)
-    return scene.points, scene.points.to(device), (scene.points[:, 0] > 0).long()
+    return scene.points, scene.points.to(accelerator), (scene.points[:, 0] > 0).long()
 
 
 def same(found, expected):
@@ -151,12 +152,13 @@ def same(found, expected):
 
 
 @pytest.mark.parametrize("options", [{"voxel": 0.1}, {"within": True}, {"sort": "area"}])
-def test_options_of_segmentations_give_the_labels_of_the_cpu(options, seen, device):
+def test_options_of_segmentations_give_the_labels_of_the_cpu(options, seen, accelerator):
     points, on_device, classes = seen
     inside = {"within": classes} if "within" in options else options
     expected = torchrg.segment_planes(points, **inside)
     inside = {
-        name: getattr(value, "to", lambda _, v=value: v)(device) for name, value in inside.items()
+        name: getattr(value, "to", lambda _, v=value: v)(accelerator)
+        for name, value in inside.items()
     }
     found = torchrg.segment_planes(on_device, **inside)
     assert torch.equal(found.labels.cpu(), expected.labels)
@@ -206,11 +208,13 @@ def test_results_of_a_device_are_shown(seen):
     assert result.plane_of_superpoint.device == result.table.area.device == points.device
 
 
-def test_metrics_of_modules_are_those_of_the_cpu(seen, device):
+def test_metrics_of_modules_are_those_of_the_cpu(seen, accelerator):
     pytest.importorskip("torchmetrics")
     points, _, classes = seen
     expected = torchrg.metrics.score_partition(classes, classes % 3, points)
-    found = torchrg.metrics.score_partition(*(x.to(device) for x in (classes, classes % 3, points)))
+    found = torchrg.metrics.score_partition(
+        *(x.to(accelerator) for x in (classes, classes % 3, points))
+    )
     assert found == pytest.approx(expected)
 
 
@@ -224,10 +228,10 @@ def test_superpoints_move_to_a_device_and_back(device):
     assert torch.equal(moved.cpu().levels[0], one // 2)
 
 
-def test_autocast_of_the_device_changes_no_fit(device):
-    patches = argument("jet").to(device)
+def test_autocast_of_the_device_changes_no_fit(accelerator):
+    patches = argument("jet").to(accelerator)
     expected = torchrg.normals.fit_jet(patches).normals
-    with torch.autocast(torch.device(device).type, dtype=torch.bfloat16):
+    with torch.autocast(torch.device(accelerator).type, dtype=torch.bfloat16):
         found = torchrg.normals.fit_jet(patches).normals
     assert torch.equal(found, expected)
 

@@ -49,7 +49,7 @@ def decompose(patches):
 
 def irls(patches):
     noise = torch.full_like(patches[..., 0, 0], 0.02)
-    return normals_of(fit_normals_irls, noise=noise, mu_decay=3.0)(patches)
+    return normals_of(fit_normals_irls, noise=noise, mu_decay=9.0)(patches)
 
 
 FUNCTIONS = {

@@ -23,7 +23,8 @@ def distributions(tmp_path_factory):
     return {path.suffix: path for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("suffix", [".whl", pytest.param(".gz", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".whl", ".gz"])
 def test_built_package_runs_in_a_fresh_environment(distributions, tmp_path, suffix):
     environment = tmp_path / "fresh"
     venv.create(environment, with_pip=False)

@@ -64,8 +64,10 @@ def test_addresses_are_complete_and_in_one_place():
     assert all(url.startswith("https://") for url in urls.values())
     folders = [ROOT / ".github", ROOT / "scripts", ROOT / "torchrg"]
     files = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
-    named = {path.name for path in [*files, ROOT / "README.md"] if b"/OWNER" in path.read_bytes()}
-    assert not named
+    assert not {path.name for path in files if b"/OWNER" in path.read_bytes()}
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"git clone {urls['Homepage']} &&" in readme
+    assert f"will be at {urls['Documentation']};" in readme
     assert any("OWNER" in url for url in urls.values()) == (
         "@OWNER" in (ROOT / ".github" / "CODEOWNERS").read_text()
     )

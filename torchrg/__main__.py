@@ -5,18 +5,15 @@ import os
 import sys
 from types import ModuleType
 
-# OpenBLAS starts a thread per core, which torchrg never uses, and interrupts the process if one
-# cannot start.
+# OpenBLAS starts a thread per core, which torchrg never uses, and fails if one cannot start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Garbage collection during the import of torch takes a fifth of the startup time. Commands and
-# workers enable it again.
+# Garbage collection during the import of torch takes a fifth of the startup. It is enabled later.
 gc.disable()
 # Commands do not use the meta device, whose registrations take a quarter of the import of torch.
 sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
 
 if __name__ == "__main__" and not getattr(sys.flags, "safe_path", False):
-    # Python puts the working directory first; modules there must not be imported, except torchrg
-    # itself.
+    # Python puts the working directory first; modules there must not be imported.
     sys.path[:1] = sys.path[:1] if __file__ == f"{sys.path[0]}/torchrg/__main__.py" else []
 
 try:

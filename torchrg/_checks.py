@@ -28,16 +28,14 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
         native = values.astype(values.dtype.newbyteorder("="), copy=False)
         return torch.from_numpy(np.require(native, requirements=["C", "W"]))
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
-    repair = ""
+    fix = ""
     if isinstance(values, list | tuple):
-        repair = "; use torch.tensor, or with_format('torch') for a data set"
+        fix = "; use torch.tensor, or with_format('torch') for a data set"
     elif type(values).__name__ == "Cloud":
-        repair = "; pass its points"
+        fix = "; pass its points"
     elif name == "points" and not isinstance(values, np.ndarray):
-        repair = "; use read_cloud(path).points, or numpy.asarray(cloud.points) for Open3D"
-    raise ShapeError(
-        f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}{repair}."
-    )
+        fix = "; use read_cloud(path).points, or numpy.asarray(cloud.points) for Open3D"
+    raise ShapeError(f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}{fix}.")
 
 
 def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
@@ -62,19 +60,16 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
     for name, tensor in tensors.items():
         if tensor.dtype not in (torch.float32, torch.float64):
             dtype = str(tensor.dtype).removeprefix("torch.")
-            repair = f"; pass {name}.float()" if tensor.is_floating_point() else ""
-            raise ShapeError(
-                f"{caller}: expected {name} of float32 or float64, got {dtype}{repair}."
-            )
+            fix = f"; pass {name}.float()" if tensor.is_floating_point() else ""
+            raise ShapeError(f"{caller}: expected {name} of float32 or float64, got {dtype}{fix}.")
         if tensor.is_nested:
             raise ShapeError(
-                f"{caller}: expected {name} to be dense, got a nested tensor; pass "
+                f"{caller}: expected dense {name}, got a nested tensor; pass "
                 f"torch.nested.to_padded_tensor({name}, 0.0), and a mask of the valid entries."
             )
         if tensor.layout is not torch.strided:
             raise ShapeError(
-                f"{caller}: expected {name} to be dense, got a sparse tensor; pass "
-                f"{name}.to_dense()."
+                f"{caller}: expected dense {name}, got a sparse tensor; pass {name}.to_dense()."
             )
     kinds = [str(tensor.dtype).removeprefix("torch.") for tensor in tensors.values()]
     if len(set(kinds)) > 1:
@@ -181,8 +176,7 @@ def is_concrete(*tensors: Tensor | None) -> bool:
 def raise_forward_mode(caller: str) -> NoReturn:
     """Raise for ``jvp``, ``jacfwd`` and ``hessian`` of torch.func."""
     raise NotImplementedError(
-        f"{caller}: supports reverse mode only; use torch.func.jacrev, vjp or grad instead of "
-        "jacfwd, jvp or hessian."
+        f"{caller}: supports reverse mode only; use jacrev, vjp or grad of torch.func."
     )
 
 

@@ -44,8 +44,7 @@ def opaque(
 
     The first argument is a tensor, the only differentiable one; the others are tensors or literals.
     ``outputs`` makes tensors of the right shape and dtype from the first, as a tuple of the same
-    kind as the result, or as one tensor; ``differentiable`` are the indices of the differentiable
-    outputs.
+    kind as the result, or as one tensor; ``differentiable`` are the differentiable ones.
     """
 
     def decorate(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:

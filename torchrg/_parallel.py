@@ -1,8 +1,7 @@
 """Chunked, multi-threaded work on rows.
 
 Each thread takes whole tasks and runs every operation alone. OpenMP threads within an operation,
-torch's default, wait for each other. If another process needs a core, that takes ten times as long
-or more.
+torch's default, wait for each other. If another process needs a core, that takes ten times as long.
 """
 
 import ctypes
@@ -27,8 +26,7 @@ Returned = TypeVar("Returned")
 CACHE_BYTES = 2**22
 """Size of one array processed at a time by a thread, in bytes, so that it stays in the cache."""
 ROWS_IN_CACHE = 8192
-"""Number of rows of about 50 values processed at a time by a thread, so that they stay in the
-cache."""
+"""Rows of about 50 values processed at a time by a thread, so that they stay in the cache."""
 CHUNK_SIZE = 16384
 """Default number of points processed at a time by each stage."""
 ROWS_AT_ONCE = 65536
@@ -39,8 +37,7 @@ _DEVICE_CHUNKS = 5
 """Factor by which chunks on other devices have more rows: they must fit not into a cache but into
 few hundred MB of memory, and the start of an operation takes as long as a small chunk."""
 _MIN_ROWS = 4096
-"""Minimum number of rows per thread: at a few tenths of a microsecond each they outweigh its
-start."""
+"""Minimum rows per thread: at a few tenths of a microsecond each they outweigh its start."""
 _RETAINED_BYTES = 31 * 2**20
 """Just below 32 MiB, the largest freed block that raises the trim threshold of glibc."""
 
@@ -90,8 +87,7 @@ def map_chunks(
 ) -> list[Returned]:
     """Call ``work`` on slices that cover all rows, in order; see :func:`map_tasks`.
 
-    Without rows it is called once, on an empty slice. ``min_rows`` is the minimum number of rows
-    per thread.
+    Without rows it is called once, on an empty slice. ``min_rows`` is the minimum per thread.
 
     Example:
         >>> map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu"))

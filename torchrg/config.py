@@ -161,7 +161,7 @@ class GrowingConfig:
     facet_tolerance: float | Auto | None = "auto"
     """Merge adjacent regions within this RMS distance of a common plane, in units of the cloud; for
     mesh facets and warped reconstructions. auto: 1/240 of the cloud height (11 mm in a room) if
-    deviations grow with scale, 1.5 times that in warped scans without a mesh, less than half of it
+    deviations grow with scale, 2.5 times that in warped scans without a mesh, less than half of it
     (5 mm) if the noise is white, at least the rounding step of quantized coordinates. None disables
     merging."""
     faceted: bool | Auto = "auto"
@@ -250,9 +250,9 @@ radius of 50 neighbors. The bound matters for scans of many stories."""
 _WHITE_FRACTION = 0.45
 """Fraction of the facet tolerance used if noise is white (5 mm in a room), since cushions and other
 bent surfaces are split there too."""
-_WARP_FRACTION = 0.5
+_WARP_FRACTION = 1.5
 """Increase of the facet tolerance in warped scans, where frames disagree over areas of any size.
-A doubled tolerance merges faces a few centimeters apart."""
+Faces a few centimeters apart stay apart, since merging also limits the step between regions."""
 _QUANTIZED = 0.04, 0.08
 """Exactness up to which white noise is that of points, and from which coordinates are rounded."""
 _SCAN_LINES = 0.8
@@ -447,7 +447,7 @@ class PipelineConfig(SelectionConfig):
             >>> config.growing.facet_tolerance, config.growing.min_size, config.normals.noise_scope
             (0.0113, 173, 'local')
             >>> load_config().with_sampling(mesh._replace(exactness=0.0)).growing.facet_tolerance
-            0.0169
+            0.0281
         """
         return dataclasses.replace(
             self,

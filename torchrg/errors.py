@@ -1,7 +1,6 @@
 """Exceptions and warnings of torchrg.
 
-All exceptions derive from :class:`TorchrgError`; messages contain the requirement, the value and
-the fix.
+All exceptions derive from :class:`TorchrgError`; messages contain requirement, value and fix.
 """
 
 import sys

@@ -14,8 +14,7 @@ torch.Size([8, 2])
 
 Patches ``(*, K, 3)`` go to :class:`Covariance` or a robust fit, then to :class:`Eigh` and
 :class:`Normal`; :class:`PatchNormals` combines these steps for any estimator. A robust fit
-describes the majority, even points on a line; with ``min_dimension=2`` lines are excluded, since
-normals need planes.
+describes the majority, even on a line; normals need planes: pass ``min_dimension=2``.
 """
 
 from collections.abc import Callable
@@ -113,8 +112,7 @@ class Eigh(_Function[Eigen]):
         tensor = matrices.covariance if isinstance(matrices, RobustFit) else matrices
         if self.method == "jacobi" and tensor.shape[-2:] != (3, 3):
             raise ShapeError(
-                f"Eigh: expected matrices of shape (*, 3, 3), got {tuple(tensor.shape)}; use "
-                'Eigh("linalg").'
+                f'Eigh: expected shape (*, 3, 3), got {tuple(tensor.shape)}; use Eigh("linalg").'
             )
         return Eigen(*(eigh3(tensor) if self.method == "jacobi" else torch.linalg.eigh(tensor)))
 
@@ -315,8 +313,7 @@ class PatchNormals(nn.Module):
         self.method, self.settings = method, settings
         if method == "irls" and not settings.get("noise", 0) > 0:
             raise ConfigError(
-                "PatchNormals: expected noise > 0 with method='irls', got none; pass noise=, in "
-                "units of the points."
+                "PatchNormals: expected noise > 0 for irls, in units of points, got none; pass it."
             )
         try:
             self.fit(torch.empty(0, 4, 3))

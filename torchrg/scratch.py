@@ -57,12 +57,10 @@ def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
 
     Segmenting a cloud then takes about 400 bytes of memory per point, including file pages not yet
     released by the system. It takes up to nine bytes of disk per neighbor of a point. Results
-    contain no such array and can be used afterwards. The folder should be on a disk; some systems
-    keep ``/tmp`` in memory.
+    contain no such array and can be used afterwards. The folder should be on a disk.
 
     Raises:
-        FormatError: If the disk is too full, or the folder is not writable; before the array is
-            used.
+        FormatError: If the disk is too full, or the folder is not writable.
 
     Example:
         >>> import torchrg

@@ -24,9 +24,9 @@ from tests.made import (
     scan_scene,
 )
 from torchrg import estimate_normals, load_config, search_knn, segment_planes
-from torchrg.batch.records import hash_file
 from torchrg.config import NormalsConfig
 from torchrg.io import read_cloud
+from torchrg.io.files import hash_file
 from torchrg.scenes import Scene, build_room, make_room
 from torchrg.structures import UNLABELED, Neighbors, NormalFit
 

@@ -12,9 +12,8 @@ from scipy.spatial import Delaunay
 from torch.utils.data import DataLoader
 
 from tests.datasets.scannet_tree import write_mesh, write_scan
-from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import DepthConfig, load_config
 from torchrg.datasets import FolderOfClouds, RGBDFrames, ScanNet, collate_offset

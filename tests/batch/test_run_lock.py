@@ -20,7 +20,7 @@ with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
 """
-UNLOCKABLE = r"\.torchrg\.lock: cannot be locked: .*; choose one on another disk"
+UNLOCKABLE = r": cannot be locked: .*; use another disk"
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,6 @@ from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import load_config
 from torchrg.datasets import FolderOfClouds, RGBDFrames
 from torchrg.depth import DepthConfig
-from torchrg.depth.camera import Pinhole
 from torchrg.errors import ConfigError, FormatError
 from torchrg.scenes import make_room
 
@@ -75,11 +74,11 @@ def test_scans_that_differ_in_the_suffix_alone_are_refused(root, convert, refuse
         (["straße.npy", "STRASSE.npy"], "expected distinct scan names, got"),
         (
             ["report.json.npy"],
-            "a scan cannot be named report.json, because OUT/report.json is a file",
+            "a scan cannot be named report.json, like OUT/report.json",
         ),
         (
             ["Report.JSON/x.npy"],
-            "a scan cannot be named Report.JSON/x, because OUT/report.json is a file",
+            "a scan cannot be named Report.JSON/x, like OUT/report.json",
         ),
     ],
 )
@@ -101,7 +100,7 @@ FLAT = ("mmdet3d", "spformer", "isbnet", "mask3d", "npy")
 def test_files_of_two_scans_in_one_folder_are_refused(root, tmp_path, names):
     save(root, *(f"{name}.npy" for name in names))
     for layout in FLAT:
-        with pytest.raises(FormatError, match="file name collision in layout") as error:
+        with pytest.raises(FormatError, match="both use") as error:
             list_jobs(CloudSource(FolderOfClouds(root), CLASSIC, layout=layout), tmp_path / "out")
         assert all(name in str(error.value) for name in (*names, layout))
     for layout in ("pointcept", "scannet"):
@@ -113,18 +112,18 @@ def test_the_command_refuses_them_before_any_work(root, refused):
     save(root, "a/b_c.npy", "a_b/c.npy", "other.npy")
     for flags in (["--dry-run"], ["--only", "other"], []):
         error = refused("--layout", "npy", *flags)
-        assert "in layout npy: a/b_c and a_b/c both use a_b_c; rename one" in error
+        assert "layout npy: a/b_c and a_b/c both use a_b_c; rename one" in error
 
 
 def test_short_names_of_mask3d_are_compared_too(root, tmp_path, convert, refused, run):
     save(root, "scene0011_00.npy", "0011_00.npy")
     error = refused("--layout", "mask3d")
-    assert "in layout mask3d: 0011_00 and scene0011_00 both use 0011_00" in error
+    assert "layout mask3d: 0011_00 and scene0011_00 both use 0011_00" in error
     assert convert("--layout", "npy", "--dry-run").code == 0
     out = tmp_path / "out"
     done = run("segment", *root.iterdir(), "--out", out, "--layout", "mask3d")
     assert (done.code, done.out) == (2, "")
-    assert "file name collision in layout mask3d: " in done.error
+    assert "layout mask3d: " in done.error
     assert not [*out.iterdir()]
 
 
@@ -163,16 +162,8 @@ def test_no_name_leads_out_of_the_directory(faults, tmp_path, name):
     scan = job.scan._replace(name=name)
     source = job.source.__class__(job.source.data)
     object.__setattr__(source, "list_scans", lambda out: [scan])
-    with pytest.raises(FormatError, match="expected a scan name without"):
+    with pytest.raises(FormatError, match="expected a name inside OUT, got"):
         list_jobs(source, tmp_path / "out")
-
-
-def test_frames_of_one_name_are_refused_with_both_files(root, tmp_path):
-    for name in ("1.npy", "1.png"):
-        (root / name).touch()
-    camera = Pinhole(5.0, 5.0, 2.0, 1.0)
-    with pytest.raises(ConfigError, match=r"got '1' twice, for .*1.npy and .*1.png; move or"):
-        RGBDFrames.from_folder(root, "images", intrinsics=camera, depth_scale=1000)
 
 
 @pytest.mark.filterwarnings("ignore:.*using the built-in camera")
@@ -205,16 +196,3 @@ def test_results_are_never_read_as_scans_through_a_link_or_from_above(root, tmp_
     # The scan in/in/hall.npy would get the folder in/hall below the directory above.
     with pytest.raises(ConfigError, match="so that no result is read as a scan"):
         list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path)
-
-
-def test_links_in_a_loop_make_no_scan_twice(root, tmp_path, convert):
-    save(root, "in/a.npy")
-    (root / "in" / "loop").symlink_to("..")
-    (root / "in" / "second").symlink_to("..")
-    done = convert("--dry-run")
-    assert done.err.startswith(f"torchrg: warning: {root}: skipped in/loop and 1 more")
-    assert done.err.count("\n") == 1
-    assert "1 scans to convert" in done.out
-    with pytest.warns(UserWarning, match="skipped in/loop"):
-        jobs = list_jobs(CloudSource(FolderOfClouds(root), CLASSIC), tmp_path / "out")
-    assert [job.scan.name for job in jobs] == ["in/a"]

@@ -7,9 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import RECORD, convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
 from torchrg.config import load_config
 from torchrg.datasets import FolderOfClouds
@@ -136,7 +135,7 @@ def test_a_scan_that_failed_keeps_its_table(job_of_a_room, tmp_path, room, monke
     # A new table is known as torchrg's when the conversion is killed then.
     np.save(path, room(400).points)
     with monkeypatch.context() as patch:
-        patch.setattr("torchrg.batch.scans.remove_unwritten", interrupt)
+        patch.setattr("torchrg.datasets.provenance.remove_unwritten", interrupt)
         with pytest.raises(KeyboardInterrupt):
             convert_scan(job)
     other = dataclasses.replace(job, source=dataclasses.replace(job.source, table=None))

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.cli.convert import RGBDArguments
 from torchrg.config import load_config

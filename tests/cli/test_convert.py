@@ -3,7 +3,6 @@
 import errno
 import io
 import json
-import os
 import shutil
 from dataclasses import asdict
 
@@ -13,8 +12,8 @@ from tqdm import tqdm
 
 from tests.batch.test_interruptions import results_of
 from tests.datasets.s3dis_tree import write_clean_room
-from torchrg.batch.records import RECORD
 from torchrg.batch.run import lock_folder
+from torchrg.batch.scans import RECORD
 from torchrg.batch.task import TaskReport
 from torchrg.cli import main
 from torchrg.cli.loop import Progress
@@ -65,6 +64,7 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
     assert [row["count"] for row in table["planes"]] == seg.planes.count.tolist()
 
 
+@pytest.mark.usefixtures("in_workers")
 def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, convert):
     done = convert("folder", rooms, tmp_path / "out", "--workers", 1, "--limit-memory", 0.1)
     assert done.err.count("may exceed the memory limit of 0.1 GB; it runs alone") == 2
@@ -126,25 +126,6 @@ def test_output_that_closes_keeps_the_code_and_the_report(rooms, tmp_path, monke
     assert report["scans_by_status"] == {
         "converted": 2, "kept": 0, "failed": 1, "not started": 0
     }  # fmt: skip
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_pipes_and_devices_are_failed_scans(rooms, tmp_path, convert):
-    root, out = tmp_path / "in", tmp_path / "out"
-    shutil.copytree(rooms, root)
-    os.mkfifo(root / "pipe.ply")
-    (root / "zero.txt").symlink_to("/dev/zero")
-    assert convert("folder", root, out, "--dry-run").code == 0
-    done = convert("folder", root, out, "--workers", 1)
-    assert done.code == 3
-    assert "2 of 4 scans are complete" in done.err
-    for name in ("pipe.ply", "zero.txt"):
-        assert f"{root / name}: expected a regular file, got a pipe or a device" in done.err
-
-
-def test_a_finished_set_has_nothing_to_do(rooms, converted, convert):
-    for flags in ([], ["--dry-run"]):
-        assert "nothing to do\n" in convert("folder", rooms, converted, *flags).out
 
 
 def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, convert, monkeypatch):

@@ -112,7 +112,7 @@ def test_names_for_files_that_have_their_own_are_wrong_use(room_file, tmp_path, 
         ("convert", "folder", room_file.parent, tmp_path / "out"),
     ):
         error = run(*command, "--columns", "x,y,z").error
-        assert "expected text or .npy input for --columns, got files with" in error
+        assert "expected text or .npy input for --columns, got files that" in error
 
 
 def test_a_matrix_of_numpy_is_a_camera(tmp_path):

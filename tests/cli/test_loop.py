@@ -129,7 +129,7 @@ def check_refused(place, there, command, target):
     code, out, err = there(*words_of(command))
     assert (code, err.count("\n"), out) == (2, 1, ""), err
     assert f"{target}: cannot be written: " in err
-    assert "is read-only; write to another folder, or make it writable." in err
+    assert "is read-only; make it writable, or use another." in err
     assert contents(place) == before
 
 

@@ -82,7 +82,7 @@ def test_mistakes_are_one_line(folders, tmp_path, run):
     assert run("score", ours, truth).code == 0
     (truth / "scan9.pcd").touch()
     for arguments, message in {
-        (ours, tmp_path / "empty"): "empty: expected files that end in one of",
+        (ours, tmp_path / "empty"): "empty: expected files ending in",
         (ours, tmp_path / "none"): "none: file not found.",
         (tmp_path / "none", truth): "none: file not found.",
         (ours, truth / "scan9.npz"): "scan9.npz: expected a folder",

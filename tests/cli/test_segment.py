@@ -68,7 +68,7 @@ def test_several_files_are_one_cloud_with_the_fields_of_all(rooms, tmp_path, run
     ("limit", "message"),
     [
         ("0.1", r"a.npz: expected --limit-memory of at least 0.408 GB for about 20,000"),
-        ("-1", "expected --limit-memory above 0 and at most 1,000,000 GB, got -1"),
+        ("-1", "expected --limit-memory above 0, at most 1,000,000 GB, got -1"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(rooms, tmp_path, run, limit, message):

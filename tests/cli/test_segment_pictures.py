@@ -43,7 +43,7 @@ def test_several_pictures_go_to_a_directory_under_the_names_of_the_inputs(rooms,
     [
         (["room1.npz"], "seg.jpg", "expected a file ending in .png"),
         (["room1.npz"], "no/seg.png", "not found; create it first"),
-        (["room1.npz", "room2.npz"], "both.png", "expected a directory for 2 files"),
+        (["room1.npz", "room2.npz"], "both.png", "expected a directory for several files"),
     ],
 )
 def test_picture_is_refused_before_the_work(rooms, tmp_path, segment, inputs, place, message):

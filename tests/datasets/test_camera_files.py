@@ -51,10 +51,6 @@ NERFSTUDIO = {"fl_x": 525, "fl_y": 526, "cx": 320, "cy": 240, "w": 640, "h": 480
         ("parameters.json", {"extrinsic": [], "intrinsic": {**SIZE, "intrinsic_matrix": COLUMNS}}),
         ("rows.json", {**SIZE, "intrinsic_matrix": ROWS}),
         ("transforms.json", NERFSTUDIO),
-        (
-            "cam_params.json",
-            {"camera": {"w": 640, "h": 480, "fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5}},
-        ),
         ("calibration.yaml", CALIBRATION),
         ("info.YML", MESSAGE),
         ("ros1.yaml", {**SIZE, "K": FLAT}),
@@ -81,21 +77,9 @@ def test_a_lens_that_bends_lines_is_told(tmp_path):
         ("a.yaml", "", "expected names with values, got NoneType"),
         ("a.json", "[1, 2]", "expected a matrix of 3 x 3, 3 x 4 or 4 x 4, fx fy cx cy, or width"),
         ("a.json", '["a"]', "expected names with values, got list"),
-        (
-            "a.json",
-            '{"fov": 60}',
-            "or a matrix, got only fov; add it, or pass --intrinsics",
-        ),
-        (
-            "a.json",
-            '{"frames": [{"fl_x": 1}]}',
-            "expected one camera, got one per frame, or none; pass",
-        ),
-        (
-            "a.json",
-            '{"intrinsic_matrix": [1, 2]}',
-            "expected intrinsic_matrix to be a matrix, got",
-        ),
+        ("a.json", '{"fov": 60}', "or a matrix, got only fov; add it, or pass --intrinsics"),
+        ("a.json", '{"frames": [{"fl_x": 1}]}', "expected one camera, got one per frame;"),
+        ("a.json", '{"intrinsic_matrix": [1, 2]}', "expected intrinsic_matrix to be a matrix, got"),
         ("a.json", '{"intrinsic_matrix": [[1], [2, 3]]}', "to be a matrix, got"),
         ("a.json", f'{{"K": {10**400}}}', "expected K to be a matrix, got 1000"),
         ("a.json", '{"K": [1, 0, 0, 0, 0, 0, 0, 0, 1]}', "expected intrinsics of rows"),
@@ -113,11 +97,6 @@ def test_files_without_a_camera_are_refused(tmp_path, name, content, message):
     path.write_text(content)
     with pytest.raises((FormatError, ConfigError), match=f"{name}: .*{message}"):
         read_camera(path)
-
-
-def test_a_camera_file_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(FormatError, match=r"a\.json: cannot be read: No such file"):
-        read_camera(tmp_path / "a.json")
 
 
 def test_a_pixel_of_a_smaller_image_looks_through_the_middle_of_those_it_stands_for():
@@ -192,9 +171,7 @@ def test_depth_units_are_units_per_meter_or_meters_per_unit(tmp_path, name, valu
 def test_cameras_that_are_no_pinhole_are_refused(tmp_path, more):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps({**NAMED, **more}))
-    with pytest.raises(
-        FormatError, match=r"expected images of a pinhole camera, got .*; undistort"
-    ):
+    with pytest.raises(FormatError, match=r"expected a pinhole camera, got .*; undistort"):
         read_camera(path)
     (name,) = more
     path.write_text(json.dumps({**NAMED, name: False}))

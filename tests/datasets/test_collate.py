@@ -49,7 +49,7 @@ def test_other_names_of_the_coordinates():
 def test_samples_that_differ_are_refused():
     with pytest.raises(ShapeError, match="got color in only one of samples 0 and 1"):
         collate_offset([{"coord": torch.zeros(1, 3)}, {"coord": torch.zeros(1, 3), "color": 1}])
-    with pytest.raises(ShapeError, match="expected samples with 'coord', got pos"):
+    with pytest.raises(ShapeError, match="expected 'coord', got pos"):
         collate_offset([{"pos": torch.zeros(1, 3)}])
     with pytest.raises(ShapeError, match="got none"):
         collate_offset([])
@@ -63,7 +63,7 @@ def test_labels_of_clouds_are_counted_on_where_asked():
     ]
     assert collate_offset(samples)["plane"].tolist() == [0, -1, 1, -1, 2, 0, 1]
     assert collate_offset(samples, unique=["plane"])["plane"].tolist() == [0, -1, 1, -1, 4, 2, 3]
-    with pytest.raises(ShapeError, match="expected samples with 'superpoint', got coord, plane"):
+    with pytest.raises(ShapeError, match="expected 'superpoint', got coord, plane"):
         collate_offset(samples, unique=("plane", "superpoint"))
 
 

@@ -120,7 +120,7 @@ def test_a_folder_of_links_is_a_data_set(root, tmp_path):
 
 def test_suffixes_can_be_chosen(root):
     assert names_of(FolderOfClouds(root, suffixes=[".ply"])) == ["scan_10"]
-    with pytest.raises(FormatError, match=r"expected files that end in one of \.e57, got none"):
+    with pytest.raises(FormatError, match=r"expected files ending in \.e57, got none"):
         FolderOfClouds(root, suffixes=[".e57"])
 
 
@@ -151,15 +151,6 @@ def test_folders_of_pointcept_are_clouds(tmp_path):
     assert names_of(data) == ["Area_1/office_1"]
     assert data.scenes[0].files == (scene / "coord.npy", scene / "segment.npy")
     assert data[0]["segment"].tolist() == [0, 0, 0]
-
-
-def test_the_transform_is_called(root):
-    assert FolderOfClouds(root, transform=lambda sample: len(sample["coord"]))[1] == 3
-
-
-def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(FormatError, match="no such folder"):
-        FolderOfClouds(tmp_path / "scans")
 
 
 def raise_of_third(sample):

@@ -7,7 +7,6 @@ import json
 import pickletools
 import shutil
 import zipfile
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -17,11 +16,9 @@ import torch
 from tests.datasets.s3dis_tree import digest
 from tests.datasets.scannet_tree import ALIGNMENT, WORDS, write_scan, write_tables
 from torchrg import load_config, make_superpoints, segment_planes
-from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
-from torchrg.cli import main
 from torchrg.cli.flags import Layout
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets import ScanNet
@@ -270,28 +267,6 @@ def test_pickles_name_no_module_that_old_numpy_lacks(converted):
         assert modules <= {"numpy", "numpy.core.multiarray", "_codecs"}
 
 
-def test_what_is_done_is_kept_and_layouts_share_no_directory(root, room, tmp_path):
-    path = tmp_path / "superpoints" / f"{SCAN}.npy"
-    (report,) = convert(root, tmp_path, "npy", only=f"*{SCAN}")
-    assert report.status == "converted", report
-    before = path.read_bytes()
-    for layout in ("mmdet3d", "pointcept"):
-        (report,) = convert(root, tmp_path, layout, only=f"*{SCAN}")
-        assert f"{SCAN}: expected results in layout {layout}, got npy; choose" in report.reason
-    assert convert(root, tmp_path, "npy", only=f"*{SCAN}") == []
-    path.write_bytes(b"")
-    assert len(convert(root, tmp_path, "npy", only=f"*{SCAN}")) == 1
-    assert path.read_bytes() == before
-    # A file of another user is never replaced.
-    path = tmp_path / "other" / "superpoints" / f"{SCAN}.npy"
-    path.parent.mkdir(parents=True)
-    path.write_bytes(b"theirs")
-    (report,) = convert(root, tmp_path / "other", "npy", only=f"*{SCAN}")
-    assert "was not written by torchrg" in report.reason
-    assert path.read_bytes() == b"theirs"
-    assert not [path for path in tmp_path.rglob(".*") if path.is_file()]
-
-
 def test_results_may_go_beside_the_scans_where_programs_look_for_them(root, room, tmp_path):
     place = tmp_path / "data"
     for layout in ("pointcept", "spformer"):
@@ -308,12 +283,11 @@ def test_results_may_go_beside_the_scans_where_programs_look_for_them(root, room
             convert(place, out, layout)
 
 
-def test_the_command_knows_kind_and_layouts(root, room, tmp_path, capsys):
+def test_the_command_knows_kind_and_layouts(root, room, tmp_path, run):
     assert set(get_args(Layout)) == {"pointcept", *LAYOUTS}
-    command = ["convert", "scannet", str(root), str(tmp_path), "--preset", "classic"]
-    command += ["--only", f"*{SCAN}", "--layout", "npy", "--superpoints", str(NUM_PARTS)]
-    assert main(command) == 0
-    assert "1 converted" in capsys.readouterr().out
+    command = ("convert", "scannet", root, tmp_path, "--preset", "classic")
+    command += ("--only", f"*{SCAN}", "--layout", "npy", "--superpoints", NUM_PARTS)
+    assert "1 converted" in run(*command).out
     found = np.load(tmp_path / "superpoints" / f"{SCAN}.npy")
     assert np.array_equal(np.unique(found), np.arange(NUM_PARTS))
     for flags, words in (
@@ -321,18 +295,17 @@ def test_the_command_knows_kind_and_layouts(root, room, tmp_path, capsys):
         (["--layout", "pointcept", "--pages", "P", "--layout", "npy"], "with --layout pointcept"),
         (["--layout", "kitti"], "--layout"),
     ):
-        assert main([*command, *flags]) == 2
-        assert words in capsys.readouterr().err
+        done = run(*command, *flags)
+        assert done.code == 2
+        assert words in done.err
 
 
-def test_colors_of_16_bits_are_those_of_8_in_layouts(room, tmp_path):
+def test_colors_of_16_bits_are_those_of_8_in_layouts(room, tmp_path, run):
     color = room.color * np.uint16(257) - np.uint16(9) * (room.color > 0)
     write_cloud(tmp_path / "hall.npz", Cloud(room.coord, {"color": color}))
-    flags = ["--preset", "classic", "--superpoints", "50"]
+    command = ("segment", tmp_path / "hall.npz", "--preset", "classic", "--superpoints", "50")
     for layout in ("mmdet3d", "spformer", "mask3d", "pointcept"):
-        out = str(tmp_path / layout)
-        scan = str(tmp_path / "hall.npz")
-        assert main(["segment", scan, "--out", out, "--layout", layout, *flags]) == 0
+        assert run(*command, "--out", tmp_path / layout, "--layout", layout).code == 0
     points = np.load(tmp_path / "mmdet3d" / "scannet_instance_data" / "hall_vert.npy")
     assert np.array_equal(points[:, 3:], room.color)
     content = load_pth(tmp_path / "spformer" / "test" / "hall_inst_nostuff.pth")
@@ -342,14 +315,14 @@ def test_colors_of_16_bits_are_those_of_8_in_layouts(room, tmp_path):
     assert np.array_equal(np.load(tmp_path / "pointcept" / "hall" / "color.npy"), room.color)
 
 
-def test_one_scan_of_any_format(room, tmp_path, capsys):
+def test_one_scan_of_any_format(room, tmp_path, run):
     """``segment`` writes the same superpoints as ``convert``."""
     scan = tmp_path / "hall.ply"
     write_cloud(scan, Cloud(room.coord, {"color": room.color}))
     flags = ["--preset", "classic", "--superpoints", f"200,{NUM_PARTS}", "--level", "1"]
     for layout in ("mmdet3d", "spformer", "pointcept"):
         out = tmp_path / layout
-        assert main(["segment", str(scan), "--out", str(out), "--layout", layout, *flags]) == 0
+        assert run("segment", scan, "--out", out, "--layout", layout, *flags).code == 0
         assert (out / "hall" / "planes.json").is_file()
     found = np.fromfile(tmp_path / "mmdet3d" / "super_points" / "hall.bin", dtype=np.int64)
     assert np.array_equal(found, room.superpoint)
@@ -358,30 +331,27 @@ def test_one_scan_of_any_format(room, tmp_path, capsys):
     assert np.array_equal(np.load(folder / "superpoint.npy"), room.superpoint)
     assert np.array_equal(np.load(folder / "plane.npy"), room.plane)
     assert read_cloud(scan).fields.keys() == {"color"}
-    capsys.readouterr()
-    assert main(["segment", str(scan), "--out", str(out), "--layout", "npy", "--level", "4"]) == 2
-    assert "expected --level from 0 to 3" in capsys.readouterr().err
+    wrong = run("segment", scan, "--out", out, "--layout", "npy", "--level", "4")
+    assert "expected --level from 0 to 3" in wrong.error
 
 
-def test_far_scans_are_about_their_origin_with_a_word(room, tmp_path, capsys):
+def test_far_scans_are_about_their_origin_with_a_word(room, tmp_path, run):
     scan = tmp_path / "far.npz"
     np.savez(scan, points=room.coord.astype(np.float64) + np.array([5e5, 4e6, 0]))
-    command = ["segment", str(scan), "--out", str(tmp_path / "out"), "--layout", "mmdet3d"]
-    assert main([*command, "--preset", "classic"]) == 0
-    assert "coordinates are written relative to 5000" in capsys.readouterr().err
+    command = ("segment", scan, "--out", tmp_path / "out", "--layout", "mmdet3d")
+    done = run(*command, "--preset", "classic")
+    assert "coordinates are written relative to 5000" in done.err
     points = np.fromfile(tmp_path / "out" / "points" / "far.bin", dtype=np.float32).reshape(-1, 6)
     shift = points[:, :3] - room.coord
     assert np.ptp(shift, axis=0).max() < 1e-5
 
 
-def test_points_that_are_not_finite_are_refused(room, tmp_path, capsys):
+def test_points_that_are_not_finite_are_refused(room, tmp_path, run):
     coord = room.coord.copy()
     coord[7] = np.nan
     np.save(tmp_path / "holes.npy", coord)
-    command = ["segment", str(tmp_path / "holes.npy"), "--out", str(tmp_path / "out")]
-    assert main([*command, "--layout", "npy", "--preset", "classic"]) == 2
-    assert (
-        "expected finite points for layout npy, got 1 non-finite of 4,000"
-        in capsys.readouterr().err
-    )
-    assert not [*Path(tmp_path / "out").rglob("*.npy")]
+    command = ("segment", tmp_path / "holes.npy", "--out", tmp_path / "out", "--layout", "npy")
+    wrong = run(*command, "--preset", "classic")
+    assert wrong.code == 2
+    assert "expected finite points for layout npy, got 1 non-finite of 4,000" in wrong.err
+    assert not [*(tmp_path / "out").rglob("*.npy")]

@@ -13,11 +13,9 @@ import yaml
 
 from tests.datasets.scannet_tree import write_scan, write_tables
 from torchrg import load_config
-from torchrg.batch.records import reason_to_convert
 from torchrg.batch.run import list_jobs
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
-from torchrg.cli import main
 from torchrg.datasets import ScanNet
 from torchrg.datasets.lists import check_lists, write_lists
 from torchrg.errors import FormatError
@@ -138,31 +136,30 @@ def test_lists_are_the_same_whichever_runs_made_them(root, converted, tmp_path, 
     assert lists_in(out) == expected
 
 
-def test_a_command_that_was_killed_before_its_lists_has_them_the_next_time(root, tmp_path, capsys):
+def test_a_command_that_was_killed_before_its_lists_has_them_the_next_time(root, tmp_path, run):
     out = tmp_path / "out"
     convert(root, out, "mask3d")
     assert not lists_in(out)
-    command = ["convert", "scannet", str(root), str(out), "--preset", "classic"]
-    assert main([*command, "--layout", "mask3d"]) == 0
-    assert "nothing to do" in capsys.readouterr().out
+    command = ("convert", "scannet", root, out, "--preset", "classic", "--layout", "mask3d")
+    assert "nothing to do" in run(*command).out
     assert [*load_mask3d(out, "train")[0]] == SPLITS["train"]
 
 
 @pytest.mark.parametrize("flags", [[], ["--dry-run"]])
-def test_databases_of_others_are_refused_before_any_work(root, tmp_path, capsys, flags):
+def test_databases_of_others_are_refused_before_any_work(root, tmp_path, run, flags):
     out = tmp_path / "out"
     out.mkdir()
     (out / "train_database.yaml").write_text("- theirs\n")
-    command = ["convert", "scannet", str(root), str(out), "--layout", "mask3d", *flags]
-    assert main(command) == 2
-    captured = capsys.readouterr()
-    assert "train_database.yaml: is of another data set or program; move it" in captured.err
-    assert (captured.err.count("\n"), captured.out) == (1, "")
+    done = run("convert", "scannet", root, out, "--layout", "mask3d", *flags)
+    assert "train_database.yaml: is of another data set or program; move it" in done.error
+    assert (done.code, done.out) == (2, "")
     assert [path.name for path in out.iterdir()] == ["train_database.yaml"]
 
 
 def test_data_sets_with_other_classes_share_no_directory(converted):
-    with pytest.raises(FormatError, match=r"label_database\.yaml: is of another data set"):
+    with pytest.raises(
+        FormatError, match=r"label_database\.yaml: is of another data set or program"
+    ):
         check_lists("mask3d", "S3DIS", converted["mask3d"])
     check_lists("mask3d", "ScanNet", converted["mask3d"])
     check_lists("mmdet3d", "S3DIS", converted["mask3d"])
@@ -201,12 +198,12 @@ def test_a_damaged_entry_is_named(converted, tmp_path):
         write_lists("mask3d", "ScanNet", out)
 
 
-def test_one_scan_after_the_other_is_on_the_list_of_the_test(root, tmp_path, monkeypatch):
+def test_one_scan_after_the_other_is_on_the_list_of_the_test(root, tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in SPLITS["val"] + SPLITS["test"]:
         scan = root / "scans" / name / f"{name}_vh_clean_2.ply"
-        command = ["segment", str(scan), "--out", "out", "--layout", "mask3d"]
-        assert main([*command, "--preset", "classic"]) == 0
+        command = ("segment", scan, "--out", "out", "--layout", "mask3d", "--preset", "classic")
+        assert run(*command).code == 0
     monkeypatch.chdir("/")
     samples, _ = load_mask3d(tmp_path / "out", "test")
     assert [*samples] == ["scene0011_00_vh_clean_2", "scene0799_00_vh_clean_2"]

@@ -38,19 +38,11 @@ def root(tmp_path_factory):
     return root
 
 
-@pytest.fixture
-def two_threads():
-    """Let the main process use threads of its own before it starts workers."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
-
-
 # The parent has threads on purpose: that is what a fork must survive.
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*rooms, got:UserWarning")
-def test_workers_give_what_the_main_process_gives(two_threads, root):
+def test_workers_give_what_the_main_process_gives(set_threads, root):
+    set_threads(2)
     pytest.importorskip("pyarrow", reason="needs torchrg[text]")
     steps = NoteProcess(nn.Sequential(SampleVoxels(0.2), CenterCloud(), SegmentPlanes("paper")))
     plain = S3DIS(root, [1], transform=steps)

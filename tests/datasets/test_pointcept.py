@@ -154,15 +154,6 @@ def test_what_torchrg_wrote_is_replaced(sample, seg, tmp_path):
     assert not (tmp_path / "superpoint.npy").exists()
 
 
-def test_a_table_cannot_name_files_elsewhere(sample, seg, tmp_path):
-    (tmp_path / "other.npy").touch()
-    (tmp_path / "room").mkdir()
-    claims = dict.fromkeys(["../other.npy", "plane.npy"])
-    (tmp_path / "room" / "provenance.json").write_text(json.dumps({"claims": claims}))
-    write_pointcept_scene(tmp_path / "room", sample, seg)
-    assert (tmp_path / "other.npy").exists()
-
-
 def test_a_run_that_was_cut_off_is_repeated_like_a_new_one(foreign, sample, seg, monkeypatch):
     """A process that dies between two files leaves a claim on all of them."""
     replace = Path.replace
@@ -186,7 +177,7 @@ def test_normals_of_the_sample_are_written(sample, seg, tmp_path):
 
 def test_other_points_are_refused(foreign, sample, seg):
     before = digest(foreign)
-    with pytest.raises(FormatError, match="expected the points of this scene, got others"):
+    with pytest.raises(FormatError, match="expected the same points, got others"):
         write_pointcept_scene(foreign, {**sample, "coord": sample["coord"] + 1e-3}, seg)
     few = segment_planes(sample["coord"][:100], CLASSIC)
     with pytest.raises(FormatError, match="expected 100 rows, got shape"):
@@ -196,21 +187,14 @@ def test_other_points_are_refused(foreign, sample, seg):
     assert digest(foreign) == before
 
 
-@pytest.mark.parametrize("name", ["plane", "curvature", "superpoint"])
-def test_labels_from_elsewhere_are_not_touched(foreign, sample, seg, name):
-    np.save(foreign / f"{name}.npy", np.zeros(3000, np.float32))
+@pytest.mark.parametrize("name", ["plane.npy", "curvature.npy", "superpoint.npy", "planes.json"])
+@pytest.mark.parametrize("content", [b"[", b'{"written": [[1]]}'])
+def test_files_from_elsewhere_are_not_touched(foreign, sample, seg, name, content):
+    (foreign / name).write_bytes(content)
     before = digest(foreign)
-    with pytest.raises(FormatError, match=rf"{name}\.npy: was not written by torchrg"):
+    with pytest.raises(FormatError, match=f"{name}: was not written by torchrg"):
         write_pointcept_scene(foreign, sample, seg, superpoint=seg.labels)
     assert digest(foreign) == before
-
-
-@pytest.mark.parametrize("content", ["{}", "[", '{"written": 5}', '{"written": [[1]]}'])
-def test_a_table_from_elsewhere_is_not_touched(foreign, sample, seg, content):
-    (foreign / "planes.json").write_text(content)
-    with pytest.raises(FormatError, match=r"planes\.json: was not written by torchrg"):
-        write_pointcept_scene(foreign, sample, seg)
-    assert (foreign / "planes.json").read_text() == content
 
 
 def test_pickles_and_wrong_sizes_are_never_loaded(foreign):
@@ -232,11 +216,5 @@ def test_pickles_and_wrong_sizes_are_never_loaded(foreign):
     with pytest.raises(FormatError, match=r"coord\.npy: expected shape \(N, 3\)"):
         read_pointcept_scene(foreign)
     (foreign / "coord.npy").unlink()
-    with pytest.raises(FormatError, match=r"expected coord\.npy in this folder"):
+    with pytest.raises(FormatError, match=r"expected coord\.npy, got none"):
         read_pointcept_scene(foreign)
-
-
-def test_a_folder_that_cannot_be_made_is_named(sample, seg, tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(FormatError, match="cannot be created"):
-        write_pointcept_scene(tmp_path / "file" / "room", sample, seg)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.datasets.captures_tree import write_text
 from torchrg.batch.scans import Job, convert_scan
 from torchrg.batch.sources import RGBDSource
 from torchrg.config import DepthConfig
@@ -31,6 +32,7 @@ HALF = math.sqrt(0.5)
 CAMERA = make_intrinsics(5.0, 5.0, 2.5, 1.5)
 QUARTER = f"0 0 {HALF} {HALF}"
 TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
+MATRIX = "577 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n"
 POSE_ROWS = "0 -1 0 0.5\n1 0 0 0.25\n0 0 1 2\n0 0 0 1\n"
 
 
@@ -48,11 +50,6 @@ def write_color(path, value=7):
         kornia_rs.io.write_image_jpeg(str(path), image, "rgb", 95)
     else:
         write_png(path, image)
-
-
-def write_text(path, text):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
 
 
 def expected_pose():
@@ -95,7 +92,7 @@ def test_tum_frames_are_matched_in_time(tum):
 
 def test_the_camera_of_tum_is_not_guessed(tum):
     other = tum.rename(tum.parent / "desk")
-    with pytest.raises(ConfigError, match=r"1.0.png: expected intrinsics, which depth images do"):
+    with pytest.raises(ConfigError, match=r"1.0.png: expected intrinsics, which images lack"):
         RGBDFrames.from_folder(other, "tum")
     data = RGBDFrames.from_folder(other, "tum", intrinsics=CAMERA.float(), depth_scale=1000)
     assert data[0]["depth"].max() == 5
@@ -130,10 +127,7 @@ def test_scannet_frames_have_files_of_their_own(tmp_path):
             write_color(root / "color" / f"{number}.jpg")
         write_text(root / "pose" / "0.txt", POSE_ROWS)
         write_text(root / "pose" / "1.txt", "-inf -inf -inf -inf\n" * 4)
-        write_text(
-            root / "intrinsic" / "intrinsic_depth.txt",
-            "577 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n",
-        )
+        write_text(root / "intrinsic" / "intrinsic_depth.txt", MATRIX)
     data = RGBDFrames.from_folder(tmp_path, "scannet")
     assert len(data) == 4
     assert data.scenes[2].name == "scene0000_01/0"
@@ -175,7 +169,7 @@ def test_any_folder_of_images_needs_its_camera(tmp_path):
         ({"intrinsics": CAMERA}, "depth_scale"),
         ({"depth_scale": 1.0}, "intrinsics"),
     ):
-        with pytest.raises(ConfigError, match=f"expected {missing}, which depth images do not"):
+        with pytest.raises(ConfigError, match=f"expected {missing}, which images lack"):
             RGBDFrames.from_folder(tmp_path, "images", **given)
     data = RGBDFrames.from_folder(tmp_path, "images", intrinsics=CAMERA, depth_scale=1)
     assert [scene.name for scene in data.scenes] == ["b/9", "b/10"]
@@ -206,7 +200,7 @@ def test_wrong_files_are_refused(tmp_path, tum):
         ("missing.png", "file not found; check the path"),
         ("empty.npy", "byte 0: the file is empty"),
         ("missing.npy", "file not found; check the path"),
-        ("depth.jpg", r"expected a depth image that ends in one of .png .npy .pgm, got '.jpg'"),
+        ("depth.jpg", "expected a depth image that ends in .*, got '.jpg'; convert it to a 16"),
     ):
         with pytest.raises(FormatError, match=f"{name}: {message}"):
             read_depth(tmp_path / name, depth_scale=1000)
@@ -214,16 +208,6 @@ def test_wrong_files_are_refused(tmp_path, tum):
         read_depth(tum / "depth" / "1.0.png", depth_scale=0)
     with pytest.raises(FormatError, match=r"text.png: expected a PNG or JPEG image"):
         read_color(tmp_path / "text.png")
-    for name, text, message in (
-        ("depth.txt", "1.0 a b\n", "expected a time and a file name in each row"),
-        ("depth.txt", "one a\n", "expected numbers"),
-        ("groundtruth.txt", "1 2 3\n", "expected time tx ty tz qx qy qz qw in each row"),
-    ):
-        before = (tum / name).read_text()
-        (tum / name).write_text(text)
-        with pytest.raises(FormatError, match=f"{name}: {message}"):
-            RGBDFrames.from_folder(tum, "tum")
-        (tum / name).write_text(before)
 
 
 def test_wrong_folders_are_refused(tmp_path):
@@ -238,7 +222,7 @@ def test_wrong_folders_are_refused(tmp_path):
     with pytest.raises(FormatError, match="expected depth images"):
         RGBDFrames.from_folder(tmp_path, "images", intrinsics=camera, depth_scale=1)
     write_depth(tmp_path / "depth" / "0.png", 1500)
-    with pytest.raises(ConfigError, match=r"expected intrinsics, which depth images do not store"):
+    with pytest.raises(ConfigError, match=r"expected intrinsics, which images lack"):
         RGBDFrames.from_folder(tmp_path, "scannet")
     write_text(tmp_path / "intrinsic" / "intrinsic_depth.txt", "1 2 3\n")
     with pytest.raises(FormatError, match=r"_depth.txt: expected a matrix of .*, got 3 numbers"):
@@ -249,7 +233,7 @@ def test_wrong_frames_are_refused(tmp_path):
     path = tmp_path / "a.png"
     with pytest.raises(ShapeError, match=r"RGBDFrame: expected intrinsics of shape \(3, 3\)"):
         RGBDFrame(path, torch.eye(4), 1000.0)
-    with pytest.raises(ConfigError, match="expected depth_scale > 0, the depth units per"):
+    with pytest.raises(ConfigError, match="expected depth_scale > 0 units per"):
         RGBDFrame(path, torch.eye(3), 0.0)
     with pytest.raises(ConfigError, match="expected distinct frame names, got 'a' twice"):
         RGBDFrames([RGBDFrame(path, torch.eye(3), 1.0, "a")] * 2)
@@ -258,10 +242,13 @@ def test_wrong_frames_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
+        ("depth.txt", b"1.0 a b\n", "expected a time and a file name in each row"),
+        ("depth.txt", b"one a\n", "expected numbers"),
+        ("groundtruth.txt", b"1 2 3\n", "expected time tx ty tz qx qy qz qw in each row"),
         ("depth.txt", b"nan depth/1.0.png\n", "expected finite times, got nan"),
         ("groundtruth.txt", b"inf 0 0 0 0 0 0 1\n", "expected finite times, got inf"),
-        ("rgb.txt", b"1.0 rgb/\xe9.png\n", r"byte 8: expected text in UTF-8, got b'\\xe9'"),
-        ("rgb.txt", b"1.0 rgb/\0.png\n", r"byte 8: expected text in UTF-8, got b'\\x00'"),
+        ("rgb.txt", b"1.0 rgb/\xe9.png\n", r"byte 8: expected UTF-8, got b'\\xe9'"),
+        ("rgb.txt", b"1.0 rgb/\0.png\n", r"byte 8: expected UTF-8, got b'\\x00'"),
     ],
 )
 def test_lists_that_are_none_are_refused_by_file_and_place(tum, name, content, message):
@@ -277,9 +264,7 @@ def test_poses_that_lead_nowhere_are_none(tum, tmp_path, value):
     root = tmp_path / "scans" / "scene0000_00"
     write_depth(root / "depth" / "0.png", 1500, (480, 640))
     write_text(root / "pose" / "0.txt", POSE_ROWS.replace("0.5", value))
-    write_text(
-        root / "intrinsic" / "intrinsic_depth.txt", "577 0 318 0\n0 578 242 0\n0 0 1 0\n0 0 0 1\n"
-    )
+    write_text(root / "intrinsic" / "intrinsic_depth.txt", MATRIX)
     assert RGBDFrames.from_folder(root, "scannet").frames[0].pose is None
 
 
@@ -317,20 +302,6 @@ def test_a_folder_in_place_of_frames_is_refused_with_the_right_call(given):
 def test_numpy_cameras_are_cameras(tum):
     given = RGBDFrames.from_folder(tum, intrinsics=CAMERA.numpy())[0]["intrinsics"]
     assert torch.equal(given, CAMERA)
-
-
-@pytest.mark.parametrize("layout", ["images", "scannet", "tum", "7-scenes"])
-def test_the_largest_value_is_no_depth_in_every_layout(tmp_path, layout):
-    root = tmp_path / "scene"
-    name = {"7-scenes": "frame-000000.depth.png"}.get(layout, "depth/0.png")
-    write_depth(root / name, 2000)
-    image = torch.full((4, 6), 2000)
-    image[2:] = 65535
-    write_png(root / name, image)
-    write_text(root / "depth.txt", "0 depth/0.png\n")
-    data = RGBDFrames.from_folder(root, layout, intrinsics=CAMERA, depth_scale=1000.0)
-    assert data[0]["depth"].flatten().unique().tolist() == [0, 2]
-    assert not data[0]["depth"][0, 2:].any()
 
 
 def test_names_listed_on_windows_are_found(tum):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.datasets.captures_tree import FRAMES, write_3rscan, write_depth
+from tests.datasets.captures_tree import FRAMES, write_3rscan, write_depth, write_text
 from torchrg.batch.run import list_jobs, make_plan
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import RGBDSource
@@ -130,11 +130,6 @@ SCALES = dict.fromkeys(
 """Stored values of one meter that files name; it is 1000 in others."""
 
 
-def write_file(path, content):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-
-
 @pytest.fixture
 def scene(tmp_path):
     """A scene with a sequence of one frame, in the folders and names of 7-Scenes."""
@@ -149,7 +144,7 @@ def only_frame(root, layout="auto", **given):
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_camera_file_next_to_the_frames_wins(scene, name):
-    write_file(scene / name, FILES[name])
+    write_text(scene / name, FILES[name])
     frame = only_frame(scene)
     expected = make_intrinsics(FX, FY, CX, CY)
     torch.testing.assert_close(frame.intrinsics, expected, rtol=1e-12, atol=1e-12)
@@ -223,12 +218,12 @@ def test_the_record_names_the_camera_and_a_new_file_changes_the_input(scene, tmp
 def test_images_of_several_cameras_have_the_nearest(tmp_path):
     for name, focal in (("a", 30.0), ("b", 40.0)):
         write_depth(tmp_path / name / "depth" / "0.png", np.full((HEIGHT, WIDTH), 1.5))
-        write_file(tmp_path / name / "camera.json", {**REALSENSE, "fx": focal, "fy": focal})
+        write_text(tmp_path / name / "camera.json", {**REALSENSE, "fx": focal, "fy": focal})
     frames = RGBDFrames.from_folder(tmp_path, depth_scale=1000.0).frames
     assert [float(frame.intrinsics[0, 0]) for frame in frames] == [30, 40]
     assert frames[1].files == (tmp_path / "b/depth/0.png", tmp_path / "b/camera.json")
     (tmp_path / "b" / "camera.json").unlink()
-    with pytest.raises(ConfigError, match=r"b/depth/0.png: expected intrinsics, which depth"):
+    with pytest.raises(ConfigError, match=r"b/depth/0.png: expected intrinsics, which images"):
         RGBDFrames.from_folder(tmp_path, depth_scale=1000.0)
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from tests.datasets import captures_tree
-from tests.datasets.captures_tree import FRAMES, HEIGHT, WIDTH
-from tests.datasets.test_rgbd import expected_pose, write_depth, write_text
+from tests.datasets.captures_tree import FRAMES, HEIGHT, WIDTH, write_text
+from tests.datasets.test_rgbd import expected_pose, write_depth
 from torchrg.datasets.rgbd_files import image_size, read_color, read_depth, read_trajectory
 from torchrg.errors import FormatError
 

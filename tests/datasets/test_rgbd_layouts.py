@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.datasets.captures_tree import (
+    COLOR,
     FRAMES,
     SIZE,
     WRITERS,
@@ -92,61 +93,33 @@ def test_frames_may_have_cameras_of_their_own(tmp_path):
         np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)
 
 
-def without_camera(shared):
-    del shared["fl_x"]
-
-
-def with_fisheye(shared):
-    shared["camera_model"] = "OPENCV_FISHEYE"
-
-
-def without_depth(shared):
-    del shared["frames"][1]["depth_file_path"]
-
-
-def without_frames(shared):
-    shared["frames"] = {"0": 1}
-
-
-def with_wide_images(shared):
-    shared["w"] *= 2
-
-
-def with_words(shared):
-    shared["frames"][1]["transform_matrix"][2][3] = "far"
-
-
-def with_a_turn_alone(shared):
-    frame = shared["frames"][0]
-    frame["transform_matrix"] = [row[:3] for row in frame["transform_matrix"][:3]]
-
-
-def with_no_focus(shared):
-    shared["fl_y"] = 0
-
-
-def with_a_huge_number(shared):
-    shared["cx"] = 10**400
-
-
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("change", "message"),
     [
-        (without_camera, "expected a camera, as fl_x, fl_y, cx, cy or a matrix, got only fl_y"),
-        (with_fisheye, "expected images of a pinhole camera, got OPENCV_FISHEYE; undistort"),
-        (without_depth, "expected a list of frames, each with depth_file_path; add the depth"),
-        (without_frames, "expected a list of frames"),
-        (with_wide_images, "as its camera's, or in their ratio, got 128 x 96; pass the camera"),
-        (with_words, "expected transform_matrix to be a matrix, got [["),
-        (with_a_turn_alone, "expected transform_matrix to be a matrix, got [["),
-        (with_no_focus, "expected nonzero fl_x and fl_y"),
-        (with_a_huge_number, "expected a number for cx, got 10000"),
+        ({"fl_x": ...}, "expected a camera, as fl_x, fl_y, cx, cy or a matrix, got only fl_y"),
+        (
+            {"camera_model": "OPENCV_FISHEYE"},
+            "expected a pinhole camera, got OPENCV_FISHEYE; undistort",
+        ),
+        ({"frames": {"0": 1}}, "expected a list of frames"),
+        ({"w": 2 * COLOR[0]}, "as its camera's, or in their ratio, got 128 x 96; pass the camera"),
+        ({"fl_y": 0}, "expected nonzero fl_x and fl_y"),
+        ({"cx": 10**400}, "expected a number for cx, got 10000"),
+        (
+            {"depth_file_path": ...},
+            "expected a list of frames, each with depth_file_path; add the depth",
+        ),
+        ({"transform_matrix": [[1, 0, 0, "far"]] * 4}, "transform_matrix to be a matrix, got [["),
+        ({"transform_matrix": [[1, 0, 0]] * 3}, "transform_matrix to be a matrix, got [["),
     ],
 )
-def test_a_spoilt_capture_is_refused_in_one_line(tmp_path, run, spoil, message):
+def test_a_spoilt_capture_is_refused_in_one_line(tmp_path, run, change, message):
     path = write_nerfstudio(tmp_path / "capture") / "transforms.json"
     shared = json.loads(path.read_text())
-    spoil(shared)
+    place = shared["frames"][1] if {*change} & {*shared["frames"][1]} else shared
+    place |= change
+    for name in [name for name, value in change.items() if value is ...]:
+        del place[name]
     write_text(path, shared)
     error = run("convert", "rgbd", path.parent, tmp_path / "out").error
     assert error.startswith("torchrg: ")
@@ -195,9 +168,7 @@ def test_an_image_of_replica_beyond_its_poses_has_none(tmp_path):
 def test_the_unit_of_floating_point_is_not_guessed(tmp_path, run):
     root = write_nerfstudio(tmp_path / "capture", ".npy", 1.0)
     error = run("convert", "rgbd", root, tmp_path / "out").error
-    assert (
-        "frame_00000.npy: expected depth_scale, which depth images do not store; pass it" in error
-    )
+    assert "frame_00000.npy: expected depth_scale, which images lack; pass it" in error
     data = RGBDFrames.from_folder(root, depth_scale=1.0)
     np.testing.assert_allclose(points_of(data[1]), FRAMES[1].points, atol=1e-5)
 
@@ -217,10 +188,10 @@ def test_other_captures_say_what_they_lack(tmp_path):
         ("arkitscenes", "lowres_wide.traj: expected time rx ry rz tx ty tz in each row"),
         (
             "scannetpp",
-            "pose_intrinsic_imu.json: expected an entry for frame_000010, which has depth",
+            "pose_intrinsic_imu.json: expected an entry for frame_000010, got none",
         ),
         ("replica", "cam_params.json: cannot be read: No such file"),
-        ("3rscan", "000000.depth.pgm: expected intrinsics, which depth images do not store; pass"),
+        ("3rscan", "000000.depth.pgm: expected intrinsics, which images lack; pass"),
     ):
         with pytest.raises((FormatError, ConfigError), match=message):
             RGBDFrames.from_folder(roots[name])

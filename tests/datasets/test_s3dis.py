@@ -80,9 +80,7 @@ def test_a_complete_area_warns_of_nothing(tmp_path):
 
 
 def test_missing_areas_are_errors_with_the_repair(root):
-    with pytest.raises(
-        FormatError, match="expected a folder Area_2, got none; select existing areas"
-    ):
+    with pytest.raises(FormatError, match="expected a folder Area_2, got none; select existing"):
         S3DIS(root)
     with pytest.raises(FormatError, match=r"got none; pass .*Aligned_Version"):
         S3DIS(root.parent)
@@ -96,5 +94,5 @@ def test_a_room_without_objects_fails_when_it_is_read_and_not_before(root):
         data = S3DIS(root, [1])
     names = [scene.name for scene in data.scenes]
     assert "Area_1/office_0" in names
-    with pytest.raises(FormatError, match="expected objects"):
+    with pytest.raises(FormatError, match="expected CLASS_NUMBER"):
         data[names.index("Area_1/office_0")]

@@ -1,6 +1,7 @@
 """Planes of depth images: rendered rooms with truth, a real frame, and what must not matter."""
 
 import math
+import pickle
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_labels
 from torchrg.scenes import build_room
 from torchrg.structures import UNLABELED
+from torchrg.structures.planes import PLANE_COLUMNS
 
 SMALL = make_intrinsics(100.0, 100.0, 79.5, 59.5)
 
@@ -204,6 +206,20 @@ def test_a_negative_focal_length_turns_the_axis_over():
     seg, turned = segment_depth(depth, SMALL), segment_depth(depth, over)
     assert torch.equal(seg.labels, turned.labels)
     torch.testing.assert_close(seg.normals * torch.tensor([1, -1, 1]), turned.normals)
+
+
+def test_the_plane_table_is_measured_later_from_the_image_as_it_was():
+    depth, intrinsics = corner()[0], make_intrinsics(100, 100, 79.5, 59.5)
+    expected = segment_depth(depth, intrinsics, up="-y").planes
+    assert len(expected.normal) == 3
+    seg = segment_depth(depth, intrinsics, up="-y")
+    depth.zero_()
+    seg.labels.zero_()
+    moved, copied = seg.to("cpu").planes, pickle.loads(pickle.dumps(seg)).planes
+    for name in (*PLANE_COLUMNS, "kind"):
+        for planes in (moved, copied, seg.planes):
+            assert torch.equal(getattr(planes, name), getattr(expected, name)), name
+    assert seg.planes is seg.planes
 
 
 def test_depth_beyond_the_limit_is_left_out():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.depth import depth_to_points, segment_depth
 from torchrg.depth.camera import make_intrinsics
 from torchrg.depth.values import convert_depth, drop_channel, has_depth
@@ -128,17 +127,6 @@ def test_every_door_doubts_a_median_that_no_camera_measures(door, factor):
     ):
         doors(wall() * factor)[door]()
     doors(wall() * factor, factor)[door]()
-
-
-def test_files_are_doubted_like_tensors(tmp_path):
-    np.save(tmp_path / "a.npy", (wall() * 1000).numpy())
-    data = RGBDFrames([RGBDFrame(tmp_path / "a.npy", CAMERA, 1.0, "a")])
-    with pytest.warns(
-        DepthWarning, match=r"a.npy: expected a median .* got 2,19\d m with --depth-"
-    ):
-        _ = data[0]
-    right = RGBDFrames([RGBDFrame(tmp_path / "a.npy", CAMERA, 1000.0, "a")])
-    torch.testing.assert_close(right[0]["depth"][0], wall().float())
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,12 @@ def make_segmentation():
     return make
 
 
+def needs(suffix):
+    """Skip a test without the package that reads a format."""
+    package = {".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy")
+    pytest.importorskip(package, reason=f"needs the extra {suffix[1:]}")
+
+
 def assert_same(found, expected):
     """Check that two clouds hold the same points and fields, to the last bit."""
     np.testing.assert_array_equal(found.coordinates, expected.coordinates)

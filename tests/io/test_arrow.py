@@ -13,20 +13,10 @@ from torchrg.io.arrow import parse_numbers
 MARKS = [" ", "\t", "  ", ",", ", ", ";"]
 NUMBERS = ["nan", "-nan", "NaN", "inf", "-inf", "Infinity", "+1", "1e400", "5.", ".5", "-0", "007"]
 NO_NUMBERS = [
-    "",
-    "x",
-    "nan(1)",
-    "1e",
-    "1 2",
-    "0x10",
-    "1_0",
-    "1,5",
-    "--1",
-    "1.2.3",
-    '"1"',
-    "1d5",
-    "-",
+    *("", "x", "nan(1)", "1e", "1 2", "0x10", "1_0"),
+    *("1,5", "--1", "1.2.3", "1d5", "-", '"1"'),
 ]
+NO_ROWS = ["", "  ", "\t", "# a b", "# a", "// a", "7", "\0"]
 
 
 def broken_text(rng):
@@ -50,18 +40,7 @@ def broken_text(rng):
                 row[rng.randrange(len(row)) :] = rng.choice([[], ["1", "2"]])
     lines = [mark.join(row) for row in rows]
     for _ in range(rng.choice([0, 0, 1])):
-        extra = [
-            "",
-            "  ",
-            "\t",
-            "# a b",
-            "# a",
-            "// a",
-            "7",
-            " ".join(rows[0]),
-            ";".join(rows[0]),
-            "\0",
-        ]
+        extra = [*NO_ROWS, *map(str.join, " ;", [rows[0]] * 2)]
         lines.insert(rng.randrange(len(lines)), rng.choice(extra))
     if rng.random() < 0.1:
         lines = [line.replace(".", ",") for line in lines]

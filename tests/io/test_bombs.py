@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.lib import format as npy_format
 
+from tests.io.e57_pages import join_e57, split_e57
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud
 
@@ -75,25 +76,12 @@ def test_missing_memory_is_not_told_as_damage(tmp_path, monkeypatch):
         read_cloud(tmp_path / "a.npz")
 
 
-def in_pages(content):
-    """Pages of an E57 file, each with its checksum."""
-    checksum = pytest.importorskip("google_crc32c").value
-    content += bytes(-len(content) % 1020)
-    pages = [content[start : start + 1020] for start in range(0, len(content), 1020)]
-    return b"".join(page + checksum(page).to_bytes(4, "big") for page in pages)
-
-
 def rewrite(path, pattern, replacement):
     """Change the XML of an E57 file."""
-    data = path.read_bytes()
-    content = b"".join(data[start : start + 1020] for start in range(0, len(data), 1024))
-    place, length = struct.unpack("<24xQQ", content[:40])
-    start = place // 1024 * 1020 + place % 1024
-    xml, count = re.subn(pattern, replacement, content[start : start + length])
+    before, xml = split_e57(path.read_bytes())
+    xml, count = re.subn(pattern, replacement, xml)
     assert count
-    size = -(-(start + len(xml)) // 1020) * 1024
-    head = content[:16] + struct.pack("<QQQ", size, place, len(xml)) + content[40:start]
-    path.write_bytes(in_pages(head + xml))
+    path.write_bytes(join_e57(before, xml))
 
 
 FIELDS = b"".join(b'<extra%d type="Integer" minimum="0" maximum="0"/>' % i for i in range(900))

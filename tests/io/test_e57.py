@@ -22,9 +22,7 @@ def scans(tmp_path):
     path = tmp_path / "scans.e57"
     with pye57.E57(str(path), "w") as file:
         for number in range(2):
-            columns = dict(
-                zip(["cartesianX", "cartesianY", "cartesianZ"], points[number].T, strict=True)
-            )
+            columns = dict(zip(AXES, points[number].T, strict=True))
             columns["intensity"] = np.linspace(0, 1, 20, dtype=np.float32)
             if number == 0:
                 columns |= dict.fromkeys(["colorRed", "colorGreen"], np.arange(20, dtype=np.uint8))
@@ -75,87 +73,59 @@ def test_the_coordinate_system_is_kept_and_pictures_are_told(tmp_path, monkeypat
     assert "coordinate_metadata" not in found.header
 
 
-def write_columns(path, columns, extensions=(), pose=None, *, order="wxyz", grid=None, bounds=()):
+def children(image, values, order=None):
+    """Return a node of numbers by name, in an order."""
+    node = pye57.libe57.StructureNode(image)
+    for name in order or values:
+        node.set(name, pye57.libe57.FloatNode(image, float(values[name])))
+    return node
+
+
+def append_scan(file, columns, pose=None, *, order="wxyz", grid=None, bounds=(), limits=None):
     """Write a scan of any columns, whole numbers in 16 bits, the others in double precision.
 
     ``pose`` is a quaternion w x y z, and may go on with a translation. With ``grid``, a scale and
-    an offset, columns that are not whole are integers in the file.
+    an offset, columns that are not whole are integers in the file. ``limits`` are those of colors.
     """
-    with pye57.E57(str(path), "w") as file:
-        libe57, image = pye57.libe57, file.image_file
-        for prefix in extensions:
-            image.extensionsAdd(prefix, f"urn:{prefix}")
-        prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
-        for name, column in columns.items():
-            is_whole = column.dtype.kind == "i"
-            node = libe57.IntegerNode(image, 0, 0, 2**16) if is_whole else libe57.FloatNode(image)
-            if grid is not None and not is_whole:
-                node = libe57.ScaledIntegerNode(image, 0, -(2**20), 2**20, *grid)
-            prototype.set(name, node)
-            count = len(column)
-            buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
-        scan = libe57.StructureNode(image)
-        points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
-        scan.set("guid", libe57.StringNode(image, "{1}"))
-        if pose is not None:
-            rotation, translation = libe57.StructureNode(image), libe57.StructureNode(image)
-            turn = dict(zip("wxyz", pose, strict=False))
-            for letter in order:
-                rotation.set(letter, libe57.FloatNode(image, float(turn[letter])))
-            for letter, value in zip("xyz", [*pose[4:], 0, 0, 0], strict=False):
-                translation.set(letter, libe57.FloatNode(image, float(value)))
-            place = libe57.StructureNode(image)
-            place.set("rotation", rotation)
-            place.set("translation", translation)
-            scan.set("pose", place)
-        if len(bounds):
-            box = libe57.StructureNode(image)
-            for i, value in enumerate(np.ravel(bounds)):
-                name = f"{'xyz'[i % 3]}{('Minimum', 'Maximum')[i // 3]}"
-                box.set(name, libe57.FloatNode(image, float(value)))
-            scan.set("cartesianBounds", box)
-        scan.set("points", points)
-        file.data3d.append(scan)
-        writer = points.writer(buffers)
-        writer.write(count)
-        writer.close()
-    return path
-
-
-def append_scan(file, columns, pose=None, limits=None):
-    """Write a scan, integers in 16 bits, the others in double precision, and limits of colors."""
     libe57, image = pye57.libe57, file.image_file
     prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
-        is_whole = column.dtype.kind == "i"
+        is_whole, count = column.dtype.kind == "i", len(column)
         node = libe57.IntegerNode(image, 0, 0, 2**16) if is_whole else libe57.FloatNode(image)
+        if grid is not None and not is_whole:
+            node = libe57.ScaledIntegerNode(image, 0, -(2**20), 2**20, *grid)
         prototype.set(name, node)
-        count = len(column)
         buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
     scan = libe57.StructureNode(image)
     points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
     scan.set("guid", libe57.StringNode(image, "{1}"))
     if pose is not None:
-        rotation, translation = libe57.StructureNode(image), libe57.StructureNode(image)
-        for letter, value in zip("wxyz", pose, strict=True):
-            rotation.set(letter, libe57.FloatNode(image, float(value)))
-        for letter in "xyz":
-            translation.set(letter, libe57.FloatNode(image, 0.0))
-        place = libe57.StructureNode(image)
-        place.set("rotation", rotation)
-        place.set("translation", translation)
+        place, moved = libe57.StructureNode(image), [*pose[4:], 0, 0, 0]
+        place.set("rotation", children(image, dict(zip("wxyz", pose, strict=False)), order))
+        place.set("translation", children(image, dict(zip("xyz", moved, strict=False))))
         scan.set("pose", place)
+    if len(bounds):
+        ends = [f"{axis}{end}" for end in ("Minimum", "Maximum") for axis in "xyz"]
+        box = children(image, dict(zip(ends, np.ravel(bounds), strict=True)))
+        scan.set("cartesianBounds", box)
     scan.set("points", points)
     if limits is not None:
-        bounds = libe57.StructureNode(image)
-        for end, values in zip(("Minimum", "Maximum"), limits, strict=True):
-            for channel, value in zip(RGB, np.broadcast_to(values, 3), strict=True):
-                bounds.set(f"{channel}{end}", libe57.FloatNode(image, float(value)))
-        scan.set("colorLimits", bounds)
+        ends = [f"{channel}{end}" for end in ("Minimum", "Maximum") for channel in RGB]
+        values = np.ravel([np.broadcast_to(end, 3) for end in limits])
+        scan.set("colorLimits", children(image, dict(zip(ends, values, strict=True))))
     file.data3d.append(scan)
     writer = points.writer(buffers)
     writer.write(count)
     writer.close()
+
+
+def write_columns(path, columns, extensions=(), **options):
+    """Write a file of one scan; see ``append_scan``."""
+    with pye57.E57(str(path), "w") as file:
+        for prefix in extensions:
+            file.image_file.extensionsAdd(prefix, f"urn:{prefix}")
+        append_scan(file, columns, **options)
+    return path
 
 
 def test_normals_turn_with_the_points(tmp_path):
@@ -305,14 +275,11 @@ def test_poses_are_read_by_name_in_any_order(tmp_path, order):
 @pytest.mark.parametrize(
     ("pose", "message"),
     [
-        ((1e300, 0, 0, 0), r"a unit quaternion in scan '', got norm 1e\+300; correct"),
-        ((1e300, 1e300, 0, 0), "a unit quaternion in scan"),
-        ((5e-324, 0, 0, 0), "a unit quaternion in scan"),
-        ((0.1, 0, 0.1, 0), "a unit quaternion in scan '', got norm 0.141"),
-        (
-            (1, 0, 0, 0, 0, -1e13, 0),
-            r"a translation of scan '' within 1e\+12, got -1e\+13; correct",
-        ),
+        ((1e300, 0, 0, 0), r"a unit quaternion in '', got norm 1e\+300; correct"),
+        ((1e300, 1e300, 0, 0), "a unit quaternion in"),
+        ((5e-324, 0, 0, 0), "a unit quaternion in"),
+        ((0.1, 0, 0.1, 0), "a unit quaternion in '', got norm 0.141"),
+        ((1, 0, 0, 0, 0, -1e13, 0), r"a translation of scan '' within 1e\+12, got -1e\+13;"),
     ],
 )
 def test_poses_that_are_no_places_are_refused(tmp_path, pose, message):

@@ -77,9 +77,9 @@ def test_no_column_is_lost_when_two_have_one_name():
     [
         ({"labels": np.zeros((2, 2))}, r"expected labels to be one integer per point, got shape"),
         ({"labels": ["a", "b"]}, "expected labels to be one integer per point"),
-        ({"labels": [0.5, 1]}, "expected labels to be 64-bit integers"),
-        ({"labels": [np.inf, 1]}, "expected labels to be 64-bit integers"),
-        ({"labels": np.array([2**64 - 1, 0], np.uint64)}, "expected labels to be 64-bit integers"),
+        ({"labels": [0.5, 1]}, "expected 64-bit integer labels"),
+        ({"labels": [np.inf, 1]}, "expected 64-bit integer labels"),
+        ({"labels": np.array([2**64 - 1, 0], np.uint64)}, "expected 64-bit integer labels"),
         ({"normals": np.zeros(2)}, r"expected normals of shape \(N, 3\)"),
         ({"normals": np.zeros((2, 3), complex)}, r"expected normals of shape \(N, 3\)"),
         ({"color": np.zeros((2, 4))}, r"expected color of shape \(N, 3\)"),
@@ -93,7 +93,7 @@ def test_values_that_make_no_sense_are_refused(columns, message):
 
 
 def test_coordinates_need_their_names_and_one_number_each():
-    with pytest.raises(FormatError, match="expected fields x, y, z, got 'x', 'y'; rename or add"):
+    with pytest.raises(FormatError, match="expected fields x, y, z, got 'x', 'y'; add or rename"):
         assemble_cloud(PATH, {"x": np.zeros(2), "y": np.zeros(2)})
     with pytest.raises(FormatError, match="expected x, y, z of one number per point"):
         assemble_cloud(PATH, {axis: np.zeros((2, 2)) for axis in "xyz"})

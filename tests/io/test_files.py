@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.io.conftest import needs
 from torchrg.datasets import FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
@@ -61,7 +62,7 @@ def test_failing_disk_is_a_line_that_names_the_file(tmp_path, monkeypatch):
 @pytest.mark.parametrize("limit", [0, 100, 4096, 100_000])
 @pytest.mark.parametrize("suffix", WRITTEN)
 def test_a_disk_that_is_full_is_the_one_thing_told(tmp_path, capfd, suffix, limit):
-    pytest.importorskip({".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy"))
+    needs(suffix)
     cloud = Cloud(np.random.default_rng(0).random((20_000, 3)))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -237,7 +237,7 @@ def test_points_off_the_grid_are_refused(tmp_path, scanned):
 
 @pytest.mark.parametrize("name", ["n" * 33, "X"])
 def test_names_that_have_no_place_are_refused(tmp_path, name):
-    with pytest.raises(FormatError, match="expected names of at most 32 bytes other than X, Y, Z"):
+    with pytest.raises(FormatError, match="expected names of at most 32 bytes, not X, Y, Z"):
         write_cloud(tmp_path / "a.las", Cloud(np.eye(3), {name: np.zeros(3)}))
 
 
@@ -506,7 +506,7 @@ def test_panic_of_the_decoder_is_a_format_error(scanned, monkeypatch):
 
     path = scanned()
     monkeypatch.setattr(laspy, "open", panic)
-    with pytest.raises(FormatError, match="cannot decompress its points: index out of b"):
+    with pytest.raises(FormatError, match="cannot decompress: index out of b"):
         read_cloud(path)
 
     def interrupt(*_, **__):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.io.conftest import needs
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.structures import Cloud
@@ -35,7 +36,7 @@ def damaged_files(whole):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("suffix", [".e57", ".las", ".laz"])
 def test_failed_reads_keep_no_memory(tmp_path, suffix, request):
-    pytest.importorskip({".e57": "pye57", ".las": "laspy", ".laz": "lazrs"}[suffix])
+    needs(suffix)
     points = np.random.default_rng(0).random((NUM_POINTS, 3))
     write = request.getfixturevalue("write_scan") if suffix == ".e57" else write_cloud
     write(tmp_path / f"whole{suffix}", Cloud(points))

@@ -42,52 +42,16 @@ def test_fortran_order_and_foreign_bytes_are_read(tmp_path):
     assert cloud.coordinates.dtype == np.dtype("=f4")
 
 
-@pytest.mark.parametrize(
-    ("rest", "names"),
-    [
-        (np.zeros((4, 0)), set()),
-        (np.full((4, 1), 0.5), {"intensity"}),
-        (np.full((4, 2), 0.5), {"column_4", "column_5"}),
-        (np.tile([255.0, 0, 7], (4, 1)), {"color"}),
-        (np.tile([0.6, 0, -0.8], (4, 1)), {"normals"}),
-        (np.tile([0.0, 0, 1], (4, 1)), {"normals"}),
-        (np.zeros((4, 3)), {"color"}),
-        (np.full((4, 3), 1e200), {"column_4", "column_5", "column_6"}),
-        (np.full((4, 3), 0.3), {"column_4", "column_5", "column_6"}),
-        (np.tile([255.0, 0, 7, 0.5], (4, 1)), {"color", "column_7"}),
-        (np.tile([256.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
-        (np.tile([-1640.0, 0, 7, 3], (4, 1)), {"intensity", "color"}),
-        (np.tile([0.5, 0.6, 0, -0.8], (4, 1)), {"column_4", "normals"}),
-        (np.tile([0.6, 0, -0.8, 3], (4, 1)), {"normals", "column_7"}),
-        # Intensity and color, or color and label: values do not tell.
-        (np.tile([255.0, 0, 7, 3], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
-        (np.tile([0.5, 0, 7, 0.5], (4, 1)), {f"column_{i}" for i in (4, 5, 6, 7)}),
-    ],
-)
-def test_columns_without_names_are_told_by_their_values(tmp_path, rest, names):
-    table = np.hstack([POINTS, rest])
-    np.save(tmp_path / "a.npy", table)
-    cloud = read_cloud(tmp_path / "a.npy")
-    np.testing.assert_array_equal(cloud.coordinates, POINTS)
-    assert cloud.fields.keys() == names
-    np.savetxt(tmp_path / "a.txt", table)
-    assert read_cloud(tmp_path / "a.txt").fields.keys() == names
-
-
 def test_arrays_that_are_no_points_are_refused(tmp_path):
     pose = np.array([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
     wrong = {
         "a.npy": (pose, "expected points, got a 4 x 4 pose matrix"),
         "b.npy": (POINTS.T.repeat(9, axis=1), "got 3 rows of 36 numbers; transpose them"),
-        "c.npy": (np.full((9, 6), "x"), "expected real numbers as coordinates, got <U1"),
     }
     for name, (values, message) in wrong.items():
         np.save(tmp_path / name, values)
         with pytest.raises(FormatError, match=rf"{name}: .*{message}"):
             read_cloud(tmp_path / name)
-    np.savez(tmp_path / "a.npz", points=POINTS.T)
-    with pytest.raises(FormatError, match=r"a\.npz: .* \(N, 3\), got \(3, 4\); transpose them\."):
-        read_cloud(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("names", ["xyz", "nx ny nz", "r g b"])
@@ -190,11 +154,11 @@ def array_bytes(shape, descr="'<f8'", data=b""):
     [
         (array_bytes((10**12, 3)), r"byte \d+: expected 24,000,000,000,000 bytes for the array of"),
         (array_bytes((4, 3), data=b"0" * 95), r"byte \d+: expected 96 bytes .*, got 95; the file"),
-        (array_bytes((-4, 3)), r"byte 0: invalid shape or type in the array: \(-4, 3\)"),
-        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: invalid shape or type in the array"),
-        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: invalid shape or type in the array"),
-        (array_bytes((4, 2), data=b"0" * 64), r"expected an array of shape \(N, 3\) or wider, got"),
-        (array_bytes((), data=b"0" * 8), r"expected an array of shape \(N, 3\) or wider, got \(\)"),
+        (array_bytes((-4, 3)), r"byte 0: wrong shape or type in the array: \(-4, 3\)"),
+        (array_bytes((-4, -3), data=b"0" * 96), "byte 0: wrong shape or type in the array"),
+        (array_bytes((4, 3), "'|V0'", b"0"), "byte 0: wrong shape or type in the array"),
+        (array_bytes((4, 2), data=b"0" * 64), r"expected shape \(N, 3\) or wider, got"),
+        (array_bytes((), data=b"0" * 8), r"expected shape \(N, 3\) or wider, got \(\)"),
         (array_bytes((0, 3)), "expected at least one point, got none"),
         (array_bytes((4, 3), "'|O'", b"0" * 96), "the array contains pickled Python objects"),
         (array_bytes((4, 3), "'<q9'"), "byte 0: expected the header of a NumPy array"),
@@ -216,24 +180,6 @@ def test_broken_arrays_are_refused(tmp_path, content, message):
             read_cloud(tmp_path / "a.npz")
 
 
-def test_archives_without_points_are_refused(tmp_path):
-    np.savez(tmp_path / "a.npz", x=POINTS, y=POINTS)
-    with pytest.raises(
-        FormatError, match=r"a\.npz: expected an array points \(or coord\), got 'x'"
-    ):
-        read_cloud(tmp_path / "a.npz")
-    np.savez(tmp_path / "a.npz", points=POINTS.reshape(2, 2, 3))
-    with pytest.raises(
-        FormatError, match=r"expected coordinates of shape \(N, 3\), got \(2, 2, 3\)"
-    ):
-        read_cloud(tmp_path / "a.npz")
-    (tmp_path / "a.npz").write_bytes(b"PK" * 50)
-    with pytest.raises(
-        FormatError, match=r"a\.npz: expected an archive of NumPy arrays, got: File"
-    ):
-        read_cloud(tmp_path / "a.npz")
-
-
 def test_sizes_in_archives_are_compared_with_the_bytes(tmp_path):
     stored = io.BytesIO()
     with zipfile.ZipFile(stored, "w") as archive:
@@ -241,14 +187,11 @@ def test_sizes_in_archives_are_compared_with_the_bytes(tmp_path):
     data = bytearray(stored.getvalue())
     place = data.index(b"PK\x01\x02")
     # What the directory says about the size of the member, whole and packed.
-    data[place + 24 : place + 28] = struct.pack("<I", 2**32 - 2)
-    (tmp_path / "a.npz").write_bytes(data)
-    with pytest.raises(FormatError, match=r"a\.npz: byte 0: expected 4,294,967,294 bytes for"):
-        read_cloud(tmp_path / "a.npz")
-    data[place + 20 : place + 24] = struct.pack("<I", 2**32 - 2)
-    (tmp_path / "a.npz").write_bytes(data)
-    with pytest.raises(FormatError, match=r"a\.npz: byte 0: expected 4,294,967,294 bytes for"):
-        read_cloud(tmp_path / "a.npz")
+    for size in (24, 20):
+        struct.pack_into("<I", data, place + size, 2**32 - 2)
+        (tmp_path / "a.npz").write_bytes(data)
+        with pytest.raises(FormatError, match=r"a\.npz: byte 0: expected 4,294,967,294 bytes for"):
+            read_cloud(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
@@ -303,7 +246,12 @@ def test_unusual_compression_is_refused(tmp_path):
         read_cloud(tmp_path / "a.npz")
 
 
-def test_names_that_are_no_text_are_refused(tmp_path):
+def test_what_is_no_archive_or_has_names_that_are_no_text_is_refused(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"PK" * 50)
+    with pytest.raises(
+        FormatError, match=r"a\.npz: expected an archive of NumPy arrays, got: File"
+    ):
+        read_cloud(tmp_path / "a.npz")
     np.savez(tmp_path / "a.npz", points=POINTS, extra=POINTS)
     data = bytearray((tmp_path / "a.npz").read_bytes())
     place = data.rindex(b"extra.npy")
@@ -335,15 +283,18 @@ def test_one_array_of_three_columns_is_the_points(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
+        ({"points": POINTS.T}, r".* \(N, 3\), got \(3, 4\); transpose them\."),
+        ({"points": POINTS.reshape(2, 2, 3)}, r".* of shape \(N, 3\), got \(2, 2, 3\)"),
+        ({"x": POINTS, "y": POINTS}, r"expected an array points \(or coord\), got 'x'"),
         ({"pos": POINTS, "xyz": POINTS}, "expected an array points"),
         ({"color": POINTS, "normal": POINTS}, "expected an array points"),
-        ({"arr_0": np.diag([500.0, 500, 1])}, "got a 3 x 3 camera matrix"),
+        ({"arr_0": np.diag([500.0, 500, 1])}, ".* got a 3 x 3 camera matrix"),
         ({"arr_0": np.zeros((0, 3))}, "expected an array points"),
     ],
 )
 def test_other_archives_are_no_clouds(tmp_path, arrays, message):
     np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(FormatError, match=message):
+    with pytest.raises(FormatError, match=rf"a\.npz: {message}"):
         read_cloud(tmp_path / "a.npz")
 
 

@@ -232,37 +232,29 @@ def test_promised_points_are_compared_with_the_file(tmp_path, order, count):
         read_cloud(save(tmp_path / "a.ply", header, body))
 
 
-def test_truncated_file_names_the_byte(tmp_path):
-    header = HEADER.format(order="binary_little_endian")
-    path = save(tmp_path / "a.ply", header, binary_body("<")[:-1])
-    message = rf"a\.ply: byte {len(header)}: expected 51 bytes for 3 records of vertex, got 50; "
-    with pytest.raises(FormatError, match=message):
-        read_cloud(path)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (("ply\n", "plx\n"), "line 1: expected 'ply', got 'plx'"),
         (
             ("end_header", "end-header"),
-            "line 12: expected a line of a PLY header, got 'end-header'",
+            "line 12: expected a PLY header, got 'end-header'",
         ),
         (
             ("format {order} 1.0\n", ""),
-            "line 11: expected a line of a PLY header, got 'end_header'",
+            "line 11: expected a PLY header, got 'end_header'",
         ),
-        (("{order}", "binary_middle_endian"), "line 2: expected a line of a PLY header"),
-        (("vertex 3", "vertex -3"), "line 4: expected a line of a PLY header"),
-        (("vertex 3", "vertex 1e3"), "line 4: expected a line of a PLY header"),
-        (("float y", "quad y"), "line 6: expected a line of a PLY header, got 'property quad y'"),
-        (("float y", "float x"), "line 6: expected distinct names, got 'x' twice; rename one"),
-        (("float y", "list float int y"), "line 6: expected a line of a PLY header"),
+        (("{order}", "binary_middle_endian"), "line 2: expected a PLY header"),
+        (("vertex 3", "vertex -3"), "line 4: expected a PLY header"),
+        (("vertex 3", "vertex 1e3"), "line 4: expected a PLY header"),
+        (("float y", "quad y"), "line 6: expected a PLY header, got 'property quad y'"),
+        (("float y", "float x"), "line 6: expected one 'x', got two; rename one"),
+        (("float y", "list float int y"), "line 6: expected a PLY header"),
         (("vertex 3", "point 3"), "expected an element vertex with properties, got elements point"),
         (("float y", "float why"), "expected fields x, y, z, got 'x', 'why', 'z', 'red'"),
         (("vertex 3", "vertex 0"), "expected at least one point, got none"),
         (("float z", "list uchar float z"), "line 13: expected a record of vertex, got '1.5 -2.0"),
-        (("uchar red", "list float uchar red"), "line 8: expected a line of a PLY header"),
+        (("uchar red", "list float uchar red"), "line 8: expected a PLY header"),
     ],
 )
 def test_broken_headers_name_the_line(tmp_path, change, message):

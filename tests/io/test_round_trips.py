@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchrg.io
+from tests.io.conftest import needs
 from torchrg.errors import FormatError, ShapeError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.fields import describe_renamed_fields
@@ -21,8 +22,10 @@ GRID = [".las", ".laz"]
 UTM = (500_000.0, 4_500_000.0, 100.0)
 
 
-def needs(suffix):
-    pytest.importorskip({".las": "laspy", ".laz": "lazrs"}.get(suffix, "numpy"))
+def with_holes(cloud):
+    """Return a cloud with two points that are not finite."""
+    cloud.coordinates[3], cloud.coordinates[7] = np.nan, [np.inf, 0.0, -np.inf]
+    return cloud
 
 
 @pytest.fixture(params=WRITTEN)
@@ -34,11 +37,11 @@ def suffix(request):
 @pytest.mark.parametrize("kind", EXACT)
 @pytest.mark.parametrize(("number", "origin"), [("f4", (0, 0, 0)), ("f8", UTM)])
 def test_binary_formats_keep_every_bit(tmp_path, make_cloud, assert_same, kind, number, origin):
-    needs(kind)
-    cloud = make_cloud(dtype=number, origin=origin)
+    cloud = with_holes(make_cloud(dtype=number, origin=origin))
     write_cloud(tmp_path / f"a{kind}", cloud)
     found = read_cloud(tmp_path / f"a{kind}")
     assert_same(found, cloud)
+    assert np.flatnonzero(~found.finite).tolist() == [3, 7]
     assert found.coordinates.dtype == cloud.coordinates.dtype
     assert found.fields["labels"].dtype == np.int64
     assert found.fields["color"].dtype == np.uint8
@@ -48,7 +51,7 @@ def test_binary_formats_keep_every_bit(tmp_path, make_cloud, assert_same, kind, 
 @pytest.mark.parametrize("kind", TEXT)
 @pytest.mark.parametrize(("number", "origin"), [("f4", (0, 0, 0)), ("f8", UTM)])
 def test_text_keeps_every_value(tmp_path, make_cloud, kind, number, origin):
-    cloud = make_cloud(dtype=number, origin=origin)
+    cloud = with_holes(make_cloud(dtype=number, origin=origin))
     write_cloud(tmp_path / f"a{kind}", cloud)
     found = read_cloud(tmp_path / f"a{kind}")
     assert found.coordinates.dtype == np.float64
@@ -69,16 +72,6 @@ def test_las_keeps_coordinates_to_its_grid_and_fields_exactly(tmp_path, make_clo
         np.testing.assert_array_equal(found.fields[name], values, err_msg=name)
 
 
-def test_files_grow_stable_after_the_first_round(tmp_path, make_cloud, suffix):
-    write_cloud(tmp_path / f"a{suffix}", make_cloud())
-    once = read_cloud(tmp_path / f"a{suffix}")
-    write_cloud(tmp_path / f"b{suffix}", once)
-    twice = read_cloud(tmp_path / f"b{suffix}")
-    np.testing.assert_array_equal(twice.coordinates, once.coordinates)
-    for name in once.fields:
-        np.testing.assert_array_equal(twice.fields[name], once.fields[name])
-
-
 @pytest.mark.parametrize("kind", WRITTEN)
 def test_equal_clouds_give_equal_bytes(tmp_path, make_cloud, kind, monkeypatch):
     needs(kind)
@@ -87,31 +80,6 @@ def test_equal_clouds_give_equal_bytes(tmp_path, make_cloud, kind, monkeypatch):
     monkeypatch.setattr("time.localtime", lambda *_: (2033, 5, 18, 3, 33, 20, 2, 138, 0))
     write_cloud(tmp_path / f"b{kind}", make_cloud())
     assert (tmp_path / f"a{kind}").read_bytes() == (tmp_path / f"b{kind}").read_bytes()
-
-
-@pytest.mark.parametrize("kind", [*EXACT[:4], *TEXT])
-def test_points_that_are_not_finite_stay_in_place(tmp_path, make_cloud, kind):
-    cloud = make_cloud()
-    cloud.coordinates[3] = np.nan
-    cloud.coordinates[7] = [np.inf, 0.0, -np.inf]
-    write_cloud(tmp_path / f"a{kind}", cloud)
-    found = read_cloud(tmp_path / f"a{kind}")
-    np.testing.assert_array_equal(found.coordinates.astype("f4"), cloud.coordinates)
-    assert np.flatnonzero(~found.finite).tolist() == [3, 7]
-
-
-def test_segmentation_is_written_beside_the_own_fields(
-    tmp_path, make_cloud, make_segmentation, suffix
-):
-    cloud, seg = make_cloud(), make_segmentation(60)
-    write_cloud(tmp_path / f"a{suffix}", cloud, seg)
-    fields = read_cloud(tmp_path / f"a{suffix}").fields
-    np.testing.assert_array_equal(fields["labels"], seg.labels)
-    np.testing.assert_array_equal(fields["normals"].astype("f4"), seg.normals)
-    np.testing.assert_array_equal(fields["curvature"].astype("f4"), seg.curvature)
-    if suffix != ".npz":
-        np.testing.assert_array_equal(fields["color"], cloud.fields["color"])
-        np.testing.assert_array_equal(fields["intensity"].astype("f4"), cloud.fields["intensity"])
 
 
 @pytest.mark.parametrize("kind", [kind for kind in WRITTEN if kind != ".npz"])
@@ -254,7 +222,7 @@ def test_other_numbers_become_floating_point_that_holds_them(tmp_path, number, k
 @pytest.mark.parametrize("number", ["c8", "bool", "U3", "M8[s]"])
 def test_other_types_of_coordinates_are_refused(tmp_path, number):
     np.savez(tmp_path / "a.npz", points=np.zeros((4, 3), number))
-    with pytest.raises(FormatError, match=r"a\.npz: expected real numbers as coordinates, got"):
+    with pytest.raises(FormatError, match=r"a\.npz: expected real coordinates, got"):
         read_cloud(tmp_path / "a.npz")
 
 
@@ -277,14 +245,14 @@ def test_truth_values_and_wide_integers_are_kept_by_value(tmp_path, make_cloud):
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
-        ("tag", np.array(["a", "b"]), "expected field tag to be real numbers"),
-        ("wave", np.zeros(2, complex), "expected field wave to be real numbers"),
-        ("long", np.zeros(2, np.longdouble), "expected field long to be real numbers"),
+        ("tag", np.array(["a", "b"]), "expected tag of real numbers"),
+        ("wave", np.zeros(2, complex), "expected wave of real numbers"),
+        ("long", np.zeros(2, np.longdouble), "expected long of real numbers"),
         ("short", np.zeros(1), r"expected field short of shape \(2, \.\.\.\), got \(1,\)"),
-        ("cube", np.zeros((2, 2, 2)), r"expected field cube of shape \(N,\) or \(N, C\)"),
-        ("none", np.zeros((2, 0)), r"expected field none of shape \(N,\) or \(N, C\)"),
+        ("cube", np.zeros((2, 2, 2)), r"expected cube of shape \(N,\) or \(N, C\)"),
+        ("none", np.zeros((2, 0)), r"expected none of shape \(N,\) or \(N, C\)"),
         ("x", np.zeros(2), "duplicate field name 'x'"),
-        ("color", np.zeros((2, 3)), "expected field color of uint8 or uint16, got float64"),
+        ("color", np.zeros((2, 3)), "expected uint8 or uint16 color, got float64"),
         ("_", np.zeros(2), "a field cannot be named '_'; rename it"),
     ],
 )
@@ -316,17 +284,11 @@ def test_no_points_are_refused(tmp_path, suffix):
         write_cloud(tmp_path / f"a{suffix}", Cloud(np.zeros((0, 3))))
 
 
-def test_suffix_in_capitals_is_the_same(tmp_path, make_cloud, assert_same):
-    cloud = make_cloud()
-    write_cloud(tmp_path / "a.PLY", cloud)
-    assert_same(read_cloud(str(tmp_path / "a.PLY")), cloud)
-
-
 @pytest.mark.parametrize(("call", "kinds"), [(read_cloud, FORMATS), (check_output, WRITTEN)])
 def test_unknown_suffix_lists_the_known_ones(tmp_path, call, kinds):
     (tmp_path / "a.abc").write_bytes(b"solid")
     known = re.escape(f"{' '.join(kinds)}, got '.abc'")
-    with pytest.raises(FormatError, match=rf"a\.abc: expected a file that ends in one of {known}"):
+    with pytest.raises(FormatError, match=rf"a\.abc: expected a file ending in one of {known}"):
         call(tmp_path / "a.abc")
 
 
@@ -360,31 +322,20 @@ def test_formats_of_one_direction_say_so(tmp_path, make_cloud):
         with pytest.raises(FormatError, match=message):
             call(tmp_path / "a.e57")
     write_cloud(tmp_path / "a.vg", make_cloud())
-    with pytest.raises(FormatError, match=r"a\.vg: expected a file that ends in one of .*'\.vg'"):
+    with pytest.raises(FormatError, match=r"a\.vg: expected a file ending in one of .*'\.vg'"):
         read_cloud(tmp_path / "a.vg")
-    with pytest.raises(FormatError, match=r"a\.bvg: expected a file that ends in one of"):
+    with pytest.raises(FormatError, match=r"a\.bvg: expected a file ending in one of"):
         check_output(tmp_path / "a.bvg")
 
 
 def test_outputs_are_checked_before_the_work(tmp_path):
-    check_output(tmp_path / "a.ply")
+    for name in ("a.ply", "a.vg", "A.PLY"):
+        check_output(tmp_path / name)
     with pytest.raises(FormatError, match="not found; create it first"):
         check_output(tmp_path / "missing" / "a.ply")
     (tmp_path / "b.ply").mkdir()
     with pytest.raises(FormatError, match=r"b\.ply: expected a file to write, got a directory"):
         check_output(tmp_path / "b.ply")
-
-
-def test_files_pass_between_formats(tmp_path, make_cloud):
-    kinds = [".npz", ".pcd", ".ply", ".npy", ".xyz", ".npz"]
-    cloud = make_cloud(dtype="f8", origin=UTM)
-    previous = cloud
-    for number, kind in enumerate(kinds):
-        write_cloud(tmp_path / f"{number}{kind}", previous)
-        previous = read_cloud(tmp_path / f"{number}{kind}")
-    np.testing.assert_array_equal(previous.coordinates, cloud.coordinates)
-    for name, values in cloud.fields.items():
-        np.testing.assert_array_equal(previous.fields[name].astype(values.dtype), values)
 
 
 @pytest.mark.parametrize("given", [torch.eye(3), np.eye(3, dtype=np.float32)])

@@ -77,11 +77,37 @@ ALPHA = np.full((40, 1), 255)
         ([UNITS, POINTS[:, :1], ALPHA], "nx ny nz column_7 column_8"),
         ([COLORS, COLORS], "column_4 column_5 column_6 column_7 column_8 column_9"),
         ([COLORS * 257, UNITS], "red green blue nx ny nz"),
+        ([], ""),
+        ([[0.5]], "intensity"),
+        ([[0.5, 0.5]], "column_4 column_5"),
+        ([[255.0, 0, 7]], "red green blue"),
+        ([[0.6, 0, -0.8]], "nx ny nz"),
+        ([[0.0, 0, 1]], "nx ny nz"),
+        ([[0.0, 0, 0]], "red green blue"),
+        ([[1e200, 1e200, 1e200]], "column_4 column_5 column_6"),
+        ([[0.3, 0.3, 0.3]], "column_4 column_5 column_6"),
+        ([[255.0, 0, 7, 0.5]], "red green blue column_7"),
+        ([[256.0, 0, 7, 3]], "intensity red green blue"),
+        ([[-1640.0, 0, 7, 3]], "intensity red green blue"),
+        ([[0.5, 0.6, 0, -0.8]], "column_4 nx ny nz"),
+        ([[0.6, 0, -0.8, 3]], "nx ny nz column_7"),
+        # Intensity and color, or color and label: values do not tell.
+        ([[255.0, 0, 7, 3]], "column_4 column_5 column_6 column_7"),
+        ([[0.5, 0, 7, 0.5]], "column_4 column_5 column_6 column_7"),
     ],
 )
-def test_columns_are_named_by_their_values(columns, names):
-    table = np.hstack([POINTS, *columns])
-    assert guess_column_names(table) == ["x", "y", "z", *names.split()]
+def test_columns_are_named_by_their_values(tmp_path, columns, names):
+    rows = (np.broadcast_to(values, (40, np.shape(values)[-1])) for values in columns)
+    table = np.hstack([POINTS, *rows])
+    with np.errstate(over="ignore"):
+        assert guess_column_names(table) == ["x", "y", "z", *names.split()]
+    np.save(tmp_path / "a.npy", table)
+    np.savetxt(tmp_path / "a.txt", table)
+    grouped = names.replace("red green blue", "color").replace("nx ny nz", "normals")
+    for kind in ("npy", "txt"):
+        cloud = read_cloud(tmp_path / f"a.{kind}")
+        np.testing.assert_allclose(cloud.coordinates, POINTS)
+        assert cloud.fields.keys() == {*grouped.split()}
 
 
 GRID = np.stack(np.meshgrid(np.arange(8), np.arange(5), indexing="ij"), -1).reshape(40, 2)

@@ -3,7 +3,6 @@
 import numpy as np
 
 from torchrg import segment_planes, write_cloud
-from torchrg.cli import main
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
 
@@ -56,10 +55,3 @@ def test_labels_alone_become_groups_of_fitted_planes(tmp_path):
     assert abs(abs(planes[0][:3] @ normal) - 1) < 1e-12
     assert np.abs(points @ planes[0][:3] + planes[0][3]).max() < 1e-12
     assert planes[1].tolist() == [0, 0, 0, 0]
-
-
-def test_the_command_writes_them(tmp_path):
-    room, out = str(tmp_path / "room.npz"), tmp_path / "planes.vg"
-    assert main(["sample", room, "--num-points", "3000"]) == 0
-    assert main(["segment", room, "--out", str(out), "--preset", "classic"]) == 0
-    assert len(literal_groups(out.read_text().splitlines(keepends=True))[1]) > 5

@@ -6,7 +6,6 @@ from unittest import mock
 import torch
 
 from torchrg import kernels
-from torchrg.linalg import unsigned_angle_deg
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals.pca import fit_points_pca
 from torchrg.regions.edges import GrowingInput
@@ -15,9 +14,6 @@ from torchrg.scenes import make_room
 from torchrg.structures import Neighbors
 
 needs_library = kernels.name_of_library() is not None
-MIN_EQUAL = 0.98
-"""Share of the points at which a choice, as that of a best plane, is the same: rounding may decide
-between two that are as good."""
 
 
 @contextlib.contextmanager
@@ -30,7 +26,7 @@ def definitions():
 def clouds():
     """Points by name: made, exact, collinear, doubled, tiny, huge and far ones."""
     generator = torch.Generator().manual_seed(0)
-    room = make_room(num_points=3000, noise=0.003, seed=3).points
+    room = make_room(num_points=1500, noise=0.003, seed=3).points
     line = torch.zeros(300, 3)
     line[:, 0] = torch.rand(300, generator=generator)
     bent = room[:1000].clone()
@@ -40,7 +36,7 @@ def clouds():
         "grid": torch.cartesian_prod(torch.arange(12.0), torch.arange(12.0), torch.arange(2.0)),
         "line": line,
         "bent": bent,
-        "doubled": room[:1500].repeat(2, 1),
+        "doubled": room[:750].repeat(2, 1),
         "tiny": room[:1000] * 1e-18,
         "huge": room[:1000] * 1e15,
         "far": room[:1000] + 500.0,
@@ -78,12 +74,3 @@ def both(function, *arguments, **settings):
     found = function(*arguments, **settings)
     with definitions():
         return found, function(*arguments, **settings)
-
-
-def assert_same_planes(found, expected, unit, fraction=1.0, rows=slice(None)):
-    """Compare normals and offsets, by angle and to a share of a unit for each row."""
-    angle = unsigned_angle_deg(found[0], expected[0])[rows]
-    turned = torch.where((found[0] * expected[0]).sum(dim=1) < 0, -1.0, 1.0)
-    error = ((found[1] * turned - expected[1]).abs() / unit)[rows]
-    same = (angle < 0.1) & (error < 1e-3)
-    assert same.float().mean() >= fraction, (angle.max(), error.max())

@@ -1,12 +1,14 @@
 """Float64 clouds: where float32 is fine enough, they are computed like float32 ones."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 import torchrg
 from torchrg import kernels
-from torchrg.linalg.precision import to_single
+from torchrg.linalg.precision import flatness_tolerance, to_single
 from torchrg.neighbors import search_knn
 from torchrg.scenes import make_room
 
@@ -17,7 +19,7 @@ FITTED = {"fit_normals_pca", "pass_edges"}
 
 @pytest.fixture(scope="module")
 def room():
-    return make_room(3000, noise=0.003, seed=4).points
+    return make_room(2000, noise=0.003, seed=4).points
 
 
 def test_a_near_cloud_keeps_its_values_and_a_far_one_its_differences(room):
@@ -124,3 +126,24 @@ def test_gradients_keep_the_precision_of_the_points(room):
 def _patch(points, row):
     patch = points[search_knn(points, 20).indices[row].long()].numpy()
     return patch - patch.mean(axis=0)
+
+
+PACKAGE = Path(__file__).parents[2] / "torchrg"
+# The largest number that a file can hold.
+MAY_ASK_FOR_PRECISION = {"datasets/s3dis.py"}
+
+
+def test_tolerance_of_a_plane_grows_with_the_distance_from_the_origin(dtype):
+    near = flatness_tolerance(torch.ones(1, 5, 3, dtype=dtype), torch.ones(1, dtype=dtype))
+    far = flatness_tolerance(torch.full((1, 5, 3), 1e4, dtype=dtype), torch.ones(1, dtype=dtype))
+    assert 9 < near / torch.finfo(dtype).eps < 11
+    assert 1e3 < far / near < 1e4
+
+
+def test_tolerances_stand_here_alone():
+    asking = {
+        str(path.relative_to(PACKAGE))
+        for path in PACKAGE.rglob("*.py")
+        if "finfo" in path.read_text() and path.parent.name != "linalg"
+    }
+    assert asking <= MAY_ASK_FOR_PRECISION

@@ -60,6 +60,7 @@ def test_forward_gives_the_score_of_one_scan_and_compute_the_mean_of_all(part):
 def test_each_index_is_the_one_of_the_catalog_that_it_is_named_for(part):
     names = [name for name in METRICS[part] if name not in NO_NAMES]
     whole, *singles = PlaneMetric(part), *map(PlaneMetric, names)
+    assert (whole.index, whole.unit, whole.higher_is_better) == (None, None, None)
     for arguments, _ in scans(part):
         for metric in (whole, *singles):
             metric.update(*arguments)
@@ -71,11 +72,6 @@ def test_each_index_is_the_one_of_the_catalog_that_it_is_named_for(part):
         assert single.full_state_update is single.is_differentiable is False
 
 
-def test_all_indices_of_a_part_have_no_direction():
-    whole = PlaneMetric("labels")
-    assert (whole.index, whole.unit, whole.higher_is_better) == (None, None, None)
-
-
 def test_unknown_indices_and_those_of_several_parts_are_refused():
     with pytest.raises(ConfigError, match=r"expected index to be one of labels, .*, got 'f2'"):
         PlaneMetric("f2")
@@ -83,17 +79,6 @@ def test_unknown_indices_and_those_of_several_parts_are_refused():
         PlaneMetric("invalid")
     with pytest.raises(ValueError, match="Unexpected keyword arguments: `min_points`"):
         PlaneMetric("f1", min_points=3)
-
-
-def test_directions_say_which_of_two_results_is_better():
-    ground_truth = torch.repeat_interleave(torch.arange(4), 25)
-    merged = torch.where(ground_truth == 1, 0, ground_truth)
-    assert PlaneMetric("f1").higher_is_better
-    for name in ("f1", "ari", "covering"):
-        right, wrong = PlaneMetric(name), PlaneMetric(name)
-        right.update(ground_truth, ground_truth)
-        wrong.update(merged, ground_truth)
-        assert (right.compute() > wrong.compute()) == right.higher_is_better
 
 
 @pytest.mark.filterwarnings("ignore:Sparse invariant checks:UserWarning")

@@ -31,14 +31,6 @@ def test_neighbors_are_those_of_brute_force(levels):
         assert search_knn(points, k).indices.tolist() == brute_force(points, k)
 
 
-def test_neighbors_do_not_depend_on_the_order(rng):
-    points = (torch.rand(400, 3, generator=rng) * 6).round()
-    points = points.unique(dim=0)
-    shuffled = torch.randperm(len(points), generator=rng)
-    plain = search_knn(points, 12).indices.long()
-    assert torch.equal(shuffled[search_knn(points[shuffled], 12).indices.long()], plain[shuffled])
-
-
 def test_chunks_and_threads_change_nothing(rng, monkeypatch, set_threads):
     points = torch.rand(3000, 3, generator=rng)
     whole = search_knn(points, 9).indices
@@ -102,19 +94,15 @@ def test_more_points_than_lists_of_int32_can_name_are_refused():
         search_knn(torch.zeros(1, 3).expand(2**31, 3), 5)
 
 
-@pytest.mark.parametrize("max_distance", [-1.0, float("nan")])
-def test_a_distance_that_is_none_is_refused(max_distance):
-    with pytest.raises(ConfigError, match="search_knn: expected max_distance >= 0, got"):
-        search_knn(torch.rand(5, 3), 2, max_distance=max_distance)
-
-
-def test_points_that_are_not_finite_are_refused():
-    points = torch.rand(5, 3)
-    points[2, 1] = torch.nan
-    with pytest.raises(ShapeError, match="got 1 of 5 with NaN or Inf"):
-        search_knn(points, 2)
-
-
-def test_offset_must_end_at_the_last_point():
-    with pytest.raises(ShapeError, match="expected offset to ascend to the number of points"):
-        search_knn(torch.rand(5, 3), 2, offset=torch.tensor([2, 4]))
+@pytest.mark.parametrize(
+    ("points", "settings", "error", "message"),
+    [
+        (torch.rand(5, 3), {"max_distance": -1.0}, ConfigError, "max_distance >= 0, got -1"),
+        (torch.rand(5, 3), {"max_distance": torch.nan}, ConfigError, "max_distance >= 0, got nan"),
+        (torch.tensor([[torch.nan, 0, 0]] * 2), {}, ShapeError, ".* got 2 of 2 with NaN or Inf"),
+        (torch.rand(5, 3), {"offset": torch.tensor([2, 4])}, ShapeError, "offset to ascend to the"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(points, settings, error, message):
+    with pytest.raises(error, match=f"search_knn: expected {message}"):
+        search_knn(points, 2, **settings)

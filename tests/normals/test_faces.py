@@ -11,7 +11,7 @@ from torchrg import scratch
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.order import finite_rows
 from torchrg.normals import orient_normals
-from torchrg.normals.faces import _compare, _Components, find_faces, find_surfaces
+from torchrg.normals.faces import _Components, _find_links, _split_plates, find_faces, find_surfaces
 from torchrg.normals.orient import turn_faces
 from torchrg.scenes import make_room
 
@@ -86,10 +86,28 @@ def test_kernel_of_links_equals_the_definition(rng):
     points[:9] = points[0]
     normals = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=rng), dim=1)
     rows = torch.arange(0, len(points), 2)
-    arguments = points, normals, rows, search_knn(points, 7).indices[rows]
-    found = _compare(*arguments)
+    groups = torch.randint(-1, 3, (len(points),), generator=rng, dtype=torch.int32)
+    for more in ([], [groups], [groups, 0.4]):
+        arguments = points, normals, search_knn(points, 7).indices, rows, [2, 4, 6], *more
+        found = _find_links(*arguments)
+        with definitions():
+            expected = _find_links(*arguments)
+        assert len(found[0]) > 100
+        for values, others in zip(found, expected, strict=True):
+            assert torch.equal(values, others)
+
+
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("thickness", [0.0, 0.02, 1.0])
+def test_kernel_of_plates_equals_the_definition(rng, thickness):
+    points = make_room(3000, noise=0.003, seed=0).points
+    rows = torch.arange(0, len(points), 2)
+    faces = torch.randint(0, 7, (len(rows),), generator=rng)
+    axes = torch.nn.functional.normalize(torch.randn(9, 3, generator=rng), dim=1)
+    points[rows] -= (points[rows] * axes[faces]).sum(dim=1, keepdim=True) * axes[faces] * 0.99
+    found = _split_plates(points, rows, faces, axes, thickness)
     with definitions():
-        expected = _compare(*arguments)
+        expected = _split_plates(points, rows, faces, axes, thickness)
     for values, others in zip(found, expected, strict=True):
         assert torch.equal(values, others)
 
@@ -171,7 +189,7 @@ def test_surfaces_are_connected_over_edges(rng):
 
 @pytest.fixture(scope="module")
 def furnished():
-    room = make_room(12_000, 0.003, 4)
+    room = make_room(8_000, 0.003, 4)
     rows = finite_rows(room.points)
     return room.points[rows].float(), room.normals[rows].float()
 
@@ -186,16 +204,14 @@ def test_a_stray_point_far_off_changes_little(furnished):
 
 
 @pytest.mark.parametrize("side", ["interior", "consistent"])
-def test_threads_and_disks_and_longer_lists_change_nothing(furnished, tmp_path, monkeypatch, side):
+def test_threads_and_disks_and_longer_lists_change_nothing(
+    furnished, tmp_path, monkeypatch, set_threads, side
+):
     points, normals = furnished
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            results.append(orient_normals(points, normals, orient=side))
-    finally:
-        torch.set_num_threads(before)
+    for threads in (3, 1):
+        set_threads(threads)
+        results.append(orient_normals(points, normals, orient=side))
     monkeypatch.setattr(scratch, "_MIN_BYTES", 0)
     with scratch.on_disk(tmp_path):
         results.append(orient_normals(points, normals, orient=side))

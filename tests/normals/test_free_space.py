@@ -1,44 +1,30 @@
-"""Free paths from cells with points."""
+"""Sides with more free space, in rooms whose normals are partly wrong."""
 
-import math
 from itertools import product
 
 import numpy as np
 import pytest
 import torch
 
+from tests.kernels.clouds import definitions
 from tests.normals.test_orient import box_room, shuffled_signs
-from torchrg.neighbors import search_knn
+from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals import orient_normals
-from torchrg.normals.free_space import _free_paths, cell_width, vote_free_side
+from torchrg.normals.free_space import _free_gaps, cell_width, vote_free_side
 
 
-def walked_path(occupied, cell, steps):
-    """Walk over empty cells to the next one with points or out of the grid."""
-    at, count = np.array(cell) + steps, 0
-    while ((at >= 0) & (at < occupied.shape)).all():
-        if occupied[tuple(at)]:
-            return count, 1.0
-        at, count = at + steps, count + 1
-    return count, 0.5
-
-
-def test_free_paths_are_those_of_a_walk_through_a_dense_grid():
-    rng = np.random.default_rng(2)
-    occupied = rng.random((7, 5, 9)) < 0.15
-    at = np.stack(np.nonzero(occupied))
-    at = at - at.min(axis=1, keepdims=True)
-    occupied = np.zeros(at.max(axis=1) + 1, dtype=bool)
-    occupied[tuple(at)] = True
+@pytest.mark.parametrize("sides", [(7, 5, 9), (300, 300, 40), (2**19, 2**19, 2**19)])
+def test_kernel_of_free_gaps_equals_the_definition(sides):
+    rng = np.random.default_rng(3)
+    cells = np.unique(np.stack([rng.integers(0, side, 5000) for side in sides]), axis=1)
+    cells = (cells - cells.min(axis=1, keepdims=True)).astype(np.int32)
     for steps in product((-1, 0, 1), repeat=3):
-        if steps <= (0, 0, 0):
-            continue
-        stride = math.sqrt(sum(map(abs, steps)))
-        for found, sign in zip(_free_paths(at, steps, stride), (1, -1), strict=True):
-            for cell, worth in zip(at.T, found, strict=True):
-                count, weight = walked_path(occupied, cell, sign * np.array(steps))
-                expected = weight * count * stride / (count * stride + 8)
-                assert worth == pytest.approx(expected, rel=1e-6)
+        if steps > (0, 0, 0):
+            found = _free_gaps(cells, steps)
+            with definitions():
+                expected = _free_gaps(cells, steps)
+            for values, others in zip(found, expected, strict=True):
+                assert np.array_equal(values, others)
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +57,55 @@ def test_cells_along_an_axis_are_numbered_by_nineteen_bits(rng):
     points[0, 1] = 1e9
     wide = cell_width(points, search_knn(points, 20).indices)
     assert wide == pytest.approx(1e9 / 2**18)
+
+
+def literal_vote(cells, cell, normal):
+    """Step from a cell in all 26 directions until the next occupied cell or out of the box."""
+    occupied = set(map(tuple, cells.tolist()))
+    sides = cells.amax(dim=0) + 1
+    total = 0.0
+    for steps in product((-1, 0, 1), repeat=3):
+        direction = torch.tensor(steps)
+        if not direction.any():
+            continue
+        stride = float(direction.double().norm())
+        cosine = float(normal.double() @ direction.double()) / stride
+        position, free = cell + direction, 0
+        while is_inside(position, sides) and tuple(position.tolist()) not in occupied:
+            position, free = position + direction, free + 1
+        weight = 1.0 if is_inside(position, sides) else 0.5
+        total += weight * cosine * abs(cosine) * stride * free / (stride * free + 8)
+    return total
+
+
+def is_inside(position, sides):
+    return bool(((position >= 0) & (position < sides)).all())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_votes_are_those_of_literal_steps(seed):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(80, 3, generator=generator) * torch.tensor([3.0, 2.0, 1.0])
+    points = points[canonical_order(points)]
+    normals = torch.nn.functional.normalize(torch.randn(80, 3, generator=generator), dim=1)
+    rows, near, width = torch.arange(0, 80, 3), torch.arange(80, dtype=torch.int32)[:, None], 0.1
+    votes = vote_free_side(points, normals, near, rows, width)
+    cells = ((points - points.amin(dim=0)) / width).long()
+    expected = torch.tensor([literal_vote(cells, cells[row], normals[row]) for row in rows])
+    torch.testing.assert_close(votes, expected, atol=1e-5, rtol=1e-5)
+    assert float(expected.abs().min()) > 1e-4
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_plate_ends_paths_between_its_faces(sign):
+    """Half a cell apart, both faces are in the same cells."""
+    grid = torch.cartesian_prod(torch.arange(8.0), torch.arange(8.0))
+    faces = [torch.cat([grid, torch.full((64, 1), height)], dim=1) for height in (0.1, 0.6)]
+    roof = torch.tensor([[4.0, 4.0, 9.0], [4.0, 4.0, -9.0]])
+    points = torch.cat([*faces, roof])
+    normals = torch.tensor([0.0, 0, sign]).expand(130, 3).contiguous()
+    near = torch.stack([torch.arange(130), (torch.arange(130) + 64) % 128], dim=1).int()
+    rows = torch.tensor([27, 91])
+    lower, upper = vote_free_side(points, normals, near, rows, 1.0).tolist()
+    assert sign * lower < -0.4
+    assert sign * upper > 0.4

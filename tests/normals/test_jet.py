@@ -6,8 +6,9 @@ import numpy as np
 import torch
 
 from torchrg.linalg import unsigned_angle_deg
+from torchrg.linalg.moments import unbind_columns
 from torchrg.normals import fit_jet, fit_normals_jet, fit_normals_pca
-from torchrg.normals.jet import least_squares
+from torchrg.normals.jet import fit_paraboloids, least_squares
 
 # Sums of CGAL lose digits far from the origin; the frame of exact planes and lines is arbitrary.
 LOSES_DIGITS = ("utm", "off1e4")
@@ -71,18 +72,6 @@ def test_curvatures_of_a_sphere_are_those_of_its_radius(rng):
     assert fit_normals_pca(sphere).normals.sub(fit.normals).norm() > 0
 
 
-def test_curvature_is_positive_where_the_surface_bends_towards_the_normal():
-    u, v = torch.meshgrid(torch.arange(-3.0, 4), torch.arange(-3.0, 4), indexing="ij")
-    saddle = torch.stack([u, v, (2 * u * u - v * v) / 50], dim=-1).reshape(49, 3).roll(-24, dims=0)
-    fit = fit_jet(saddle)
-    expected = torch.tensor([0.08, -0.04]) * fit.normals[2].sign()
-    assert torch.allclose(
-        fit.principal_curvatures, expected.sort(descending=True).values, atol=1e-5
-    )
-    steep = 0 if fit.normals[2] > 0 else 1
-    assert fit.principal_directions[steep, 0].abs() > 0.999
-
-
 def test_curvatures_scale_with_the_unit(rng):
     patch = torch.randn(30, 3, generator=rng, dtype=torch.float64) * torch.tensor([1, 1, 0.1])
     small, large = fit_jet(patch), fit_jet(patch * 1000)
@@ -144,3 +133,40 @@ def test_dependent_columns_are_left_out(rng):
     found, residual = least_squares([(a, 1e-9), (b, 1e-9), (a - 2 * b, 1e-9)], 3 * a + b)
     assert torch.allclose(torch.cat(found, dim=1), torch.tensor([[3.0, 1, 0]]).double())
     assert residual.abs().max() < 1e-12
+
+
+def literal_paraboloid(patch, up):
+    """Fit one height field with numpy's least squares."""
+    helper = np.eye(3)[np.argmin(np.abs(up))]
+    first = np.cross(up, helper)
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    u, v, h = patch @ first, patch @ second, patch @ up
+    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    a, b, c = (solution := np.linalg.lstsq(design, h, rcond=None)[0])[:3]
+    normal = up - b * first - c * second
+    length = np.sqrt(1 + b * b + c * c)
+    rest = h - design @ solution
+    return normal / length, a / length, np.sqrt((rest**2).sum() / (len(u) - 6))
+
+
+def test_paraboloids_are_those_of_numpy(rng):
+    patches = torch.randn(40, 30, 3, generator=rng, dtype=torch.float64)
+    patches[:, 0] = 0
+    ups = torch.nn.functional.normalize(torch.randn(40, 3, generator=rng).double(), dim=1)
+    found = fit_paraboloids(unbind_columns(patches), ups, torch.ones(40, 30).double())
+    for row in range(40):
+        normal, offset, deviation = literal_paraboloid(patches[row].numpy(), ups[row].numpy())
+        assert np.allclose(found[0][row].numpy(), normal, atol=1e-8)
+        assert np.isclose(float(found[1][row]), offset, atol=1e-8)
+        assert np.isclose(float(found[2][row]), deviation, atol=1e-8)
+
+
+def test_paraboloids_of_two_scan_lines_are_their_plane():
+    line = torch.linspace(-1, 1, 15)
+    lines = torch.stack([line.repeat(2), torch.tensor([0.0, 0.5]).repeat_interleave(15)], dim=1)
+    patch = torch.cat([lines, torch.zeros(30, 1)], dim=1)[None]
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    normals, offsets, deviations = fit_paraboloids(unbind_columns(patch), up, torch.ones(1, 30))
+    assert torch.allclose(normals, up)
+    assert float(offsets.abs() + deviations) < 1e-6

@@ -69,11 +69,6 @@ def test_lines_are_no_planes_wherever_they_are(rng, dtype, far):
     assert not fit.normals.any()
 
 
-def test_three_points_on_a_line_are_no_plane(dtype):
-    points = torch.tensor([[0.1, 0.2, 0.3], [0.2, 0.4, 0.6], [0.7, 1.4, 2.1]], dtype=dtype)
-    assert not fit_normals_pca(points).valid
-
-
 def test_resolution_decides_what_is_rounding(rng):
     patches = strips(rng, 1e-4, torch.float64)
     size = torch.full((len(patches),), 1e-3, dtype=torch.float64)

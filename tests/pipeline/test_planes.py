@@ -28,20 +28,12 @@ def small(config):
 
 @pytest.fixture(scope="module")
 def scene(room):
-    return room(8000, 0.003, 1)
+    return room(5000, 0.003, 1)
 
 
 @pytest.fixture(scope="module", params=PRESETS)
 def config(request):
     return small(load_config(request.param))
-
-
-def same_partition(a, b):
-    """Return whether two labellings are equal but for the names of regions of equal size."""
-    forward = dict(zip(a.tolist(), b.tolist(), strict=True))
-    return all(forward[x] == y for x, y in zip(a.tolist(), b.tolist(), strict=True)) and (
-        len(set(forward.values())) == len(forward)
-    )
 
 
 def assert_same_planes(ours, theirs):
@@ -67,7 +59,8 @@ def test_box_faces_are_found(preset):
     assert torch.stack([axis, offset]).unique(dim=1).shape[1] == 6
 
 
-def test_table_says_what_meets_and_what_is_asked_for(scene):
+def test_table_says_what_meets_and_what_is_asked_for(room):
+    scene = room(8000, 0.003, 1)
     plain = load_config("consensus")
     planes = segment_planes(scene.points, plain).planes
     assert planes.adjacency is not None
@@ -76,7 +69,8 @@ def test_table_says_what_meets_and_what_is_asked_for(scene):
     without = planes.kind
     asked = dataclasses.replace(plain, planes=PlanesConfig(up="z", outline=True))
     planes = segment_planes(scene.points, asked).planes
-    assert [PLANE_KINDS[kind] for kind in planes.kind[:6]] == ["ceiling", "floor"] + ["wall"] * 4
+    kinds = sorted(PLANE_KINDS[kind] for kind in planes.kind[:6])
+    assert kinds == ["ceiling", "floor"] + ["wall"] * 4
     assert torch.equal(without, planes.kind)
     assert len(planes.outline) == len(planes)
     turned = dataclasses.replace(plain, planes=PlanesConfig(up="-y"))
@@ -93,10 +87,13 @@ def test_order_changes_nothing(scene, config):
     assert torch.equal(other.curvature, plain.curvature[shuffled])
     assert torch.equal(other.sharp, plain.sharp[shuffled])
     assert_same_planes(other.planes, plain.planes)
+    counts = torch.bincount(plain.labels[plain.labels >= 0])
+    assert torch.equal(counts, plain.planes.count)
+    assert bool((counts.diff() <= 0).all())
 
 
 def test_chunks_and_threads_change_nothing(scene, config, set_threads):
-    points = scene.points[:3000]
+    points = scene.points[:2000]
     plain = segment_planes(points, config)
     for chunk_size, num_threads in ((397, 1), (100_000, 2)):
         set_threads(num_threads)
@@ -104,30 +101,18 @@ def test_chunks_and_threads_change_nothing(scene, config, set_threads):
         assert torch.equal(other.labels, plain.labels)
         assert torch.equal(other.normals, plain.normals)
         assert torch.equal(other.curvature, plain.curvature)
+        assert_same_planes(other.planes, plain.planes)
 
 
-@pytest.mark.parametrize("unit", [2.0**-13, 1000.0])
-def test_unit_changes_nothing(scene, config, unit):
-    plain = segment_planes(scene.points.double(), config)
-    other = segment_planes(scene.points.double() * unit, config)
-    agreement = score_labels(other.labels, plain.labels).ari
-    assert agreement > (0.999 if unit == 1000.0 else 1 - 1e-12)
-    assert torch.allclose(other.planes.area.sum(), plain.planes.area.sum() * unit**2, rtol=1e-2)
-
-
-def test_origin_changes_nothing_in_double_precision(scene, config):
+def test_unit_and_origin_change_nothing_in_double_precision(scene, config):
     # Coordinates on a grid of 2^-20 m are moved without rounding.
-    points = (scene.points.double() * 2**20).round() / 2**20
-    plain = segment_planes(points, config)
-    other = segment_planes(points + torch.tensor([5e5, 4e6, 100.0]), config)
-    assert score_labels(other.labels, plain.labels).ari > 0.999
-
-
-def test_arrays_and_tensors_give_the_same(scene, config):
-    assert torch.equal(
-        segment_planes(scene.points.numpy(), config).labels,
-        segment_planes(scene.points, config).labels,
-    )
+    points = (scene.points[::2].double() * 2**20).round() / 2**20
+    plain = segment_planes(points.numpy(), config)
+    for other, unit in ((points * 1000, 1000), (points + torch.tensor([5e5, 4e6, 100.0]), 1)):
+        moved = segment_planes(other, config)
+        assert score_labels(moved.labels, plain.labels).ari > 0.999
+        area = plain.planes.area.sum() * unit**2
+        assert torch.allclose(moved.planes.area.sum(), area, rtol=1e-2)
 
 
 def test_points_that_are_not_finite_stay_in_place(scene, config):
@@ -162,13 +147,6 @@ def test_equal_points_give_no_region(config):
     seg = segment_planes(torch.ones(500, 3), config)
     assert not seg.valid.any()
     assert bool((seg.labels == UNLABELED).all())
-
-
-def test_labels_are_sorted_by_size(scene, config):
-    seg = segment_planes(scene.points, config)
-    counts = torch.bincount(seg.labels[seg.labels >= 0])
-    assert torch.equal(counts, seg.planes.count)
-    assert bool((counts.diff() <= 0).all())
 
 
 def test_stages_are_announced_in_order(scene, config):
@@ -212,22 +190,6 @@ def test_tutorial_scan_gives_the_regions_of_pcl(scan):
     seg = segment_planes(cloud.points, load_config("classic"))
     assert len(seg.planes) == 53
     assert int(seg.planes.count[0]) == 58031
-
-
-def test_consensus_keeps_the_faces_of_a_plate_apart():
-    rng = np.random.default_rng(1)
-    size = np.array([1.2, 0.8, 0.04])
-    area = np.repeat(size.prod() / size, 2)
-    face = rng.choice(6, 8000, p=area / area.sum())
-    points = rng.random((8000, 3)) * size
-    points[np.arange(8000), face // 2] = (face % 2) * size[face // 2]
-    points[np.arange(8000), face // 2] += 0.003 * rng.standard_normal(8000)
-    seg = segment_planes(points, load_config("consensus"))
-    for side in (4, 5):
-        found = int(seg.labels[torch.from_numpy(face == side)].mode().values)
-        both = ((seg.labels == found).numpy() & (face == side)).sum()
-        either = ((seg.labels == found).numpy() | (face == side)).sum()
-        assert both > 0.9 * either
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -77,16 +77,16 @@ def line(rng, n):
 
 
 KINDS = {
-    "exact room": lambda rng: room(rng, 250),
-    "room": lambda rng: room(rng, 250, 0.005),
-    "noisy room": lambda rng: room(rng, 200, 0.03),
-    "lattice": lambda rng: lattice(rng, 200),
-    "quantized": lambda rng: quantized(rng, 200),
-    "doubled": lambda rng: doubled(rng, 160),
-    "blob": lambda rng: blob(rng, 150),
-    "sphere": lambda rng: sphere(rng, 250),
-    "plates": lambda rng: plates(rng, 250),
-    "graded": lambda rng: graded(rng, 250),
+    "exact room": lambda rng: room(rng, 130),
+    "room": lambda rng: room(rng, 130, 0.005),
+    "noisy room": lambda rng: room(rng, 110, 0.03),
+    "lattice": lambda rng: lattice(rng, 128),
+    "quantized": lambda rng: quantized(rng, 110),
+    "doubled": lambda rng: doubled(rng, 90),
+    "blob": lambda rng: blob(rng, 90),
+    "sphere": lambda rng: sphere(rng, 130),
+    "plates": lambda rng: plates(rng, 130),
+    "graded": lambda rng: graded(rng, 130),
     "line": lambda rng: line(rng, 100),
 }
 

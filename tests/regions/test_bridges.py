@@ -21,6 +21,14 @@ CUT = load_config("consensus")
 WHOLE = dataclasses.replace(CUT, growing=dataclasses.replace(CUT.growing, cut_bridges=False))
 
 
+def grow_plain_and_cutting(points, normals):
+    """Return the labels of exact normals without cutting, which must be one region, and with it."""
+    curvature, neighbors = torch.zeros(len(points), dtype=torch.float64), search_knn(points, 12)
+    cloud = points, normals, curvature, neighbors
+    assert int(grow_regions(*cloud, PLAIN).max()) == 0
+    return grow_regions(*cloud, CUTTING)
+
+
 def crease(angle_deg, noise, joint, width=0.5, num_points=4000):
     """Faces 0.5 and ``width`` wide, 1 meter long, that meet in an arc; 1 on the second."""
     rng = np.random.default_rng(0)
@@ -79,23 +87,12 @@ def bridged_sheets(rng):
 
 def test_a_ramp_of_few_points_does_not_join_two_sheets(rng):
     points, normals, truth = bridged_sheets(np.random.default_rng(2))
-    curvature = torch.zeros(len(points), dtype=torch.float64)
-    neighbors = search_knn(points, 12)
-    joined = grow_regions(points, normals, curvature, neighbors, PLAIN)
-    assert int(joined.max()) == 0
-    found = grow_regions(points, normals, curvature, neighbors, CUTTING)
+    found = grow_plain_and_cutting(points, normals)
     assert int(found.max()) == 1
     for face in (0, 1):
         assert len(found[truth == face].unique()) == 1
     order = torch.randperm(len(points), generator=rng)
-    again = grow_regions(
-        points[order] * 1e3,
-        normals[order],
-        curvature,
-        search_knn(points[order] * 1e3, 12),
-        CUTTING,
-        chunk_size=100,
-    )
+    again = grow_plain_and_cutting(points[order] * 1e3, normals[order])
     assert torch.equal(again, found[order])
 
 
@@ -114,10 +111,7 @@ def bridged_strips(rng, turn_deg=40):
 
 def test_narrow_strips_at_an_edge_are_not_parts_of_one_noisy_face():
     points, normals, truth = bridged_strips(np.random.default_rng(4))
-    curvature, neighbors = torch.zeros(len(points), dtype=torch.float64), search_knn(points, 12)
-    joined = grow_regions(points, normals, curvature, neighbors, PLAIN)
-    assert int(joined.max()) == 0
-    found = grow_regions(points, normals, curvature, neighbors, CUTTING)[:1200]
+    found = grow_plain_and_cutting(points, normals)[:1200]
     assert score_labels(found, truth).ari > 0.99
 
 
@@ -136,10 +130,7 @@ def panel_beside_a_cove(rng):
 
 def test_a_flat_panel_is_cut_off_a_curved_surface_that_stays_whole():
     points, normals = panel_beside_a_cove(np.random.default_rng(5))
-    curvature, neighbors = torch.zeros(len(points), dtype=torch.float64), search_knn(points, 12)
-    joined = grow_regions(points, normals, curvature, neighbors, PLAIN)
-    assert int(joined.max()) == 0
-    found = grow_regions(points, normals, curvature, neighbors, CUTTING)
+    found = grow_plain_and_cutting(points, normals)
     assert found[:1200].eq(0).all()
     assert found[1200:1440].eq(1).all()
 

@@ -3,16 +3,11 @@
 import pytest
 import torch
 
-from tests.kernels.clouds import clouds, definitions, growing_cloud, needs_library
 from tests.regions.growing_clouds import papers_growing
 from tests.regions.test_growth import CLASSIC, strip
-from torchrg.config import GrowingConfig
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import search_knn
 from torchrg.regions import grow_regions
-from torchrg.regions.edges import accept_edges
-
-CLOUDS = clouds()
 
 
 def test_angle_limit_is_between_neighbours_and_inclusive():
@@ -66,12 +61,6 @@ def test_faces_of_a_plate_join_only_without_planes_to_be_on():
     labels = grow_regions(*cloud, config, residual_rms=rms)
     assert labels.max() == 1
     assert torch.equal(labels == labels[0], face == face[0])
-    order = torch.randperm(600, generator=rng)
-    again = search_knn(points[order], 30)
-    shuffled = grow_regions(
-        points[order], cloud[1], cloud[2], again, config, residual_rms=rms[order]
-    )
-    assert torch.equal(shuffled, labels[order])
     with pytest.raises(ConfigError, match="grow_regions: expected residual_rms"):
         grow_regions(*cloud, config)
     with pytest.raises(ShapeError, match=r"expected residual_rms of shape \(N\)"):
@@ -86,20 +75,3 @@ def test_two_faces_of_a_thin_wall_join_only_if_normals_have_no_sign():
     assert grow_regions(points, normals, curvature, neighbors, CLASSIC).max() == 0
     labels = grow_regions(points, normals, curvature, neighbors, CLASSIC, signed_normals=True)
     assert labels.tolist() == [0, 1] * 10
-
-
-@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("signed", [False, True])
-@pytest.mark.parametrize("name", CLOUDS)
-def test_edges_are_those_of_the_definition(name, signed, masked):
-    for reach, distance, angle in ((None, None, 5.0), (2.0, None, 90.0), (2.0, 0.3, 15.0)):
-        cloud = growing_cloud(CLOUDS[name], 50, masked, reach, signed_normals=signed)
-        config = GrowingConfig(
-            max_angle_deg=angle, max_distance=distance, coplanarity=False, connectivity=None
-        )
-        for rows in (slice(0, len(cloud.points)), torch.arange(0, len(cloud.points), 3)):
-            found, _ = accept_edges(cloud, config, rows, None)
-            with definitions():
-                expected, _ = accept_edges(cloud, config, rows, None)
-            assert torch.equal(found, expected)

@@ -105,9 +105,9 @@ def test_points_decide_whether_a_faceted_region_is_flat(radius, curved):
         assert fit_regions(cloud, labels, config).curved.tolist() == [expected]
 
 
-@pytest.mark.parametrize("num_points", [10, 20, 30, 40, 60, 90])
+@pytest.mark.parametrize("num_points", [10, 30, 90])
 def test_random_points_in_a_cube_are_no_flat_plane(num_points):
-    for seed in range(6):
+    for seed in range(4):
         points = torch.rand(num_points, 3, generator=torch.Generator().manual_seed(seed))
         assert segment_planes(points).planes.curved.all()
 

@@ -60,10 +60,10 @@ def expected_labels(points, normals, curvature, neighbors, config, valid=None, r
     )
 
 
-def check_all_rules(coordinates, k=8, ties=0, f32=False, **settings):
+def check_rules(coordinates, chosen, k=8, ties=0, f32=False, **settings):
     dtype = torch.float32 if f32 else torch.float64
     cloud = growing_clouds.prepare(coordinates, k, dtype=dtype, ties=ties)
-    for rules in RULES:
+    for rules in chosen:
         config = papers_growing(**rules, **settings)
         expected = expected_labels(*cloud, config)
         for way in (contextlib.nullcontext(), definitions()):
@@ -78,13 +78,15 @@ def check_all_rules(coordinates, k=8, ties=0, f32=False, **settings):
 )
 def test_labels_equal_the_literal_algorithm(kind, variant):
     rng = np.random.default_rng(variant)
-    check_all_rules(growing_clouds.KINDS[kind](rng), **VARIANTS[variant])
+    # Every rule meets about six of the kinds.
+    half = RULES[list(growing_clouds.KINDS).index(kind) % 2 :: 2]
+    check_rules(growing_clouds.KINDS[kind](rng), half, **VARIANTS[variant])
 
 
 @pytest.mark.parametrize("kind", growing_clouds.KINDS)
 def test_labels_equal_the_literal_algorithm_for_settings_drawn_at_random(kind):
     rng = np.random.default_rng(list(growing_clouds.KINDS).index(kind))
-    for _ in range(15):
+    for _ in range(10):
         k, ties = int(rng.integers(4, 12)), int(rng.choice([0, 3, 6]))
         cloud = growing_clouds.prepare(growing_clouds.KINDS[kind](rng), k, ties=ties)
         rules = dict(RULES[rng.integers(len(RULES))])
@@ -108,19 +110,9 @@ def test_labels_equal_the_literal_algorithm_on_crops_of_scans(scan, name, corner
     points = PointCloud.from_path(scan(name)).numpy(("x", "y", "z"))
     points = points[np.isfinite(points).all(axis=1)]
     center = points[int(corner * len(points))]
-    nearest = np.argsort(((points - center) ** 2).sum(axis=1), kind="stable")[:250]
-    check_all_rules(points[nearest], k=10, max_angle_deg=8.0, curvature_quantile=0.9, min_size=3)
-
-
-@pytest.mark.parametrize("rules", RULES[::4])
-def test_invalid_points_neither_join_nor_conduct(rules):
-    rng = np.random.default_rng(5)
-    cloud = growing_clouds.prepare(growing_clouds.room(rng, 250, 0.005), 8)
-    valid = torch.from_numpy(rng.random(len(cloud[0])) < 0.7)
-    config = papers_growing(**rules, min_size=2, max_angle_deg=15.0)
-    labels = grow_regions(*cloud, config, valid=valid, canonical=True)
-    assert labels.tolist() == expected_labels(*cloud, config, valid)
-    assert (labels[~valid] == -1).all()
+    nearest = np.argsort(((points - center) ** 2).sum(axis=1), kind="stable")[:120]
+    settings = {"k": 10, "max_angle_deg": 8.0, "curvature_quantile": 0.9, "min_size": 3}
+    check_rules(points[nearest], RULES[::3], **settings)
 
 
 @pytest.mark.parametrize("rules", RULES[::3])

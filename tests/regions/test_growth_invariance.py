@@ -38,7 +38,7 @@ def permuted(points, normals, curvature, neighbors, order):
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-@pytest.mark.parametrize("kind", ["room", "lattice", "exact room", "blob"])
+@pytest.mark.parametrize("kind", ["room", "lattice", "blob"])
 def test_labels_follow_the_points_into_any_order(kind, config, rng):
     cloud = clouds(kind, ties=5)
     labels = grow_regions(*cloud, config)
@@ -80,23 +80,3 @@ def test_labels_do_not_depend_on_unit_or_origin(kind, config):
     for moved in (points * 1e-4, points * 1e3, points + torch.tensor([5e6, -5e6, 100.0])):
         again = grow_regions(moved, normals, curvature, neighbors, config, canonical=True)
         assert torch.equal(again, labels)
-
-
-@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_the_sign_of_normals_does_not_matter(config, rng):
-    points, normals, curvature, neighbors = clouds("room")
-    sign = torch.randint(0, 2, (len(points), 1), generator=rng) * 2.0 - 1
-    first = grow_regions(points, normals, curvature, neighbors, config)
-    again = grow_regions(points, normals * sign, curvature, neighbors, config)
-    assert torch.equal(again, first)
-
-
-@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_float32_and_float64_agree(config):
-    *values, neighbors = clouds("room")
-    # Points with the same neighbors have the same curvature up to the rounding of float64, which
-    # differs from processor to processor: both runs get numbers that float32 can hold.
-    singles = [value.float() for value in values]
-    doubles = [value.double() for value in singles]
-    single = grow_regions(*singles, neighbors, config, canonical=True)
-    assert torch.equal(single, grow_regions(*doubles, neighbors, config, canonical=True))

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 import torchrg
-from torchrg.batch.records import reason_to_convert
-from torchrg.batch.scans import Job, convert_scan
+from torchrg.batch.scans import Job, convert_scan, reason_to_convert
 from torchrg.cli.arguments import parse
 from torchrg.cli.convert import FolderArguments, RGBDArguments
 from torchrg.config import DepthConfig, PipelineConfig, SelectionConfig

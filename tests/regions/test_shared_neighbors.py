@@ -40,14 +40,6 @@ def test_counts_equal_those_of_sets(kind, max_distance, monkeypatch):
             assert torch.equal(found, (expected(neighbors, min_shared) & counted)[rows])
 
 
-def test_the_point_itself_may_be_anywhere_in_its_list():
-    points = growing_clouds.prepare(growing_clouds.KINDS["blob"](np.random.default_rng(0)), 12)[0]
-    neighbors = Neighbors(search_knn(points, 12, canonical=True).indices.flip(1))
-    everyone = torch.ones(len(points), 12, dtype=torch.bool)
-    found = SharedNeighbors(neighbors, 9).connected(slice(0, len(points)), everyone)
-    assert torch.equal(found, expected(neighbors, 9))
-
-
 def test_long_lists_do_not_overflow_the_counter():
     neighbors = Neighbors(torch.arange(300).expand(300, 300))
     everyone = torch.ones(300, 300, dtype=torch.bool)

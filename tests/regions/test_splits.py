@@ -90,21 +90,6 @@ def test_the_plane_of_a_region_may_lie_between_its_levels():
     assert iou(labels == 1, upper) > 0.95
 
 
-def test_two_levels_of_a_step_are_split_one_after_the_other():
-    rng = np.random.default_rng(5)
-    points, on_board = wall_with_board(rng, 0.02, count=12_000)
-    on_frame = (np.abs(points[:, 0] - 1) < 0.12) & (np.abs(points[:, 1] - 0.5) < 0.12)
-    points[on_frame, 2] += 0.03
-    points = points.astype(np.float32)
-    seg = segment_planes(points, "consensus")
-    truth = on_board.astype(int) + on_frame
-    ious = [
-        max(iou(seg.labels.numpy() == label, truth == kind) for label in range(len(seg.planes)))
-        for kind in range(3)
-    ]
-    assert min(ious) > 0.85
-
-
 @pytest.mark.parametrize("step", [0.02, 0.04])
 def test_points_between_parallel_regions_go_to_the_nearer_plane(step):
     rng = np.random.default_rng(6)

@@ -20,6 +20,9 @@ from torchrg.structures import Sampling
 
 CONFIG = SuperpointsConfig(strengths=(0.3, 1.0, 4.0), min_size=4)
 
+SIZE = 3500
+"""Points of the room."""
+
 PLACE_SPACINGS = 5
 """So few that places count in a cloud of 100 points."""
 
@@ -27,9 +30,9 @@ PLACE_SPACINGS = 5
 @pytest.fixture(scope="module")
 def room():
     """Points, true normals, and true faces with every fifth point, and small faces, left out."""
-    scene = make_room(6000, noise=0.003, seed=2, layout=KINECT_LAYOUT)
+    scene = make_room(SIZE, noise=0.003, seed=2, layout=KINECT_LAYOUT)
     small = torch.bincount(scene.labels)[scene.labels] < 50
-    planes = torch.where(small | (torch.arange(6000) % 5 == 0), -1, scene.labels)
+    planes = torch.where(small | (torch.arange(SIZE) % 5 == 0), -1, scene.labels)
     return scene.points, scene.normals, planes
 
 
@@ -133,7 +136,7 @@ def same_partition(a, b):
 
 
 @pytest.mark.parametrize("planes_enter", ["borders", "whole"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_merging_is_that_of_literal_loops(seed, planes_enter, monkeypatch):
     monkeypatch.setattr(superpoints, "_POSITION_SPACINGS", PLACE_SPACINGS)
     rng = torch.Generator().manual_seed(seed)
@@ -163,39 +166,9 @@ def test_every_point_is_in_one_superpoint_and_levels_are_nested(room, parts):
         finer = level
 
 
-def test_superpoints_are_connected(room, parts):
-    points = room[0]
-    near = cKDTree(points).query(points, k=9)[1]
-    for level in (parts.labels, *parts.levels):
-        links = {}
-        for i, row in enumerate(near.tolist()):
-            for j in row[1:]:
-                if level[i] == level[j]:
-                    links.setdefault(i, []).append(j)
-                    links.setdefault(j, []).append(i)
-        for number in level.unique().tolist():
-            members = torch.nonzero(level == number).squeeze(1).tolist()
-            reached, waiting = {members[0]}, [members[0]]
-            while waiting:
-                new = set(links.get(waiting.pop(), [])) - reached
-                reached |= new
-                waiting += new
-            assert reached == set(members)
-
-
-def test_planes_are_what_most_points_are_on(room, parts):
-    planes = room[2]
-    for number, plane in enumerate(parts.plane.tolist()):
-        inside = planes[parts.labels == number]
-        fractions = {p: float((inside == p).double().mean()) for p in inside.unique().tolist()}
-        most = [p for p, fraction in fractions.items() if fraction > 0.5 and p >= 0]
-        assert plane == (most[0] if most else -1)
-    assert 5 < (parts.plane >= 0).sum() < len(parts.plane)
-
-
 def test_kernels_merge_as_their_definitions(room, parts, monkeypatch):
     bounded = dataclasses.replace(CONFIG, max_extent=0.8, counts=(300, 40))
-    shade = torch.rand(6000, 3, generator=torch.Generator().manual_seed(2))
+    shade = torch.rand(SIZE, 3, generator=torch.Generator().manual_seed(2))
     expected = partition_points(*room, bounded, shade)
     monkeypatch.setattr(superpoints.kernels, "serve", lambda *_, **__: False)
     for found, level in zip(
@@ -206,33 +179,37 @@ def test_kernels_merge_as_their_definitions(room, parts, monkeypatch):
         assert all(map(torch.equal, (found.labels, *found.levels), (level.labels, *level.levels)))
 
 
-def test_order_threads_and_chunks_change_nothing(room, parts, monkeypatch, set_threads):
-    order = torch.randperm(6000, generator=torch.Generator().manual_seed(1))
-    moved = partition_points(*(values[order] for values in room), CONFIG)
-    assert torch.equal(moved.labels, parts.labels[order])
-    assert torch.equal(moved.plane, parts.plane)
+@pytest.mark.parametrize("config", [CONFIG, SuperpointsConfig(counts=(300, 40))])
+def test_order_unit_and_origin_change_nothing(room, config):
+    points, normals, planes = room
+    found = partition_points(*room, config)
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(3))
+    far = points.double() * 2.0**-12 + torch.tensor([2.0**22, -(2.0**21), 0.0])
+    moved = partition_points(far[order], normals[order], planes[order], config)
+    assert torch.equal(moved.plane, found.plane)
+    for level, other in zip(
+        (found.labels, *found.levels), (moved.labels, *moved.levels), strict=True
+    ):
+        assert torch.equal(level[order], other)
+
+
+def test_threads_and_chunks_change_nothing(room, parts, monkeypatch, set_threads):
     set_threads(2 if torch.get_num_threads() == 1 else 1)
     assert torch.equal(partition_points(*room, CONFIG).levels[1], parts.levels[1])
     monkeypatch.setattr(superpoints, "ROWS_AT_ONCE", 77)
     assert torch.equal(partition_points(*room, CONFIG).labels, parts.labels)
 
 
-def test_unit_and_origin_change_nothing(room, parts):
-    points, normals, planes = room
-    far = points.double() * 2.0**-12 + torch.tensor([2.0**22, -(2.0**21), 0.0])
-    assert torch.equal(partition_points(far, normals, planes, CONFIG).labels, parts.labels)
-
-
 def test_duplicates_stay_together_and_points_that_are_not_finite_stay_out(room):
     points, normals, planes = room
-    copies = torch.cat([torch.arange(6000), torch.arange(40).repeat(30), torch.tensor([7, 8])])
+    copies = torch.cat([torch.arange(SIZE), torch.arange(40).repeat(30), torch.tensor([7, 8])])
     cloud = points[copies]
     cloud[-1, 1], cloud[-2, 2] = torch.nan, torch.inf
     found = partition_points(cloud, normals[copies], planes[copies], CONFIG)
     assert found.labels[-2:].tolist() == [-1, -1]
-    assert torch.equal(found.labels[6000:-2], found.labels[:40].repeat(30))
+    assert torch.equal(found.labels[SIZE:-2], found.labels[:40].repeat(30))
     alone = partition_points(points, normals, planes, CONFIG)
-    assert same_partition(found.labels[:6000], alone.labels)
+    assert same_partition(found.labels[:SIZE], alone.labels)
     assert torch.bincount(found.labels[:-2]).diff().le(0).all()
 
 
@@ -254,22 +231,9 @@ def test_numbers_of_superpoints_are_met_and_levels_nested(room, counts, planes):
 
 
 def test_more_superpoints_than_parts_of_a_size_are_not_made(room):
-    found = partition_points(*room, SuperpointsConfig(counts=(3000,), min_size=10))
-    assert 250 < len(found.plane) <= 600
+    found = partition_points(*room, SuperpointsConfig(counts=(1700,), min_size=10))
+    assert SIZE / 25 < len(found.plane) <= SIZE / 10
     assert torch.bincount(found.labels).min() >= 10
-
-
-def test_given_numbers_do_not_depend_on_order_unit_or_origin(room):
-    config = SuperpointsConfig(counts=(300, 40))
-    points, normals, planes = room
-    found = partition_points(*room, config)
-    order = torch.randperm(6000, generator=torch.Generator().manual_seed(3))
-    far = points.double() * 2.0**-12 + torch.tensor([2.0**22, -(2.0**21), 0.0])
-    moved = partition_points(far[order], normals[order], planes[order], config)
-    for level, other in zip(
-        (found.labels, *found.levels), (moved.labels, *moved.levels), strict=True
-    ):
-        assert torch.equal(level[order], other)
 
 
 def test_place_alone_parts_a_flat_wall_into_compact_pieces():
@@ -352,17 +316,17 @@ def test_specks_on_both_sides_do_not_exceed_an_extent():
 
 
 def test_colours_tell_flat_things_apart():
-    x, y = torch.cartesian_prod(torch.arange(40.0), torch.arange(40.0)).unbind(1)
+    x, y = torch.cartesian_prod(torch.arange(30.0), torch.arange(30.0)).unbind(1)
     floor = torch.stack([x, y, 0 * x], dim=1)
     seg = segment_planes(floor)
-    shade = torch.where(x < 17, 250, 20)[:, None].expand(-1, 3).to(torch.uint8)
+    shade = torch.where(x < 13, 250, 20)[:, None].expand(-1, 3).to(torch.uint8)
     config = SuperpointsConfig(strengths=(12.0,))
     plain = make_superpoints(floor, seg, config)
     colored = make_superpoints(floor, seg, config, colors=shade)
     assert len(plain.plane) == 1
-    assert score_partition(colored.labels, (x < 17).long()).asa > 0.9
+    assert score_partition(colored.labels, (x < 13).long()).asa > 0.9
     assert 1 < len(colored.plane) < 8
-    for same in (shade.double() / 255 * (1 + 1e-9), shade.long(), shade.half(), shade.double()):
+    for same in (shade.double() / 255 * (1 + 1e-9), shade.half()):
         found = make_superpoints(floor, seg, config, colors=same)
         assert torch.equal(colored.labels, found.labels)
     with pytest.warns(UserWarning, match="^make_superpoints: colors are read as 0..65535"):
@@ -381,7 +345,7 @@ def test_arguments_are_checked(room):
     with pytest.raises(ConfigError, match=r"expected color of shape \(N, 3\), got"):
         make_superpoints(points, colors=points.to(torch.complex64))
     seg = segment_planes(points[:100])
-    with pytest.raises(ShapeError, match="expected seg of 6,000 points, got 100"):
+    with pytest.raises(ShapeError, match="expected seg of 3,500 points, got 100"):
         make_superpoints(points, seg)
     for wrong in (
         {"strengths": ()},

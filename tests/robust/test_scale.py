@@ -7,12 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.robust.oracle_cases import load_oracles, local_float32
+from tests.kernels.clouds import both, needs_library
+from tests.robust.oracle_cases import load_oracles
 from torchrg.errors import ShapeError
 from torchrg.robust import mad, median, qn, qn_exceeds, tau
 from torchrg.robust.scale import (
-    _difference_by_counts,
-    _difference_by_lags,
     qn_sample_factor,
     sum_points,
 )
@@ -45,20 +44,6 @@ def test_qn_agrees_with_other_implementations(oracles_folder):
         assert_close(median(columns, dim=0), theirs["median"], 1e-12)
 
 
-def test_qn_of_float32_agrees_after_centering(oracles_folder):
-    patches, _, ours = load_oracles(oracles_folder, "ref_numpy")
-    compared = 0
-    for name, patch in patches.items():
-        if name.endswith(("utm", "off1e4")):
-            continue
-        expected = np.asarray(ours[name]["qn"]["raw_order_stat"])
-        found = qn(local_float32(patch), dim=0).double().numpy() / 2.2219
-        rounding = 2e-7 * np.abs(patch - patch[0]).max(axis=0)
-        assert (np.abs(found - expected) <= 1e-6 * expected + rounding).all(), name
-        compared += 1
-    assert compared == 71
-
-
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 9, 12, 13, 36, 37, 49, 50, 51, 52, 53, 64])
 def test_qn_is_its_definition(n, dtype, rng):
     rows = torch.randn(7, n, generator=rng, dtype=dtype)
@@ -84,7 +69,7 @@ def test_qn_is_its_definition_with_ties_and_mixed_magnitudes(values):
 
 def rows_of_all_kinds(n, dtype, rng):
     """Return rows with ties, several magnitudes, infinities, NaN and negative zeros."""
-    rows = torch.randn(9, n, generator=rng, dtype=dtype)
+    rows = torch.randn(11, n, generator=rng, dtype=dtype)
     rows[1] = rows[1].mul(3).round()
     rows[2, : n // 2 + 1] = 3.0
     rows[3] *= 10.0 ** (torch.arange(n, dtype=dtype) % 12)
@@ -93,29 +78,32 @@ def rows_of_all_kinds(n, dtype, rng):
     rows[6, n // 2] = torch.nan
     rows[7] = rows[7].mul(40).round() * torch.finfo(dtype).smallest_normal / 4
     rows[8] = rows[8].sign() * 0.0
+    rows[9] = 0.9 * torch.finfo(dtype).max * rows[9].sign()
+    rows[10] *= 1e-42
     return rows
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 5, 8, 9, 31, 32, 33, 100, 401, 402])
-def test_counting_pairs_selects_the_same_difference_as_listing_them(n, dtype, rng):
-    ascending = rows_of_all_kinds(n, dtype, rng).sort(dim=1).values
-    counted, listed = _difference_by_counts(ascending), _difference_by_lags(ascending)
-    torch.testing.assert_close(counted, listed, rtol=0, atol=0, equal_nan=True)
-    assert _difference_by_counts(ascending[:0]).shape == (0,)
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("n", [2, 3, 4, 7, 8, 9, 15, 16, 17, 50, 51, 300])
+def test_kernels_find_qn_of_the_definition_to_the_bit(n, rng):
+    found, expected = both(qn, rows_of_all_kinds(n, torch.float32, rng))
+    assert torch.equal(found.nan_to_num(nan=-1.0), expected.nan_to_num(nan=-1.0))
 
 
-def test_qn_of_many_values_has_mask_and_gradient(dtype, rng, monkeypatch):
-    rows = rows_of_all_kinds(1200, dtype, rng)[[0, 1, 2, 5]].requires_grad_()
-    mask = torch.rand(rows.shape, generator=rng) < torch.tensor([1.0, 0.95, 0.5, 0.9])[:, None]
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 8, 9, 31, 32, 33, 100, 401, 402, 1200])
+def test_qn_by_counting_pairs_is_that_by_listing_them(n, dtype, rng, monkeypatch):
+    rows = rows_of_all_kinds(n, dtype, rng).requires_grad_()
+    mask = torch.rand(rows.shape, generator=rng) < torch.linspace(0.5, 1, 11)[:, None]
     found = []
-    for longest in (400, 1200):
+    for longest in (1, 1200):
         monkeypatch.setattr("torchrg.robust.scale._MAX_LISTED_VALUES", longest)
-        value = qn(rows, mask=mask)
-        found.append((value, *torch.autograd.grad(value.sum(), rows)))
+        values = qn(rows), qn(rows, mask=mask)
         batched = torch.vmap(lambda row, used: qn(row, mask=used))(rows.detach(), mask)
-        assert torch.equal(batched, value)
-    assert torch.equal(found[0][0], found[1][0])
-    assert torch.equal(found[0][1], found[1][1])
+        assert torch.equal(batched.nan_to_num(), values[1].nan_to_num())
+        known = torch.where(values[1].isfinite(), values[1], 0)
+        found.append((*values, *torch.autograd.grad(known.sum(), rows)))
+    for counted, listed in zip(*found, strict=True):
+        torch.testing.assert_close(counted, listed, rtol=0, atol=0, equal_nan=True)
 
 
 def test_qn_of_a_hundred_thousand_values(dtype):
@@ -138,15 +126,9 @@ def test_qn_exceeds_is_qn_greater_than_the_threshold(values, threshold, dtype):
     assert qn_exceeds(row, threshold).item() == (qn(row) > threshold).item()
 
 
-def test_qn_exceeds_at_the_value_of_qn_itself(dtype, rng):
-    rows = torch.randn(60, 50, generator=rng, dtype=dtype)
-    for row, value in zip(rows, qn(rows).tolist(), strict=True):
-        assert not qn_exceeds(row, value)
-
-
 def test_qn_exceeds_next_to_the_threshold(dtype, rng):
     kind = np.float32 if dtype == torch.float32 else np.float64
-    for threshold in torch.rand(300, generator=rng).tolist():
+    for threshold in torch.rand(100, generator=rng).tolist():
         step = kind(kind(threshold) / kind(2.2219))
         for length in (np.nextafter(step, kind(0)), step, np.nextafter(step, kind(9))):
             row = torch.tensor([0.0, float(length)], dtype=dtype)
@@ -192,15 +174,6 @@ def test_qn_of_a_row_does_not_depend_on_its_batch(dtype, rng):
     assert torch.equal(qn(rows.reshape(2, 150, 50)), qn(rows).reshape(2, 150))
 
 
-def test_qn_does_not_depend_on_order_shift_and_sign(rng):
-    rows = torch.randint(-1000, 1000, (50, 50), generator=rng).double()
-    shuffled = rows[:, torch.randperm(50, generator=rng)]
-    assert torch.equal(qn(shuffled), qn(rows))
-    assert torch.equal(qn(rows + 4e6), qn(rows))
-    assert torch.equal(qn(-rows), qn(rows))
-    assert torch.equal(qn(rows * 2.0**-20), qn(rows) * 2.0**-20)
-
-
 def test_tau_agrees_with_statsmodels():
     # statsmodels.robust.scale.scale_tau(np.array(row))[1]
     rows = {
@@ -215,13 +188,6 @@ def test_finite_sample_factor_tends_to_one():
     assert qn_sample_factor(1) == 1
     assert qn_sample_factor(2) == 0.399356
     assert 0.999 < qn_sample_factor(10_001) < qn_sample_factor(100_001) < 1
-
-
-def test_scales_are_consistent_at_the_normal_distribution(rng):
-    row = torch.randn(4000, generator=rng, dtype=torch.float64)
-    assert abs(qn(row[:1500]) - 1) < 0.05
-    assert abs(mad(row) - 1) < 0.05
-    assert abs(tau(row) - 1) < 0.05
 
 
 def test_refusals():

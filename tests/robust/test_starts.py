@@ -5,7 +5,6 @@ import torch
 
 from tests.robust.oracle_cases import fit_all, load_oracles
 from torchrg.robust import fit_detmcd, fit_fastmcd
-from torchrg.robust.starts import _score_table
 
 # The cases include patches of fewer than six points.
 pytestmark = pytest.mark.filterwarnings("ignore:.*too few to trust the covariance")
@@ -52,12 +51,6 @@ def test_more_starts_reach_most_of_the_best_known_minima(oracles_folder):
     ]
     assert len(fits) == 53
     assert len(reached) >= 45, set(fits) - set(reached)
-
-
-def test_normal_scores_are_those_of_the_publication():
-    # scipy.stats.norm.ppf((np.arange(2, 9) / 2 - 1 / 3) / (4 + 1 / 3))
-    expected = [-1.02007623, -0.6151411, -0.29338123, 0.0, 0.29338123]
-    assert _score_table(4)[2:7] == pytest.approx(expected, abs=1e-7)
 
 
 def test_starts_are_the_same_each_time(rng):

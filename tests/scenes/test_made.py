@@ -85,24 +85,17 @@ IMPLICIT = {
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_shapes_are_closed_with_normals_outwards_and_points_by_area(name):
-    shape = make_shape(name, 100_000)
+    shape = make_shape(name, 40_000)
     (area, volume), areas = KNOWN[name], shape.face_areas.numpy()
     assert areas.sum() == pytest.approx(area, rel=1e-12)
     counts = shape.labels.bincount(minlength=len(areas)).numpy()
-    assert len(areas) == 1 or chisquare(counts, areas / areas.sum() * 100_000).pvalue > 1e-4
+    assert len(areas) == 1 or chisquare(counts, areas / areas.sum() * 40_000).pvalue > 1e-4
     # The flux of a constant field is zero, that of the position three times the volume.
     normals, points = shape.normals.double(), shape.points.double()
-    assert normals.mean(dim=0).abs().max() < 5 / 100_000**0.5
+    assert normals.mean(dim=0).abs().max() < 5 / 40_000**0.5
     height = (points * normals).sum(dim=1)
-    tolerance = 5 * height.std() / 100_000**0.5
+    tolerance = 5 * height.std() / 40_000**0.5
     assert (height.mean() - 3 * volume / area).abs() <= tolerance + 1e-7
-
-
-@pytest.mark.parametrize("name", ["cuboid", "octahedron", "dodecahedron", "hexagonal_prism"])
-def test_no_point_of_a_convex_shape_is_beyond_a_face(name):
-    shape = make_shape(name, 20_000)
-    heights = shape.points.double() @ shape.face_normals.T - shape.face_offsets
-    assert heights.max() < 1e-6
 
 
 @pytest.mark.parametrize("name", IMPLICIT)
@@ -117,18 +110,18 @@ def test_points_and_normals_are_those_of_the_equation(name):
 
 
 def test_points_are_spread_evenly_over_curved_and_cut_faces():
-    ball = make_shape("sphere", 50_000).points.double().numpy()
+    ball = make_shape("sphere", 25_000).points.double().numpy()
     # Archimedes: every coordinate of an even sphere is uniform.
     assert all(kstest(ball[:, axis] + 0.5, "uniform").pvalue > 1e-3 for axis in range(3))
-    torus = make_shape("torus", 50_000).points.double().numpy()
+    torus = make_shape("torus", 25_000).points.double().numpy()
     across = np.arctan2(torus[:, 2], np.hypot(torus[:, 0], torus[:, 1]) - 0.35)
     counts, edges = np.histogram(across, bins=16, range=(-np.pi, np.pi))
     weights = 0.35 * np.diff(edges) + 0.15 * np.diff(np.sin(edges))
-    assert chisquare(counts, weights / weights.sum() * 50_000).pvalue > 1e-4
-    end = make_shape("cylinder", 50_000)
+    assert chisquare(counts, weights / weights.sum() * 25_000).pvalue > 1e-4
+    end = make_shape("cylinder", 25_000)
     radii = end.points[end.labels == 0, :2].double().norm(dim=1).numpy()
     assert kstest((radii / 0.3) ** 2, "uniform").pvalue > 1e-3
-    plate = make_shape("plate", 50_000)
+    plate = make_shape("plate", 25_000)
     top = plate.points[plate.labels == 1].double().numpy()
     inner = (np.abs(top[:, :2] - [0.3, 0.35]) < 0.15).all(axis=1)
     expected = (4 - np.pi) * 0.0225 / plate.face_areas[1].item()
@@ -136,7 +129,7 @@ def test_points_are_spread_evenly_over_curved_and_cut_faces():
 
 
 def test_noise_of_a_shape_is_a_share_of_the_diagonal():
-    exact, noisy = (make_shape("cuboid", 50_000, noise) for noise in (0, 0.006))
+    exact, noisy = (make_shape("cuboid", 25_000, noise) for noise in (0, 0.006))
     shifts = (noisy.points - exact.points).double().numpy()
     diagonal = (1 + 0.36 + 0.35**2) ** 0.5
     assert kstest(shifts.ravel() / (0.006 * diagonal), "norm").pvalue > 1e-3
@@ -144,7 +137,7 @@ def test_noise_of_a_shape_is_a_share_of_the_diagonal():
 
 def test_bent_wall_passes_through_its_corners_and_bulges_by_the_bend():
     layout = CurvedLayout(num_bent_walls=1, wall_bend=0.05)
-    scene = make_room(300_000, noise=0, seed=0, layout=layout)
+    scene = make_room(60_000, noise=0, seed=0, layout=layout)
     wall = scene.points[scene.labels == 2].double()
     length = layout.size[0]
     # The circle through both corners and the middle, 5 cm into the room.

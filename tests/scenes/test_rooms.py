@@ -28,7 +28,7 @@ CURVED = CurvedLayout(
 
 @pytest.fixture(scope="module")
 def exact(room):
-    return room(200_000, 0.0, 0)
+    return room(80_000, 0.0, 0)
 
 
 def test_default_room_has_153_faces_and_35_of_4_cm(exact):
@@ -41,7 +41,7 @@ def test_default_room_has_153_faces_and_35_of_4_cm(exact):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: make_room(50_000, 0.0, 0),
+        lambda: make_room(20_000, 0.0, 0),
         lambda: make_room(20_000, 0.0, 0, layout=CURVED),
         lambda: make_room(20_000, 0.0, 0, layout=HALL_LAYOUT),
         lambda: make_storey(30_000, 0.0),
@@ -127,13 +127,13 @@ def test_viewpoints_keep_a_metre_from_bodies_where_there_is_space():
 
 
 def test_noise_is_along_the_normal_or_along_each_axis(exact):
-    noisy = make_room(200_000, noise=0.004, seed=0)
+    noisy = make_room(80_000, noise=0.004, seed=0)
     assert noisy.labels.equal(exact.labels)
     shifts = (noisy.points - exact.points).double()
     along = (shifts * exact.normals.double()).sum(dim=1)
     assert (shifts - along[:, None] * exact.normals.double()).abs().max() < 2e-6
     assert kstest(along.numpy() / 0.004, "norm").pvalue > 1e-3
-    noisy = sample_scene(build_room(), 200_000, noise=0.004, noise_direction="isotropic")
+    noisy = sample_scene(build_room(), 80_000, noise=0.004, noise_direction="isotropic")
     shifts = (noisy.points - exact.points).double().numpy() / 0.004
     assert all(kstest(shifts[:, axis], "norm").pvalue > 1e-3 for axis in range(3))
 

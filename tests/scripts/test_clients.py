@@ -8,10 +8,8 @@ installed or on ``PYTHONPATH``.
 
 import os
 import re
-import shlex
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import guide_pages
@@ -20,8 +18,6 @@ import pytest
 
 from tests.datasets.s3dis_tree import digest, text_of, write_objects
 from tests.datasets.scannet_tree import WORDS, write_scan, write_scan_plus, write_tables
-from torchrg.cli import COMMANDS, convert
-from torchrg.cli.arguments import list_flags
 from torchrg.io import write_cloud
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -79,22 +75,6 @@ def recipes():
     found = {title: "".join(lines) for title, lines in blocks.items() if lines}
     lines = found["OneFormer3D and UniDet3D"].replace("oneformer3d_1xb4", "unidet3d_1xb8")
     return found | {"UniDet3D": lines.replace("oneformer3d", "unidet3d")}
-
-
-def commands():
-    """Each command of torchrg in the recipes, as words."""
-    lines = "".join(recipes().values()).splitlines()
-    return [shlex.split(line) for line in lines if line.startswith("torchrg ")]
-
-
-def test_commands_have_the_flags_that_they_are_shown_with():
-    assert len(commands()) > 15
-    for _, name, *rest in commands():
-        assert name in COMMANDS
-        module = import_module(f"torchrg.cli.{name}")
-        kind = convert.KINDS[rest[0]] if name == "convert" else module.Arguments
-        known = {flag.name for flag in list_flags(kind)}
-        assert {word for word in rest if word.startswith("--")} <= known
 
 
 def write_processed(folder, name, room):

@@ -246,11 +246,6 @@ def test_writing_and_reading_choose_one_range(tmp_path, kind, channel):
     assert read_cloud(path).fields["color"].tolist() == shown.tolist()
 
 
-def test_sixteen_bits_are_rounded_where_a_file_has_eight(tmp_path):
-    write_cloud(tmp_path / "cloud.ply", Cloud(POINTS, {"color": SIXTEEN.astype(np.uint16)}))
-    assert read(tmp_path / "cloud.ply")[0] == np.rint(SIXTEEN / 257).astype(int).tolist()
-
-
 def test_a_result_shows_small_values_of_16_bits():
     cloud = Cloud(POINTS, {"color": EIGHT.astype(np.uint16)})
     assert Result(cloud).fields["color"].tolist() == EIGHT.tolist()

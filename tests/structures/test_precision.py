@@ -100,18 +100,14 @@ def test_what_cannot_be_told_is_not_told(places):
 def test_the_library_warns_once_a_call(places, call):
     with pytest.warns(PrecisionWarning, match=f"{LINE}; pass float64, or subtract") as caught:
         call(moved(places, UTM))
-    assert len(caught) == 1
+    assert [warning.filename for warning in caught] == [__file__]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         call(moved(places, 0))
 
 
-def test_the_warning_is_where_the_function_was_called(places):
+def test_the_warning_of_a_cloud_is_where_its_points_were_taken(places):
     points = moved(places, UTM)
-    for call in (segment_planes, estimate_normals):
-        with pytest.warns(PrecisionWarning, match="steps of 0.5") as caught:
-            call(points, "classic")
-        assert caught[0].filename == __file__
     with pytest.warns(PrecisionWarning, match=r"^scan.ply: coordinates have steps") as caught:
         _ = Cloud(points, source="scan.ply").points
     assert caught[0].filename == __file__

@@ -1,6 +1,5 @@
 """OrientNormals: each cloud of every kind of sample on its own, to rooms, axes and viewpoints."""
 
-import pickle
 import warnings
 
 import numpy as np
@@ -101,15 +100,6 @@ def test_batches_of_pyg_are_oriented_cloud_by_cloud(rooms):
         found = transform(data.Batch.from_data_list(samples))
         assert torch.equal(found.normal, expected)
         assert len(found.to_data_list()) == 3
-
-
-def test_it_survives_pickling_and_shows_its_settings(rooms):
-    sample = dict(zip(("coord", "normal"), rooms[0], strict=True))
-    step = OrientNormals("viewpoint", (1, 2, 0.5))
-    again = pickle.loads(pickle.dumps(step))
-    assert torch.equal(again(sample)["normal"], step(sample)["normal"])
-    assert repr(step) == "OrientNormals(orient='viewpoint', viewpoint=(1.0, 2.0, 0.5))"
-    assert repr(OrientNormals("up")) == "OrientNormals(orient='up')"
 
 
 def test_empty_clouds_and_points_without_place_pass():

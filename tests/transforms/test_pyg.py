@@ -154,7 +154,7 @@ def test_a_batch_that_cannot_be_taken_apart_is_taken_by_its_rows(pyg, clouds):
 
 def test_edges_are_refused_by_who_takes_points_out(pyg, data):
     data[0].edge_index = torch.tensor([[0, 1], [1, 2]])
-    with pytest.raises(ConfigError, match="cannot remove points from a sample with edge_index"):
+    with pytest.raises(ConfigError, match="cannot remove points from samples with edge_index"):
         KeepFinite()(data[0])
     assert SegmentPlanes("classic")(data[0]).edge_index.shape == (2, 2)
 

@@ -143,7 +143,7 @@ def test_images_may_have_the_names_of_entries():
 
 @pytest.mark.parametrize("key", ["edge_index", "sampled_index", "frame_pcd_offset"])
 def test_numbers_of_points_are_refused_by_who_takes_points_out(key):
-    with pytest.raises(ConfigError, match=f"cannot remove points from a sample with {key}"):
+    with pytest.raises(ConfigError, match=f"cannot remove points from samples with {key}"):
         KeepFinite()(sample_of(**{key: np.zeros((2, 5), dtype=int)}))
 
 

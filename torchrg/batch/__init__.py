@@ -9,24 +9,7 @@ A source (:class:`~torchrg.batch.sources.CloudSource` for any
 :func:`~torchrg.batch.local.run_local` and :func:`~torchrg.batch.ray_tasks.run_ray` run the jobs.
 :func:`~torchrg.batch.run.run_plan` collects their reports.
 
-Example:
-    >>> import tempfile
-    >>> from pathlib import Path
-    >>> import numpy as np
-    >>> from torchrg.batch.scans import convert_scan
-    >>> from torchrg.batch.sources import CloudSource
-    >>> from torchrg.batch.run import list_jobs
-    >>> from torchrg.config import load_config
-    >>> from torchrg.datasets import FolderOfClouds
-    >>> from torchrg.scenes import make_room
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> (folder / "in").mkdir()
-    >>> np.save(folder / "in" / "room.npy", make_room(2000).points)
-    >>> source = CloudSource(FolderOfClouds(folder / "in"), load_config("classic"))
-    >>> [convert_scan(job).status for job in list_jobs(source, folder / "out")]
-    ['converted']
-    >>> sorted(path.name for path in (folder / "out" / "room").iterdir())
-    ['coord.npy', 'curvature.npy', 'normal.npy', 'plane.npy', 'planes.json', 'provenance.json']
+The guide on data sets converts a data set of one's own.
 """
 
 __all__ = ["local", "ray_tasks", "run", "scans", "sources", "stale"]

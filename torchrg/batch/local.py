@@ -37,8 +37,7 @@ def run_local(jobs: Sequence[Job], *, workers: int, memory_limit: int) -> Report
     """Convert scans in local processes, largest memory first.
 
     A scan starts when a worker is free and all running scans fit the limit; a scan above the limit
-    runs alone. If a worker dies, its scan is retried once, alone, after all others. Workers always
-    end with this process.
+    runs alone. If a worker dies, its scan is retried once, alone, after all others.
 
     Args:
         jobs: The scans to convert.

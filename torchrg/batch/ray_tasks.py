@@ -22,8 +22,7 @@ __all__ = ["run_ray"]
 __dir__ = __all__.copy
 
 _ATTEMPTS = 3
-"""Maximum attempts at a scan whose process or node is lost. Retries by Ray itself have no limit if
-the memory of a node runs out."""
+"""Maximum attempts at a scan whose process or node is lost; Ray itself may retry without limit."""
 _CONNECT_SECONDS = 10.0
 """Timeout of the test of an address. Ray itself tries for minutes."""
 _OBJECT_STORE_BYTES = 100_000_000
@@ -49,8 +48,7 @@ def run_ray(
         address: Cluster to use. Default: one is started here, and stopped at the end.
 
     Yields:
-        The report of each finished scan, and None while there is none. Closing the iterator cancels
-        unfinished scans.
+        The report of each finished scan, and None while there is none. Closing it cancels others.
 
     Raises:
         ConfigError: If the address is not that of a cluster, or Ray cannot start or connect.
@@ -131,8 +129,7 @@ def _check_address(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), _CONNECT_SECONDS).close()
     except (OSError, OverflowError) as error:
         raise ConfigError(
-            f"Ray address {address}: no cluster there: {first_line(error)}; start one with "
-            f"ray start --head --port {port}."
+            f"Ray {address}: no cluster: {first_line(error)}; run ray start --head --port {port}."
         ) from error
 
 

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -13,8 +14,7 @@ from typing import NamedTuple
 
 import filelock
 
-from torchrg.batch.records import reason_to_convert
-from torchrg.batch.scans import Job, Source
+from torchrg.batch.scans import Job, Source, reason_to_convert
 from torchrg.batch.task import STATUSES, Reports, TaskReport
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.provenance import Record, describe_versions, read_record
@@ -46,8 +46,7 @@ REPORT = "report.json"
 LOCK = ".torchrg.lock"
 """Name of the lock file in the output directory; it remains there, empty."""
 _BYTES_PER_SCAN = 32_768
-"""Disk space of a scan's files beyond their content: its tables, and half a 4 KiB block for each of
-six to eight files."""
+"""Disk space of a scan beyond its arrays: tables, and half a block of 4 KiB for each file."""
 LOCK_TIMEOUT_SECONDS = 5.0
 """Timeout for the lock, in seconds: an interrupted command ends its workers by then."""
 
@@ -57,8 +56,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
     """Lock an existing output directory for one command at a time.
 
     It is an operating system lock, released when the process ends, even on a crash; workers end
-    with their command. On network file systems it works if they support locking: see the package
-    filelock.
+    with their command. On network file systems it works if they support locking.
 
     Raises:
         FormatError: If another command holds the lock, or the lock file cannot be written.
@@ -74,14 +72,11 @@ def lock_folder(folder: Path) -> Iterator[None]:
         lock.acquire(timeout=LOCK_TIMEOUT_SECONDS)
     except filelock.Timeout:
         raise FormatError(
-            f"{folder}: locked by another torchrg process; wait for it, stop it, or choose another "
-            "directory."
+            f"{folder}: locked by another torchrg process; wait for it, stop it, or choose another."
         ) from None
     except (OSError, NotImplementedError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise FormatError(
-            f"{folder / LOCK}: cannot be locked: {reason}; choose one on another disk."
-        ) from error
+        raise FormatError(f"{folder}: cannot be locked: {reason}; use another disk.") from error
     try:
         yield
     finally:
@@ -164,9 +159,7 @@ def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
     for name in (scan.name for scan in scans):
         key = normalize_file_name(name)
         if name.startswith("/") or ".." in name.split("/"):
-            raise FormatError(
-                f"{root}: expected a scan name without '..' and leading /, got {name!r}; rename it."
-            )
+            raise FormatError(f"{root}: expected a name inside OUT, got {name!r}; rename it.")
         if key in owners:
             raise FormatError(
                 f"{root}: expected distinct scan names, got {owners[key]} and {name}, which are "
@@ -175,8 +168,7 @@ def _check_names(root: Path, scans: Sequence[SceneFiles]) -> None:
         owners[key] = name
         if (first := key.partition("/")[0]) in batch_files:
             raise FormatError(
-                f"{root}: a scan cannot be named {name}, because OUT/{batch_files[first]} is a "
-                "file of the command; rename it."
+                f"{root}: a scan cannot be named {name}, like OUT/{batch_files[first]}; rename it."
             )
 
 
@@ -189,8 +181,7 @@ def make_plan(
 ) -> Plan:
     """Determine the scans to convert with :func:`reason_to_convert`.
 
-    Each of ``threads`` checks one scan at a time; ``on_scan`` is called after each check. ``force``
-    selects all scans.
+    Each of ``threads`` checks one scan at a time, then calls ``on_scan``. ``force`` selects all.
     """
 
     def check(job: Job) -> str:
@@ -250,11 +241,10 @@ class BatchReport:
     @property
     def stage_seconds(self) -> dict[str, float]:
         """Total seconds per stage of the scans converted now."""
-        total: dict[str, float] = {}
+        total = Counter[str]()
         for scan in self.with_status("converted"):
-            for stage, seconds in scan.seconds.items():
-                total[stage] = total.get(stage, 0.0) + seconds
-        return total
+            total.update(scan.seconds)
+        return dict(total)
 
     @property
     def num_points(self) -> int:

@@ -13,23 +13,17 @@ from typing import ClassVar
 from torchrg.batch.memory import scan_memory
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
+from torchrg.datasets import provenance
 from torchrg.datasets.folder import SceneDataset, SceneFiles
-from torchrg.datasets.provenance import (
-    Record,
-    check_owned,
-    check_source,
-    claim_files,
-    describe_versions,
-    owned_files,
-    read_record,
-    remove_unwritten,
-    write_record,
-)
+from torchrg.errors import FormatError
 from torchrg.io.files import check_writable, fingerprint, remove_leftovers, sync_folder
 from torchrg.io.result import PLANES_FILE, RECORD, write_table
 
 __all__ = ["Job", "Source", "convert_scan"]
 __dir__ = __all__.copy
+
+_RESULTS = {"points": int, "regions": int, "repairs": list, "warnings": list}
+"""Types of the record entries that reports repeat."""
 
 
 class Source:
@@ -56,13 +50,13 @@ class Source:
         """The directory of the data set."""
         return self.data.root
 
-    def __getstate__(self) -> Record:
+    def __getstate__(self) -> provenance.Record:
         """Return the state for other processes, without scenes: each job has its own."""
         data = copy.copy(self.data)
         data.scenes = []
         return vars(self) | {"data": data}
 
-    def describe(self) -> Record:
+    def describe(self) -> provenance.Record:
         """Return the type of the source and its options that affect results, for JSON."""
         raise NotImplementedError
 
@@ -122,14 +116,14 @@ class Job:
         root = self.source.root
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
-    def describe(self) -> Record:
+    def describe(self) -> provenance.Record:
         """Return what determines the results, as JSON values; OSError if an input is unreadable."""
         config, table = asdict(self.source.settings), self.source.table
         # It never changes results, so lowering it after a memory error must not reconvert scans.
         config.pop("chunk_size", None)
         inputs = [(self.input_name(path), path) for path in self.scan.files]
         return {
-            "versions": describe_versions(),
+            "versions": provenance.describe_versions(),
             "config": config,
             "source": self.source.describe() | ({"table": table} if table else {}),
             "inputs": [{"name": name} | fingerprint(path) for name, path in inputs],
@@ -141,8 +135,36 @@ class Job:
         """Remove temporary files of a killed process, and a claim on no file."""
         if self.folder.is_dir():
             remove_leftovers(self.folder)
-            if (read_record(self.folder) or {}).get("claims") == {}:
+            if (provenance.read_record(self.folder) or {}).get("claims") == {}:
                 (self.folder / RECORD).unlink()
+
+
+def reason_to_convert(job: Job) -> str:
+    """Return why a scan must be converted, or "" if it is up to date.
+
+    ``"new"`` without a complete record; else the first of version, settings, options, input or
+    results that differs from the record, or that the record is damaged.
+    """
+    record = provenance.read_record(job.folder)
+    if record is None or "outputs" not in record:
+        return "new"
+    try:
+        description = json.loads(json.dumps(job.describe()))
+    except (OSError, FormatError):
+        return "input cannot be read"
+    changes = {"versions": "version", "config": "settings", "source": "options", "inputs": "input"}
+    for key, name in changes.items():
+        if record.get(key) != description[key]:
+            return f"{name} changed"
+    if not all(isinstance(record.get(name), kind) for name, kind in _RESULTS.items()):
+        return "record damaged"
+    for name, stored in record["outputs"].items():
+        try:
+            if fingerprint(job.folder / name) != stored:
+                return f"{name} changed"
+        except OSError:
+            return f"{name} missing"
+    return ""
 
 
 def convert_scan(job: Job) -> TaskReport:
@@ -151,7 +173,7 @@ def convert_scan(job: Job) -> TaskReport:
     The record of an earlier run becomes a claim first, and the new one is written last, so that a
     record of outputs implies complete files.
     """
-    is_ours = not os.path.lexists(job.folder) or read_record(job.folder) is not None
+    is_ours = not os.path.lexists(job.folder) or provenance.read_record(job.folder) is not None
     report = report_on(job.name, partial(_convert, job))
     if report.status == "failed":
         with contextlib.suppress(OSError):
@@ -171,20 +193,22 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         if path == job.out:
             break
     check_writable(folder / RECORD)
-    earlier = read_record(folder, strict=True)
-    check_owned(folder, [RECORD, *([] if table is None else [table])], earlier)
+    earlier = provenance.read_record(folder, strict=True)
+    provenance.check_owned(folder, [RECORD, *([] if table is None else [table])], earlier)
     if earlier is not None:
-        check_source(folder, earlier, description["source"])
+        provenance.check_source(folder, earlier, description["source"])
         description |= {key: earlier[key] for key in earlier.keys() & {"pages"}}
     job.clean()
-    write_record(folder, description | {"claims": owned_files(earlier)})
+    provenance.write_record(folder, description | {"claims": provenance.owned_files(earlier)})
     report = job.source.convert(job.scan, folder, begin)
     if table is not None:
-        write_record(folder, claim_files(read_record(folder) or description, [table]))
+        provenance.write_record(
+            folder, provenance.claim_files(provenance.read_record(folder) or description, [table])
+        )
         write_table(folder / table, json.loads((folder / PLANES_FILE).read_text("utf-8")))
         report = replace(report, files=(*report.files, table))
     begin("record")
-    changed = remove_unwritten(job.out, folder, earlier, report.files)
+    changed = provenance.remove_unwritten(job.out, folder, earlier, report.files)
     notes = [f"{name} is kept, as it was changed since torchrg wrote it" for name in changed]
     report = replace(report, warnings=(*report.warnings, *notes))
     results = {
@@ -195,12 +219,15 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         "measured": report.measured,
         "outputs": {name: fingerprint(folder / name) for name in report.files},
     }
-    write_record(folder, description | results)
+    provenance.write_record(folder, description | results)
     return report
 
 
 def claim_pages(job: Job, folder: Path) -> None:
     """Add a folder of pages to the record of a complete scan, before they are written."""
-    record, pages = read_record(job.folder), os.path.relpath(os.path.realpath(folder), job.out)
+    record, pages = (
+        provenance.read_record(job.folder),
+        os.path.relpath(os.path.realpath(folder), job.out),
+    )
     if record is not None and pages not in (known := record.get("pages", [])):
-        write_record(job.folder, record | {"pages": sorted([*known, pages])})
+        provenance.write_record(job.folder, record | {"pages": sorted([*known, pages])})

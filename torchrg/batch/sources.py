@@ -157,8 +157,7 @@ class RGBDSource(Source):
 
     Files per frame, all of its height and width: ``coord`` ``(H, W, 3)``, ``normal``
     ``(H, W, 3)``, ``curvature`` and ``plane`` ``(H, W)`` as ``.npy``, and ``planes.json``.
-    Coordinates are in the world if the pose is known, else in the camera; pixels without depth are
-    zero, with plane -1.
+    Coordinates are in the world if the pose is known, else in the camera; zero without depth.
 
     Args:
         data: The frames of a folder; see :meth:`torchrg.datasets.RGBDFrames.from_folder`.
@@ -195,9 +194,7 @@ class RGBDSource(Source):
         with collecting_notes() as notes:
             depth = frame.read_depth()
         if not bool((depth > 0).any()):
-            raise FormatError(
-                f"{frame.depth}: expected pixels with depth, got none; remove this frame."
-            )
+            raise FormatError(f"{frame.depth}: expected pixels with depth, got none; remove it.")
         begin("planes")
         seg = segment_depth(
             depth, frame.intrinsics, self.settings, pose=frame.pose, orient=self.orient

@@ -14,7 +14,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from torchrg.batch.records import RECORD
 from torchrg.batch.run import LOCK, read_root
 from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
@@ -29,7 +28,7 @@ from torchrg.io.files import (
     remove_leftovers,
     sync_folder,
 )
-from torchrg.io.result import PAGE_SUFFIXES
+from torchrg.io.result import PAGE_SUFFIXES, RECORD
 
 __all__ = ["StaleResult", "check_stale", "find_stale", "remove_stale"]
 __dir__ = __all__.copy
@@ -76,8 +75,7 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
         jobs: All scans of the data set.
 
     Raises:
-        FormatError: If the directory contains another data set, kind or layout, or a corrupt
-            record.
+        FormatError: If there is another data set, kind or layout, or a corrupt record.
     """
     out, source = jobs[0].out, jobs[0].source
     names, found, described = {job.name for job in jobs}, find_records(out), source.describe()

@@ -8,15 +8,7 @@ from collections.abc import Sequence
 
 from torchrg._limits import system_limit
 from torchrg._synonyms import nearest_name
-from torchrg.cli.ending import (
-    INTERRUPTED,
-    INTERRUPTED_LINE,
-    USAGE_ERROR,
-    fail,
-    raising_interrupts,
-    warn,
-    writing_to,
-)
+from torchrg.cli import ending
 from torchrg.errors import ConfigError, PrecisionWarning, TorchrgError
 
 COMMANDS = {
@@ -53,12 +45,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 success; 2 usage error or invalid input; 3 some inputs of a batch failed; 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    with writing_to(sys.stdout) as output, writing_to(sys.stderr):
+    with ending.writing_to(sys.stdout) as output, ending.writing_to(sys.stderr):
         code = _exit_code(arguments)
     if output.error is None or isinstance(output.error, BrokenPipeError):
         return code
     message = f"standard output: {output.error.strerror or output.error}."
-    return fail(message, code=code or USAGE_ERROR)
+    return ending.fail(message, code=code or ending.USAGE_ERROR)
 
 
 def _exit_code(arguments: list[str]) -> int:
@@ -67,22 +59,22 @@ def _exit_code(arguments: list[str]) -> int:
     try:
         return _run(arguments)
     except TorchrgError as error:
-        return fail(str(error))
+        return ending.fail(str(error))
     except OSError as error:
-        return fail(f"{error.filename or name}: {error.strerror or error}.")
+        return ending.fail(f"{error.filename or name}: {error.strerror or error}.")
     except Exception as error:
         if limit := system_limit(error):
-            return fail(f"{name}: {limit}")
+            return ending.fail(f"{name}: {limit}")
         raise
     except KeyboardInterrupt:
-        return fail(INTERRUPTED_LINE, code=INTERRUPTED)
+        return ending.fail(ending.INTERRUPTED_LINE, code=ending.INTERRUPTED)
 
 
 def _run(arguments: list[str]) -> int:
     """Run the command named by the first argument."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_OVERVIEW)
-        return 0 if arguments else USAGE_ERROR
+        return 0 if arguments else ending.USAGE_ERROR
     name, *remaining = arguments
     if name == "--version":
         from torchrg.version import __version__
@@ -97,9 +89,9 @@ def _run(arguments: list[str]) -> int:
     if not gc.isenabled():  # See torchrg.__main__: loaded modules are no garbage.
         gc.freeze()
         gc.enable()
-    with raising_interrupts(), warnings.catch_warnings():
+    with ending.raising_interrupts(), warnings.catch_warnings():
         # Commands print the precision of each file themselves (check_finite).
         warnings.simplefilter("ignore", PrecisionWarning)
-        warnings.showwarning = lambda message, *_, **__: warn(" ".join(str(message).split()))
+        warnings.showwarning = lambda message, *_, **__: ending.warn(" ".join(str(message).split()))
         code: int = command.run(remaining)
     return code

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.batch.records import describe_run
 from torchrg.cli import flags
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import STAGES, check_distinct, note_input, output_paths, run_each, stage_bar
+from torchrg.datasets.provenance import describe_run
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, check_output, read_cloud, write_cloud
 from torchrg.io.files import atomic_path, check_writable
@@ -40,8 +40,7 @@ class Arguments(flags.PlaneSettings):
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     matrix: Path | None = None
-    """File for the rigid transform of a single input: .npy (4 x 4 array) or .txt (axisAlignment
-    line of ScanNet)."""
+    """File for the transform of one input: .npy (4 x 4 array) or .txt (ScanNet's axisAlignment)."""
     segment: bool = False
     """Also write labels, normals, curvature and the plane table, as torchrg segment does."""
     threads: flags.ThreadsFlag = None
@@ -63,9 +62,7 @@ def run(argv: list[str]) -> int:
 def _check_matrix(arguments: Arguments, path: Path, outputs: list[Path]) -> None:
     """Raise if the transform cannot be written, or there are several inputs."""
     if len(arguments.inputs) > 1:
-        raise ConfigError(
-            f"expected one input with --matrix, got {len(arguments.inputs)}; align them one by one."
-        )
+        raise ConfigError(f"expected one input with --matrix, got {len(outputs)}; align each.")
     if path.suffix.lower() not in (".npy", ".txt"):
         raise ConfigError(f"expected --matrix to end in .npy or .txt, got {path.name}.")
     check_distinct([path], [*arguments.inputs, *outputs])

@@ -311,8 +311,7 @@ def list_flags(
 ) -> Iterator[Flag]:
     """Yield the arguments defined by the fields of a dataclass, in order.
 
-    ``default`` has the default values. ``path`` and ``section`` are the prefixes of an argument's
-    path and name.
+    ``default`` has the default values. ``path`` and ``section`` are prefixes of path and name.
     """
     texts = _field_docstrings(kind)
     for field, hint, argument in _fields(kind):

@@ -27,24 +27,15 @@ from torchrg.batch.scans import Job, Source, claim_pages
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.batch.stale import StaleResult, check_stale, find_stale, remove_empty, remove_stale
 from torchrg.batch.task import Reports
-from torchrg.cli import flags
+from torchrg.cli import ending, flags
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import (
-    INTERRUPTED,
-    SOME_FAILED,
-    USAGE_ERROR,
-    fail,
-    print_lines,
-    print_warnings,
-    warn,
-)
 from torchrg.cli.loop import Progress, print_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SuperpointsConfig
 from torchrg.datasets import S3DIS, FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.datasets.folder import SceneDataset
 from torchrg.datasets.provenance import read_record
-from torchrg.datasets.s3dis import find_areas
+from torchrg.datasets.s3dis import ClassOrder, find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
 from torchrg.io.files import (
@@ -61,8 +52,7 @@ from torchrg.render.page import read_library
 
 _Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
 _MEMORY_FRACTION = 0.8
-"""Fraction of the available memory for all scans by default; the remainder is for the parent
-process and other programs."""
+"""Fraction of the available memory for all scans by default; other programs get the remainder."""
 _Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]
 
 
@@ -73,14 +63,11 @@ class Arguments:
     root: Annotated[Path, Argument("ROOT", is_positional=True)]
     """Directory of the data set, read only."""
     out: Annotated[Path, Argument("OUT", is_positional=True)]
-    """Output directory of one data set in one layout, with one folder per scan; created if missing.
-    Finished scans are skipped."""
+    """Output directory of one data set in one layout; finished scans are skipped."""
     workers: int | None = None
-    """Number of scans processed at a time. Default: one per core; on a cluster, as the memory
-    allows."""
+    """Number of scans processed at a time. Default: one per core; on a cluster, by memory."""
     engine: Literal["local", "ray"] = "local"
-    """Execution: processes on this machine (local), or tasks on a Ray cluster (ray; pip install
-    'torchrg[ray]')."""
+    """Execution: processes on this machine (local), or on Ray (ray; pip install 'torchrg[ray]')."""
     ray_address: str | None = None
     """Address of the Ray cluster; auto: the cluster of this machine. ROOT and OUT must have the
     same paths on every node. Default: starts a cluster for this command."""
@@ -90,8 +77,7 @@ class Arguments:
     """Also write the plane table under this file name to the folder of each scan, as torchrg
     segment --table does; for example planes.csv. planes.json is always written."""
     only: str | None = None
-    """Shell pattern for the names of the scans to convert, such as "Area_5/*". Results of scans
-    missing from ROOT are kept."""
+    """Shell pattern of scans to convert, such as "Area_5/*". Results of missing scans are kept."""
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False
@@ -186,7 +172,7 @@ class S3DISArguments(CloudArguments):
 
     areas: tuple[int, ...] = ()
     """Area numbers. Default: all areas in ROOT."""
-    class_order: Literal["pointcept", "spt"] = "pointcept"
+    class_order: ClassOrder = "pointcept"
     """Class order of segment.npy. Other layouts always use pointcept."""
 
     def data(self, root: Path) -> SceneDataset:
@@ -271,7 +257,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, check the plan, convert, and print a report."""
     if not argv or argv[0] in ("-h", "--help"):
         print(OVERVIEW)
-        raise SystemExit(0 if argv else USAGE_ERROR)
+        raise SystemExit(0 if argv else ending.USAGE_ERROR)
     kind, *remaining = argv
     if kind not in KINDS:
         raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
@@ -281,7 +267,7 @@ def run(argv: list[str]) -> int:
     listing = tqdm(
         desc=f"listing the scans in {root}", bar_format="{desc}", leave=False, disable=None
     )
-    with listing, print_warnings():
+    with listing, ending.print_warnings():
         scans = list_jobs(arguments.source(root), out)
     jobs = match_jobs(scans, arguments.only)
     if arguments.dry_run:
@@ -290,7 +276,7 @@ def run(argv: list[str]) -> int:
         print(format_plan(plan))
         for result in stale:
             if result.paths and (result.scan is not None or arguments.prune):
-                print_lines(f"remove {result.name}: {result.reason}")
+                ending.print_lines(f"remove {result.name}: {result.reason}")
         print(format_costs(plan, *resources, arguments.seconds_per_million))
         check_stale(stale, root, prune=arguments.prune)
         check_free_space(plan)
@@ -319,8 +305,7 @@ def _check(arguments: Arguments) -> None:
     table = arguments.table or PLANES_FILE
     if Path(table).name != table or Path(table).suffix not in TABLE_SUFFIXES or table == RECORD:
         raise ConfigError(
-            "expected --table to be a file name ending in .csv or .json, got "
-            f"{table}; use planes.csv."
+            f"expected --table to be a name ending in .csv or .json, got {table}; use planes.csv."
         )
     if arguments.ray_address is not None and arguments.engine != "ray":
         raise ConfigError("expected --ray-address with --engine ray, got --engine local; add it.")
@@ -336,8 +321,7 @@ def _check(arguments: Arguments) -> None:
             )
         if arguments.pages is not None and arguments.layout != "pointcept":
             raise ConfigError(
-                f"expected --pages with --layout pointcept, got --layout {arguments.layout}; "
-                "leave one of them out."
+                f"expected --pages with --layout pointcept, got {arguments.layout}; omit one."
             )
 
 
@@ -365,13 +349,13 @@ def _remove_stale(stale: list[StaleResult], scans: list[Job]) -> None:
     for result in stale:
         remove_stale(result)
         if result.paths:
-            print_lines(f"{result.folder}: removed: {result.reason}")
+            ending.print_lines(f"{result.folder}: removed: {result.reason}")
     for folder in {folder for result in stale for folder in result.page_folders}:
         try:
             if (folder / INDEX).is_file():
                 _index_pages(folder, scans)
         except (TorchrgError, OSError) as error:
-            warn(f"{folder / INDEX}: may list removed scans: {error}")
+            ending.warn(f"{folder / INDEX}: may list removed scans: {error}")
 
 
 def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
@@ -380,7 +364,7 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     jobs, workers, limit = plan.to_convert, arguments.workers, _memory_limit(arguments)
     for job in jobs:
         if job.memory > limit:
-            warn(
+            ending.warn(
                 f"{job.name}: about {job.scan.num_points:,} points may exceed the memory limit of "
                 f"{limit / 1e9:.1f} GB; it runs alone."
             )
@@ -410,11 +394,11 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
         plan.jobs[0].source.write_lists(out)
     code = _finish(report, out, unit=arguments.unit)
     if unreported:
-        code = fail(unreported, code=code or USAGE_ERROR)
+        code = ending.fail(unreported, code=code or ending.USAGE_ERROR)
     pages = _page_folder(arguments)
     if pages is not None and not report.interrupted:
         _draw_pages(plan, report, pages)
-        print_lines(f"pages -> {_index_pages(pages, scans)}")
+        ending.print_lines(f"pages -> {_index_pages(pages, scans)}")
     return code
 
 
@@ -433,7 +417,7 @@ def _draw_pages(plan: Plan, report: BatchReport, folder: Path) -> None:
             claim_pages(job, folder)
             write_entry(folder, job.name, read_result(job.folder))
         except (TorchrgError, OSError) as error:
-            warn(f"{job.name}: no page: {error}")
+            ending.warn(f"{job.name}: no page: {error}")
 
 
 def _index_pages(folder: Path, scans: list[Job]) -> Path:
@@ -460,10 +444,12 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     state = f"{num_complete:,} of {len(report.scans):,} scans are complete"
     hint = "Rerun the same command to resume."
     if report.disk_full:
-        return fail(f"{out}: the disk is full; {state}. Free space. {hint}", code=SOME_FAILED)
+        return ending.fail(
+            f"{out}: the disk is full; {state}. Free space. {hint}", code=ending.SOME_FAILED
+        )
     if report.interrupted:
-        return fail(f"interrupted; {state}. {hint}", code=INTERRUPTED)
+        return ending.fail(f"interrupted; {state}. {hint}", code=ending.INTERRUPTED)
     if num_complete < len(report.scans):
-        return fail(f"{state}; see {out / REPORT}.", code=SOME_FAILED)
-    print_lines(f"{state} -> {out}")
+        return ending.fail(f"{state}; see {out / REPORT}.", code=ending.SOME_FAILED)
+    ending.print_lines(f"{state} -> {out}")
     return 0

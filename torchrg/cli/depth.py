@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from torchrg.batch.memory import available_memory
-from torchrg.batch.records import describe_run
 from torchrg.batch.sources import write_frame
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines, print_warnings, warn
 from torchrg.cli.loop import check_distinct, note_input, output_paths, run_each, sidecar_paths
 from torchrg.datasets import RGBDFrame, RGBDFrames
+from torchrg.datasets.provenance import describe_run
 from torchrg.datasets.rgbd import scale_camera
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, refuse_form
 from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
@@ -38,8 +38,7 @@ color them differently. Coloring from all pixels would take as long as segmentat
 _NOT_IMAGES = ("planes", "points", "neighbors", "sampling", "num_copies")
 """Fields of an image segmentation that are not images."""
 _MAX_MISFIT = 0.01
-"""Maximum median reprojection distance of points for a camera to fit a cloud, as a fraction of the
-longer image side."""
+"""Maximum median reprojection error of a camera that fits, as a fraction of the longer side."""
 _MIN_BYTES_PER_PIXEL = 300
 """Lower bound of the memory for segmentation, in bytes per pixel."""
 
@@ -50,8 +49,7 @@ class Arguments:
 
     Writes the plane labels as a 16-bit PNG (0: no plane, 1: first plane) with a colored image and a
     plane table (.json) next to it, or as a point cloud. With an output directory, each image gets a
-    folder with the same files as torchrg convert rgbd, which converts sequences and whole folders.
-    Results are in camera coordinates.
+    folder with the files of torchrg convert rgbd, for sequences. Results are in camera coordinates.
 
     Examples:
         torchrg depth frame.png --intrinsics 525,525,319.5,239.5 --depth-scale 1000 --out labels.png
@@ -61,8 +59,7 @@ class Arguments:
     """
 
     inputs: Annotated[tuple[Path, ...], Argument("IMAGE", is_positional=True)]
-    """Depth images (16-bit .png or .pgm, or .npy), folders with one depth image, or organized
-    clouds (.pcd)."""
+    """Depth images (16-bit .png, .pgm, or .npy), folders with one, or organized clouds (.pcd)."""
     out: Path
     """Output file: .png for labels, or a point cloud format. With several inputs, or a folder, an
     output directory: each image gets a folder with coord, normal, curvature and plane as .npy, and
@@ -243,21 +240,16 @@ def _read_cloud(path: Path, known: Pinhole | None) -> tuple[Cloud, Tensor, Tenso
     """
     cloud = read_cloud(path)
     if cloud.grid_shape is None:
-        raise FormatError(
-            f"{path}: not an organized point cloud (its height is 1); use torchrg segment."
-        )
+        raise FormatError(f"{path}: not an organized cloud (its height is 1); use torchrg segment.")
     height, width = cloud.grid_shape
     points = torch.from_numpy(cloud.coordinates).view(height, width, 3)
     camera = find_intrinsics(points) if known is None else known.matrix((width, height), f"{path}")
     if camera is None:
-        raise FormatError(
-            f"{path}: expected points in the coordinates of a pinhole camera; use torchrg segment."
-        )
+        raise FormatError(f"{path}: expected points of a pinhole camera; use torchrg segment.")
     off = 0.0 if known is None else reprojection_error(points, camera)
     if off > _MAX_MISFIT * max(height, width):
         raise FormatError(
-            f"{path}: --intrinsics do not match the points: half of them are {off:.3g} pixels or "
-            "more off; leave it out."
+            f"{path}: --intrinsics do not match the points: half are {off:.3g} pixels off; omit it."
         )
     depth = points[..., 2]
     return cloud, torch.where(depth.isfinite(), depth, 0.0), camera

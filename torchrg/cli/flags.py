@@ -136,8 +136,7 @@ Layout = Literal["pointcept", "scannet", "mmdet3d", "spformer", "isbnet", "mask3
 def _base_settings(options: Mapping[str, Any]) -> PipelineConfig:
     """Return the settings of the preset or file, with the options that concern several settings.
 
-    The up axis is z unless the file sets another. With --table, polygons are traced if shapely is
-    installed.
+    The up axis is z unless the file sets another. --table traces polygons if shapely is installed.
     """
     source = options.get("config") or options.get("preset", DEFAULT_PRESET)
     changes = {name: options[name] for name in ("angle_deg",) if options.get(name) is not None}
@@ -221,17 +220,13 @@ def read_noted(path: Path, columns: str | None) -> Result:
 def check_viewpoint(viewpoint: tuple[float, float, float] | None, orient: str) -> None:
     """Raise if a viewpoint is passed without --orient viewpoint."""
     if viewpoint is not None and orient != "viewpoint":
-        raise ConfigError(
-            f"expected --viewpoint X Y Z with --orient viewpoint, got --orient {orient}; add it."
-        )
+        raise ConfigError(f"expected --viewpoint with --orient viewpoint, got {orient}; add it.")
 
 
 def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) -> None:
     """Raise if column names are passed but every file stores its own."""
     if columns is not None and not any(map(takes_columns, paths)):
-        raise ConfigError(
-            "expected text or .npy input for --columns, got files with named columns."
-        )
+        raise ConfigError("expected text or .npy input for --columns, got files that name columns.")
 
 
 def check_superpoints(config: SuperpointsConfig, level: int, *, is_on: bool) -> None:
@@ -269,8 +264,7 @@ def parse_intrinsics(text: str | None) -> Pinhole | None:
         with print_warnings():
             return read_camera(Path(text))
     raise ConfigError(
-        "expected --intrinsics fx,fy,cx,cy (four numbers without spaces) or a camera file, got "
-        f"{text!r}."
+        f"expected --intrinsics fx,fy,cx,cy (no spaces) or a camera file, got {text!r}."
     )
 
 
@@ -289,7 +283,6 @@ def limit_in_bytes(limit_memory: float | None, default: int = 0) -> int:
         return default
     if not 0 < limit_memory <= _MAX_GIGABYTES:
         raise ConfigError(
-            f"expected --limit-memory above 0 and at most {_MAX_GIGABYTES:,} GB, got "
-            f"{limit_memory}."
+            f"expected --limit-memory above 0, at most {_MAX_GIGABYTES:,} GB, got {limit_memory}."
         )
     return int(limit_memory * 1e9)

@@ -37,8 +37,7 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
     ``suffix`` is empty, each result is a directory.
 
     Raises:
-        FormatError: If there is no input, two results have the same name, or a result cannot be
-            written.
+        FormatError: If there is no input, two results share a name, or one cannot be written.
     """
     if not inputs:
         raise FormatError("expected at least one input file, got none.")
@@ -48,8 +47,7 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         return [out]
     if ending and ending in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(
-            f"{out}: expected a directory for {len(inputs)} inputs, got a file name; pass a "
-            "directory."
+            f"{out}: expected a directory for {len(inputs)} inputs, got a file; pass a directory."
         )
     results = [out / f"{path.stem}{suffix}" for path in inputs]
     first: dict[str, Path] = {}
@@ -73,9 +71,7 @@ def check_distinct(results: Sequence[Path], inputs: Sequence[Path]) -> None:
     for path in results:
         output = str(path.resolve())
         if not taken.isdisjoint((output, normalize_file_name(output))) or _file_id(path) in files:
-            raise FormatError(
-                f"{path}: would overwrite an input or another result; choose another output path."
-            )
+            raise FormatError(f"{path}: would overwrite an input or a result; choose another.")
         taken.add(normalize_file_name(output))
 
 
@@ -102,9 +98,7 @@ def sidecar_paths(
             check_sidecar(output, suffixes=suffixes)
             return [output]
         if output.suffix.lower() in suffixes:
-            raise FormatError(
-                f"{output}: expected a directory for {len(results)} files, got a file name."
-            )
+            raise FormatError(f"{output}: expected a directory for several files, got a file.")
     create_folder(output)
     paths = [output / f"{path.stem}{suffixes[0]}" for path in results]
     for path in paths:
@@ -117,8 +111,7 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
         raise FormatError(
-            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; write one of these "
-            "and convert it."
+            f"{path}: expected a file ending in {endings}, got {path.suffix!r}; write one."
         )
     check_writable(path)
     if is_viewer(path):

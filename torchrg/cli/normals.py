@@ -8,20 +8,11 @@ from typing import Any
 
 import torch
 
-from torchrg.batch.records import describe_run
-from torchrg.cli import flags
+from torchrg.cli import flags, loop
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, warn
-from torchrg.cli.loop import (
-    check_distinct,
-    dropped_fields_note,
-    is_archive,
-    note_input,
-    output_paths,
-    run_each,
-    stage_bar,
-)
 from torchrg.config import NormalMethod, NormalsConfig, PipelineConfig, load_config
+from torchrg.datasets.provenance import describe_run
 from torchrg.errors import ConfigError
 from torchrg.io import check_output, read_cloud, write_cloud
 from torchrg.io.fields import add_result_fields
@@ -71,23 +62,23 @@ def run(argv: list[str]) -> int:
     if arguments.method is not None:
         arguments = replace(arguments, normals=replace(arguments.normals, method=arguments.method))
     flags.check_columns(arguments.columns, arguments.inputs)
-    outputs = output_paths(arguments.inputs, arguments.out)
-    check_distinct(outputs, arguments.inputs)
-    return run_each(_estimate_file, arguments, arguments.inputs, outputs)
+    outputs = loop.output_paths(arguments.inputs, arguments.out)
+    loop.check_distinct(outputs, arguments.inputs)
+    return loop.run_each(_estimate_file, arguments, arguments.inputs, outputs)
 
 
 def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     """Estimate the normals of one file."""
     begin = time.perf_counter()
     cloud = read_cloud(source, columns=flags.file_columns(source, arguments.columns))
-    note_input(f"{source}", cloud, target, RESULTS)
+    loop.note_input(f"{source}", cloud, target, RESULTS)
     for note in check_finite(cloud):
         warn(f"{source}: {note}.")
     side: dict[str, Any] = {"orient": arguments.orient, "viewpoint": arguments.viewpoint}
     # Fail before the computation.
     find_directions("normals", cloud, **side)
     check_output(target, cloud)
-    with stage_bar(source.name, ("normals", "orientation")) as advance:
+    with loop.stage_bar(source.name, ("normals", "orientation")) as advance:
         side |= {"chunk_size": arguments.chunk_size, "on_stage": advance}
         fit = estimate_normals(cloud, arguments.normals, **side)
     for note in note_on_copies(distinct_points(cloud.points).num_copies, len(cloud)):
@@ -97,7 +88,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     provenance |= {name: getattr(arguments, name) for name in names}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     results = zip(RESULTS, (fit.normals, fit.curvature, sharp, fit.valid), strict=True)
-    keeps_fields = not is_archive(target)
+    keeps_fields = not loop.is_archive(target)
     fields = {
         name: v for name, v in cloud.fields.items() if keeps_fields or name in DISPLAYED_FIELDS
     }
@@ -108,5 +99,5 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
         warn(f"{source}: {num_lost:,} of {len(cloud):,} finite points have no normal.")
     counted = "" if fit.sharp is None else f"{int(sharp.sum()):,} sharp, "
     seconds = time.perf_counter() - begin
-    destination = f"{target}{dropped_fields_note(target, cloud.fields)}"
+    destination = f"{target}{loop.dropped_fields_note(target, cloud.fields)}"
     print_lines(f"{source}: {len(cloud):,} points, {counted}{seconds:.1f} s -> {destination}")

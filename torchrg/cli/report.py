@@ -8,8 +8,7 @@ from torchrg.batch.task import TaskReport
 from torchrg.cli.ending import printable
 
 _SECONDS_PER_SCAN = 0.03
-"""Time for a scan of 40 points on one core of an AMD EPYC, in seconds: hashing and flushing
-files."""
+"""Time for a scan of 40 points on one core of an AMD EPYC, in seconds: hashing, flushing."""
 _MIN_NEXT_UNIT = 100
 """Durations from this many seconds or minutes on are printed in the next larger unit."""
 MAX_ROWS = 300
@@ -54,8 +53,7 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     """Format a report: one row per scan, notes, then the totals.
 
-    With more than :data:`MAX_ROWS` scans, only failures are listed. ``unit`` is the name of a scan
-    in the throughput.
+    With more than :data:`MAX_ROWS` scans, only failures are listed. ``unit`` names a scan.
     """
     stages = list(report.stage_seconds)
     shown = report.scans if len(report.scans) <= MAX_ROWS else report.with_status("failed")

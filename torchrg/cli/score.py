@@ -10,21 +10,13 @@ from typing import Annotated, TypeAlias
 import numpy as np
 from tqdm import tqdm
 
+from torchrg import metrics
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_warnings, warn
 from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
 from torchrg.datasets.folder import FolderOfClouds, is_scene, natural_key
 from torchrg.errors import ConfigError, FormatError
 from torchrg.io.files import list_some
-from torchrg.metrics import (
-    METRICS,
-    Index,
-    differing_rows,
-    match_points,
-    score_labels,
-    score_normals,
-    score_partition,
-)
 from torchrg.structures import UNLABELED, Cloud
 
 Scores: TypeAlias = dict[str, dict[str, float | None]]
@@ -48,15 +40,13 @@ class Arguments:
     """
 
     predicted: Annotated[Path, Argument("PREDICTED", is_positional=True)]
-    """Scan with labels or normals, as written by torchrg segment or convert, or a folder of
-    scans."""
+    """Scan with labels or normals, of torchrg segment or convert, or a folder of scans."""
     ground_truth: Annotated[Path, Argument("TRUTH", is_positional=True)]
     """File with ground-truth labels or normals, or a folder with one such file per result."""
     match_distance: float | None = None
     """Match each ground-truth point to the nearest predicted point within this distance, in units
     of the cloud. Every ground-truth point counts once; without a match it counts as unlabeled.
-    Unmatched predicted points are ignored. Default: points are compared row by row and must be the
-    same."""
+    Unmatched predicted points are ignored. Default: the points must be the same, row by row."""
     superpoints: bool = False
     """Also evaluate superpoints against the ground-truth labels."""
     ignore: int | None = None
@@ -66,8 +56,7 @@ class Arguments:
     """Maximum distance between matching superpoint and ground-truth boundaries, in units of the
     cloud. Default: the median distance to the 8th nearest neighbor."""
     json: bool = False
-    """Print a JSON object instead of text; for folders with the keys "scans" (scores per scan) and
-    "mean"."""
+    """Print a JSON object instead of text; for folders with the keys "scans" and "mean"."""
     columns: ColumnsFlag = None
 
 
@@ -100,7 +89,7 @@ def run(argv: list[str]) -> int:
     for part, values in scores.items():
         print(part)
         for name, value in values.items():
-            print(f"  {name:<22}{_format(value, METRICS.get(part, {}).get(name))}")
+            print(f"  {name:<22}{_format(value, metrics.METRICS.get(part, {}).get(name))}")
     return 0
 
 
@@ -132,18 +121,16 @@ def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> S
     else:
         distance = arguments.match_distance
         ours, scores["match"] = _match_nearest(distance, predicted, ground_truth, ours, theirs)
-    for part, score in (("labels", score_labels), ("normals", score_normals)):
+    for part, score in (("labels", metrics.score_labels), ("normals", metrics.score_normals)):
         if part in ours.fields and part in theirs.fields:
             scores[part] = _defined(score(ours.fields[part], theirs.fields[part])._asdict())
     if arguments.superpoints:
         needed = (predicted, ours, "superpoint"), (ground_truth, theirs, "labels")
         for path, cloud, field in needed:
             if field not in cloud.fields:
-                named = ", ".join(cloud.fields) or "points alone"
-                raise FormatError(
-                    f"{path}: missing {field}, required by --superpoints; has {named}."
-                )
-        indices = score_partition(
+                has = ", ".join(cloud.fields) or "points alone"
+                raise FormatError(f"{path}: missing {field}, required by --superpoints; has {has}.")
+        indices = metrics.score_partition(
             ours.fields["superpoint"],
             theirs.fields["labels"],
             ours.points,
@@ -167,7 +154,7 @@ def _check_rows(predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud)
             f"{len(ours):,}; to compare each point with the nearest one within D, "
             "pass --match-distance D."
         )
-    rows = differing_rows(ours, theirs)
+    rows = metrics.differing_rows(ours, theirs)
     if len(rows):
         points = (cloud.coordinates[rows[0]] for cloud in (ours, theirs))
         got, expected = (" ".join(f"{value:.9g}" for value in point) for point in points)
@@ -182,7 +169,7 @@ def _match_nearest(
     distance: float, predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud
 ) -> tuple[Cloud, dict[str, float | None]]:
     """Transfer the results to the nearest ground-truth points, and count unmatched points."""
-    rows = match_points(ours, theirs, distance)
+    rows = metrics.match_points(ours, theirs, distance)
     is_matched = rows >= 0
     num_lost = int(np.count_nonzero(~is_matched))
     if num_lost == len(rows):
@@ -227,7 +214,7 @@ def _mean(scans: Mapping[str, Scores]) -> Scores:
     return means
 
 
-def _format(value: float | None, index: Index | None) -> str:
+def _format(value: float | None, index: metrics.Index | None) -> str:
     """Format a value with its unit; fractions are printed in percent."""
     unit = "" if index is None else index.unit
     if value is None:

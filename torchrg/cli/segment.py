@@ -14,24 +14,11 @@ import torch
 
 from torchrg import scratch
 from torchrg.batch.memory import available_memory, scan_memory
-from torchrg.batch.records import describe_run
 from torchrg.batch.run import lock_folder
 from torchrg.batch.stale import find_records
-from torchrg.cli import flags
+from torchrg.cli import flags, loop
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, warn
-from torchrg.cli.loop import (
-    STAGES,
-    check_distinct,
-    display_name,
-    dropped_fields_note,
-    is_viewer,
-    note_input,
-    output_paths,
-    run_each,
-    sidecar_paths,
-    stage_bar,
-)
 from torchrg.config import PipelineConfig, SuperpointsConfig
 from torchrg.datasets.folder import SceneFiles
 from torchrg.datasets.layouts import (
@@ -42,7 +29,7 @@ from torchrg.datasets.layouts import (
     write_scan,
 )
 from torchrg.datasets.lists import check_lists, write_lists
-from torchrg.datasets.provenance import Record, check_source
+from torchrg.datasets.provenance import Record, check_source, describe_run
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
@@ -85,8 +72,7 @@ class Arguments(flags.PlaneSettings):
     inputs: flags.CloudsFlag
     out: flags.OutFlag
     picture: Path | None = None
-    """Also render the planes as an image (.png) or an interactive viewer (.html). With several
-    inputs, a directory of images."""
+    """Also render the planes as an image (.png) or viewer (.html); for several, a directory."""
     table: flags.TableFlag = None
     pages: bool = False
     """Also write an interactive viewer for each image, and an index.html linking to them. Requires
@@ -124,8 +110,7 @@ def run(argv: list[str]) -> int:
         arguments = dataclasses.replace(arguments, superpoints=True)
     if arguments.level and arguments.layout is None:
         raise ConfigError(
-            "expected --layout with --level, got none; leave --level out, since other files "
-            "contain all levels."
+            "expected --layout with --level, got none; omit it, as other files contain all levels."
         )
     flags.check_superpoints(arguments.partition, arguments.level, is_on=arguments.superpoints)
     if arguments.layout is not None:
@@ -139,14 +124,14 @@ def run(argv: list[str]) -> int:
     flags.check_viewpoint(arguments.viewpoint, arguments.orient)
     firsts = tuple(sources[0] for sources in clouds if sources)
     suffix = ".npz" if arguments.layout is None else ""
-    outputs = output_paths(firsts, arguments.out, suffix=suffix)
-    pictures = sidecar_paths(outputs, arguments.picture)
-    tables = sidecar_paths(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
-    check_distinct([*outputs, *filter(None, tables)], arguments.inputs)
+    outputs = loop.output_paths(firsts, arguments.out, suffix=suffix)
+    pictures = loop.sidecar_paths(outputs, arguments.picture)
+    tables = loop.sidecar_paths(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
+    loop.check_distinct([*outputs, *filter(None, tables)], arguments.inputs)
     if arguments.pages:
         _check_pages(arguments, pictures)
     with _layout_lock(arguments, outputs):
-        code = run_each(_segment, arguments, clouds, outputs, tables, pictures)
+        code = loop.run_each(_segment, arguments, clouds, outputs, tables, pictures)
     if arguments.pages and arguments.picture is not None:
         pages = [(path, path.with_suffix(".html")) for path in filter(None, pictures)]
         done = [(path, page) for path, page in pages if page.is_file()]
@@ -200,7 +185,7 @@ def _segment(
     picture: Path | None,
 ) -> None:
     """Segment a cloud with a progress bar, and print one line about the result."""
-    begin, source = time.perf_counter(), display_name(sources)
+    begin, source = time.perf_counter(), loop.display_name(sources)
     limit = flags.limit_in_bytes(arguments.limit_memory, available_memory() // 2)
     num_points = sum(map(estimate_points, sources))
     _check_limit(arguments, source, num_points, limit)  # Before reading.
@@ -211,8 +196,8 @@ def _segment(
     where = _array_storage(arguments, source, target, len(cloud), limit)
     find_objects(cloud, arguments.within)  # An unknown field fails before any warning.
     _check_points(arguments, source, cloud, target)
-    stages = (*STAGES, *["superpoints"] * arguments.superpoints)
-    with stage_bar(sources[0].name, stages) as advance, where:
+    stages = (*loop.STAGES, *["superpoints"] * arguments.superpoints)
+    with loop.stage_bar(sources[0].name, stages) as advance, where:
         seg, superpoints = segment_cloud(
             cloud,
             arguments.settings,
@@ -242,7 +227,7 @@ def _segment(
     if seg.sampling is not None:
         settings = arguments.settings.measured(seg.sampling)["settings"]
         print_lines(f"{source}: {flags.describe_sampling(seg.sampling, settings)}")
-    destination = f"{target}{dropped_fields_note(target, cloud.fields)}"
+    destination = f"{target}{loop.dropped_fields_note(target, cloud.fields)}"
     reason = flags.reason_for_no_plane(arguments.settings)
     _report(source, seg, cloud, destination, reason, time.perf_counter() - begin)
 
@@ -293,7 +278,7 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
     parts = [f"superpoint_{i}" if i else "superpoint" for i in levels]
     written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
-    note_input(source, cloud, target, written)
+    loop.note_input(source, cloud, target, written)
     if arguments.layout is None:
         check_output(target, cloud)
     grid = cloud.grid_shape
@@ -341,7 +326,7 @@ def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
     """Write the image or viewer of a result, or both."""
     if arguments.pages:
         write_entry(picture.parent, picture.stem, result)
-    elif is_viewer(picture):
+    elif loop.is_viewer(picture):
         write_page(picture, make_page(result))
     else:
         write_planes(picture, result)

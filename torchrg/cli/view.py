@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchrg import render
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
@@ -16,16 +17,6 @@ from torchrg.cli.loop import check_sidecar, is_viewer
 from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.io.result import Result
-from torchrg.render import (
-    color_curvature,
-    color_normals,
-    color_planes,
-    color_sharp,
-    make_page,
-    render_cloud,
-    write_page,
-    write_png,
-)
 from torchrg.render.channels import COLOR_MODES
 from torchrg.render.page import MAX_SHOWN_POINTS
 from torchrg.structures import Cloud
@@ -33,7 +24,6 @@ from torchrg.structures.colors import narrow_colors
 
 ColorBy = Literal["plane", "superpoint", "color", "normal", "curvature", "sharp"]
 PageColorBy = Literal[ColorBy, "error", "normal-error"]
-Direction = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -53,8 +43,7 @@ class Arguments:
     file: Annotated[Path, Argument("FILE", is_positional=True)]
     """Point cloud or result."""
     out: Path
-    """Output image (.png) or interactive viewer (.html; pip install 'torchrg[view]'). A viewer is a
-    single file that works offline."""
+    """Output image (.png) or viewer (.html, one offline file; pip install 'torchrg[view]')."""
     color: PageColorBy | None = None
     """Quantity shown as color; in a viewer, the initial one. Default: the planes, or the first
     quantity in the file. error and normal-error require --ground-truth and a viewer."""
@@ -95,9 +84,7 @@ def run(argv: list[str]) -> int:
 def _write_picture(arguments: Arguments, result: Result) -> str:
     """Write an image, or two side by side, and return its description."""
     if arguments.ground_truth is not None:
-        raise ConfigError(
-            f"expected --ground-truth with a viewer, got {arguments.out}; use --out PAGE.html."
-        )
+        raise ConfigError(f"expected --ground-truth with a viewer, got {arguments.out}; use .html.")
     halves = [_render(arguments, result)]
     if arguments.compare is not None:
         halves.append(_render(arguments, read_noted(arguments.compare, arguments.columns), result))
@@ -105,7 +92,7 @@ def _write_picture(arguments: Arguments, result: Result) -> str:
     level = [
         functional.pad(half, (0, 0, 0, 0, 0, height - len(half)), value=255) for half in halves
     ]
-    write_png(arguments.out, torch.cat(level, dim=1))
+    render.write_png(arguments.out, torch.cat(level, dim=1))
     return f"{sum(half.shape[1] for half in halves)} x {height} pixels"
 
 
@@ -115,8 +102,8 @@ def _render(arguments: Arguments, result: Result, first: Result | None = None) -
     reference = None
     if first and np.array_equal(cloud.coordinates, first.cloud.coordinates, equal_nan=True):
         reference = first.fields.get("labels")
-    up = _direction(arguments.up or "z")
-    return render_cloud(
+    up = arguments.up or "z"
+    return render.render_cloud(
         cloud.points,
         _colors(cloud, arguments.color, up, reference),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
@@ -134,25 +121,23 @@ def _write_page(arguments: Arguments, result: Result) -> str:
         None if path is None else read_noted(path, arguments.columns)
         for path in (arguments.compare, arguments.ground_truth)
     )
-    page = make_page(
+    page = render.make_page(
         result,
         compare=compare,
         ground_truth=None if ground_truth is None else ground_truth.cloud,
         color=arguments.color,
         view=arguments.view,
-        up=None if arguments.up is None else _direction(arguments.up),
+        up=arguments.up,
         azimuth_deg=arguments.azimuth_deg,
         max_points=arguments.max_points,
         unit=arguments.unit,
     )
-    write_page(arguments.out, page)
+    render.write_page(arguments.out, page)
     shown = " and ".join(f"{number:,}" for number in page.num_points)
     return f"{shown} points, {arguments.out.stat().st_size / 1e6:.1f} MB"
 
 
-def _colors(
-    cloud: Cloud, color: PageColorBy | None, up: Direction, reference: Tensor | None
-) -> Tensor:
+def _colors(cloud: Cloud, color: PageColorBy | None, up: Up, reference: Tensor | None) -> Tensor:
     """Return the color of each point; raise ConfigError if the cloud lacks the quantity."""
     present = [name for name in get_args(ColorBy) if COLOR_MODES[name][1] in cloud.fields]
     if color is None:
@@ -167,18 +152,13 @@ def _colors(
         return torch.full((len(cloud), 3), 170, dtype=torch.uint8)
     values = torch.from_numpy(cloud.fields[COLOR_MODES[color][1]])
     if color in ("plane", "superpoint"):
-        return color_planes(values, cloud.points, reference=reference if color == "plane" else None)
+        return render.color_planes(
+            values, cloud.points, reference=reference if color == "plane" else None
+        )
     if color == "normal":
-        return color_normals(values, up=up)
+        return render.color_normals(values, up=up)
     if color == "curvature":
-        return color_curvature(values)
+        return render.color_curvature(values)
     if color == "sharp":
-        return color_sharp(values)
+        return render.color_sharp(values)
     return torch.from_numpy(narrow_colors(cloud.fields["color"]))
-
-
-def _direction(axis: Up) -> Direction:
-    """Return the unit vector of an axis."""
-    sign = -1.0 if axis.startswith("-") else 1.0
-    x, y, z = (sign * (letter == axis[-1]) for letter in "xyz")
-    return x, y, z

@@ -96,14 +96,12 @@ def read_camera(path: Path) -> Pinhole:
         FormatError: If the file is missing, or contains no camera.
 
     Warns:
-        DepthWarning: If the lens distorts images, which torchrg does not correct, or a focal length
-            is negative.
+        DepthWarning: If the lens distorts images, or a focal length is negative.
     """
     record = read_entries(path)
     if isinstance(record.get("frames"), list) and "fl_x" not in record:
         raise FormatError(
-            f"{path}: expected one camera, got one per frame, or none; pass the folder of the file "
-            "to torchrg convert rgbd."
+            f"{path}: expected one camera, got one per frame; pass its folder to convert rgbd."
         )
     return parse_camera(path, record)
 
@@ -152,9 +150,7 @@ def _name_numbers(path: Path, numbers: list[float]) -> Entries:
 def _colmap_camera(path: Path, rows: list[str]) -> Entries:
     """Return the camera in COLMAP's ``cameras.txt``, with nerfstudio's names."""
     if len(rows) > 1:
-        raise FormatError(
-            f"{path}: expected one camera, got {len(rows):,}; pass --intrinsics fx,fy,cx,cy."
-        )
+        raise FormatError(f"{path}: expected one camera, got {len(rows):,}; pass --intrinsics.")
     _, model, *words = rows[0].split()
     with wrap_errors(f"{path}: expected numbers after {model}, got: ", ValueError):
         width, height, *numbers = map(float, words)
@@ -206,8 +202,7 @@ def parse_camera(path: Path, record: Entries) -> Pinhole:
     models = (name if value in (True, 1) else str(value) for name, value in values)
     if model := next(filter(_NO_PINHOLE.search, models), ""):
         raise FormatError(
-            f"{path}: expected images of a pinhole camera, got {model}; undistort them, as the "
-            "image_undistorter of COLMAP does."
+            f"{path}: expected a pinhole camera, got {model}; undistort images, as COLMAP does."
         )
     fx, fy, cx, cy = _read_pinhole(path, record)
     if distorted := _distortions(record):
@@ -301,8 +296,7 @@ def find_camera(folder: Path, root: Path) -> tuple[Pinhole, Path] | None:
         FormatError: If a camera file is corrupt.
 
     Warns:
-        DepthWarning: If another file of the same folder has another camera, or the file is outside
-            ``root``.
+        DepthWarning: If another file there has another camera, or the file is outside ``root``.
     """
     # Links are not resolved: the parents of a recording are those in its path.
     start, top = (Path(os.path.abspath(path)) for path in (folder, root))  # noqa: PTH100

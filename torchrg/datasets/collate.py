@@ -8,17 +8,17 @@ import torch
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from torchrg._checks import as_tensor
+from torchrg._checks import as_tensor, default_device_cpu
 from torchrg.errors import ShapeError
 from torchrg.transforms.rows import LIST_KEY, Entries, SampleDict, get_list
 from torchrg.transforms.sample import NeighborSearch
 
 
+@default_device_cpu()
 def collate_offset(
     samples: Sequence[Entries],
     *,
     coord: str = "coord",
-    inverse: str = "inverse",
     unique: Sequence[str] = (),
 ) -> SampleDict:
     """Collate samples as Pointcept does: concatenated arrays, and ``offset``, each cloud's end row.
@@ -29,10 +29,9 @@ def collate_offset(
 
     Args:
         samples: Samples with the same keys. Tensors and arrays are concatenated along their first
-            axis, scalars stacked, other values collected in a list. Cached neighbors are dropped.
+            axis, scalars stacked, other values collected in a list; ``inverse`` then has rows of
+            the batch. Cached neighbors are dropped.
         coord: Key whose length is the number of points of a sample.
-        inverse: Key of point indices, as from :class:`torchrg.transforms.SampleVoxels`, which are
-            offset to rows of the batch.
         unique: Keys of labels to make distinct across clouds, as in ``("plane", "superpoint")``,
             so that a network can pool over them.
 
@@ -64,16 +63,14 @@ def collate_offset(
             )
     for key in (coord, *unique):
         if key not in keys:
-            raise ShapeError(
-                f"collate_offset: expected samples with {key!r}, got {', '.join(keys) or 'none'}."
-            )
+            raise ShapeError(f"collate_offset: expected {key!r}, got {', '.join(keys) or 'none'}.")
     ends = [torch.as_tensor(s.get("offset", [len(s[coord])])) for s in samples]
     counts = [end.diff(prepend=end.new_zeros(1)).to(ends[0].device) for end in ends]
     batch = {key: _join(key, [s[key] for s in samples]) for key in keys if key != "offset"}
-    for key in dict.fromkeys([*[inverse] * (inverse in batch), *unique]):
+    for key in dict.fromkeys([*["inverse"] * ("inverse" in batch), *unique]):
         numbers = [as_tensor("collate_offset", key, s[key]) for s in samples]
         sizes = [
-            len(s[coord]) if key == inverse else (int(ids.max()) + 1 if len(ids) else 0)
+            len(s[coord]) if key == "inverse" else (int(ids.max()) + 1 if len(ids) else 0)
             for s, ids in zip(samples, numbers, strict=True)
         ]
         pairs = zip(numbers, itertools.accumulate(sizes, initial=0), strict=False)

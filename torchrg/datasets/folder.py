@@ -169,10 +169,8 @@ class FolderOfClouds(SceneDataset):
 
     Args:
         root: The folder.
-        suffixes: Suffixes of cloud files. Default: :data:`torchrg.io.FOLDER_SUFFIXES`, all
-            readable formats except ``.csv``.
-        columns: Column names of text files and plain ``.npy`` arrays; see
-            :func:`torchrg.read_cloud`.
+        suffixes: Suffixes of cloud files. Default: all formats except ``.csv``.
+        columns: Column names of text and ``.npy``; see :func:`torchrg.read_cloud`.
         transform: Applied to each sample.
 
     Attributes:
@@ -214,9 +212,7 @@ class FolderOfClouds(SceneDataset):
         warn_skipped(self.root, [*others], "files without points")
         paths = [path for path in paths if path not in others]
         if not paths:
-            raise FormatError(
-                f"{root}: expected files that end in one of {' '.join(suffixes)}, got none."
-            )
+            raise FormatError(f"{root}: expected files ending in {' '.join(suffixes)}, got none.")
         self.scenes = [self._scene(path) for path in paths]
         first: dict[str, Path] = {}
         for name, path, *_ in self.scenes:
@@ -286,8 +282,7 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     Returns:
         Results of :func:`torchrg.datasets.read_pointcept_scene`, concatenated in natural order:
         ``(N, ...)``, with ``offset`` ``(B,)``, the end row of each scene, and ``name``, a list.
-        IDs in ``instance``, ``plane`` and ``superpoint`` are offset to be unique across scenes; -1
-        is unchanged.
+        IDs in ``instance``, ``plane`` and ``superpoint`` are offset to be unique; -1 is unchanged.
 
     Raises:
         FormatError: If the folder is missing, contains no scene, or a file is corrupt.
@@ -295,16 +290,10 @@ def read_pointcept_area(folder: str | os.PathLike[str]) -> SampleDict:
     """
     paths = [path for path in find_files(local_path(folder), is_item=is_scene) if path.is_dir()]
     if not paths:
-        raise FormatError(
-            f"{folder}: expected folders with coord.npy, got none; pass the folder of an area."
-        )
+        raise FormatError(f"{folder}: expected folders with coord.npy, got none; pass an area.")
     scenes: list[SampleDict] = [{**read_pointcept_scene(p), "name": p.name} for p in paths]
-    for key in {"instance", "plane", "superpoint"} & set(scenes[0]):
-        first = 0
-        for labels in (scene[key] for scene in scenes if key in scene):
-            labels[labels >= 0] += first
-            first = int(labels.max()) + 1 if (labels >= 0).any() else first
-    return collate_offset(scenes)
+    unique = [key for key in ("instance", "plane", "superpoint") if key in scenes[0]]
+    return collate_offset(scenes, unique=unique)
 
 
 def is_other(path: Path) -> bool:

@@ -9,7 +9,6 @@ in every layout, because programs that read raw bytes expect that.
 import io
 import json
 import pickle
-import pickletools
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -44,8 +43,7 @@ _CENTERED = 127.5
 SPLIT_NAMES = {"train": "train", "val": "validation", "test": "test"}
 """Mask3D's names of splits."""
 _MAX_OBJECTS = 999
-"""Maximum number of objects per scan in Mask3D, whose ground truth is 1000 times the class plus the
-object ID, from one."""
+"""Maximum objects per scan in Mask3D: ground truth is 1000 times the class plus ID, from one."""
 _MAX_EXACT = 2**24
 """Limit up to which float32 represents every integer."""
 VERSION = 2
@@ -58,10 +56,9 @@ class LayoutScan:
 
     Attributes:
         name: Stem of its files.
-        listed: ``train``, ``val`` or ``test``, empty if the data set defines no split.
+        declared_split: ``train``, ``val`` or ``test``, empty if the data set defines no split.
         folder: Path in its own data set, which some programs keep.
-        dataset: The data set that defines classes and objects, a key of a row of :data:`LAYOUTS`;
-            ``"ScanNet"`` without any.
+        dataset: The data set of classes and objects, a key in :data:`LAYOUTS`, else ``"ScanNet"``.
         coord: Coordinates, shape ``(N, 3)``, float32.
         normal: Unit normals, shape ``(N, 3)``.
         superpoint: Superpoint of each point, shape ``(N,)``, int64.
@@ -149,10 +146,7 @@ def check_stems(layout: str, paths: Mapping[str, str]) -> None:
         stem = _mask3d_name(stem) if layout == "mask3d" else stem
         other = owners.setdefault(normalize_file_name(stem), name)
         if other != name:
-            raise FormatError(
-                f"file name collision in layout {layout}: {other} and {name} both use {stem}; "
-                "rename one, or choose layout pointcept."
-            )
+            raise FormatError(f"layout {layout}: {other} and {name} both use {stem}; rename one.")
 
 
 def note_on_origin(layout: str, cloud: Cloud) -> tuple[str, ...]:
@@ -508,25 +502,10 @@ class _OldPickler(pickle.Pickler):
         super().__init__(self._memory, protocol)
 
     def dump(self, obj: Any) -> None:  # noqa: ANN401
-        """Pickle an object."""
+        """Pickle an object; its protocol names a function on a line of its own."""
         super().dump(obj)
-        self._file.write(_with_old_names(self._memory.getvalue()))
+        self._file.write(self._memory.getvalue().replace(b"cnumpy._core.", b"cnumpy.core."))
 
 
 _OLD_PICKLE = types.ModuleType("pickle")
 _OLD_PICKLE.Pickler = _OldPickler  # type: ignore[attr-defined]
-
-
-def _with_old_names(pickled: bytes) -> bytes:
-    r"""Replace NumPy's module names in a protocol 2 pickle by those from before version 2.
-
-    Example:
-        >>> _with_old_names(b"cnumpy._core.multiarray\n_reconstruct\n.")
-        b'cnumpy.core.multiarray\n_reconstruct\n.'
-    """
-    parts, start, new = [], 0, b"numpy._core."
-    for opcode, argument, at in pickletools.genops(pickled):
-        if opcode.name == "GLOBAL" and str(argument).startswith(new.decode()) and at is not None:
-            parts += [pickled[start : at + 1], b"numpy.core."]
-            start = at + 1 + len(new)
-    return b"".join([*parts, pickled[start:]])

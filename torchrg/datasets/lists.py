@@ -36,7 +36,7 @@ def check_lists(layout: str, dataset: str, out: Path) -> None:
     for name in contents(dict.fromkeys(folders, ())):
         if (out / name).exists():
             raise FormatError(
-                f"{out / name}: is of another data set or program; move it, or choose another "
+                f"{out / name}: is of another data set or program; move it, or use another "
                 "directory."
             )
 

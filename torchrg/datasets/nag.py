@@ -86,8 +86,7 @@ def make_nag(
             data = importlib.import_module("torch_geometric.data").Data
         except ImportError as error:
             raise MissingDependencyError(
-                "make_nag: torch_geometric is not installed; pip install torch_geometric, or pass "
-                "data."
+                "make_nag: torch_geometric is missing; pip install it, or pass data."
             ) from error
     entries: dict[str, Any] = {"pos": pos, **values}
     below = torch.arange(len(pos), device=pos.device)

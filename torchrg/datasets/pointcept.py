@@ -21,15 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
-from torchrg.datasets.provenance import (
-    Record,
-    check_owned,
-    claim_files,
-    owned_files,
-    read_record,
-    remove_unwritten,
-    write_record,
-)
+from torchrg.datasets import provenance
 from torchrg.errors import FormatError
 from torchrg.io.columns import narrow_integers
 from torchrg.io.files import atomic_path, create_folder, local_path
@@ -102,8 +94,7 @@ def write_pointcept_scene(
             ``normal``: the normals of the segmentation.
         segmentation: Result of :func:`torchrg.segment_planes` for ``coord``.
         superpoint: Superpoint of each point, shape ``(N,)``. Default: not written.
-        origin: Origin of ``coord``, for the plane table. Default: ``coord`` is in the coordinates
-            of the data set.
+        origin: Origin of ``coord``, for the plane table. Default: that of the data set.
 
     Returns:
         Names of the files written.
@@ -114,7 +105,7 @@ def write_pointcept_scene(
     """
     target = Path(folder)
     arrays = _convert_arrays(target, sample, segmentation, superpoint=superpoint)
-    torchrg_files = owned_files(read_record(target, strict=True))
+    torchrg_files = provenance.owned_files(provenance.read_record(target, strict=True))
     # The arrays of torchrg are never kept as inputs: such a file of another program is an error.
     inputs = {
         name
@@ -156,7 +147,7 @@ def write_files(
     target: Path,
     contents: Mapping[str, Array | bytes],
     planes: Mapping[str, object],
-    description: Record | None = None,
+    description: provenance.Record | None = None,
 ) -> list[str]:
     """Write files and the plane table of a scene, and return their names.
 
@@ -166,8 +157,8 @@ def write_files(
     precedes them, when all of them are complete. ``description`` are entries of a new claim.
     """
     contents = {**contents, PLANES_FILE: json.dumps(planes, indent=1).encode()}
-    earlier = read_record(target, strict=True)
-    check_owned(target, [*contents, RECORD], earlier)
+    earlier = provenance.read_record(target, strict=True)
+    provenance.check_owned(target, [*contents, RECORD], earlier)
     create_folder(target)
     with ExitStack() as stack:
         # Files are renamed in reverse order: the plane table first, the coordinates last.
@@ -180,8 +171,10 @@ def write_files(
                     stream.write(content)
                 else:
                     npy_format.write_array(stream, content, allow_pickle=False)
-        write_record(target, claim_files(earlier or description or {}, contents))
-    remove_unwritten(target, target, earlier, contents)
+        provenance.write_record(
+            target, provenance.claim_files(earlier or description or {}, contents)
+        )
+    provenance.remove_unwritten(target, target, earlier, contents)
     return [*contents]
 
 
@@ -224,6 +217,4 @@ def _check_inputs(target: Path, arrays: Mapping[str, Array], inputs: set[str]) -
         values = map_array(path)
         check_rows(path, values, arrays[name].shape[:1])
         if name == "coord" and not np.array_equal(values.astype(np.float32), arrays[name]):
-            raise FormatError(
-                f"{path}: expected the points of this scene, got others; write to another folder."
-            )
+            raise FormatError(f"{path}: expected the same points, got others; use another folder.")

@@ -8,6 +8,7 @@ The records in an output directory are its index.
 import json
 import os
 from collections.abc import Iterable
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ import numpy as np
 import torch
 
 from torchrg import kernels, version
+from torchrg.config import DepthConfig, NormalsConfig, PipelineConfig
 from torchrg.errors import FormatError
-from torchrg.io.files import PARSE_ERRORS, atomic_path, first_line, is_unchanged
+from torchrg.io.files import PARSE_ERRORS, atomic_path, first_line, hash_file, is_unchanged
 from torchrg.io.result import RECORD
 
 Record = dict[str, Any]
@@ -32,6 +34,16 @@ def describe_versions() -> dict[str, str]:
         "numpy": np.__version__,
         "scipy": metadata.version("scipy"),
         "kernels": "none" if kernels.name_of_library() is None else "C++",
+    }
+
+
+def describe_run(source: Path, settings: PipelineConfig | NormalsConfig | DepthConfig) -> Record:
+    """Return the provenance of a result of one file, as JSON values."""
+    return {
+        "versions": describe_versions(),
+        "config": asdict(settings),
+        "input": {"name": source.name, "sha256": hash_file(source)},
+        "device": "cpu",
     }
 
 
@@ -91,8 +103,7 @@ def check_owned(folder: Path, names: Iterable[str], record: Record | None) -> No
         path = Path(os.path.normpath(folder / name))
         if name not in owned and os.path.lexists(path):
             raise FormatError(
-                f"{path}: was not written by torchrg for this scan; move it, or choose another "
-                "directory."
+                f"{path}: was not written by torchrg for this scan; move it, or choose another."
             )
 
 
@@ -106,8 +117,7 @@ def check_source(folder: Path, record: Record, source: Record) -> None:
     ):
         if old != new and old is not None and new is not None:
             raise FormatError(
-                f"{folder}: expected results {what} {new}, got {old}; choose another directory, or "
-                "remove them."
+                f"{folder}: expected results {what} {new}, got {old}; choose another directory."
             )
 
 

@@ -12,17 +12,9 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
+from torchrg.datasets import rgbd_files
 from torchrg.datasets.camera_files import find_camera
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform
-from torchrg.datasets.rgbd_files import (
-    DEPTH_SUFFIXES,
-    MAX_PIXELS,
-    image_size,
-    num_pixels,
-    read_color,
-    read_depth,
-    refuse_form,
-)
 from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, ListedFrame, find_layout, find_recordings
 from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view, unproject_image
 from torchrg.depth.values import DepthKind, check_conversion
@@ -86,7 +78,7 @@ class RGBDFrame:
 
     def read_depth(self) -> Tensor:
         """Return the depth in meters along the optical axis, shape ``(H, W)``, float32."""
-        return read_depth(self.depth, self.depth_scale, self.depth_kind, self.intrinsics)
+        return rgbd_files.read_depth(self.depth, self.depth_scale, self.depth_kind, self.intrinsics)
 
 
 class RGBDFrames(SceneDataset):
@@ -186,7 +178,7 @@ class RGBDFrames(SceneDataset):
         """
         folder = local_path(root)
         if folder.is_file():
-            refuse_form(folder, folder.suffix.lower())
+            rgbd_files.refuse_form(folder, folder.suffix.lower())
             raise FormatError(f"{root}: expected a folder of frames, got a file; pass its folder.")
         name = find_layout(folder) if layout == "auto" else layout
         if name not in FRAME_LAYOUTS:
@@ -200,7 +192,7 @@ class RGBDFrames(SceneDataset):
             camera = Pinhole(*matrix.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
         frames = _find_frames(folder, name, camera, depth_scale, depth_kind)
         if not frames:
-            suffixes = " ".join(DEPTH_SUFFIXES)
+            suffixes = " ".join(rgbd_files.DEPTH_SUFFIXES)
             raise FormatError(f"{root}: expected depth images ({suffixes}), got none.")
         data = cls(frames, transform=transform)
         data.root = folder
@@ -220,7 +212,7 @@ class RGBDFrames(SceneDataset):
 
     def count_points(self, scene: SceneFiles) -> int:
         """Return the number of pixels of a frame."""
-        return num_pixels(scene.path)
+        return rgbd_files.num_pixels(scene.path)
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
         """Return the pixels of a frame as an organized cloud, with its front towards the camera.
@@ -252,7 +244,7 @@ class RGBDFrames(SceneDataset):
         if frame.pose is not None:
             sample["pose"] = frame.pose.to(torch.float64)
         if frame.color is not None:
-            sample["color"] = read_color(frame.color)
+            sample["color"] = rgbd_files.read_color(frame.color)
         return sample
 
 
@@ -291,8 +283,7 @@ def _find_frames(
                 if chosen is None:
                     missing, example = "intrinsics", "fx,fy,cx,cy or a camera file"
                 raise ConfigError(
-                    f"{frame.depth}: expected {missing}, which depth images do not store; pass it, "
-                    f"{example}."
+                    f"{frame.depth}: expected {missing}, which images lack; pass it, {example}."
                 )
             if not camera and not files:
                 numbers = ",".join(f"{number:g}" for number in chosen[:4])
@@ -339,8 +330,8 @@ def scale_camera(image: Path, camera: Pinhole, file: Path | None = None) -> tupl
         ConfigError: If the camera cannot belong to the image.
     """
     caller = f"{image}" if file is None else f"{image}: {file.name}"
-    size = image_size(image)
-    size = None if size and math.prod(size) > MAX_PIXELS else size
+    size = rgbd_files.image_size(image)
+    size = None if size and math.prod(size) > rgbd_files.MAX_PIXELS else size
     matrix = camera.matrix(size, caller)
     fitted = Pinhole(*matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
     doubt = describe_improbable_view(caller, fitted, size, name="--intrinsics") if size else ""

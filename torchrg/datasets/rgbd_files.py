@@ -92,8 +92,7 @@ def read_color(source: Path) -> Tensor:
     is_known = image.dtype in (np.uint8, np.uint16) and image.ndim == 3
     if not is_known or image.shape[2] not in (1, 3, 4):
         raise FormatError(
-            f"{source}: expected a color image of 8 or 16 bits per channel, got shape "
-            f"{image.shape} and {image.dtype}."
+            f"{source}: expected colors of 8 or 16 bits, got shape {image.shape} and {image.dtype}."
         )
     image = narrow_colors(image)
     channels = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
@@ -134,8 +133,7 @@ def _read_pgm16(source: Path) -> NDArray[np.uint16]:
     header = _PGM.match(content)
     if header is None or not BYTE < int(header[3]) <= WORD:
         raise FormatError(
-            f"{source}: expected a 16-bit binary PGM, P5, got {content[:16]!r}; 8 bits cannot "
-            "represent depth."
+            f"{source}: expected a 16-bit binary PGM, P5, got {content[:16]!r}; 8 bits are too few."
         )
     width, height, start = int(header[1]), int(header[2]), header.end()
     available = len(content) - start
@@ -176,9 +174,7 @@ def _read_npy(source: Path) -> Array:
     """Return the array of a ``.npy`` file, shape ``(H, W)``; floating point as float64."""
     values = drop_channel(read_array(source))
     if values.ndim != 2 or values.size == 0:
-        raise FormatError(
-            f"{source}: expected depth of shape (H, W), got {values.shape} and {values.dtype}."
-        )
+        raise FormatError(f"{source}: expected depth of shape (H, W), got {values.shape}.")
     return values.astype(np.float64) if values.dtype.kind == "f" else values
 
 
@@ -290,9 +286,7 @@ def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
     wrong = next((row for row in rows if len(row) != num_words), [])
     if wrong or not rows:
         got = repr(" ".join(wrong)[:60]) if wrong else "none"
-        raise FormatError(
-            f"{path}: expected {what} in each row, got {got}; the file may be corrupt."
-        )
+        raise FormatError(f"{path}: expected {what} in each row, got {got}; it may be corrupt.")
     return rows
 
 

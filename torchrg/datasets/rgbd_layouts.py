@@ -100,8 +100,7 @@ class FrameLayout(NamedTuple):
 def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of TUM RGB-D listed in ``depth.txt``.
 
-    Color (``rgb.txt``) and pose (``groundtruth.txt``) of a depth image are the nearest in time, or
-    None.
+    Color (``rgb.txt``) and pose (``groundtruth.txt``) are the nearest in time, or None.
     """
     lists = [folder / file for file in ("depth.txt", "rgb.txt", "groundtruth.txt")]
     times, images = read_timed(lists[0])
@@ -228,8 +227,7 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
 def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of ARKitScenes: ``lowres_depth/<video>_<seconds>.png``.
 
-    Cameras are files of the same name, with times that may differ by a millisecond; poses are in
-    ``lowres_wide.traj``.
+    Cameras are files of the same name, up to a millisecond; poses are in ``lowres_wide.traj``.
     """
     frames = [*_list_frames(folder, "lowres_depth/*", "lowres_wide/*")]
     with wrap_errors(
@@ -281,9 +279,7 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
     for frame in _list_frames(folder, "depth/*", "rgb/*"):
         record = records.get(frame.name)
         if not isinstance(record, dict):
-            raise FormatError(
-                f"{path}: expected an entry for {frame.name}, which has depth, got none."
-            )
+            raise FormatError(f"{path}: expected an entry for {frame.name}, got none.")
         camera = parse_camera(path, _SCANNETPP_COLOR | record)
         has_pose = record.get("aligned_pose") is not None
         pose = parse_matrix(path, record, "aligned_pose", 4) if has_pose else None

@@ -14,11 +14,12 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg._checks import check_choices
 from torchrg._optional import require
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError, warn
@@ -28,7 +29,8 @@ from torchrg.io.files import check_file, local_path
 from torchrg.structures import Cloud
 from torchrg.structures.colors import find_white, narrow_colors, read_colors
 
-CLASS_ORDERS = {
+ClassOrder = Literal["pointcept", "spt"]
+CLASS_ORDERS: dict[ClassOrder, tuple[str, ...]] = {
     "pointcept": (
         "ceiling", "floor", "wall", "beam", "column", "window", "door",
         "table", "chair", "sofa", "bookcase", "board", "clutter",
@@ -91,7 +93,7 @@ class S3DIS(SceneDataset):
         root: str | os.PathLike[str],
         areas: Sequence[int] = tuple(ROOMS_PER_AREA),
         *,
-        class_order: str = "pointcept",
+        class_order: ClassOrder = "pointcept",
         transform: Transform | None = None,
     ) -> None:
         self.root = local_path(root)
@@ -155,7 +157,7 @@ def find_areas(root: Path) -> tuple[int, ...]:
     return tuple(n for n in ROOMS_PER_AREA if (root / f"Area_{n}").is_dir()) or (*ROOMS_PER_AREA,)
 
 
-def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
+def read_room(path: Path, *, class_order: ClassOrder = "pointcept") -> Cloud:
     """Read a room from the raw release. Points of an object are contiguous.
 
     Args:
@@ -201,13 +203,9 @@ def read_room(path: Path, *, class_order: str = "pointcept") -> Cloud:
     )
 
 
-def class_names(class_order: str) -> tuple[str, ...]:
+def class_names(class_order: ClassOrder) -> tuple[str, ...]:
     """Return the names of the 13 classes in the order of a key of :data:`CLASS_ORDERS`."""
-    if class_order not in CLASS_ORDERS:
-        raise ConfigError(
-            f"S3DIS: expected class_order to be one of {', '.join(CLASS_ORDERS)}, got "
-            f"{class_order!r}."
-        )
+    check_choices("S3DIS", class_order=(class_order, ClassOrder))
     return CLASS_ORDERS[class_order]
 
 
@@ -226,9 +224,7 @@ def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
     """
     folder = path / ANNOTATIONS
     if not folder.is_dir():
-        raise FormatError(
-            f"{path}: expected a folder {ANNOTATIONS}, got none; the file may be corrupt."
-        )
+        raise FormatError(f"{path}: expected a folder {ANNOTATIONS}, got none; it may be corrupt.")
     objects, notes = [], []
     for file in list_dir(folder):
         match = _OBJECT.fullmatch(file.stem)
@@ -241,9 +237,7 @@ def _list_room(path: Path) -> tuple[list[tuple[str, Path]], list[str]]:
         else:
             objects.append((match[1], file))
     if not objects:
-        raise FormatError(
-            f"{folder}: expected objects as CLASS_NUMBER.txt, got none; the file may be corrupt."
-        )
+        raise FormatError(f"{folder}: expected CLASS_NUMBER.txt, got none; it may be corrupt.")
     return objects, notes
 
 
@@ -323,7 +317,5 @@ def _parse_lines(path: Path, content: bytes, original: bytes) -> NDArray[np.floa
             )
         rows.append(row)
     if not rows:
-        raise FormatError(
-            f"{path}: expected at least one point, got none; the file may be corrupt."
-        )
+        raise FormatError(f"{path}: expected at least one point, got none; it may be corrupt.")
     return np.array(rows)

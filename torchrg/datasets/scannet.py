@@ -12,14 +12,15 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchrg._checks import check_choices
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
-from torchrg.errors import ConfigError, FormatError, warn
+from torchrg.errors import FormatError, warn
 from torchrg.io import read_cloud
 from torchrg.io.files import PARSE_ERRORS, decode_file, list_some, local_path, wrap_errors
 from torchrg.io.plane_table import Arrays
@@ -52,7 +53,8 @@ IDS_200 = tuple(
     for number in range(int(first), int(last or first) + 1)
 )
 """IDs in :data:`CATEGORIES` of the ScanNet200 classes, by index."""
-_SPLITS = {
+Split = Literal["train", "val", "test"]
+_SPLITS: dict[Split, tuple[str, str]] = {
     "train": ("scannetv2_train.txt", "nvs_sem_train.txt"),
     "val": ("scannetv2_val.txt", "nvs_sem_val.txt"),
     "test": ("scannetv2_test.txt", "sem_test.txt"),
@@ -81,8 +83,7 @@ class ScanNet(SceneDataset):
     float64 is the rigid transform that makes the scan upright. With annotations: ``segment``
     ``(N,)`` int64, an index into ``classes``, and ``instance`` ``(N,)`` int64, the object ID; -1
     for none. If the table ``scannetv2-labels.combined.tsv`` is next to the lists, also
-    ``segment200``, an index into :data:`IDS_200`. ScanNet++ vertices of several objects are
-    assigned to the smallest.
+    ``segment200``, an index into :data:`IDS_200`. In ScanNet++ the smallest object counts.
 
     Args:
         root: The folder that contains ``scans`` or ``data``, or the scans themselves.
@@ -110,14 +111,12 @@ class ScanNet(SceneDataset):
     def __init__(
         self,
         root: str | os.PathLike[str],
-        split: str | None = None,
+        split: Split | None = None,
         *,
         transform: Transform | None = None,
     ) -> None:
-        if split is not None and split not in _SPLITS:
-            raise ConfigError(
-                f"ScanNet: expected split to be one of {', '.join(_SPLITS)}, got {split!r}."
-            )
+        if split is not None:
+            check_choices("ScanNet", split=(split, Split))
         self.root = local_path(root)
         self.transform = transform
         check_folder(self.root)
@@ -376,8 +375,7 @@ def _groups(
     segments = _read_list(path, "segIndices")
     if len(segments) != count:
         raise FormatError(
-            f"{path}: expected a segment for each of {count:,} vertices, got {len(segments):,}; "
-            "the file may be corrupt."
+            f"{path}: expected {count:,} segments, got {len(segments):,}; the file may be corrupt."
         )
     vertex_segments = _to_int64(path, "segIndices", segments)
     known, path = np.unique(vertex_segments), files["groups"]

@@ -30,14 +30,12 @@ def depth_to_points(depth: Tensor, intrinsics: Tensor, poses: Tensor | None = No
 
     Convention:
         Camera axes are x to the right, y down, z forward; ``depth`` is z, not the length of the
-        ray. The center of the first pixel is at (0, 0). A negative focal length flips an axis, as
-        in ICL-NUIM.
+        ray. The center of the first pixel is at (0, 0). Negative focal lengths flip an axis.
 
     Args:
         depth: Shape ``(B, H, W)``, floating point, in any unit.
         intrinsics: Camera matrices, shape ``(B, 3, 3)``; see :func:`read_intrinsics`.
-        poses: Camera-to-world matrices, shape ``(B, 4, 4)``. Default: points are in camera
-            coordinates.
+        poses: Camera-to-world matrices, shape ``(B, 4, 4)``. Default: camera coordinates.
 
     Returns:
         Points, shape ``(B, H, W, 3)``, in the unit of ``depth`` and in its dtype, or in that of the
@@ -201,8 +199,7 @@ def unproject_image(depth: Tensor, intrinsics: Tensor, pose: Tensor | None = Non
 def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     """Return a camera matrix ``(3, 3)``, float64, from focal lengths and optical axis in pixels.
 
-    ``fx`` and ``cx`` are along rows, ``fy`` and ``cy`` along columns; the center of the first pixel
-    is 0.
+    ``fx`` and ``cx`` are along rows, ``fy`` and ``cy`` along columns; the first center is 0.
 
     Raises:
         ConfigError: If a focal length is 0, or a value is not within 1e12.
@@ -244,8 +241,7 @@ class Pinhole(NamedTuple):
             pixel outside the centers of the outermost pixels: ``cx + 0.5`` scales with ``fx``.
 
         Raises:
-            ConfigError: If the aspect ratio of the images differs by more than a pixel, or the
-                optical axis is outside them.
+            ConfigError: If the aspect ratio differs by over a pixel, or the axis is outside.
         """
         fx, fy, cx, cy, calibrated, _ = self
         if size is None:

@@ -1,7 +1,6 @@
 """Regions of a depth image that belong to one surface.
 
-Strips along rounded edges are merged into the adjacent surface; coplanar regions separated only by
-a nearer object count as adjacent.
+Strips along rounded edges join the adjacent surface; coplanar regions may meet behind an object.
 """
 
 from collections.abc import Iterable, Iterator
@@ -34,8 +33,7 @@ _STRIDE = 4
 _MIN_LINES = 2
 """Minimum number of sampled rows and columns that connect two regions."""
 _MAX_OFFSET = 0.5
-"""Maximum distance of the center of the smaller region from the plane of the larger one, in
-thicknesses."""
+"""Maximum distance of a smaller region's center from the plane of the larger, in thicknesses."""
 _MIN_NEARER = 0.5
 """Minimum fraction of the pixels between two regions in front of their plane. The remaining ones
 may lie on it or have no depth, as in the shadow of a nearer object."""

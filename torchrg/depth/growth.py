@@ -46,8 +46,7 @@ class InverseCloud(NamedTuple):
 
     Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
     the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are float64, in
-    columns; ``noise`` ``(H * W,)`` is the noise of the last coordinate; ``seen`` ``(H, W)`` masks
-    pixels with depth.
+    columns; ``noise`` ``(H * W,)`` is that of the last coordinate; ``seen`` ``(H, W)`` masks depth.
     """
 
     points: Tensor
@@ -245,8 +244,7 @@ def move_to_creases(
     regions form a crease if their centers are on opposite sides of the intersection line, each off
     the other's plane. A pixel on the other side then joins the other region if it is on its plane.
     It must be next to a pixel of that region straight behind it, as seen from the crease.
-    Boundaries thus move towards the crease, never along it. Neighbors of changed pixels are
-    revisited.
+    Boundaries thus move towards the crease, never along it. Their neighbors are revisited.
 
     ``reach`` is the maximum distance of a point on the plane along the last coordinate, ``(M,)``.
     """

@@ -30,8 +30,8 @@ FLAT = 1.35
 _MAX_PIXEL_NOISE = 3.5
 """Maximum distance of a pixel on the plane of a window, in units of the noise."""
 _QUARTER_MARGIN = 2.0
-"""Maximum ratio of the deviation of a flat window to that of its quarters, minus 1, times its side
-in pixels."""
+"""Maximum ratio of the deviations of a flat window and its quarters, minus 1, times its side, in
+pixels."""
 _MIN_QUARTERS = 0.7
 """Minimum counted deviation of the quarters of a window, in units of the tolerance."""
 _BEND_FRACTION = 0.005
@@ -40,8 +40,7 @@ _MAX_BEND_FRACTION = 0.03
 """Maximum bend of a smallest window as a fraction of half its side, if none is flat. Twice this
 value would hide creases of 20 degrees."""
 _MAX_STEEPNESS = 4.0
-"""Inverse cosine of the maximum angle at which a surface may bend. At a steeper angle, a step looks
-like a bend."""
+"""Inverse cosine of the maximum angle at which a surface may bend; beyond it, steps look bent."""
 _STEEP_SIZE = 2
 """Cell width of the windows used to measure jitter, in pixels."""
 

@@ -25,8 +25,7 @@ class Pixels(NamedTuple):
 
     ``curvature`` is the fraction of a window's variance perpendicular to its plane; ``noise`` is
     the noise of inverse depth in large windows. ``valid`` marks pixels that have a plane; normals
-    and curvature are 0 at other pixels. ``right`` and ``down`` mark pixels on one surface with the
-    next.
+    and curvature are 0 otherwise. ``right`` and ``down`` mark pixels on one surface with the next.
     """
 
     normals: Tensor
@@ -139,8 +138,7 @@ def _join(
 def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
     """Return the slope variance of windows with the given rows and columns, ``(2, n)``.
 
-    For least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, averaged over the
-    axes.
+    For least squares over m n pixels of variance (n^2 - 1) / 12 along an axis, their mean.
     """
     rows, columns = sides.unbind()
     count = rows * columns
@@ -150,8 +148,7 @@ def _sq_slope_noise(sides: Tensor, tolerance: Tensor) -> Tensor:
 def contain(sides: Tensor, middles: Tensor, pixels: Tensor, width: int) -> Tensor:
     """Return a mask of windows that contain pixels, by row-major index; ``width`` is in pixels.
 
-    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` the row and column of their
-    centers.
+    ``sides`` ``(2, n)`` are their rows and columns, ``middles`` row and column of centers.
     """
     (rows, columns), (row, column) = sides.unbind(), middles.unbind()
     down, right = (pixels // width - row).abs(), (pixels % width - column).abs()

@@ -1,15 +1,15 @@
 """Plane segmentation of a single depth image."""
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_choices, check_shapes, eager_only
 from torchrg._parallel import nonzero_rows
-from torchrg.config import DepthConfig, settings_of
+from torchrg.config import DepthConfig, SelectionConfig, settings_of
 from torchrg.depth.camera import check_view, read_intrinsics
 from torchrg.depth.growth import InverseCloud, grow_pixels
 from torchrg.depth.normals import fit_pixels
@@ -24,7 +24,8 @@ from torchrg.regions.classes import classify_planes
 from torchrg.regions.fit import fit_planes
 from torchrg.regions.selection import keep_planes, selected_rows
 from torchrg.regions.table import measure_planes
-from torchrg.structures import Segmentation
+from torchrg.structures import Planes, Segmentation
+from torchrg.structures.planes import Deferred
 
 
 @eager_only
@@ -55,8 +56,7 @@ def segment_depth(
         intrinsics: Camera matrix, shape ``(3, 3)``, 4 x 4 or a kornia ``PinholeCamera``; see
             :func:`torchrg.depth.camera.depth_to_points`.
         config: A depth configuration, or a dictionary. Default: :class:`DepthConfig`.
-        pose: Camera-to-world matrix, shape ``(4, 4)``, for normals and planes in world coordinates.
-            Default: camera coordinates.
+        pose: Camera-to-world matrix, shape ``(4, 4)``. Default: results in camera coordinates.
         orient: Normal orientation: towards the camera for "auto", "viewpoint" and "none", otherwise
             as in :func:`torchrg.normals.orient_normals`. Default: "auto".
         depth_scale: Depth units per meter, 1000 for millimeters. Default: 1, meters.
@@ -96,7 +96,9 @@ def segment_depth(
     settings = settings_of("segment_depth", DepthConfig, config, changes)
     depth = convert_depth("segment_depth", depth, intrinsics, depth_scale, depth_kind)
     seg = _segment(depth, intrinsics, settings, pose, orient)
-    return keep_planes(seg, selected_rows(seg.planes, settings))
+    # Labels have the default order.
+    is_default = all(getattr(settings, f.name) == f.default for f in fields(SelectionConfig))
+    return seg if is_default else keep_planes(seg, selected_rows(seg.planes, settings))
 
 
 def _segment(
@@ -134,18 +136,26 @@ def _segment(
     if pose is not None:
         pose = pose.to(normals)
         normals, plane_normals = normals @ pose[:3, :3].T, plane_normals @ pose[:3, :3].T
-    z = torch.where(seen, depth.double(), 1.0)
-    points = torch.stack([(x * z).flatten(), (y[:, None] * z).flatten(), z.flatten()]).T
-    if pose is not None:
-        points = (pose[:3, :3] @ points.T + pose[:3, 3:]).T
-    segments = Segments(labels)
-    fit = fit_planes(segments, points, plane_normals, shared=True)
-    table = measure_planes(segments, points, fit._replace(curved=curved))
-    if config.up is not None:
+    # The table is measured later, even if images change by then.
+    depth, numbers = depth.clone(), labels.clone()
+
+    def locate() -> Tensor:
+        z = torch.where(seen, depth.double(), 1.0)
+        points = torch.stack([(x * z).flatten(), (y[:, None] * z).flatten(), z.flatten()])
+        return points.T if pose is None else (pose[:3, :3] @ points + pose[:3, 3:]).T
+
+    @torch.no_grad()
+    def measure(_: object) -> Planes:
+        segments, points = Segments(numbers), locate()
+        fit = fit_planes(segments, points, plane_normals, shared=True)
+        table = measure_planes(segments, points, fit._replace(curved=curved))
+        if config.up is None:
+            return table
         up = unit_direction("segment_depth", config.up)
-        table = replace(table, kind=classify_planes(table, points, labels, up))
+        return replace(table, kind=classify_planes(table, points, numbers, up))
+
     if orient not in ("auto", "viewpoint", "none"):
-        positions = torch.where(seen.view(-1, 1), points, torch.nan).float()
+        positions = torch.where(seen.view(-1, 1), locate(), torch.nan).float()
         normals = orient_normals(positions, normals, orient=orient)
     return Segmentation(
         labels.view(depth.shape),
@@ -153,7 +163,7 @@ def _segment(
         pixels.curvature.to(depth.dtype),
         edge,
         valid,
-        table,
+        cast(Planes, Deferred(measure)),
     )
 
 

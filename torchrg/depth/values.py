@@ -26,8 +26,7 @@ _SAMPLED = 20_000
 def has_depth(depth: Tensor) -> Tensor:
     """Return a mask of pixels with depth, in the shape of ``depth``.
 
-    Depth is finite and positive. The largest value of an integer type, and that of 16 bits in any
-    type, stands for missing depth.
+    Depth is finite and positive; the largest integer of its type and of 16 bits mean none.
     """
     largest, values = _MAX_16_BIT, depth
     if not depth.is_floating_point():
@@ -46,9 +45,7 @@ def check_conversion(caller: str, depth_scale: float, depth_kind: DepthKind) -> 
     """Raise ConfigError if ``depth_scale`` is not positive or ``depth_kind`` is unknown."""
     check_choices(caller, depth_kind=(depth_kind, DepthKind))
     if not 0 < depth_scale < float("inf"):
-        raise ConfigError(
-            f"{caller}: expected depth_scale > 0, the depth units per meter, got {depth_scale}."
-        )
+        raise ConfigError(f"{caller}: expected depth_scale > 0 units per meter, got {depth_scale}.")
 
 
 def convert_depth(
@@ -61,8 +58,7 @@ def convert_depth(
     """Convert stored depth to meters along the optical axis, with 0 for missing depth.
 
     ``stored`` ``(*, H, W)`` has any memory layout; float64 stays, integers become float32.
-    ``intrinsics`` ``(*, 3, 3)`` are needed only for distances along the ray. ``caller`` is the
-    function or file for messages.
+    ``intrinsics`` ``(*, 3, 3)`` are for distances along the ray, ``caller`` for messages.
 
     Warns:
         DepthWarning: If the median depth is below 5 cm or above 20 m.

@@ -33,8 +33,7 @@ _NUM_MOMENTS = 10
 _FLAT_QUANTILE = 0.35
 """Fraction of the windows of an image that deviate by noise alone: at least a third is flat."""
 _SAMPLE_STRIDE = 4
-"""Stride of the small windows used for the noise, in pixels: because windows overlap, it loses
-nothing."""
+"""Stride of the small windows used for the noise, in pixels: windows overlap, so none is lost."""
 _NUM_BINS = 12
 """Number of depth bins for the noise fit."""
 _MAX_GROWTH = 1.4
@@ -233,8 +232,7 @@ def noise_by_size(
     Without ``noise``, ``a`` and ``b`` are fitted to the deviations of windows from their planes,
     i.e. to the 35 % quantiles of twelve depth bins. Errors of adjacent sensor pixels are
     correlated, and depth is quantized. Large windows thus deviate more than small ones, and the
-    noise has a factor for each size. It is at least the rounding of ``dtype``, the dtype of the
-    depth.
+    noise has a factor for each size. It is at least the rounding of ``dtype``, that of the depth.
     """
     rounding = max(_ROUNDING * machine_epsilon(dtype), _MIN_ROUNDING)
     if noise is not None:

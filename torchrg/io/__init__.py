@@ -125,10 +125,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
     source = local_path(path)
     size, fmt = check_file(source), _get_format(source)
     if columns is not None and not fmt.takes_columns:
-        raise FormatError(
-            f"{source}: column names apply to text and .npy files only; this format stores its "
-            "own. Omit them."
-        )
+        raise FormatError(f"{source}: column names apply to text and .npy files only; omit them.")
     names = () if columns is None else (columns,)
     try:
         # Arbitrary bit patterns may overflow or signal; keep them without a warning.
@@ -138,8 +135,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
         raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
     except MemoryError as error:
         raise FormatError(
-            f"{source}: not enough memory for its points. Use a machine with more memory, or split "
-            "the cloud."
+            f"{source}: not enough memory for its points; use a larger machine, or split the cloud."
         ) from error
 
 
@@ -272,8 +268,7 @@ def _get_format(path: Path, *, for_writing: bool = False) -> Format:
     if suffix not in FORMATS:
         suffixes = [kind for kind, format_ in FORMATS.items() if format_.write or not for_writing]
         raise FormatError(
-            f"{path}: expected a file that ends in one of {' '.join(suffixes)}, got "
-            f"{path.suffix!r}."
+            f"{path}: expected a file ending in one of {' '.join(suffixes)}, got {path.suffix!r}."
         )
     return FORMATS[suffix]
 

@@ -56,9 +56,7 @@ def flatten_cloud(path: Path, cloud: Cloud, field_names: FieldNames) -> dict[str
             values = narrow_integers(values, ("i4",))
         for column_name, column in _split_field(name, values, field_names).items():
             if column_name in columns:
-                raise FormatError(
-                    f"{path}: duplicate field name {column_name!r}; rename one of the fields."
-                )
+                raise FormatError(f"{path}: duplicate field name {column_name!r}; rename one.")
             columns[column_name] = column
     return columns
 
@@ -81,18 +79,14 @@ def _to_storable(path: Path, name: str, values: Array, field_names: FieldNames) 
     """Convert a field to real numbers of a dtype that files can store."""
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
         raise FormatError(
-            f"{path}: expected field {name} to be real numbers of at most 64 bits, got "
-            f"{values.dtype}; remove it or write .npz."
+            f"{path}: expected {name} of real numbers in 64 bits, got {values.dtype}; write .npz."
         )
     if values.ndim > 2 or 0 in values.shape[1:]:
         raise FormatError(
-            f"{path}: expected field {name} of shape (N,) or (N, C), got {values.shape}; "
-            "remove it or write .npz."
+            f"{path}: expected {name} of shape (N,) or (N, C), got {values.shape}; write .npz."
         )
     if name == "color" and values.dtype.kind == "f":
-        raise FormatError(
-            f"{path}: expected field color of uint8 or uint16, got {values.dtype}; convert it."
-        )
+        raise FormatError(f"{path}: expected uint8 or uint16 color, got {values.dtype}; cast it.")
     if name == "color" and values.shape[1:] == (3,):
         color, _ = read_colors(path, values)
         return color if field_names.color_bits == 16 else narrow_colors(color)
@@ -121,8 +115,7 @@ def check_exact(path: Path, columns: NamedColumns) -> None:
         is_integer = column.dtype.kind in "iu"
         if is_integer and max(-int(column.min()), int(column.max())) >= MAX_EXACT_INTEGER:
             raise FormatError(
-                f"{path}: field {name} contains integers beyond 2^53, which this format rounds; "
-                "remove the field or write .npz."
+                f"{path}: {name} has integers above 2^53, which would be rounded; write .npz."
             )
 
 

@@ -61,8 +61,7 @@ _Block = dict[str, Array]
 class ScanPose(NamedTuple):
     """Name and pose of a scan in an E57 file.
 
-    The rotation is a quaternion w x y z of any norm (zero: identity), applied before the
-    translation.
+    The rotation is a quaternion w x y z of any norm (zero: identity), applied first.
     """
 
     name: str = ""
@@ -114,9 +113,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     ):
         headers = [file.get_header(i) for i in range(file.scan_count)]
         if not headers:
-            raise FormatError(
-                f"{path}: expected at least one scan, got none; check the source of the file."
-            )
+            raise FormatError(f"{path}: expected at least one scan, got none; check its source.")
         counts = [header.point_count for header in headers]
         content = f"{sum(counts):,} points"
         num_values = sum(header.point_count * len(header.point_fields) for header in headers)
@@ -249,8 +246,7 @@ def _check_pages(path: Path, size: int) -> None:
             content, checksum = page[:_CONTENT_BYTES], page[_CONTENT_BYTES:]
             if crc32c.value(content) != int.from_bytes(checksum, "big"):
                 raise FormatError(
-                    f"{path}: byte {start}: the checksum of this page does not match; the file is "
-                    "corrupt, copy or write it again."
+                    f"{path}: byte {start}: the checksum of a page does not match; copy it again."
                 )
 
 
@@ -290,8 +286,7 @@ def _read_pose(path: Path, header: Any) -> ScanPose:  # noqa: ANN401
     length = math.hypot(*rotation)
     if length and not 1 / _MAX_ROTATION <= length <= _MAX_ROTATION:
         raise FormatError(
-            f"{path}: expected a unit quaternion in scan {name!r}, got norm {length:.3g}; "
-            "correct the pose or write the file again."
+            f"{path}: expected a unit quaternion in {name!r}, got norm {length:.3g}; correct it."
         )
     if not all(abs(value) <= FARTHEST for value in translation):
         raise FormatError(
@@ -341,9 +336,7 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
         spherical = [block.pop(axis).astype("d") for axis in _SPHERICAL]
         points = to_cartesian(np.stack(spherical, axis=1))
     else:
-        raise FormatError(
-            f"{path}: expected points with {', '.join(_AXES)}, got {', '.join(block) or 'none'}."
-        )
+        raise FormatError(f"{path}: expected {', '.join(_AXES)}, got {', '.join(block) or 'none'}.")
     for name in _STATES:
         if name in block:
             points[block.pop(name) != 0] = np.nan

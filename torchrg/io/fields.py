@@ -3,8 +3,7 @@
 Read as ``labels``: ``label``; as ``normals``: ``nx ny nz``, ``normal_x ...``, ``NormalX ...``,
 ``normal``; as ``color``: ``red green blue``, ``diffuse_red ...``, ``r g b``, ``rgb``, ``colors``,
 ``rf gf bf``; as ``intensity``: ``intensities``. Case and CloudCompare's prefix ``scalar_`` are
-ignored. ``name_0``, ``name_1``, ... of one type become one multi-column field ``name``. All other
-names are unchanged.
+ignored. ``name_0``, ``name_1``, ... of one type become one field. Other names are unchanged.
 """
 
 import re
@@ -51,8 +50,7 @@ SKIPPED = "_"
 _SHOWN_NAMES = 8
 """Maximum number of column names listed in a note."""
 MAX_EXACT_INTEGER = 2**53
-"""Limit below which float64, and thus text, represents integers exactly. The limit itself may be a
-rounded integer."""
+"""Limit below which float64, and thus text, has exact integers; it may itself be a rounded one."""
 
 
 def assemble_cloud(
@@ -76,15 +74,12 @@ def assemble_cloud(
         names = [axis if is_lower else axis.upper() for axis in "xyz"]
         if not all(name in remaining for name in names):
             present = ", ".join(map(ascii, remaining)) or "none"
-            raise FormatError(
-                f"{path}: expected fields x, y, z, got {present}; rename or add them."
-            )
+            raise FormatError(f"{path}: expected fields x, y, z, got {present}; add or rename.")
         axes = [remaining.pop(name) for name in names]
         if any(axis.ndim != 1 for axis in axes):
             shapes = ", ".join(map(_row_shape, axes))
             raise FormatError(
-                f"{path}: expected x, y, z of one number per point, got {shapes}; flatten "
-                "or rename them."
+                f"{path}: expected x, y, z of one number per point, got {shapes}; flatten them."
             )
         values = _stack(path, axes)
     else:
@@ -138,8 +133,7 @@ def assemble_table(
 def convert_coordinates(path: Path, coordinates: Array) -> NDArray[np.floating]:
     """Return coordinates as float32 or float64 in native byte order.
 
-    Integers of at most 16 bits and half precision become float32, which is exact; other numbers
-    become float64.
+    Integers of at most 16 bits and half precision become float32, which is exact; others float64.
     """
     check_coordinates(path, coordinates.shape, coordinates.dtype)
     dtype = coordinates.dtype
@@ -150,18 +144,12 @@ def convert_coordinates(path: Path, coordinates: Array) -> NDArray[np.floating]:
 def check_coordinates(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
     """Check that an array of this shape and type can hold coordinates."""
     if len(shape) != 2 or shape[1] != 3:
-        repair = "transpose" if len(shape) == 2 and shape[0] == 3 else "reshape"
-        raise FormatError(
-            f"{path}: expected coordinates of shape (N, 3), got {shape}; {repair} them."
-        )
+        fix = "transpose" if len(shape) == 2 and shape[0] == 3 else "reshape"
+        raise FormatError(f"{path}: expected coordinates of shape (N, 3), got {shape}; {fix} them.")
     if dtype.kind not in "fiu":
-        raise FormatError(
-            f"{path}: expected real numbers as coordinates, got {dtype}; convert them to float64."
-        )
+        raise FormatError(f"{path}: expected real coordinates, got {dtype}; use float64.")
     if shape[0] == 0:
-        raise FormatError(
-            f"{path}: expected at least one point, got none; check the source of the file."
-        )
+        raise FormatError(f"{path}: expected at least one point, got none; check its source.")
 
 
 def backup_name(name: str) -> str:
@@ -273,8 +261,7 @@ def _stack(path: Path, columns: list[Array]) -> Array:
     except TypeError as error:
         kinds = ", ".join(str(column.dtype) for column in columns)
         raise FormatError(
-            f"{path}: expected columns of one type to combine, got {kinds}; convert them to "
-            "numbers."
+            f"{path}: expected columns of one type to combine, got {kinds}; convert to numbers."
         ) from error
     stacked = np.empty((len(columns[0]), len(columns)), dtype)
     for i, column in enumerate(columns):
@@ -295,8 +282,7 @@ def _convert_labels(path: Path, labels: Array) -> NDArray[np.int64]:
     largest = float(np.abs(flat.astype(np.float64)).max(initial=0))
     if not are_integers(flat) or (flat.dtype.kind in "uf" and largest >= 2.0**63):
         raise FormatError(
-            f"{path}: expected labels to be 64-bit integers, got fractions or larger values; "
-            "rename or remove that field."
+            f"{path}: expected 64-bit integer labels, got fractions or larger; rename or drop them."
         )
     if flat.dtype.kind == "f" and largest >= MAX_EXACT_INTEGER:
         raise FormatError(

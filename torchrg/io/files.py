@@ -41,8 +41,7 @@ PARSE_ERRORS = (
 ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, *PARSE_ERRORS)
 """Exceptions raised on corrupt archives."""
 _PROBE_BYTES = 1 << 20
-"""Bytes written to test whether a disk is full. They exceed the buffer of a library, so they do not
-fit if its last write failed."""
+"""Bytes written to test whether a disk is full: more than the buffer of a library."""
 _UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 """First bytes of text as Excel and PowerShell write it."""
 _CHECKED_END = 1 << 16
@@ -68,8 +67,7 @@ def atomic_path(
     """Yield a temporary path that replaces ``path`` atomically if the block succeeds.
 
     The file is written next to its destination, flushed to disk, and renamed in one step; then the
-    folder entry is flushed. If the block raises, no file remains and an existing file is unchanged.
-    The suffix is kept.
+    folder entry is flushed. If the block raises, an existing file is unchanged.
 
     Args:
         path: Destination. A symbolic link is followed.
@@ -104,8 +102,7 @@ def atomic_path(
 def remove_leftovers(folder: Path, mark: str = "") -> None:
     """Remove the temporary files with a mark that a killed process left in a folder.
 
-    No process may be writing there under the same mark. Default: any mark, for a folder in which
-    only this process writes.
+    No other process may write there under the same mark. Default: any mark.
     """
     for path in find_leftovers(folder, mark):
         if path.is_dir():
@@ -163,8 +160,7 @@ def hash_file(path: Path) -> str:
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check that a path can be written, before long work.
 
-    The folder exists and is writable. An existing target is a writable file, not a directory or
-    device.
+    The folder exists and is writable. An existing target is a writable file, no device.
     """
     target = Path(os.path.realpath(path))
     if target.is_dir():
@@ -176,8 +172,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     for item in (target.parent, target):
         if item.exists() and not os.access(item, os.W_OK):
             raise FormatError(
-                f"{path}: cannot be written: {item} is read-only; write to another folder, or make "
-                "it writable."
+                f"{path}: cannot be written: {item} is read-only; make it writable, or use another."
             )
 
 
@@ -259,8 +254,7 @@ def check_file(path: Path) -> int:
         ) from error
     if stat.S_ISDIR(status.st_mode):
         raise FormatError(
-            f"{path}: expected a file, got a directory; name a file inside it, or run torchrg "
-            "convert folder."
+            f"{path}: expected a file, got a directory; name a file in it, or run convert folder."
         )
     if status.st_size == 0:
         raise FormatError(f"{path}: byte 0: the file is empty; copy or write it again.")
@@ -286,9 +280,7 @@ def decode_file(path: Path) -> str:
         byte = error.start
     if byte >= 0:
         found = "UTF-16" if content[:2] in _UTF_16_MARKS else repr(content[byte : byte + 1])
-        raise FormatError(
-            f"{path}: byte {byte}: expected text in UTF-8, got {found}; save it as UTF-8."
-        )
+        raise FormatError(f"{path}: byte {byte}: expected UTF-8, got {found}; save it as UTF-8.")
     return text
 
 
@@ -351,8 +343,7 @@ def check_end(path: Path, stream: BinaryIO, record_bytes: int = 0) -> tuple[str,
 def raise_os_error(path: Path, *errors: type[BaseException]) -> Iterator[None]:
     """Raise the system's OSError if a library hides it while writing.
 
-    On a full disk, or at a limit of the file size, writing a few extra bytes raises it. The partial
-    file is discarded anyway.
+    On a full disk, or at a limit of the file size, writing a few extra bytes raises it.
     """
     try:
         yield
@@ -401,8 +392,7 @@ def list_some(names: Sequence[str], max_names: int) -> str:
 def normalize_file_name(name: str) -> str:
     """Normalize a name so that names which collide on some file systems become equal.
 
-    The file systems of macOS and Windows ignore case and the composition of accented letters, and
-    results are copied there.
+    macOS and Windows ignore case and the composition of accented letters.
 
     Example:
         >>> normalize_file_name("B\u00fcro") == normalize_file_name("bu\u0308RO")

@@ -13,8 +13,7 @@ MAX_INTEGER = 2**31 - 1
 _MIN_EXTENT = 2.0**-126
 """Minimum extent of all integers: the smallest normal float32, the type of points."""
 _MAX_OUTSIDE = 0.01
-"""Maximum distance of points from the box in a header without a note, as a fraction of their
-extent. Programs round the box."""
+"""Maximum distance of points from the box in a header, which is rounded, as a fraction of it."""
 
 
 def check_grid(path: Path, what: str, scales: ArrayLike, offsets: ArrayLike) -> None:

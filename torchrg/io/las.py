@@ -53,8 +53,7 @@ _REPAIR = "convert it to .las with LASzip or PDAL, or copy it again"
 _POINTWISE, _MAX_LAZ_VERSION = 1, 3
 """LASzip's compressor without chunks, and the latest compression version that lazrs reads."""
 _CHUNK_SIZE_AT, _ITEMS_AT = 12, 32
-"""Offsets in LASzip's record of the chunk size in points, and of the number of items. An item is a
-type, a size and a version."""
+"""Offsets in LASzip's record of the chunk size, and of the number of items: type, size, version."""
 _UNDOCUMENTED = "Un-registered ExtraBytes"
 """Description that laspy gives to undocumented extra bytes."""
 _RANGE_BITS = 0b110
@@ -156,9 +155,7 @@ def _open_reader(laspy: ModuleType, path: Path) -> Iterator[Any]:
         # A panic of lazrs (written in Rust) is not an Exception and cannot be imported.
         if type(error).__name__ != "PanicException":
             raise
-        raise FormatError(
-            f"{path}: cannot decompress its points: {first_line(error)}; {_REPAIR}."
-        ) from error
+        raise FormatError(f"{path}: cannot decompress: {first_line(error)}; {_REPAIR}.") from error
 
 
 def check_las(path: Path, cloud: Cloud | None) -> None:
@@ -264,8 +261,7 @@ def _add_dimensions(
         name = f"{name}{_WIDE_SUFFIX}" if is_wide else name
         if name in ("X", "Y", "Z") or len(name.encode()) > 32:
             raise FormatError(
-                f"{path}: expected names of at most 32 bytes other than X, Y, Z, got {name!r}; "
-                "rename the field."
+                f"{path}: expected names of at most 32 bytes, not X, Y, Z, got {name!r}; rename it."
             )
         if name not in standard:
             description = _WIDE_DESCRIPTION if is_wide else ""

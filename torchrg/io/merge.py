@@ -27,8 +27,7 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
         A field is kept if all clouds have it with the same shape and kind of numbers, and colors
         with the same bit depth. Coordinates are float64 if any are. Header entries are kept if
         equal in all files. For LAS files the header with the finest scale is kept if the dimensions
-        agree and its grid covers all points; for E57 files all scans are kept. The notes list the
-        dropped data.
+        agree and its grid covers all points; for E57 files all scans are kept. Notes list the rest.
 
     Args:
         clouds: At least one cloud; all must use the same frame and unit.
@@ -140,13 +139,11 @@ def _check_systems(clouds: Sequence[Cloud]) -> list[str]:
     return []
 
 
-def _check_equal(facts: Sequence[tuple[str, object]], what: str, repair: str) -> None:
+def _check_equal(facts: Sequence[tuple[str, object]], what: str, fix: str) -> None:
     """Raise FormatError if the values of two files differ."""
-    for source, fact in facts[1:]:
+    for name, fact in facts[1:]:
         if fact != facts[0][1]:
-            raise FormatError(
-                f"{source}: expected the {what} of {facts[0][0]}, got another; {repair}."
-            )
+            raise FormatError(f"{name}: expected the {what} of {facts[0][0]}, got another; {fix}.")
 
 
 def _system(cloud: Cloud) -> object:

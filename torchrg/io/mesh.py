@@ -33,8 +33,7 @@ def find_fronts(
     The direction is the area-weighted sum of the normals of the adjacent faces.
 
     Args:
-        faces: Blocks of vertex indices of faces with the same number of corners, shape ``(n,
-            corners)``.
+        faces: Blocks of vertex indices of faces of equal size, shape ``(n, corners)``.
         coordinates: Vertex coordinates, shape ``(N, 3)``.
         finite: Mask of vertices with finite coordinates, shape ``(N,)``; other faces are ignored.
 

@@ -80,9 +80,7 @@ def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Clo
         records = np.load(path, allow_pickle=False).reshape(-1)
         return assemble_cloud(path, {name: records[name] for name in records.dtype.names})
     if len(shape) != 2 or shape[1] < 3:
-        raise FormatError(
-            f"{path}: expected an array of shape (N, 3) or wider, got {shape}; reshape it."
-        )
+        raise FormatError(f"{path}: expected shape (N, 3) or wider, got {shape}; reshape it.")
     check_coordinates(path, (shape[0], 3), dtype)
     if columns is None and path.stem.lower() in FIELD_NAMES:
         raise FormatError(
@@ -161,9 +159,7 @@ def _find_coordinates(path: Path, layouts: Mapping[str, _Layout]) -> tuple[str |
     if len(others) == 1:
         return next(iter(others.items()))
     names = ", ".join(map(repr, layouts)) or "none"
-    raise FormatError(
-        f"{path}: expected an array points (or coord), got {names}; rename the coordinates."
-    )
+    raise FormatError(f"{path}: expected an array points (or coord), got {names}; rename them.")
 
 
 def read_result_arrays(path: Path) -> dict[str, Array]:
@@ -189,9 +185,7 @@ def write_npz(
     if segmentation is None:
         for name, values in cloud.fields.items():
             if name in _COORDINATES or name in _NOT_PER_POINT:
-                raise FormatError(
-                    f"{path}: a field cannot be named {name!r}, a reserved array name; rename it."
-                )
+                raise FormatError(f"{path}: a field cannot be named {name!r}; rename it.")
             if values.dtype.hasobject:
                 raise FormatError(f"{path}: field {name} contains Python objects; remove it.")
             arrays[name] = values
@@ -230,9 +224,7 @@ def map_folder(folder: Path, names: Sequence[str]) -> dict[str, Array]:
     """
     paths = {name: folder / f"{name}.npy" for name in names}
     if not paths["coord"].is_file():
-        raise FormatError(
-            f"{folder}: expected coord.npy in this folder, got none; pass the folder of a scene."
-        )
+        raise FormatError(f"{folder}: expected coord.npy, got none; pass the folder of a scene.")
     arrays = {name: map_array(path) for name, path in paths.items() if path.is_file()}
     shape = arrays["coord"].shape
     if len(shape) not in (2, 3) or shape[-1] != 3:
@@ -246,9 +238,7 @@ def check_rows(path: Path, values: Array, shape: tuple[int, ...]) -> None:
     """Check that an array has one row per point, or per pixel of an image."""
     if values.shape[: len(shape)] != shape:
         rows = " x ".join(map(str, shape))
-        raise FormatError(
-            f"{path}: expected {rows} rows, got shape {values.shape}; write one row per point."
-        )
+        raise FormatError(f"{path}: expected {rows} rows, got shape {values.shape}; correct it.")
 
 
 def map_array(path: Path) -> Array:
@@ -288,8 +278,7 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
     layouts, members = {}, archive.infolist()
     if len(members) > _MAX_ARRAYS:
         raise FormatError(
-            f"{path}: expected at most {_MAX_ARRAYS:,} arrays, got {len(members):,}; remove the "
-            "arrays that are not per point."
+            f"{path}: expected at most {_MAX_ARRAYS:,} arrays, got {len(members):,}; remove some."
         )
     # Overlapping members of a small file could expand to any size.
     packed = sum(member.compress_size for member in members)
@@ -347,8 +336,7 @@ def _check_array(path: Path, stream: IO[bytes], size: int, content: str) -> _Lay
         )
     if min(shape, default=0) < 0 or dtype.itemsize == 0:
         raise FormatError(
-            f"{path}: byte 0: invalid shape or type in {content}: {shape} of {dtype}; "
-            "write it again."
+            f"{path}: byte 0: wrong shape or type in {content}: {shape} of {dtype}; write it again."
         )
     num_bytes, start = math.prod(shape) * dtype.itemsize, head.tell()
     check_available(path, start, num_bytes, f"{content} of shape {shape}", available=size - start)

@@ -67,8 +67,7 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
     """Write a binary file; identical clouds give byte-identical files.
 
     Coordinates keep their precision, colors are packed as in PCL, and an organized cloud keeps its
-    width and height. (Open3D's legacy reader and PCL's point types accept float32 coordinates only;
-    ``open3d.t.io`` accepts both.)
+    width and height. (Open3D's legacy reader and PCL's point types accept float32 only.)
     """
     height, width = cloud.grid_shape or (1, len(cloud))
     if height * width != len(cloud):

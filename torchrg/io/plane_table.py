@@ -54,8 +54,7 @@ def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
     Returns:
         ``plane_normal`` and so on, with M rows; ``plane_kind`` as text; ``adjacency_pairs``,
         ``adjacency_boundary_length`` and ``adjacency_dihedral_deg``; polygons as ``outline_points``
-        (concatenated rings), ``outline_ring_sizes`` (their lengths) and ``outline_ring_planes``
-        (their plane IDs).
+        (all rings), ``outline_ring_sizes`` (lengths) and ``outline_ring_planes`` (plane IDs).
     """
 
     def moved(positions: Tensor) -> NDArray[np.float64]:
@@ -149,8 +148,7 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
 
     Args:
         planes: The table.
-        origin: Origin of its coordinates in the coordinates of the data set, shape ``(3,)``.
-            Default: the same origin.
+        origin: Origin of its coordinates in those of the data set, ``(3,)``. Default: zero.
 
     Returns:
         ``planes``: for each plane its ``id`` (the value in ``plane.npy``) and the columns of

@@ -108,8 +108,7 @@ def _is_mesh(element: "_Element") -> bool:
 def write_ply(path: Path, cloud: Cloud) -> None:
     """Write a little-endian file; identical clouds give byte-identical files.
 
-    Coordinates keep their precision. 64-bit integers become 32-bit integers, or ``double`` if that
-    represents them.
+    Coordinates keep their precision. 64-bit integers become 32-bit ones, or ``double`` if exact.
     """
     columns = flatten_cloud(path, cloud, FieldNames())
     check_exact(path, columns)
@@ -214,13 +213,10 @@ def _read_header(path: Path, stream: BinaryIO) -> _Header:
                 elements[-1].properties.append(_Property(name, _READ_TYPES[code]))
             case _:
                 raise FormatError(
-                    f"{path}: line {number}: expected a line of a PLY header, got {shown}; write "
-                    "the file again."
+                    f"{path}: line {number}: expected a PLY header, got {shown}; write it again."
                 )
         if name in names:
-            raise FormatError(
-                f"{path}: line {number}: expected distinct names, got {name!r} twice; rename one."
-            )
+            raise FormatError(f"{path}: line {number}: expected one {name!r}, got two; rename one.")
     elements = [element for element in elements if element.properties]
     return _Header(_BYTE_ORDERS[formats[-1]], elements, number, stream.tell())
 

@@ -1,7 +1,6 @@
 """Segmentation results: a cloud with its labels, planes and superpoints.
 
-Written by :func:`torchrg.write_cloud`, ``torchrg convert`` and ``torchrg depth``; read by
-:func:`read_result`.
+:func:`torchrg.write_cloud` and commands write them, :func:`read_result` reads them.
 """
 
 from __future__ import annotations
@@ -71,8 +70,7 @@ _KINDS = {
 _MAX_SAMPLED_POINTS = 100_000
 """Number of points of a random sample from which adjacent planes are found if unknown."""
 _NUM_NEIGHBORS = 50
-"""Number of neighbors, equal to the default for normals, so that a cloud that is not sampled gets
-the same adjacency as its result."""
+"""Number of neighbors: the default for normals, so that small clouds get their own adjacency."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +81,7 @@ class Result:
         cloud: The points. Its fields include the known results: ``labels``, ``normals``,
             ``curvature``, the masks ``sharp`` and ``valid``, and ``superpoint``, with coarser
             levels as ``superpoint_1`` and so on.
-        table: Plane table relative to :attr:`Cloud.origin`; its rows are the labels, ascending.
-            Default: no table.
+        table: Plane table relative to :attr:`Cloud.origin`; rows by label. Default: none.
         plane_of_superpoint: See :attr:`torchrg.structures.Superpoints.plane`, shape ``(S,)``.
         provenance: Record of how the result was made.
         neighbors: See :attr:`torchrg.structures.Segmentation.neighbors`.
@@ -152,8 +149,7 @@ class Result:
         """Convert to a sample for data loaders and transforms.
 
         Contains ``coord`` ``(N, 3)``, float32, relative to ``origin`` ``(1, 3)``, float64, and if
-        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint`` and the table
-        ``planes``.
+        known ``plane``, ``normal``, ``curvature``, ``color``, ``superpoint``, ``planes``.
 
         Example:
             >>> sample = Result(Cloud(np.zeros((2, 3)), {"labels": np.array([0, -1])})).to_dict()
@@ -192,8 +188,7 @@ class Result:
     def planes(self) -> Planes | None:
         """The plane table; None without labels.
 
-        Missing data is computed once from the labels: the whole table for labels of other programs,
-        the adjacency for images.
+        Missing data is computed once from the labels: the table, or adjacency for images.
         """
         table = self.table
         if "labels" not in self.fields or (table is not None and table.adjacency is not None):

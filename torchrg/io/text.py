@@ -38,11 +38,9 @@ _SAMPLE_BYTES = 1 << 16
 _COMMENTS = ("#", "//", "BEGIN", "END")
 """Beginnings of lines without points. Words alone separate the scans of a file."""
 _WINDOWS_NAN = re.compile(r"1[.,]#[A-Z]+[0-9]*|nan\([a-z]*\)", re.IGNORECASE)
-"""Numbers that are not finite, as printed by the C library of Windows: ``-1.#IND``, ``1.#QNAN0``,
-``-nan(ind)``."""
+"""Numbers that are not finite, as Windows prints them: ``-1.#IND``, ``1.#QNAN0``, ``-nan(ind)``."""
 _COLMAP = "POINT3D_ID, X, Y, Z"
-"""Comment above the points in COLMAP's ``points3D.txt``, whose rows list the images that see a
-point."""
+"""Comment above the points in COLMAP's ``points3D.txt``, whose rows list images."""
 
 
 class _Dialect(NamedTuple):
@@ -121,8 +119,7 @@ def read_rows(
 ) -> Array:
     """Read rows of a structured type from an ASCII file, starting at ``line_number``.
 
-    ``content`` names the rows in messages. Blank lines are ignored, and no more lines are read than
-    needed.
+    ``content`` names the rows in messages. Blank lines are ignored, and no further line is read.
     """
     # A digit and a separator per number; the last separator may be missing.
     min_bytes, start = num_rows * _num_columns(dtype) * 2 - 1, stream.tell()
@@ -187,8 +184,7 @@ def _parse(
 ) -> Array:
     """Parse a block of lines; an error names the first wrong line.
 
-    Without a dialect, white space separates numbers and there are no comments. Skipped columns may
-    contain words.
+    Without a dialect, blanks separate numbers, without comments. Skipped columns may hold words.
     """
     delimiter, decimal, comments = (*dialect, _COMMENTS[0]) if dialect else (None, ".", None)
     converters: dict[int | str, Callable[[str], float]] | None

@@ -1,8 +1,7 @@
 """Writer of vertex groups (``.vg``) for PolyFit, abspy and Easy3D.
 
 A group is a plane ``a x + b y + c z + d = 0`` with the indices of its points. A file contains
-coordinates, colors, normals and groups; other fields are dropped. Groups are unnumbered: plane IDs
-are written in ascending order.
+coordinates, colors, normals and groups, by ascending plane ID; other fields are dropped.
 """
 
 from pathlib import Path

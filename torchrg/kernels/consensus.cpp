@@ -227,5 +227,5 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
         voted_offsets[i] = plane.offset, meeting_offsets[i] = found.plane.offset;
         deviations[i] = found.deviation;
       });
-  return inside ? status : NO_SUCH_ROW;
+  return inside ? status : int64_t(NO_SUCH_ROW);
 }

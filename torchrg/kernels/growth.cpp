@@ -71,17 +71,91 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   return DONE;
 }
 
-// adjacency._RegionEdges._at_boundary: which rows have a neighbor of another region.
-KERNEL at_boundary(int64_t num_points, int64_t num_rows, int64_t k, Ints labels, Ints regions,
-                   Ints indices, Flagged mask, bool* meets) {
-  for (int64_t i = 0; i < num_rows; i++) {
+// adjacency._mark_boundary: which rows have a neighbor of another region in some columns. Counts
+// the edges of each pair of regions in a table (R, R), which may be empty; threads may share it.
+KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_regions, Ints labels, Ints indices,
+                     Flagged mask, int64_t first, int64_t last, int64_t low, int64_t high,
+                     int64_t* counts, bool* meets) {
+  if (first < 0 || last > num_points || low < 0 || high > k) return TOO_WIDE;
+  for (int64_t i = first; i < last; i++) {
+    const int32_t *list = indices + i * k, label = labels[i];
+    if (!are_rows(list + low, high - low, num_points)) return NO_SUCH_ROW;
+    int32_t differences = 0;
+    for (int64_t j = low; j < high; j++) {
+      const int32_t other = labels[list[j]];
+      differences |= (other ^ label) & ~(other >> 31);  // negative labels do not count
+    }
     meets[i] = false;
-    if (!are_rows(indices + i * k, k, num_points)) return NO_SUCH_ROW;
-    for (int64_t e = i * k; regions[i] >= 0 && e < (i + 1) * k; e++) {
-      const int32_t other = labels[indices[e]];
-      meets[i] |= other != regions[i] && other >= 0 && (!mask || mask[e]);
+    for (int64_t j = low; differences != 0 && j < high; j++) {
+      const int32_t other = labels[list[j]];
+      if (other == label || other < 0 || (mask && !mask[i * k + j])) continue;
+      meets[i] = true;
+      if (label < 0 || num_regions == 0) break;
+      if (larger(label, other) >= num_regions) return TOO_WIDE;
+      const int64_t pair = smaller(label, other) * num_regions + larger(label, other);
+      __atomic_fetch_add(counts + pair, 1, __ATOMIC_RELAXED);
     }
   }
+  return DONE;
+}
+
+// adjacency._RegionEdges._find: edges of rows to other regions, in order, with the keys of their
+// pairs.
+KERNEL crossing_edges(int64_t num_points, int64_t k, int64_t num_rows, Ints labels, Ints indices,
+                      Flagged mask, Ints rows, int64_t low, int64_t high, int64_t num_regions,
+                      int32_t* sources, int32_t* targets, int32_t* columns, int64_t* keys,
+                      int64_t* count) {
+  if (low < 0 || high > k) return TOO_WIDE;
+  int64_t found = 0;
+  for (int64_t r = 0; r < num_rows; r++) {
+    const int32_t i = rows[r];
+    if (!is_row(i, num_points) || !are_rows(indices + i * k + low, high - low, num_points))
+      return NO_SUCH_ROW;
+    for (int64_t e = i * k + low; e < i * k + high; e++) {
+      // Without a branch, which would be unpredictable: others overwrite it.
+      const int32_t label = labels[i], other = labels[indices[e]];
+      sources[found] = i, targets[found] = indices[e], columns[found] = int32_t(e - i * k - low);
+      keys[found] = smaller(label, other) * num_regions + larger(label, other);
+      found += (other != label) & (other >= 0) & (label >= 0) & (!mask || mask[e]);
+    }
+  }
+  *count = found;
+  return DONE;
+}
+
+// adjacency._length_on_line: distinct cells of the lines of pairs that contain the middle of an edge.
+// `slots` is a hash table of indices of found cells.
+KERNEL line_cells(int64_t num_points, int64_t num_edges, int64_t num_pairs, int64_t num_slots,
+                  Floats points, Ints sources, Ints targets, Longs pairs, const double* along,
+                  const double* spacing, double max_cell, int32_t* slots, int64_t* owners,
+                  int64_t* cells, int64_t* count) {
+  if (num_slots <= num_edges || num_slots & (num_slots - 1)) return TOO_WIDE;
+  const uint64_t mask = uint64_t(num_slots) - 1;
+  int32_t found = 0;
+  for (int64_t slot = 0; slot < num_slots; slot++) slots[slot] = -1;
+  for (int64_t e = 0; e < num_edges; e++) {
+    const int64_t pair = pairs[e];
+    if (pair < 0 || pair >= num_pairs || !is_row(sources[e], num_points) ||
+        !is_row(targets[e], num_points))
+      return NO_SUCH_ROW;
+    if (!is_finite(spacing[pair])) continue;
+    const float *start = points + 3 * int64_t(sources[e]), *end = points + 3 * int64_t(targets[e]);
+    double position = 0;
+    for (int axis = 0; axis < 3; axis++) {
+      const double origin = points[axis];
+      const double middle = ((start[axis] - origin) + (end[axis] - origin)) / 2;
+      position += middle * along[3 * pair + axis];
+    }
+    position /= spacing[pair];
+    if (!is_finite(position)) position = 0;
+    const int64_t cell = int64_t(__builtin_floor(smaller(larger(position, -max_cell), max_cell)));
+    uint64_t slot = (uint64_t(pair) * 0x9E3779B97F4A7C15u + uint64_t(cell)) * 0xD6E8FEB86659FD93u;
+    for (slot = slot >> 24 & mask; slots[slot] >= 0; slot = (slot + 1) & mask)
+      if (cells[slots[slot]] == cell && owners[slots[slot]] == pair) break;
+    if (slots[slot] >= 0) continue;
+    owners[found] = pair, cells[found] = cell, slots[slot] = found++;
+  }
+  *count = found;
   return DONE;
 }
 

@@ -56,6 +56,7 @@ ON_BOTH_ASSIGN(+, Flags)
 ON_BOTH_ASSIGN(-, Flags)
 ON_BOTH(Flags, &, Flags)
 ON_BOTH(Flags, ^, Flags)
+ON_BOTH(Flags, |, Flags)
 ON_BOTH(Flags, >>, Flags)
 ON_BOTH(Flags, <, Lanes)
 ON_BOTH(Flags, <=, Lanes)
@@ -87,20 +88,25 @@ INLINE T smaller(T a, T b) {
 
 INLINE Lanes load(const float* values) {
   Lanes lanes;
-  __builtin_memcpy(&lanes, values, sizeof lanes);
+  __builtin_memcpy((void*)&lanes, values, sizeof lanes);
   return lanes;
 }
 INLINE Flags load(const int32_t* values) {
   Flags lanes;
-  __builtin_memcpy(&lanes, values, sizeof lanes);
+  __builtin_memcpy((void*)&lanes, values, sizeof lanes);
   return lanes;
 }
 INLINE void store(float* values, Lanes lanes) { __builtin_memcpy(values, &lanes, sizeof lanes); }
 INLINE Lanes all(float value) { return Lanes{} + value; }
 #ifdef __AVX__
+INLINE Lanes to_float(Flags a) { return __builtin_convertvector(a, Lanes); }
 INLINE Lanes where(Flags flags, Lanes a, Lanes b) { return flags ? a : b; }
 INLINE Flags where(Flags flags, Flags a, Flags b) { return flags ? a : b; }
 #else
+INLINE Lanes to_float(Flags a) {
+  return Lanes(__builtin_convertvector(a.low, FourFloats),
+               __builtin_convertvector(a.high, FourFloats));
+}
 INLINE Lanes where(Flags flags, Lanes a, Lanes b) {
   return Lanes(flags.low ? a.low : b.low, flags.high ? a.high : b.high);
 }

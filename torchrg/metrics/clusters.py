@@ -85,16 +85,14 @@ def score_clusters(
         Two parallel walls have the same center on the sphere. In real rooms DBI therefore tends to
         infinity and DVI to 0. (The formulas bound DVI by (pi/2) / CP; the 10.0 printed in the
         paper exceeds this bound.) ``distinct_directions`` evaluates the *directions* instead.
-        Points labeled ``UNLABELED`` (-1), and labeled points with a zero or non-finite normal, are
-        ignored.
+        Points labeled ``UNLABELED`` (-1), or with a zero or non-finite normal, are ignored.
 
     Args:
         normals: Normals of any sign and length, shape ``(N, 3)``, floating point.
         labels: Cluster of each point, shape ``(N,)``, integers.
         min_size: Minimum number of points per cluster; smaller clusters count as unlabeled.
         distinct_directions: Whether to merge clusters with similar directions first.
-        max_angle_deg: Maximum angle between the centers of merged clusters, in degrees; merging is
-            transitive.
+        max_angle_deg: Maximum angle between the centers of merged clusters, in degrees, transitive.
         sample_size: Maximum cluster size for exact evaluation. Larger clusters are subsampled to
             this size for ``w_i``, and for the diameter in DVI if it has more candidate end points
             (few on planes). Everything else is exact.

@@ -131,9 +131,7 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
     for name, tensor in tensors.items():
         if tensor.dtype not in INTEGERS:
             dtype = str(tensor.dtype).removeprefix("torch.")
-            raise ShapeError(
-                f"{caller}: expected integer {name}, got {dtype}; convert with .long()."
-            )
+            raise ShapeError(f"{caller}: expected integer {name}, got {dtype}; use .long().")
     check_shapes(caller, **{name: (tensor, "N") for name, tensor in tensors.items()})
     return [tensor.long() for tensor in tensors.values()]
 
@@ -148,6 +146,17 @@ def is_not_ignored(ground_truth: Tensor, ignore: int | None) -> Tensor:
     if ignore is None or not -(2**63) <= ignore < 2**63:
         return torch.ones_like(ground_truth, dtype=torch.bool)
     return ground_truth != ignore
+
+
+def is_first(groups: Tensor, *keys: Tensor) -> Tensor:
+    """Mark the first row of each group, ordered by the keys, shape ``(E,)``."""
+    order = torch.arange(len(groups), device=groups.device)
+    for key in (*reversed(keys), groups):
+        order = order[key[order].argsort(stable=True)]
+    ordered = groups[order]
+    begins = torch.ones_like(ordered, dtype=torch.bool)
+    begins[1:] = ordered[1:] != ordered[:-1]
+    return torch.empty_like(begins).index_put((order,), begins)
 
 
 def fraction(count: float, whole: float) -> float:

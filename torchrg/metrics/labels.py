@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.metrics.contingency import ContingencyTable, count_overlaps, fraction
+from torchrg.metrics.contingency import ContingencyTable, count_overlaps, fraction, is_first
 
 
 class LabelScore(NamedTuple):
@@ -63,12 +63,10 @@ def score_labels(
 
     Arguments, errors and the handling of unlabeled points are as in
     :func:`torchrg.metrics.contingency_table`: a point without a face lowers the precision of its
-    region, a point without a region the recall of its face. The paper shows regions of at least 50
-    points.
+    region, a point without a region the recall of its face. The paper shows regions from 50 points.
 
     Returns:
-        The indices. Means and fractions over nothing are 0; the counts distinguish this from an
-        actual 0.
+        The indices. Means and fractions over nothing are 0; the counts show this.
 
     References:
         [1] Indoor Point Cloud Segmentation Using a Modified Region Growing Algorithm and Accurate
@@ -142,20 +140,9 @@ def match_regions(table: ContingencyTable) -> Tensor:
         [0, 1]
     """
     regions, faces, fewest = table.regions, table.faces, -table.overlaps
-    of_region = _is_first(regions, fewest, table.face_sizes[faces], faces)
-    of_face = _is_first(faces, fewest, table.region_sizes[regions], regions)
+    of_region = is_first(regions, fewest, table.face_sizes[faces], faces)
+    of_face = is_first(faces, fewest, table.region_sizes[regions], regions)
     return (of_region & of_face).nonzero().squeeze(1)
-
-
-def _is_first(groups: Tensor, *keys: Tensor) -> Tensor:
-    """Mark the first row of each group, ordered by the keys, shape ``(E,)``."""
-    order = torch.arange(len(groups), device=groups.device)
-    for key in (*reversed(keys), groups):
-        order = order[key[order].argsort(stable=True)]
-    ordered = groups[order]
-    begins = torch.ones_like(ordered, dtype=torch.bool)
-    begins[1:] = ordered[1:] != ordered[:-1]
-    return torch.empty_like(begins).index_put((order,), begins)
 
 
 def adjusted_rand_index(table: ContingencyTable) -> float:

@@ -32,8 +32,7 @@ def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
 def match_points(ours: Cloud, theirs: Cloud, max_distance: float) -> NDArray[np.int64]:
     """Return the nearest point of ours for each of theirs, as rows of ours, shape ``(M,)``.
 
-    The entry is -1 for points that are not finite, or farther than ``max_distance``, in units of
-    the clouds.
+    The entry is -1 for points not finite, or farther than ``max_distance``, in units of the clouds.
 
     Example:
         >>> room = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])

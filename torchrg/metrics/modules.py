@@ -46,10 +46,8 @@ class PlaneMetric(Metric):
     addition. Metrics of one part in a ``MetricCollection`` evaluate each scan once.
 
     Args:
-        index: A part of :data:`torchrg.metrics.METRICS`, for a dict of all its metrics, or the name
-            of a metric, such as ``"f1"``.
-        **settings: Settings of the evaluation function, such as ``min_size=50``, and of
-            :class:`torchmetrics.Metric`.
+        index: A part of :data:`torchrg.metrics.METRICS`, for a dict, or a metric, such as ``"f1"``.
+        **settings: Settings of the evaluation, such as ``min_size=50``, and of ``Metric``.
 
     Attributes:
         part: The part of ``METRICS``.

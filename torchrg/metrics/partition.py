@@ -9,7 +9,13 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.metrics.contingency import check_labels, contingency_table, fraction, is_not_ignored
+from torchrg.metrics.contingency import (
+    check_labels,
+    contingency_table,
+    fraction,
+    is_first,
+    is_not_ignored,
+)
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.order import distinct_rows
 from torchrg.structures import UNLABELED
@@ -77,8 +83,7 @@ def score_partition(
         The metrics. Fractions of nothing are 0.
 
     Raises:
-        ShapeError: If the labels are not integers, the points not floating point, or lengths
-            differ.
+        ShapeError: If labels are no integers, points not floating point, or lengths differ.
         ConfigError: If ``boundary_distance`` is not positive.
 
     References:
@@ -129,19 +134,13 @@ def score_partition(
 def _score_oracle(superpoints: Tensor, ground_truth: Tensor) -> tuple[int, float]:
     """Return the number of points with the most frequent object, and the mean IoU."""
     table = contingency_table(superpoints, ground_truth)
-    num_parts = len(table.face_sizes)
-    # Overlaps are sorted by superpoint, then by object, so ties go to the lowest label.
-    max_overlaps = torch.zeros_like(table.region_sizes).scatter_reduce(
-        0, table.regions, table.overlaps, "amax"
-    )
-    largest = table.overlaps == max_overlaps[table.regions]
-    most_frequent = torch.full_like(table.region_sizes, num_parts).scatter_reduce(
-        0, table.regions[largest], table.faces[largest], "amin"
-    )
-    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, max_overlaps)
-    sizes = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, table.region_sizes)
+    # Ties go to the lowest label.
+    largest = is_first(table.regions, -table.overlaps, table.faces)
+    most_frequent, num_right = table.faces[largest], table.overlaps[largest]
+    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, num_right)
+    sizes = torch.zeros_like(right).index_add(0, most_frequent, table.region_sizes)
     iou = right.double() / (sizes + table.face_sizes - right)
-    return int(right.sum()), fraction(float(iou.sum()), num_parts)
+    return int(right.sum()), fraction(float(iou.sum()), len(iou))
 
 
 def _score_boundaries(

@@ -5,6 +5,7 @@ normal and with the opposite one, and a link joins the copies that agree. A conn
 contains one copy of each of its nodes and is a face.
 """
 
+import math
 from threading import Lock
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, map_tasks, nonzero_rows
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, nonzero_rows
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
@@ -61,7 +62,7 @@ def find_faces(
     faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
     rows = nonzero_rows(labels >= 0)
     label, axes = labels[rows].long(), axes.to(points)
-    cosine = _project(normals, rows, axes, label)
+    cosine = dot(normals[rows], axes[label])
     side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
     is_on_plane = is_thin[label] & (cosine.abs() > _MIN_COSINE)
     rows = rows[is_on_plane]
@@ -104,12 +105,16 @@ def _split_plates(
 
     The points ``rows`` ``(n,)`` are on ``faces`` ``(n,)``, rows of the ``axes`` ``(M, 3)``.
     """
+    if kernels.serve(points, axes):
+        limits = max_thickness * max_thickness, _MAX_HEIGHT_FACTOR, _MIN_TWO_SIDED
+        side, is_thin, *_ = kernels.call("split_plates", points, rows, faces, axes, *limits)
+        return side.long(), is_thin
     counts = torch.bincount(faces, minlength=len(axes)).clamp(min=1)
 
     def mean(values: Tensor) -> Tensor:
         return torch.bincount(faces, values, minlength=len(axes)) / counts
 
-    middle = _project(points, rows, axes, faces).double()
+    middle = dot(points[rows], axes[faces]).double()
     middle -= mean(middle)[faces]
     for _ in range(2):
         reach = (_MAX_HEIGHT_FACTOR * mean(middle.abs()))[faces]
@@ -119,17 +124,6 @@ def _split_plates(
     is_thin = squares <= max_thickness * max_thickness
     is_plate = is_thin & (mean(middle.abs()) ** 2 > _MIN_TWO_SIDED * squares)
     return ((middle > 0) & is_plate[faces]).long(), is_thin
-
-
-def _project(vectors: Tensor, rows: Tensor, axes: Tensor, faces: Tensor) -> Tensor:
-    """Return the coordinates ``(n,)`` of some of the vectors along the axes of their faces."""
-    parts = map_chunks(
-        lambda part: dot(vectors[rows[part]], axes[faces[part]]),
-        len(rows),
-        ROWS_AT_ONCE,
-        vectors.device,
-    )
-    return torch.cat(parts)
 
 
 def _join_patches(
@@ -153,20 +147,10 @@ def _join_patches(
     patch, sign = _grow_patches(points, normals, near, rows, ranks)
     faces, signs = faces.clone(), signs.clone()
     faces[rows], signs[rows] = num_faces + patch, sign.to(signs)
+    narrow = faces.to(torch.int32)
 
     def compare(chunk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        ends = gather_lists(near, chunk, ranks)
-        there = faces.index_select(0, ends.view(-1)).view(ends.shape)
-        is_between = there != faces[chunk, None]
-        some = nonzero_rows(is_between.any(dim=1))
-        chunk, ends = chunk.index_select(0, some), ends.index_select(0, some)
-        links = nonzero_rows(is_between.index_select(0, some))
-        cosine, bend = (
-            values.view(-1).index_select(0, links)
-            for values in _compare(points, normals, chunk, ends)
-        )
-        starts = chunk.index_select(0, links // len(ranks))
-        ends = ends.view(-1).index_select(0, links)
+        starts, ends, cosine, bend = _find_links(points, normals, near, chunk, ranks, narrow)
         trust = (1 - bend / 2).clamp(min=0) ** _TRUST_POWER
         agreement = trust * cosine.sign() * signs[starts] * signs[ends]
         return faces[starts], faces[ends], agreement
@@ -182,7 +166,7 @@ def _grow_patches(
     points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, ranks: list[int]
 ) -> tuple[Tensor, Tensor]:
     """Return the smooth patch of each of the points ``rows`` ``(n,)``, and its sign in it."""
-    bend = _compare(points, normals, rows[::8], gather_lists(near, rows[::8], ranks))[1]
+    bend = _find_links(points, normals, near, rows[::8], ranks)[3]
     typical = float(bend.median()) if bend.numel() else 0.0
     limit = min(max(_BEND_FACTOR * typical, _MIN_BEND), _MAX_BEND)
     node = torch.full((len(points),), -1, dtype=torch.int32)
@@ -190,46 +174,52 @@ def _grow_patches(
     patches, lock = _Components(len(rows)), Lock()
 
     def link(chunk: Tensor) -> None:
-        ends = gather_lists(near, chunk, ranks)
-        cosine, bend = _compare(points, normals, chunk, ends)
-        there = node.index_select(0, ends.view(-1))
-        links = nonzero_rows((bend.view(-1) <= limit) & (there >= 0))
-        starts = node.index_select(0, chunk.index_select(0, links // len(ranks)))
-        is_flipped = cosine.view(-1).index_select(0, links) < 0
+        starts, ends, cosine, _ = _find_links(points, normals, near, chunk, ranks, node, limit)
+        nodes = node.index_select(0, starts), node.index_select(0, ends)
         # The components do not depend on the order of the links.
         with lock:
-            patches.link(starts, there.index_select(0, links), is_flipped)
+            patches.link(*nodes, cosine < 0)
 
     map_tasks(link, torch.split(rows, ROWS_AT_ONCE), rows.device)
     return patches.find()
 
 
-def _compare(points: Tensor, normals: Tensor, rows: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cosine of normals, one of them mirrored, and the bend of links ``(n, K)``."""
+def _find_links(
+    points: Tensor,
+    normals: Tensor,
+    near: Tensor,
+    rows: Tensor,
+    ranks: list[int],
+    groups: Tensor | None = None,
+    max_bend: float = math.inf,
+) -> tuple[Tensor, ...]:
+    """Return links from rows ``(n,)`` to their neighbors at some ranks: ends, cosine and bend.
 
-    def compare(chunk: slice) -> tuple[Tensor, ...]:
-        if kernels.serve(points, normals):
-            return kernels.call("compare_links", points, normals, rows[chunk], ends[chunk].int())
-        at, shape = rows[chunk], ends[chunk].shape
-        cosine, here, there, squares = (points.new_zeros(shape) for _ in range(4))
-        for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
-            offset, other = (
-                values.index_select(0, ends[chunk].reshape(-1)).view(shape)
-                for values in (position, normal)
-            )
-            offset -= position[at, None]
-            normal_here = normal[at, None]
-            cosine += other * normal_here
-            here += offset * normal_here
-            there += offset * other
-            squares += offset * offset
-        squares = torch.where(squares > 0, squares, 1.0)
-        cosine -= 2 * here * there / squares
-        return cosine, 1 - cosine.abs() + (here * here + there * there) / squares
-
-    parts = map_chunks(compare, len(rows), ROWS_IN_CACHE, points.device)
-    cosine, bend = (torch.cat(part) for part in zip(*parts, strict=True))
-    return cosine, bend
+    The cosine is that of the normals, one of them mirrored. With ``groups`` ``(N,)``, int32, only
+    links to another group, not negative, are returned; bends are at most ``max_bend``.
+    """
+    if kernels.serve(points, normals, near, groups) and near.is_contiguous():
+        columns = torch.tensor(ranks, dtype=torch.int64)
+        lists = points, normals, near, rows, columns, groups
+        *found, count = kernels.call("find_links", *lists, max_bend)
+        scratch.release()
+        return tuple(values.view(-1)[: int(count)].clone() for values in found)
+    starts, ends = rows.repeat_interleave(len(ranks)), gather_lists(near, rows, ranks).view(-1)
+    cosine, here, there, squares = (points.new_zeros(len(starts)) for _ in range(4))
+    for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
+        offset, normal_here, other = position[ends] - position[starts], normal[starts], normal[ends]
+        cosine += other * normal_here
+        here += offset * normal_here
+        there += offset * other
+        squares += offset * offset
+    squares = torch.where(squares > 0, squares, 1.0)
+    cosine -= 2 * here * there / squares
+    bend = 1 - cosine.abs() + (here * here + there * there) / squares
+    chosen = bend <= max_bend
+    if groups is not None:
+        chosen &= (groups[ends] >= 0) & (groups[ends] != groups[starts])
+    chosen = nonzero_rows(chosen)
+    return starts[chosen].int(), ends[chosen].int(), cosine[chosen], bend[chosen]
 
 
 def _join_faces(

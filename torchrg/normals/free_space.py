@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks
 from torchrg.linalg.moments import dot, kth_smallest
 from torchrg.normals.faces import gather_lists
@@ -62,7 +63,7 @@ def vote_free_side(
         stride = math.sqrt(sum(step * step for step in steps))
         cosine = dot(normal, normal.new_tensor(steps)) / stride
         ahead, behind = (
-            torch.from_numpy(score[cell]).to(normal) for score in _free_paths(at, steps, stride)
+            torch.from_numpy(score).to(normal) for score in _free_paths(at, cell, steps, stride)
         )
         is_front = cosine > 0
         ahead = torch.minimum(ahead, torch.where(is_front, front, back))
@@ -121,32 +122,44 @@ def _find_obstacles(
 
 
 def _free_paths(
-    at: NDArray[np.int32], steps: tuple[int, ...], stride: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the weights of the free paths from cells ``(3, C)`` in a direction and its opposite.
+    at: NDArray[np.int32], cell: NDArray[np.int64], steps: tuple[int, ...], stride: float
+) -> list[NDArray[np.float32]]:
+    """Return the weights of the free paths from some cells in a direction and its opposite.
 
-    Each is ``(C,)``. Gaps between the cells of a line are paths, without a grid of empty cells.
+    Of the occupied cells ``at`` ``(3, C)``, paths start at ``cell`` ``(n,)``. Each is ``(n,)``.
     """
-    sides = (at.max(axis=1) + 1).tolist()
-    a = next(axis for axis in range(3) if steps[axis])
-    b, c = (axis for axis in range(3) if axis != a)
-    first, second = (at[axis] - steps[axis] * at[a] + sides[a] for axis in (b, c))
-    lines = first.astype(np.int64) * (sides[c] + 2 * sides[a]) + second
-    order = np.argsort(lines * sides[a] + at[a])
-    first, second, along = first[order], second[order], at[a][order]
-    is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
-    gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)
-
-    def score(gap: NDArray[np.int32], sign: int) -> NDArray[np.float32]:
-        free = np.empty(len(order), np.int32)
-        free[order] = gap
+    sides, here, scores = at.max(axis=1) + 1, at[:, cell], []
+    for gaps, sign in zip(_free_gaps(at, steps), (1, -1), strict=True):
+        free = gaps[cell]
         to_ends = [
-            sides[axis] - 1 - at[axis] if steps[axis] * sign > 0 else at[axis]
+            sides[axis] - 1 - here[axis] if steps[axis] * sign > 0 else here[axis]
             for axis in range(3)
             if steps[axis]
         ]
         path = stride * np.where(free < 0, np.minimum.reduce(to_ends), free).astype(np.float32)
         weight = np.where(free < 0, np.float32(_OPEN_WEIGHT), np.float32(1))
-        return weight * (path / (path + np.float32(_HALF_PATH)))
+        scores.append(weight * (path / (path + np.float32(_HALF_PATH))))
+    return scores
 
-    return score(np.append(gaps, -1), 1), score(np.insert(gaps, 0, -1), -1)
+
+def _free_gaps(at: NDArray[np.int32], steps: tuple[int, ...]) -> tuple[NDArray[np.int32], ...]:
+    """Return the number of free cells ahead of cells ``(3, C)`` and behind, -1 without an end.
+
+    Gaps between the cells of a line are paths, without a grid of empty cells.
+    """
+    if kernels.serve():
+        size = 2 ** (2 * at.shape[1] + 8).bit_length()
+        table = torch.empty(size, dtype=torch.int64), torch.empty(size, dtype=torch.int32)
+        found = kernels.call("free_gaps", torch.from_numpy(at), *steps, *table)
+        return tuple(gaps.numpy() for gaps in found)
+    a = next(axis for axis in range(3) if steps[axis])
+    b, c = (axis for axis in range(3) if axis != a)
+    first, second = (at[axis] - steps[axis] * at[a] for axis in (b, c))
+    # Cells are ascending, and the sort is stable: the cells of a line remain ascending.
+    order = np.lexsort((second, first))
+    first, second, along = first[order], second[order], at[a][order]
+    is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
+    gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)
+    ahead, behind = np.empty((2, len(order)), np.int32)
+    ahead[order], behind[order] = np.append(gaps, -1), np.insert(gaps, 0, -1)
+    return ahead, behind

@@ -282,7 +282,7 @@ def turn_faces(
     if neighbors is None or neighbors.indices.shape[1] < k:
         neighbors = search_knn(points, k)
     near, positions, units = (
-        values.detach().cpu() for values in (neighbors.indices[:, :k], points, upright.to(points))
+        values.detach().cpu() for values in (neighbors.indices, points, upright.to(points))
     )
     if side == "consistent":
         signs = _turn_outwards(positions, units, near)
@@ -297,7 +297,7 @@ def _turn_inside(
     points: Tensor, normals: Tensor, near: Tensor, labels: Tensor, axes: Tensor
 ) -> Tensor:
     """Return signs towards the freer side, voted by a sample of the points of each face."""
-    width = cell_width(points, near)
+    width = cell_width(points, near[:, :NUM_NEIGHBORS])
     faces, signs = find_faces(points, normals, near, labels, axes, _THICKNESS * width)
     sizes = torch.bincount(faces)
     hashes = torch.arange(len(points)) * _HASH % _HASHES

@@ -32,7 +32,7 @@ from torchrg.regions.classes import find_kinds
 from torchrg.regions.growth import needs_sampling, rank_by_count
 from torchrg.regions.selection import keep_planes, selected_rows
 from torchrg.structures import UNLABELED, Cloud, Neighbors, Planes, Segmentation
-from torchrg.structures.planes import DeferredKind
+from torchrg.structures.planes import Deferred
 from torchrg.structures.points import FilePath, Labels, Points, Rows
 from torchrg.structures.precision import warn_about_coordinates
 
@@ -328,7 +328,7 @@ def _complete(
         of_plane[labels[labels >= 0]] = objects[labels >= 0]
         planes = replace(planes, object=of_plane)
     if config.planes.up is None:
-        deferred: Any = DeferredKind(partial(find_kinds, points=points, labels=labels, up=_UP))
+        deferred: Any = Deferred(partial(find_kinds, points=points, labels=labels, up=_UP))
         planes = replace(planes, kind=deferred)
     return planes
 

@@ -1,8 +1,6 @@
 """Region adjacency: pairs of planes that meet, boundary lengths and angles."""
 
 import math
-from array import array
-from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -26,6 +24,8 @@ from torchrg.structures.points import Rows
 
 NUM_CONTACTS = 8
 """Nearest neighbors that count as adjacent; farther neighbors reach across gaps."""
+_NEAREST = slice(1, NUM_CONTACTS + 1)
+"""Their columns in the neighbor lists; the first one is the point itself."""
 MIN_CONTACTS = 3
 """Minimum number of edges between two regions that meet or are merged: a single edge may be an
 outlier's."""
@@ -113,19 +113,14 @@ class KnnAdjacency:
     """Adjacency of a point cloud: up to 8 nearest neighbors per point."""
 
     def __init__(self, neighbors: Neighbors) -> None:
-        columns, valid = slice(1, NUM_CONTACTS + 1), neighbors.valid
-        valid = None if valid is None else valid[:, columns]
-        self.neighbors = Neighbors(neighbors.indices[:, columns], valid)
+        valid = None if neighbors.valid is None else neighbors.valid[:, _NEAREST]
+        self._all, self.neighbors = neighbors, Neighbors(neighbors.indices[:, _NEAREST], valid)
+        self._points = neighbors.indices[:, :1]
 
     def neighbor_rows(self, rows: Rows) -> Tensor:
         """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
         near, counted = self.neighbors.select(rows)
-        if counted is None:
-            return near
-        indices = rows
-        if isinstance(indices, slice):
-            indices = torch.arange(len(self.neighbors.indices), device=near.device)[indices]
-        return torch.where(counted, near, indices[:, None].to(near.dtype))
+        return near if counted is None else torch.where(counted, near, self._points[rows])
 
     def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
         """Return the candidates that have a changed neighbor."""
@@ -136,16 +131,23 @@ class KnnAdjacency:
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Apply :func:`find_region_pairs` to the nearest neighbors."""
-        return find_region_pairs(labels, self.neighbors)
+        return find_region_pairs(labels, self._all, _NEAREST)
+
+    def boundary(self, labels: Tensor) -> Tensor:
+        """Return the points with a nearest neighbor in another region, also unlabeled points."""
+        no_table = labels.new_empty((0, 0), dtype=torch.int64)
+        return nonzero_rows(_mark_boundary(labels.to(torch.int32), self._all, _NEAREST, no_table))
 
 
-def find_region_pairs(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
+def find_region_pairs(
+    labels: Tensor, neighbors: Neighbors, columns: slice = slice(None)
+) -> tuple[Tensor, Tensor]:
     """Return pairs of adjacent regions and the number of edges between them.
 
-    For labels ``(N,)``, negative if unlabeled: pairs ``(E, 2)``, smaller label first, ascending,
-    and counts ``(E,)``.
+    For labels ``(N,)``, negative if unlabeled, and some columns of the lists: pairs ``(E, 2)``,
+    smaller label first, ascending, and counts ``(E,)``.
     """
-    edges = _RegionEdges(labels, neighbors)
+    edges = _RegionEdges(labels, neighbors, columns)
     return edges.pairs, edges.counts
 
 
@@ -164,66 +166,89 @@ class _RegionEdges:
     ``pairs`` ``(E, 2)`` are the adjacent regions, ascending, and ``counts`` ``(E,)`` their edges.
     """
 
-    def __init__(self, labels: Tensor, neighbors: Neighbors) -> None:
+    def __init__(self, labels: Tensor, neighbors: Neighbors, columns: slice = slice(None)) -> None:
         # int32 indexing is three times faster.
-        self._labels, self._neighbors = labels.to(torch.int32), neighbors
-        self._num_regions = int(labels.max()) + 1 if len(labels) else 0
-        self._width = max(neighbors.indices.shape[1], 1)
-        self._at_once = limit_rows(ROWS_IN_CACHE, self._width)
-        meets = torch.empty_like(labels, dtype=torch.bool)
+        self._labels, self._neighbors, self._columns = labels.to(torch.int32), neighbors, columns
+        self._num_regions = max(int(labels.max()) + 1, 1) if len(labels) else 1
+        self._at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
+        # More possible pairs than points are too many for a table.
+        size = self._num_regions if self._num_regions**2 <= len(labels) else 0
+        table = labels.new_zeros((size, size), dtype=torch.int64)
+        meets = _mark_boundary(self._labels, neighbors, columns, table)
+        self._rows = nonzero_rows(meets & (self._labels >= 0)).to(torch.int32)
+        self._keys = nonzero_rows(table)
+        self.counts = table.flatten()[self._keys]
+        if len(self._rows) and not len(self._keys):
+            chunks = torch.split(self._rows, self._at_once)
+            keys = torch.cat([self._find(rows)[3].clone() for rows in chunks])
+            self._keys, self.counts = torch.unique(keys, return_counts=True)
+        first, second = self._keys // self._num_regions, self._keys % self._num_regions
+        self.pairs = torch.stack([first, second], dim=1)
 
-        def mark(chunk: slice) -> None:
-            meets[chunk] = self._at_boundary(chunk)
-
-        map_chunks(mark, len(labels), self._at_once, labels.device)
-        self._rows = nonzero_rows(meets).to(torch.int32)
-        # Keeping small tensors of every chunk would fragment the heap (glibc).
-        counts: Counter[int] = Counter()
-        for rows in torch.split(self._rows, self._at_once):
-            values = torch.unique(self._boundary_edges(rows)[2], return_counts=True)
-            counts.update(dict(zip(*(of_chunk.tolist() for of_chunk in values), strict=True)))
-        self._keys = labels.new_tensor(sorted(counts), dtype=torch.int64)
-        self.counts = labels.new_tensor([counts[key] for key in sorted(counts)], dtype=torch.int64)
-        num_regions = max(self._num_regions, 1)
-        self.pairs = torch.stack([self._keys // num_regions, self._keys % num_regions], dim=1)
-
-    def _at_boundary(self, rows: slice) -> Tensor:
-        """Return which points have a neighbor in another region, shape ``(n,)``."""
-        label, near = self._labels[rows], self._neighbors.select(rows)
-        if kernels.serve(label, *near):
-            return kernels.call("at_boundary", self._labels, label, *near)[0]
-        return self._crossing_neighbors(label, near)[0].any(dim=1)
-
-    def _crossing_neighbors(self, label: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
-        """Return a mask of the neighbors in another region, and their labels."""
-        other = near.gather(self._labels)
-        crosses = (other != label[:, None]) & (other >= 0) & (label >= 0)[:, None]
-        return crosses if near.valid is None else crosses & near.valid, other
-
-    def _boundary_edges(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the flat list indices of boundary edges, the neighbor lists, and the pairs."""
-        label, near = self._labels[rows], self._neighbors.select(rows)
+    def _find(self, rows: Tensor) -> list[Tensor]:
+        """Return end points and columns of the edges of points, and the keys of their pairs."""
+        low, high, _ = self._columns.indices(self._neighbors.indices.shape[1])
+        width = max(high - low, 1)
+        if _are_served(self._labels, self._neighbors):
+            where = self._labels, *self._neighbors, rows, low, high, self._num_regions
+            *edges, count = kernels.call("crossing_edges", *where)
+            scratch.release()
+            return [values.view(-1)[: int(count)] for values in edges]
+        near = self._neighbors.select(rows)
         scratch.release()
-        crosses, other = self._crossing_neighbors(label, near)
-        flat_index = nonzero_rows(crosses)
-        first = label.index_select(0, flat_index // self._width)
-        second = other.reshape(-1).index_select(0, flat_index)
-        lower, higher = torch.minimum(first, second), torch.maximum(first, second)
-        return flat_index, near.indices, lower.long() * self._num_regions + higher
+        chosen = nonzero_rows(_crosses(self._labels, rows, near, self._columns))
+        source = rows.index_select(0, chosen // width)
+        targets = near.indices[:, self._columns].reshape(-1).index_select(0, chosen)
+        ends = torch.stack([self._labels.index_select(0, end) for end in (source, targets)])
+        keys = ends.amin(dim=0).long() * self._num_regions + ends.amax(dim=0)
+        return [source, targets, chosen % width, keys]
 
     def map_contacts(self, work: Callable[[_Contacts], Returned]) -> Iterator[Returned]:
         """Yield the results of ``work`` for all edges in order, one chunk of points at a time."""
 
         def find(rows: Tensor) -> Returned:
-            flat_index, targets, keys = self._boundary_edges(rows)
-            source, column = flat_index // self._width, flat_index % self._width
-            targets = targets.reshape(-1).index_select(0, flat_index)
-            pair = torch.searchsorted(self._keys, keys)
-            return work(_Contacts(pair, rows.index_select(0, source), targets, column))
+            *edges, keys = self._find(rows)
+            return work(_Contacts(torch.searchsorted(self._keys, keys), *edges))
 
         chunks = torch.split(self._rows, self._at_once)
         for batch in split_rows(len(chunks), _CHUNKS_AT_ONCE):
             yield from map_tasks(find, chunks[batch], self._rows.device)
+
+
+def _are_served(labels: Tensor, neighbors: Neighbors) -> bool:
+    """Return whether kernels support lists, which they must not copy for each chunk of rows."""
+    present = [part for part in neighbors if part is not None]
+    return kernels.serve(labels, *present) and all(part.is_contiguous() for part in present)
+
+
+def _mark_boundary(labels: Tensor, neighbors: Neighbors, columns: slice, table: Tensor) -> Tensor:
+    """Return which points have a neighbor in another region, ``(N,)``; labels are int32.
+
+    Kernels also count the edges of each pair of regions in a ``table`` ``(R, R)``, if not empty.
+    """
+    meets = torch.empty_like(labels, dtype=torch.bool)
+
+    def mark(chunk: slice) -> None:
+        if _are_served(labels, neighbors):
+            low, high, _ = columns.indices(neighbors.indices.shape[1])
+            where = chunk.start, chunk.stop, low, high
+            kernels.call("mark_boundary", labels, *neighbors, *where, table, meets)
+        else:
+            near = neighbors.select(chunk)
+            meets[chunk] = _crosses(labels, chunk, near, columns).any(dim=1)
+
+    at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
+    map_chunks(mark, len(labels), at_once, labels.device)
+    return meets
+
+
+def _crosses(labels: Tensor, rows: Rows, near: Neighbors, columns: slice) -> Tensor:
+    """Return a mask of the neighbors of points in another region."""
+    valid = None if near.valid is None else near.valid[:, columns]
+    near = Neighbors(near.indices[:, columns], valid)
+    other = near.gather(labels)
+    crosses = (other != labels[rows, None]) & (other >= 0)
+    return crosses if valid is None else crosses & valid
 
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
@@ -241,9 +266,14 @@ def _edge_vectors(points: Tensor, contacts: _Contacts) -> Tensor:
 def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing: Tensor) -> Tensor:
     """Return the length of each pair's line covered by edge midpoints, shape ``(E,)``."""
     origin = points[:1].double()
-    cells = array("q"), array("q")
 
-    def find_cells(contacts: _Contacts) -> tuple[Tensor, Tensor]:
+    def find_cells(contacts: _Contacts) -> tuple[Tensor, ...]:
+        if kernels.serve(points, contacts.source):
+            slots = torch.empty(2 ** (2 * len(contacts.pair)).bit_length(), dtype=torch.int32)
+            edges = contacts.source, contacts.target, contacts.pair
+            lines = along.double(), spacing, _MAX_CELL, slots
+            *found, count = kernels.call("line_cells", points, *edges, *lines)
+            return tuple(values[: int(count)].clone() for values in found)
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)
         start, end = (points.index_select(0, rows).double() - origin for rows in ends)
@@ -251,11 +281,7 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
         cell = position.nan_to_num(0, 0, 0).clamp(-_MAX_CELL, _MAX_CELL).floor().long()
         return unique_cells(contacts.pair, cell)
 
-    for found in edges.map_contacts(find_cells):
-        for indices, values in zip(cells, found, strict=True):
-            indices.frombytes(values.cpu().numpy().tobytes())
-    columns = (torch.from_numpy(np.array(indices)).to(points.device) for indices in cells)
-    pair, cell = unique_cells(*columns)
+    pair, cell = unique_cells(*map(torch.cat, zip(*edges.map_contacts(find_cells), strict=True)))
     # An interval of n cells on average meets n + 1: count the steps from cell to cell.
     is_next = (pair[1:] == pair[:-1]) & (cell[1:] == cell[:-1] + 1)
     steps = torch.bincount(pair[1:][is_next], minlength=len(spacing))

@@ -81,7 +81,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
     if heading is None:
         warn(
             "align_axes: expected vertical planes (walls) to define x and y, got none large "
-            "enough. Only the up axis is aligned.",
+            "enough. Only the up axis is aligned."
         )
         heading = horizontal_toward(unit_axis(upwards), axis)
     rotation = torch.stack([heading, torch.linalg.cross(axis, heading), axis])

@@ -108,11 +108,7 @@ def _write_bits(target: NDArray[np.uint8], flags: Tensor) -> None:
 
 
 def _become_seeds(
-    cloud: GrowingInput,
-    config: GrowingConfig,
-    rows: slice,
-    limit: Tensor,
-    connected: Tensor | None,
+    cloud: GrowingInput, config: GrowingConfig, rows: slice, limit: Tensor, connected: Tensor | None
 ) -> Tensor:
     """Return a mask of the edges that make the neighbor a seed, shape ``(n, K)``."""
     target = cloud.neighbors.gather(cloud.curvature, rows)
@@ -147,10 +143,8 @@ def accept_edges(
     connected neighbors, valid only where the first holds. The second is None without ``connect``,
     which tests the connectivity of the edges in a mask.
     """
-    ids = rows
-    if isinstance(ids, slice):
-        ids = torch.arange(ids.start, ids.stop, device=cloud.points.device)
     near, signed = cloud.neighbors.select(rows), cloud.signed_normals
+    ids = near.indices[:, 0].long()
     max_angle_deg = cloud.angle_fraction * config.max_angle_deg
     angle = distance = None
     if max_angle_deg < 90 or signed:
@@ -161,7 +155,7 @@ def accept_edges(
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
         limits = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
         (joins,) = kernels.call(
-            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids.long(), *limits, signed
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids, *limits, signed
         )
     else:
         joins = are_valid(near, ids, cloud.valid)
@@ -229,11 +223,7 @@ def within_reach(
 
 
 def are_coplanar(
-    cloud: GrowingInput,
-    rows: Rows,
-    mask: Tensor,
-    compared: Tensor | None,
-    floor_fraction: float,
+    cloud: GrowingInput, rows: Rows, mask: Tensor, compared: Tensor | None, floor_fraction: float
 ) -> Tensor:
     """Return a mask of the candidate neighbors on the point's plane, eq. (11).
 

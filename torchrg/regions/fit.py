@@ -42,8 +42,6 @@ _MAX_FACET_RMS = 1.5
 _MIN_HEIGHT = 0.2
 """An arc of width w whose normals spread by a is 0.45 a w thick, a spherical cap 0.41 a w. A region
 thinner than 0.2 a w is a plane with noisy normals."""
-
-
 _MAX_RMS, _MAX_RMS_OF_FEW = 0.2, 0.1
 """Maximum RMS distance of flat regions to their plane, as a fraction of their length: a cube has
 0.29, clutter in rooms up to 0.19, a slab a third as thick as long 0.1. The second limit is for
@@ -144,7 +142,7 @@ def fit_planes(
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
+def mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean normal of each region, up to sign, and its spread in degrees."""
     columns = segments.gather_centered(normals, normals.new_zeros(len(segments.counts), 3).double())
     _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
@@ -157,7 +155,7 @@ def _fit_chunk(
 ) -> RegionPlanes:
     """Fit planes to one chunk of regions; see :func:`fit_planes`."""
     if shared is None:
-        mean_normal, spread = _mean_normals(segments, normals)
+        mean_normal, spread = mean_normals(segments, normals)
     else:
         mean_normal, spread = shared.double(), torch.zeros_like(shared[:, 0])
     origin = segments.first(points).double()

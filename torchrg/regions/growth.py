@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
-from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, limit_rows, map_chunks, split_rows
+from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, limit_rows, map_chunks
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
@@ -166,11 +165,9 @@ def label_regions(
         labels = labels if split is labels else rank_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = rank_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
-    if bool((labels >= 0).any()):
-        solid = find_solid_regions(cloud, labels)
-        if bool(solid.any()):
-            labels = rank_by_size(labels.where(~solid[labels] & (labels >= 0), UNLABELED), 1)
-    return labels
+    solid = find_solid_regions(cloud, labels)
+    kept = torch.cat([~solid, solid.new_zeros(1)])
+    return rank_by_size(labels.where(kept[labels], UNLABELED), 1)
 
 
 def checked_cloud(
@@ -277,10 +274,6 @@ def rank_by_count(labels: Tensor) -> Tensor:
 
     ``labels`` ``(N,)`` are per point, -1 if unlabeled. The last of the numbers ``(M + 1,)`` belongs
     to -1, so that labels can index them.
-
-    Example:
-        >>> rank_by_count(torch.tensor([0, 1, 1, -1])).tolist()
-        [1, 0, -1]
     """
     counts = torch.bincount(labels + 1, minlength=1)[1:]
     numbers = counts.argsort(descending=True, stable=True).argsort()
@@ -343,7 +336,9 @@ def grow_fifo(
     lists, free, is_seed_itself = neighbors.numpy(), valid.numpy().copy(), is_seed.numpy()
     roots, slots = np.full(len(free), UNLABELED, dtype=np.int32), np.empty(len(free), np.int32)
 
-    def claim(root: int, seeds: NDArray[np.integer], *, promoted: bool) -> NDArray[np.integer]:
+    def claim(
+        root: np.integer, seeds: NDArray[np.integer], *, promoted: bool
+    ) -> NDArray[np.integer]:
         """Assign unassigned neighbors of the seeds to a region, and return the new seeds."""
         near = lists[seeds]
         claims = _unpack(joins, seeds, near) & free[near]
@@ -359,7 +354,7 @@ def grow_fifo(
         new: NDArray[np.integer] = targets[becomes_seed & (slots[targets] == numbers)]
         return new
 
-    for root in _unassigned(order.numpy(), free):
+    for root in order.numpy():
         if not free[root]:
             continue
         free[root], roots[root] = False, root
@@ -378,10 +373,3 @@ def _unpack(
     of_rows = bits.numpy()[rows].view(np.uint8)
     flags = np.unpackbits(of_rows, axis=1, count=near.shape[1], bitorder="little")
     return flags.view(np.bool_)
-
-
-def _unassigned(order: NDArray[np.int32], free: NDArray[np.bool_]) -> Iterator[int]:
-    """Yield the unassigned points chunk by chunk; a full list would take 36 bytes per point."""
-    for rows in split_rows(len(order), ROWS_AT_ONCE):
-        chunk = order[rows]
-        yield from chunk[free[chunk]].tolist()

@@ -1,6 +1,7 @@
 """Region refinement after growing: boundary reassignment and merging of coplanar regions."""
 
 import heapq
+import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -8,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows
+from torchrg._parallel import ROWS_IN_CACHE, map_chunks, nonzero_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
@@ -22,34 +23,28 @@ _NORMAL_AGREEMENT = 0.3
 """Fraction of ``max_angle_deg``. A region below ``min_size`` is kept before boundary assignment if
 the RMS angle of its normals is smaller. About half of a small surface is boundary. Other small
 regions are clutter."""
-
 _MAX_PASSES = 10
 """Maximum number of boundary passes. Each pass revisits the neighbors of changed points, so narrow
 strips are filled from their ends."""
-
 _ROUNDING = 0.01
 """Distance differences below this many thicknesses are ignored."""
-
 _MIN_STEP = 1.5
 """Minimum distance of two levels, in thicknesses; closer planes are parts of one surface."""
-
 _LEVEL_REACH = 3.0
 """Maximum distance of a point to its level, in thicknesses of the nearer plane."""
-
 _MIN_ONE_SIDED = 0.5
 """A region ends at another plane if the mean signed distance of its points to that plane is at
 least this fraction of the mean absolute distance. It is near 0 for a region that continues behind
 it."""
-
-
-_MAX_FACET_TURN_DEG = 25.0
-"""Maximum angle between either of two facets and their joint plane. Facets of ten points come
-closest to it; the two sides of a thin board differ by 90 degrees."""
-
-_MAX_TILT, _MAX_FACET_TILT = 1.0, 2 / 3
+_MIN_FACET_COSINE = math.cos(math.radians(25.0))
+"""Minimum cosine of the angle between either of two facets and their joint plane. Facets of ten
+points come closest to it; the two sides of a thin board differ by 90 degrees."""
+_MAX_FACET_TILT = 2 / 3
 """Maximum RMS distance, in tolerances, that tilting to the joint plane adds to the points of a
-region, and of a facet. Otherwise one plane across a 5 cm step would explain two shelves. White
-noise tilts small regions more."""
+facet. Otherwise one plane across a 5 cm step would explain two shelves."""
+_MAX_FACET_STEP = 2.0
+"""Maximum distance of the mean of a facet to the joint plane, in median reaches of the regions. A
+warp bends a surface, but does not double it, as a table top and its underside do."""
 
 
 class Adjacency(Protocol):
@@ -106,10 +101,12 @@ def refine_regions(
         labels = refine_borders(cloud, labels, planes, reach)
         labels = assign_levels(cloud, labels, planes)
         if config.facet_tolerance is not None:
-            # A gap narrower than a neighborhood may divide a faceted surface. With white noise, it
-            # separates faces such as cushions side by side; rooms differ little with all neighbors.
-            near = cloud.neighbors if faceted else adjacency.neighbors
-            contacts, tolerance = find_region_pairs(labels, near), float(config.facet_tolerance)
+            # A gap narrower than a neighborhood may divide a faceted surface. With white noise,
+            # growth crosses it on one plane: regions still apart, such as cushions side by side,
+            # are surfaces of their own. Results of rooms are equal with 4 to 16 neighbors.
+            all_pairs = find_region_pairs(labels, cloud.neighbors) if faceted else None
+            contacts = all_pairs or adjacency.contacts(labels)
+            tolerance = float(config.facet_tolerance)
             labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
     return labels
 
@@ -215,11 +212,7 @@ def _pairs_to_merge(
 
 
 def merge_coplanar(
-    labels: Tensor,
-    contacts: tuple[Tensor, Tensor],
-    planes: RegionPlanes,
-    *,
-    tolerance: float,
+    labels: Tensor, contacts: tuple[Tensor, Tensor], planes: RegionPlanes, *, tolerance: float
 ) -> Tensor:
     """Greedily merge adjacent coplanar regions, best fit first.
 
@@ -252,15 +245,17 @@ def merge_facets(
     thickness does not show how far it may be from the surface. Two regions are merged, smallest
     distance first, if the RMS distance of each to their joint plane is at most ``tolerance`` (in
     coordinate units). The joint plane must be tilted by at most 25 degrees against both, since a
-    strip narrower than the tolerance is close to any adjacent plane. The tilt alone must not move
-    the points of either by more than two thirds of the tolerance, or the tolerance if surfaces are
-    not ``faceted``. The facets of a bend are thus merged only if they are nearly coplanar. For
-    ``contacts`` and labels see :func:`merge_coplanar`.
+    strip narrower than the tolerance is close to any adjacent plane. If surfaces are ``faceted``,
+    the tilt alone must not move the points of either by more than two thirds of the tolerance, so
+    the facets of a bend are merged only if they are nearly coplanar. Nor may the mean of either
+    move by more than the noise of nearby points explains. For ``contacts`` and labels see
+    :func:`merge_coplanar`.
     """
-    scale, noise = torch.full_like(planes.floor, tolerance), torch.zeros_like(planes.floor)
-    moments = _region_moments(planes)._replace(scale=scale, noise=noise)
-    max_tilt = (_MAX_FACET_TILT if faceted else _MAX_TILT) * tolerance
-    return _merge(labels, contacts, moments, 1.0, max_tilt=max_tilt)
+    moments, limit = _region_moments(planes), torch.full_like(planes.floor, tolerance)
+    moments, bounds = moments._replace(scale=limit, noise=0 * limit), (torch.inf, torch.inf)
+    if faceted:
+        bounds = _MAX_FACET_TILT * tolerance, _MAX_FACET_STEP * float(planes.reach.median())
+    return _merge(labels, contacts, moments, 1.0, bounds)
 
 
 class _Moments(NamedTuple):
@@ -313,52 +308,44 @@ def _merge(
     contacts: tuple[Tensor, Tensor],
     moments: _Moments,
     tolerance: float,
-    *,
-    max_tilt: float | None = None,
+    bounds: tuple[float, float] | None = None,
 ) -> Tensor:
-    """Merge regions in contact within both limits of their misfit."""
+    """Merge regions in contact whose :func:`_misfit` is at most ``tolerance``."""
     pairs = contacts[0][contacts[1] >= MIN_CONTACTS].cpu()
     groups = _Moments(*(values.cpu().clone() for values in moments))
     adjacent: list[set[int]] = [set() for _ in groups.weight]
-    owner, age = list(range(len(adjacent))), [0] * len(adjacent)
+    owner, age = torch.arange(len(adjacent)), [0] * len(adjacent)
     queue: list[tuple[float, int, int, int, int]] = []
 
     def offer(pairs: Tensor) -> None:
-        first, second = pairs.unbind(dim=1)
-        sides = groups.select(first), groups.select(second)
-        misfits = _misfit(*sides, _combined(*sides), max_tilt)
+        pairs = pairs.sort(dim=1).values
+        first, second = (groups.select(side) for side in pairs.unbind(dim=1))
+        misfits = _misfit(first, second, _combined(first, second), bounds)
         for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
+            adjacent[a].add(b)
+            adjacent[b].add(a)
             if misfit <= tolerance:
                 heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
 
-    for a, b in pairs.tolist():
-        adjacent[a].add(b)
-        adjacent[b].add(a)
     offer(pairs)
     while queue:
-        _, a, b, age_a, age_b = heapq.heappop(queue)
-        if owner[a] != a or owner[b] != b or (age[a], age[b]) != (age_a, age_b):
+        _, a, b, *ages = heapq.heappop(queue)
+        if [age[a], age[b]] != ages:
             continue
         both = _combined(groups.select(slice(a, a + 1)), groups.select(slice(b, b + 1)))
         for values, joined in zip(groups, both, strict=True):
             values[a] = joined[0]
         owner[b] = a
         age[a] += 1
-        adjacent[a] = {_root(owner, c) for c in adjacent[a] | adjacent[b]} - {a}
-        for c in adjacent[a]:
-            adjacent[c].add(a)
-        joined_pairs = [(min(a, c), max(a, c)) for c in adjacent[a]]
+        age[b] += 1
+        for c in adjacent[b]:
+            adjacent[c].remove(b)
+        joined_pairs = [(a, c) for c in (adjacent[a] | adjacent[b]) - {a}]
         offer(torch.tensor(joined_pairs, dtype=torch.int64).view(-1, 2))
-    roots = [_root(owner, i) for i in range(len(owner))]
-    return remap_labels(labels, torch.tensor(roots, dtype=torch.int64, device=labels.device))
-
-
-def _root(owner: list[int], i: int) -> int:
-    """Return the representative of region i (union-find)."""
-    while owner[i] != i:
-        owner[i] = owner[owner[i]]
-        i = owner[i]
-    return i
+    # Regions join those of smaller labels, whose owner is known first.
+    for b, a in enumerate(owner.tolist()):
+        owner[b] = owner[a]
+    return remap_labels(labels, owner.to(labels.device))
 
 
 def _combined(a: _Moments, b: _Moments) -> _Moments:
@@ -377,10 +364,13 @@ def _combined(a: _Moments, b: _Moments) -> _Moments:
     return _Moments(weight, mean, covariance, scale, noise, values[:, 0], axes[:, :, 0])
 
 
-def _misfit(a: _Moments, b: _Moments, both: _Moments, max_tilt: float | None = None) -> Tensor:
+def _misfit(
+    a: _Moments, b: _Moments, both: _Moments, bounds: tuple[float, float] | None = None
+) -> Tensor:
     """Return the larger of both regions' RMS distances to the joint plane, in their own scales.
 
-    With ``max_tilt`` it is infinite if the joint plane is tilted too far against either region's.
+    With ``bounds`` it is infinite if the joint plane is tilted too far against the plane of either
+    region, or too far from its mean: the maximum RMS distance by the tilt, and that of the mean.
     """
     misfits, normal = [], both.normal
     for side, other in ((a, b), (b, a)):
@@ -389,10 +379,10 @@ def _misfit(a: _Moments, b: _Moments, both: _Moments, max_tilt: float | None = N
         rms = (variance.clamp(min=0) + shift * shift).sqrt()
         lent = torch.where(other.weight > side.weight, other.noise, 0.0)
         misfits.append(torch.where(rms > 0, rms / torch.maximum(side.scale, lent), 0.0))
-        if max_tilt is not None:
-            tilted = unsigned_angle_deg(side.normal, normal) > _MAX_FACET_TURN_DEG
-            tilted |= variance - side.min_variance > max_tilt**2
-            misfits[-1].masked_fill_(tilted, torch.inf)
+        if bounds is not None:
+            apart = (side.normal * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
+            apart |= variance - side.min_variance > bounds[0] ** 2
+            misfits[-1].masked_fill_(apart | (shift.abs() > bounds[1]), torch.inf)
     return torch.maximum(*misfits)
 
 
@@ -441,7 +431,7 @@ def _reassign(
     """
     adjacency = KnnAdjacency(cloud.neighbors)
     labels = labels.clone()
-    rows = _boundary_points(labels, adjacency)
+    rows = adjacency.boundary(labels)
     for _ in range(_MAX_PASSES):
         rows = rows[movable[labels[rows]]]
         near = adjacency.neighbor_rows(rows)
@@ -487,20 +477,6 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
         return label.index_copy(0, both[moved], other[both[moved]])
 
     return _reassign(cloud, labels, flat, choose)
-
-
-def _boundary_points(labels: Tensor, adjacency: KnnAdjacency) -> Tensor:
-    """Return the boundary points: points with a nearest neighbor in another region."""
-    # int32 indexing is three times faster.
-    narrow = labels.to(torch.int32)
-
-    def find(chunk: slice) -> Tensor:
-        near = Neighbors(adjacency.neighbor_rows(chunk)).gather(narrow)
-        is_adjacent = (near != narrow[chunk, None]) & (near >= 0)
-        rows: Tensor = chunk.start + nonzero_rows(is_adjacent.any(dim=1))
-        return rows
-
-    return torch.cat(map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device))
 
 
 def _choose_regions(

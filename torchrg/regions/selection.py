@@ -116,12 +116,7 @@ def keep_planes(seg: Segmentation, rows: Tensor) -> Segmentation:
 
 
 def renumber_planes(labels: Tensor, rows: Tensor, num_planes: int) -> Tensor:
-    """Map labels to the indices of their planes in ``rows``, -1 if not selected.
-
-    Example:
-        >>> renumber_planes(torch.tensor([0, 1, 2, -1]), torch.tensor([2, 0]), 3).tolist()
-        [1, -1, 0, -1]
-    """
+    """Map labels to the indices of their planes in ``rows``, -1 if not selected."""
     index_of = labels.new_full((num_planes + 1,), UNLABELED)
     index_of[rows] = torch.arange(len(rows), device=labels.device, dtype=labels.dtype)
     return index_of[labels.long()]

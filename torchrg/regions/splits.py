@@ -364,9 +364,10 @@ def _find_levels(
     residual, average, noise = _measure_residuals(cloud, region, planes)
     adjacency = KnnAdjacency(cloud.neighbors)
     limit = _SEED_NOISE_FACTOR * torch.cat([noise, noise.new_tensor([torch.inf])])
-    level = _connected_points(average.abs() > limit[region], 2 * region + (average > 0), adjacency)
+    nearest, side = adjacency.neighbor_rows(slice(None)), 2 * region + (average > 0)
+    level = connected_points(side.where(average.abs() > limit[region], UNLABELED), nearest)
     step = _median_steps(level, residual)
-    level = _connected_points(average.abs() > step[level] / 2, level, adjacency)
+    level = connected_points(level.where(average.abs() > step[level] / 2, UNLABELED), nearest)
     step, owner = _median_steps(level, residual)[:-1], Segments(level).first(region)
     min_step = (_STEP_NOISE_FACTOR * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
     num_points = torch.bincount(level + 1, minlength=1)[1:]
@@ -427,14 +428,15 @@ def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
     return (middle + total / segments.sum(near.double()).clamp(min=1)).float()
 
 
-def _connected_points(chosen: Tensor, groups: Tensor, adjacency: KnnAdjacency) -> Tensor:
-    """Label the connected components of chosen points within each group, -1 for other points."""
-    rows = nonzero_rows(chosen & (groups >= 0))
-    index = torch.full_like(groups, UNLABELED).index_copy_(
-        0, rows, torch.arange(len(rows), device=rows.device)
-    )
-    near = adjacency.neighbor_rows(rows).long()
-    joined = (index[near] >= 0) & (groups[near] == groups[rows, None])
+def connected_points(groups: Tensor, nearest: Tensor) -> Tensor:
+    """Label the connected components of points within each group, -1 if that is negative.
+
+    ``nearest`` ``(N, K)`` are the adjacent points, the first component that of the first point.
+    """
+    rows = nonzero_rows(groups >= 0)
+    near, index = nearest[rows].long(), torch.full_like(groups, UNLABELED)
+    index[rows] = torch.arange(len(rows), device=rows.device)
+    joined = groups[near] == groups[rows, None]
     ends = index[rows, None].expand_as(near)[joined], index[near][joined]
     return index.index_copy_(0, rows, _components(len(rows), *ends))
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from torchrg import kernels
+from torchrg._checks import eager_only
 from torchrg._parallel import ROWS_AT_ONCE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import SuperpointsConfig, is_terraced
 from torchrg.linalg.angles import sq_chords
@@ -20,8 +20,10 @@ from torchrg.neighbors import distinct_points, measure_sampling, search_knn
 from torchrg.neighbors.knn import prepare_search
 from torchrg.neighbors.order import DistinctPoints, finite_rows
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
-from torchrg.regions.fit import fit_planes
+from torchrg.regions.edges import neighborhood_radii
+from torchrg.regions.fit import fit_planes, mean_normals
 from torchrg.regions.growth import rank_by_count
+from torchrg.regions.splits import connected_points
 from torchrg.structures import UNLABELED, Neighbors, Sampling, Superpoints
 
 _NUM_MEASURED = 50
@@ -62,6 +64,7 @@ _MIN_SIZE_RATIO = 16
 they hardly change it. Otherwise a floor would take one speck per round."""
 
 
+@eager_only
 def partition_points(
     points: Tensor,
     normals: Tensor,
@@ -238,11 +241,9 @@ def _blend_with_planes(normals: Tensor, labels: Tensor) -> Tensor:
         return normals
     plane = torch.unique(labels[rows], return_inverse=True)[1]
     inputs = normals[rows].double()
-    segments, columns = Segments(plane), inputs.unbind(dim=1)
-    products = [segments.mean(segments.gather(a * b)) for a in columns for b in columns]
-    values, axes = eigh3_lapack(torch.stack(products, dim=1).view(-1, 3, 3))
-    flat = values[:, 2] >= math.cos(math.radians(_MAX_SPREAD_DEG)) ** 2
-    shared = torch.where(flat[:, None], axes[:, :, 2], 0.0)[plane]
+    axes, spread = mean_normals(Segments(plane), inputs)
+    flat = spread <= _MAX_SPREAD_DEG
+    shared = torch.where(flat[:, None], axes, 0.0)[plane]
     shared = torch.where((inputs * shared).sum(dim=1, keepdim=True) < 0, -shared, shared)
     blended = functional.normalize(torch.lerp(inputs, shared, _PLANE_FRACTION), dim=1)
     return normals.index_copy(0, rows, torch.where(flat[plane, None], blended, inputs).to(normals))
@@ -302,31 +303,15 @@ class _Graph(NamedTuple):
 
 def _median_spacing(positions: Tensor, neighbors: Neighbors) -> float:
     """Return the median point spacing, assuming evenly spread points."""
-    last = neighbors.indices[:, -1].long()
-    reach = (positions[last].double() - positions.double()).norm(dim=1).median()
-    return float(reach) / _RADIUS_SPACINGS
+    return float(neighborhood_radii(positions.double(), neighbors).median()) / _RADIUS_SPACINGS
 
 
 def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
     """Return the initial region of each point ``(n,)``: connected parts of planes, or the point."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    def find(rows: slice) -> tuple[Tensor, Tensor]:
-        inside = (labels[nearest[rows]] == labels[rows, None]) & (labels[rows, None] >= 0)
-        return inside.sum(dim=1), nearest[rows][inside].to(torch.int32)
-
-    parts = map_chunks(find, len(labels), ROWS_AT_ONCE, labels.device)
-    counts, targets = (torch.cat(parts) for parts in zip(*parts, strict=True))
-    starts = functional.pad(counts.cumsum(0), (1, 0))
-    links = np.ones(len(targets), dtype=np.int8)
-    shape = (len(labels), len(labels))
-    edges = csr_array((links, targets.numpy(), starts.numpy()), shape=shape)
-    indices = torch.from_numpy(connected_components(edges, directed=False)[1]).long()
-    # Numbered by first points, ties do not depend on scipy's order.
-    first = torch.full((int(indices.max()) + 1,), len(indices))
-    first = first.scatter_reduce(0, indices, torch.arange(len(indices)), "amin")
-    return first.argsort().argsort()[indices]
+    segments, regions = Segments(connected_points(labels, nearest)), torch.arange(len(labels))
+    regions[segments.rows] = segments.broadcast(segments.first(regions))
+    initial: Tensor = torch.unique(regions, return_inverse=True)[1]
+    return initial
 
 
 def _initial_regions(

@@ -3,7 +3,7 @@
 from torchrg.render.cameras import make_camera
 from torchrg.render.colors import color_curvature, color_normals, color_planes, color_sharp
 from torchrg.render.page import make_page, write_page
-from torchrg.render.pictures import render_cloud, render_points, write_png
+from torchrg.render.pictures import render_cloud, write_png
 
 __all__ = [
     "color_curvature",
@@ -13,7 +13,6 @@ __all__ = [
     "make_camera",
     "make_page",
     "render_cloud",
-    "render_points",
     "write_page",
     "write_png",
 ]

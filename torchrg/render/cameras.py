@@ -76,8 +76,7 @@ def fit_camera(
         points: Points to show, shape ``(N, 3)``, finite.
         axes: Right, down and forward, shape ``(3, 3)``.
         width: Width of the image, in pixels.
-        height: Height of the image. Default: fitted to the points, from a quarter of the width to
-            the width.
+        height: Height of the image. Default: fitted, from a quarter of the width to the width.
         field_of_view_deg: Field of view over the larger of width and height, in degrees.
     """
     across = points.double() @ axes.to(points.device).T

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.metrics.contingency import check_labels, contingency_table
+from torchrg.metrics.contingency import check_labels, contingency_table, is_first
 from torchrg.metrics.labels import match_regions
 from torchrg.render.colors import UNLABELED_GRAY, color_curvature, color_normals, color_sharp
 from torchrg.structures import UNLABELED
@@ -35,8 +35,7 @@ OUTCOMES = {
 }
 """Outcomes of a point against ground truth: color and meaning."""
 _OCTAHEDRON_STEPS = 254
-"""Steps along the sides of the octahedral map: about one degree. Even, so that the axes are
-exact."""
+"""Steps along the sides of the octahedral map: about a degree. Even, for exact axes."""
 _DIRECTION_BITS = 6
 """Bits per coordinate of the octahedral map that select a color."""
 _CURVATURE_END = 0.1
@@ -73,8 +72,7 @@ def make_channels(
     """Yield the available color channels, in the order of :data:`COLOR_MODES`.
 
     Args:
-        fields: Fields of n points; see :class:`torchrg.Cloud`. Labels and superpoints
-            are consecutive.
+        fields: Fields of n points; see :class:`torchrg.Cloud`. IDs are consecutive.
         ground_truth: Ground-truth ``labels`` or ``normals`` of the same points.
         palettes: Results of :func:`torchrg.render.colors.palette_of_planes` for the available modes
             of ``plane`` and ``superpoint``, with rows of the n points.
@@ -158,8 +156,7 @@ def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
 
     Returns:
         Shape ``(N,)``, int64: 0 if the region matches the point's plane, 1 if it is another region
-        with that plane as its largest part, 2 if it consists mostly of other planes, 3 if the point
-        is unlabeled.
+        with that plane as its largest part, 2 if it is mostly of other planes, 3 if unlabeled.
 
     Raises:
         ShapeError: If a shape or dtype is invalid.
@@ -173,11 +170,9 @@ def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
     pairs = match_regions(table)
     partner = torch.full_like(table.region_labels, UNLABELED - 1)
     partner[table.regions[pairs]] = table.face_labels[table.faces[pairs]]
-    # Overlaps sorted by region, largest first; the first of each region is its main plane.
-    order = np.lexsort((-table.overlaps.numpy(), table.regions.numpy()))
-    rows, first = np.unique(table.regions.numpy()[order], return_index=True)
+    largest = is_first(table.regions, -table.overlaps, table.faces)
     main = torch.full_like(table.region_labels, UNLABELED - 1)
-    main[rows] = table.face_labels[table.faces[order[first]]]
+    main[table.regions[largest]] = table.face_labels[table.faces[largest]]
     outcome = torch.full_like(regions, 3)
     labeled = regions != UNLABELED
     indices = torch.searchsorted(table.region_labels, regions[labeled])

@@ -1,5 +1,7 @@
 """Perceptually distinct colors for planes, normals, curvature and sharp points."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -97,8 +99,7 @@ def choose_colors(
     """Choose a palette row for each plane greedily, the largest plane first.
 
     Each chosen color repels later ones with the inverse square of its distance in Lab: the color of
-    an adjacent plane, in ``pairs`` ``(E, 2)``, with its weight, others weakly. Nonnegative entries
-    of ``fixed`` are kept.
+    an adjacent plane, in ``pairs`` ``(E, 2)``, with its weight, others weakly. ``fixed`` ones stay.
 
     Example:
         >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))
@@ -146,7 +147,7 @@ _REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
 """Red, green and blue of regular points (light gray) and of sharp ones (red)."""
 
 
-def color_normals(normals: Points, *, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Tensor:
+def color_normals(normals: Points, *, up: Sequence[float] | str = "z") -> Tensor:
     """Color normals by direction; opposite normals get the same color.
 
     Horizontal surfaces are light gray. Vertical surfaces are colored by the direction they face,
@@ -154,7 +155,7 @@ def color_normals(normals: Points, *, up: tuple[float, float, float] = (0.0, 0.0
 
     Args:
         normals: Unit normals of arbitrary sign, shape ``(*, 3)``; zero if unknown.
-        up: Up direction.
+        up: Up direction: three numbers, or the name of an axis.
 
     Returns:
         Shape ``(*, 3)``, uint8; gray for unknown normals.
@@ -203,9 +204,7 @@ def color_curvature(curvature: Values, *, max_curvature: float = 0.1) -> Tensor:
     tensor = as_tensor("color_curvature", "curvature", curvature)
     check_floating("color_curvature", curvature=tensor)
     if not max_curvature > 0:
-        raise ConfigError(
-            f"color_curvature: expected max_curvature to be positive, got {max_curvature!r}."
-        )
+        raise ConfigError(f"color_curvature: expected max_curvature > 0, got {max_curvature!r}.")
     position = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
     before = position.long().clamp(max=len(_RAMP) - 2)
     ramp = tensor.new_tensor(_RAMP)

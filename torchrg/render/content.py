@@ -1,5 +1,6 @@
 """Content of a viewer: axes, displayed points, planes, and outer sides of surfaces."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import NamedTuple
@@ -79,7 +80,7 @@ class PointSample(NamedTuple):
     sides: Sides
 
 
-def make_frame(cloud: Cloud, up: tuple[float, float, float]) -> PageFrame:
+def make_frame(cloud: Cloud, up: Sequence[float] | str) -> PageFrame:
     """Return the axes of a viewer for its first cloud."""
     third = unit_direction("make_page", up)
     # With z up, x stays x; otherwise use the axis most perpendicular to the up direction.

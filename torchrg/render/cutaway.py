@@ -27,13 +27,11 @@ MIN_FACING = {"cutaway": 0.1, "above": 0.7}
 """Minimum cosine between the outward direction of a side and the direction to the viewer for the
 side to be hidden, by view. From above only nearly horizontal sides obstruct the view."""
 MAX_SIDES = 7
-"""Maximum number of outer sides: bits of a byte, without the last one, which hides planes in a
-viewer."""
+"""Maximum number of outer sides: bits of a byte but the last, which hides planes in a viewer."""
 _MAX_WALLS = 60
 """Maximum number of candidate walls and ceilings, the largest ones; bounds the memory."""
 _ANGLE_DEG = 4.0
-"""Maximum angle for region growing on voxels, in degrees. Voxels have little noise; with more,
-ceilings grow into walls."""
+"""Maximum angle for region growing on voxels, in degrees. With more, ceilings grow into walls."""
 _MIN_SIDE_COSINE = 0.9
 """Minimum cosine between the directions of walls that are hidden together."""
 _MAX_BEYOND_FRACTION = 0.03
@@ -43,13 +41,11 @@ _MIN_INSIDE_FRACTION = 0.05
 _THICKNESS = 1.5
 """Distance to a wall, in voxel edges plus twice its noise, up to which voxels belong to it."""
 _CEILING_DEPTH = 0.15
-"""Depth below a ceiling that is hidden with it, as a fraction of the cloud height, for lamps and
-beams."""
+"""Depth hidden with a ceiling, as a fraction of the cloud height, for lamps and beams."""
 _MAX_PIXELS = 500
 """Maximum side of the image for measuring how much a view shows, in pixels."""
 _AZIMUTHS_DEG = (30.0, 60.0, 120.0, 150.0, 210.0, 240.0, 300.0, 330.0)
-"""Candidate azimuths, in degrees. None is perpendicular to a wall, so both walls of a corner are
-visible."""
+"""Candidate azimuths, in degrees. None is perpendicular to a wall: both of a corner are visible."""
 
 
 class Sides(NamedTuple):
@@ -83,8 +79,7 @@ def find_sides(surface: VisibleSurface, labels: Tensor | None, up: Tensor) -> Si
 
     Args:
         surface: Surface of at least one finite point.
-        labels: Plane of each of its n points, shape ``(n,)``, or negative. Default: from a
-            segmentation of the voxels.
+        labels: Plane of each of its n points, shape ``(n,)``, or negative. Default: from voxels.
         up: Up direction, a unit vector of shape ``(3,)``.
     """
     centers = surface.centers

@@ -57,9 +57,7 @@ def check_gallery(folder: Path, names: Sequence[str]) -> None:
     for name in names:
         page = folder / f"{name}.html"
         if page.parent == folder and page.name.lower() == INDEX:
-            raise FormatError(
-                f"{page}: the viewer of {name} would overwrite the index; rename the scan."
-            )
+            raise FormatError(f"{page}: the viewer of {name} would overwrite the index; rename it.")
         if page.parent.is_dir():
             check_writable(page)
 

@@ -26,8 +26,7 @@ def _result_of(segmentation: Segmentation) -> Result:
     """Return the result of a segmentation; raise if it has no points."""
     if segmentation.points is None:
         raise ConfigError(
-            "Segmentation: expected points to display, got None; use "
-            "dataclasses.replace(seg, points=points)."
+            "Segmentation: expected points, got None; use dataclasses.replace(seg, points=points)."
         )
     points = segmentation.points.numpy(force=True).reshape(-1, 3)
     return Result.from_segmentation(Cloud(points, source="segmentation"), segmentation)

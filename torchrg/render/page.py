@@ -15,7 +15,7 @@ import json
 import math
 import os
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -88,7 +88,7 @@ def make_page(
     title: str | None = None,
     color: str | None = None,
     view: View = "cutaway",
-    up: tuple[float, float, float] | None = None,
+    up: Sequence[float] | str | None = None,
     azimuth_deg: float | None = None,
     max_points: int = MAX_SHOWN_POINTS,
     unit: str | None = None,
@@ -105,15 +105,12 @@ def make_page(
             matching planes have the same color.
         ground_truth: Cloud of the same points with ``labels`` or ``normals``, to show errors.
         title: Title. Default: the names of the files.
-        color: Initial color mode, a key of :data:`torchrg.render.channels.COLOR_MODES`.
-            Default: the first available one.
+        color: Initial mode, of :data:`torchrg.render.channels.COLOR_MODES`. Default: the first.
         view: Initial camera, see :func:`torchrg.render.render_cloud`.
-        up: Up direction. Default: z; -y for the view ``"sensor"``.
+        up: Up direction, as in :func:`torchrg.render.render_cloud`. Default: z; -y for a sensor.
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
-        max_points: Maximum number of points per cloud; larger clouds are randomly downsampled, with
-            a note in the viewer.
-        unit: Unit of the coordinates, for lengths and areas. Default: "m" if the cloud is as high
-            as a room in meters, else "units".
+        max_points: Maximum number of points per cloud; larger ones are sampled, with a note.
+        unit: Unit of the coordinates. Default: "m" if the cloud is as high as a room in meters.
 
     Returns:
         The viewer.
@@ -164,9 +161,10 @@ def make_page(
     return Page(text, tuple(scene["shown"] for scene in scenes))
 
 
-def _guess_unit(cloud: Cloud, up: tuple[float, float, float]) -> str:
+def _guess_unit(cloud: Cloud, up: Sequence[float] | str) -> str:
     """Return the unit of a cloud, estimated from its height."""
-    heights = cloud.coordinates[cloud.finite].astype(float) @ np.array(up) / np.linalg.norm(up)
+    axis = unit_direction("make_page", up).numpy()
+    heights = cloud.coordinates[cloud.finite].astype(float) @ axis
     height = np.ptp(heights) if len(heights) else 0.0
     return "m" if _ROOM_HEIGHTS[0] <= height <= _ROOM_HEIGHTS[1] else "units"
 
@@ -174,22 +172,20 @@ def _guess_unit(cloud: Cloud, up: tuple[float, float, float]) -> str:
 def _check_settings(
     cloud: Cloud,
     ground_truth: Cloud | None,
-    up: tuple[float, float, float] | None,
+    up: Sequence[float] | str | None,
     view: View,
     max_points: int,
-) -> tuple[float, float, float]:
+) -> Sequence[float] | str:
     """Return the up direction; raise if a setting is invalid."""
     check_choices("make_page", view=(view, View))
     if max_points < 1:
         raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
-    if up is not None:
-        unit_direction("make_page", up)
     if ground_truth is not None and len(ground_truth) != len(cloud):
         raise ConfigError(
             f"{ground_truth.source or 'make_page'}: expected ground truth for {len(cloud):,} "
             f"points, got {len(ground_truth):,}; pass the same points in the same order."
         )
-    return up or ((0.0, -1.0, 0.0) if view == "sensor" else (0.0, 0.0, 1.0))
+    return up or ("-y" if view == "sensor" else "z")
 
 
 def write_page(path: str | os.PathLike[str], page: Page) -> None:
@@ -212,8 +208,7 @@ def read_library() -> str:
     source = Path(str(module.__file__)).parent / _LIBRARY
     if not source.is_file():
         raise MissingDependencyError(
-            f"pydeck with {_LIBRARY} is needed to create viewers; install it with: "
-            "pip install --upgrade 'torchrg[view]'"
+            f"pydeck with {_LIBRARY} is needed for viewers; pip install --upgrade 'torchrg[view]'"
         )
     return source.read_text(encoding="utf-8")
 
@@ -307,8 +302,7 @@ def _initial_direction(
 def _pack(arrays: Mapping[str, NDArray[np.generic]]) -> tuple[list[dict[str, object]], str]:
     """Return the layout of arrays, and all arrays as one text; see ``unpack`` in ``page.js``.
 
-    Columns are split into byte planes, low bytes first. Positions, which lie along a curve, are
-    stored as differences.
+    Columns are split into byte planes, low bytes first, positions as differences.
     """
     manifest, planes = [], []
     for name, array in arrays.items():

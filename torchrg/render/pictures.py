@@ -2,7 +2,7 @@
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,16 +15,9 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.io.files import atomic_path, wrap_errors
 from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
+from torchrg.render import raster
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides
-from torchrg.render.raster import (
-    DepthBuffer,
-    Discs,
-    close_gaps,
-    depth_and_colors,
-    light_colors,
-    shade_hollows,
-)
 from torchrg.render.surface import VisibleSurface, sample_surface
 from torchrg.structures.points import Labels, Points
 
@@ -40,11 +33,9 @@ _MAX_RADIUS_RATIO = 4
 _RADIUS_FRACTION = 0.02
 """Maximum radius of a disc, as a fraction of the image width; bounds the drawing time."""
 _SMALL_RADIUS, _MAX_RADIUS = 8.0, 64.0
-"""Maximum radii of a disc in pixels: for small images, and for any image, since the time grows with
-the square of the radius."""
+"""Maximum radii of a disc in pixels, for small and for any images; their squares bound the time."""
 _MAX_SIDE, _MAX_SUPERSAMPLING = 2**13, 16
-"""Maximum number of pixels per side (an 8K screen), and of subpixels per pixel and axis; bounds the
-memory."""
+"""Maximum pixels per side (an 8K screen), and subpixels per pixel and axis; bound the memory."""
 _MAX_SUBPIXELS = 2**26
 """Maximum number of subpixels of an image, 70 bytes each while it is drawn."""
 _GAP_RADIUS = 0.6
@@ -52,8 +43,7 @@ _GAP_RADIUS = 0.6
 _MIN_COSINE = 0.05
 """Minimum cosine of the viewing angle of a disc (87 degrees), beyond which slopes diverge."""
 _OUTLIER_SPACING = 6
-"""Distance to the neighbors, in median spacings, beyond which points are outliers that do not
-affect the image section."""
+"""Distance to the neighbors, in median spacings, beyond which points do not affect the section."""
 
 
 def draw_picture(
@@ -82,11 +72,11 @@ def draw_picture(
     indices = is_shown.nonzero().squeeze(-1)
     radius, length = _median_radius(project, surface.points, lengths, indices)
     widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
-    buffer = DepthBuffer(
+    buffer = raster.DepthBuffer(
         width * supersampling, height * supersampling, max_radius=widest, device=indices.device
     )
 
-    def discs_of(chunk: Tensor) -> Discs:
+    def discs_of(chunk: Tensor) -> raster.Discs:
         rows = surface.rows[chunk]
         slant = surface.normals_at(chunk) if normals is None else normals[rows]
         position, floor = surface.points[chunk], supersampling / 2
@@ -99,8 +89,10 @@ def draw_picture(
     for chunk in parts:
         buffer.paint(discs_of(chunk))
     reach = max(1, round(_GAP_RADIUS * min(radius, widest)))
-    depth, paint = depth_and_colors(close_gaps(buffer.keys(), reach=reach, thickness=length))
-    brightness = shade_hollows(
+    depth, paint = raster.depth_and_colors(
+        raster.close_gaps(buffer.keys(), reach=reach, thickness=length)
+    )
+    brightness = raster.shade_hollows(
         _reduce(depth, supersampling, torch.maximum),
         focal=project.focal / supersampling,
         radius=max(1.0, radius / supersampling),
@@ -130,7 +122,7 @@ def _discs(
     lengths: Tensor,
     *,
     floor: float,
-) -> Discs:
+) -> raster.Discs:
     """Return shaded discs of radii ``lengths``, in units of the cloud, at least ``floor`` pixels.
 
     Points behind the camera are dropped.
@@ -145,10 +137,10 @@ def _discs(
     along = (normals * positions).sum(dim=-1) * inverse
     min_cosine = torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE)
     along = torch.where(along.abs() < _MIN_COSINE, min_cosine, along)
-    return Discs(
+    return raster.Discs(
         pixels,
         inverse,
-        light_colors(colors, normals, positions),
+        raster.light_colors(colors, normals, positions),
         (lengths * inverse * project.focal).clamp(min=floor),
         # n . X = const gives 1 / z = n . ray / const, with the gradient n_xy / focal in pixels.
         slopes=normals[:, :2] * (inverse / (along * project.focal))[:, None],
@@ -168,15 +160,15 @@ def render_cloud(
     *,
     normals: Points | None = None,
     labels: Labels | None = None,
-    view: View = "cutaway",
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    view: "View | PinholeCamera" = "cutaway",
+    up: Sequence[float] | str = "z",
     azimuth_deg: float | None = None,
     elevation_deg: float | None = None,
     width: int = 1400,
     height: int | None = None,
     supersampling: int = 2,
 ) -> Tensor:
-    """Render a cloud from an automatically chosen camera.
+    """Render a cloud from a camera, chosen automatically or given.
 
     ``"cutaway"`` looks from outside, without the ceiling and the walls that face the viewer;
     ``"above"`` looks down, without the ceiling; ``"outside"`` shows everything; ``"sensor"`` looks
@@ -184,26 +176,24 @@ def render_cloud(
 
     Convention:
         Points are drawn as discs with the radius of the local spacing, tilted by their normals. The
-        image does not depend on the order of the points nor, except for rounding, on unit and
-        origin.
+        image depends neither on the order of the points nor, but for rounding, on unit and origin.
 
     Args:
         points: Points, shape ``(N, 3)``; points with NaN or Inf are omitted.
         colors: Shape ``(N, 3)``, uint8.
-        normals: Normals for tilt and shading, of arbitrary sign, shape ``(N, 3)``; zero if unknown.
-            Default: voxel normals.
+        normals: Normals of any sign, shape ``(N, 3)``; zero if unknown. Default: voxel normals.
         labels: Plane of each point, shape ``(N,)``, integers, negative for none, from which walls
             and ceilings are found. Default: the voxels are segmented.
-        view: See above.
-        up: Up direction; ignored for ``"sensor"``.
+        view: See above; or a batch of one kornia camera, with the size of the image, such as from
+            :func:`torchrg.render.make_camera`. Points behind a camera are omitted.
+        up: Up direction, three numbers or the name of an axis. It and the angles are ignored for
+            ``"sensor"`` and for a given camera.
         azimuth_deg: Azimuth of the camera about ``up``, in degrees, from the direction of
             most walls nearest to x, so that clouds of one room share a camera.
             Default: the one of eight with the most visible surface.
         elevation_deg: Elevation of the camera, in degrees. Default: 35, from above 90.
-        width: Width in pixels, at most 8,192; with few enough subpixels, about 4,800 at the
-            default supersampling.
-        height: Height in pixels, at most 8,192. Default: fitted to the cloud, from a quarter of the
-            width to the width.
+        width: Width in pixels, at most 8,192; about 4,800 at the default supersampling.
+        height: Height in pixels, at most 8,192. Default: fitted, from a quarter of the width on.
         supersampling: Subpixels per pixel and axis, which are averaged.
 
     Returns:
@@ -219,22 +209,30 @@ def render_cloud(
         >>> picture.shape[1:], picture.amin().item() < 100, picture[0, 0].tolist()
         (torch.Size([40, 3]), True, [255, 255, 255])
     """
-    cloud, paint, slant = _check_cloud("render_cloud", points, colors, normals)
+    cloud, paint, slant = _check_cloud(points, colors, normals)
     planes = None
     if labels is not None:
         (planes,) = check_labels("render_cloud", labels=labels)
         check_shapes("render_cloud", points=(cloud, "N 3"), labels=(planes, "N"))
-    check_choices("render_cloud", view=(view, View))
+    if isinstance(view, str):
+        check_choices("render_cloud", view=(view, View))
+    else:
+        width, height = int(view.width), int(view.height)
     upward = unit_direction("render_cloud", up)
-    _check_sizes("render_cloud", _MAX_SIDE, width=width, height=height)
-    _check_sizes("render_cloud", _MAX_SUPERSAMPLING, supersampling=supersampling)
+    limits = {"width": _MAX_SIDE, "height": _MAX_SIDE, "supersampling": _MAX_SUPERSAMPLING}
+    for (name, limit), value in zip(limits.items(), (width, height, supersampling), strict=True):
+        if value is not None and not 1 <= value <= limit:
+            raise ConfigError(f"render_cloud: expected {name} from 1 to {limit:,}, got {value!r}.")
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
-        return _white(height or round(0.75 * width), width, cloud.device)
+        shape = (height or round(0.75 * width), width, 3)
+        return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
     planes = None if planes is None else planes[surface.rows]
     near = surface.spacing <= _OUTLIER_SPACING * surface.spacing.median()
     is_shown = torch.ones_like(near)
-    if view == "sensor":
+    if not isinstance(view, str):
+        camera = view
+    elif view == "sensor":
         camera = sensor_camera(cloud[surface.rows[near]], width=width, height=height)
     else:
         upward = upward.to(surface.points)
@@ -249,53 +247,6 @@ def render_cloud(
     return draw_picture(
         camera, surface, is_shown, paint, slant, labels=planes, supersampling=supersampling
     )
-
-
-def render_points(
-    points: Points,
-    colors: Tensor | NDArray[np.uint8],
-    camera: "PinholeCamera",
-    *,
-    normals: Points | None = None,
-    supersampling: int = 2,
-) -> Tensor:
-    """Render a cloud from a given camera; see :func:`render_cloud`.
-
-    Args:
-        points: Points, shape ``(N, 3)``; points with NaN or Inf, or behind the camera, are omitted.
-        colors: Shape ``(N, 3)``, uint8.
-        camera: A batch of one kornia camera, with the size of the image; for example from
-            :func:`torchrg.render.make_camera`.
-        normals: See :func:`render_cloud`.
-        supersampling: See :func:`render_cloud`.
-
-    Returns:
-        The image, shape ``(height, width, 3)``, uint8.
-
-    Raises:
-        ShapeError: If a shape or dtype is invalid.
-        ConfigError: If ``supersampling`` is not from 1 to 16.
-
-    Example:
-        >>> from torchrg.render import make_camera
-        >>> camera = make_camera(torch.eye(4), 10.0, (2.0, 1.0), 5, 3)
-        >>> red = torch.tensor([[255, 0, 0]], dtype=torch.uint8)
-        >>> picture = render_points(torch.tensor([[0.1, 0.0, 1.0]]), red, camera, supersampling=1)
-        >>> picture[1, 2:4].tolist()
-        [[255, 255, 255], [207, 0, 0]]
-    """
-    cloud, paint, slant = _check_cloud("render_points", points, colors, normals)
-    _check_sizes("render_points", _MAX_SUPERSAMPLING, supersampling=supersampling)
-    surface = sample_surface(cloud)
-    if len(surface.rows) == 0:
-        return _white(int(camera.height), int(camera.width), cloud.device)
-    is_shown = torch.ones_like(surface.rows, dtype=torch.bool)
-    return draw_picture(camera, surface, is_shown, paint, slant, supersampling=supersampling)
-
-
-def _white(height: int, width: int, device: torch.device) -> Tensor:
-    """Return a white image."""
-    return torch.full((height, width, 3), 255, dtype=torch.uint8, device=device)
 
 
 def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:
@@ -346,12 +297,10 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic])
 
 
 def _check_cloud(
-    caller: str,
-    points: Points,
-    colors: Tensor | NDArray[np.uint8],
-    normals: Points | None,
+    points: Points, colors: Tensor | NDArray[np.uint8], normals: Points | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return the arguments as tensors, after checking shapes and dtypes."""
+    caller = "render_cloud"
     cloud, paint = as_tensor(caller, "points", points), as_tensor(caller, "colors", colors)
     slant = None if normals is None else as_tensor(caller, "normals", normals)
     check_shapes(caller, points=(cloud, "N 3"), colors=(paint, "N 3"), normals=(slant, "N 3"))
@@ -361,10 +310,3 @@ def _check_cloud(
         dtype = str(paint.dtype).removeprefix("torch.")
         raise ShapeError(f"{caller}: expected colors of uint8, got {dtype}; scale them to 0..255.")
     return cloud, paint, None if slant is None else slant.detach()
-
-
-def _check_sizes(caller: str, limit: int, **settings: int | None) -> None:
-    """Raise ConfigError unless numbers of pixels are from 1 to ``limit``."""
-    for name, value in settings.items():
-        if value is not None and not 1 <= value <= limit:
-            raise ConfigError(f"{caller}: expected {name} from 1 to {limit:,}, got {value!r}.")

@@ -20,11 +20,9 @@ _WHITE = 0xFFFFFF
 _DEPTH_BITS = 32
 """Number of bits of a key below the depth."""
 _OVERHANG = 2.0
-"""Maximum depth difference, in radii of a disc, at which a disc may wrongly hide another: both may
-extend one radius beyond an edge."""
+"""Maximum depth difference, in disc radii, at which a disc may wrongly hide another at an edge."""
 _DOME = 0.1
-"""Curvature of discs, as depth of the rim in radii, so that among coplanar discs the one with the
-nearest center wins."""
+"""Curvature of discs, as depth of the rim in radii: of coplanar discs, the nearest center wins."""
 _FLAT = 0.1
 """Tolerance in depth, in radii of a disc, since noise moves the centers of one surface off the
 planes of its discs. With 0 more pixels of noisy boxes get the color of another surface."""
@@ -49,8 +47,7 @@ _MAX_SHADE_RADIUS = 4.0
 class Discs(NamedTuple):
     """Surface discs in an image.
 
-    The inverse depth of a plane is linear in image coordinates, so a disc is defined by the value
-    at its center and two slopes.
+    Inverse depth of a plane is linear in the image: a value at the center, and two slopes.
 
     Attributes:
         pixels: Column and row of the centers, shape ``(N, 2)``; integers are pixel centers. Discs

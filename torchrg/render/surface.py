@@ -29,8 +29,7 @@ class VisibleSurface(NamedTuple):
         rows: Row of each point in the cloud, shape ``(n,)``, int64.
         points: Coordinates relative to ``origin``, shape ``(n, 3)``, float32.
         origin: Lower corner of the bounding box, shape ``(3,)``, float64.
-        spacing: Distance of each point to its neighbors on the surface, shape ``(n,)``; 0 if all
-            points coincide.
+        spacing: Distance of points to their neighbors on the surface, ``(n,)``; 0 if all coincide.
         voxel_of: Voxel of each point, shape ``(n,)``.
         first: First point of each voxel, shape ``(V,)``.
         centers: Means of the points, shape ``(V, 3)``, float32, relative to ``origin``.
@@ -86,8 +85,7 @@ class VisibleSurface(NamedTuple):
 def sample_surface(points: Tensor) -> VisibleSurface:
     """Sort the finite points of a cloud into voxels, and measure density and normals.
 
-    The result does not depend on the order of the points: means are computed from integer steps,
-    which add up exactly.
+    The result does not depend on the order of the points: sums of integers are exact.
     """
     rows = points.isfinite().all(dim=-1).nonzero().squeeze(-1)
     finite = points[rows].detach()

@@ -8,10 +8,11 @@ from math import comb
 import torch
 from torch import Tensor
 
-from torchrg._parallel import split_rows
+from torchrg import kernels
 from torchrg.robust.lanes import (
     covariance_entries,
     eigenvectors,
+    is_in_kernels,
     sum_products,
     sum_squares,
     take_lanes,
@@ -23,8 +24,6 @@ _NUM_SIMPLICES = 128
 it once in 25,000."""
 _MAX_CANDIDATES = 16
 """Maximum number of candidate flats per patch. On exact planes nearly every simplex gives one."""
-_LANES = 1024
-"""Number of patches processed at a time, so that their data fits into the cache."""
 _MIN_EDGE = 0.01
 """Minimum length of an edge that spans another dimension, as a fraction of the patch extent."""
 
@@ -40,20 +39,28 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Ten
     Returns its dimension ``(M,)`` (0 for a point, 1 for a line, ..., P - 1 for a hyperplane, P for
     none), and the mask of its points ``(K, M)``, all False for none.
     """
-    parts = [
-        _find_flats([column[:, lanes].contiguous() for column in columns], tolerance[lanes], size)
-        for lanes in split_rows(len(tolerance), _LANES)
-    ]
-    dimensions, members = zip(*parts, strict=True)
-    return torch.cat(dimensions), torch.cat(members, dim=1)
+    num_coordinates, num_points = len(columns), len(columns[0])
+    simplices = _simplices(num_points, min(num_coordinates, num_points - 1))
+    if num_points <= num_coordinates or not is_in_kernels(columns):
+        return _find_flats(columns, tolerance, size, simplices)
+    dimension = torch.full_like(tolerance, num_coordinates, dtype=torch.int64)
+    members = torch.zeros_like(columns[0], dtype=torch.bool)
+    (candidates,) = kernels.call("may_have_flats", *columns, torch.tensor(simplices), tolerance)
+    lanes = torch.nonzero(candidates).squeeze(1)
+    if len(lanes):
+        lane_columns = take_lanes(columns, lanes)
+        found = _find_flats(lane_columns, tolerance[lanes], size, simplices)
+        dimension[lanes], members[:, lanes] = found
+    return dimension, members
 
 
-def _find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Implement :func:`find_flats` for lanes that fit into the cache."""
+def _find_flats(
+    columns: list[Tensor], tolerance: Tensor, size: int, simplices: list[list[int]]
+) -> tuple[Tensor, Tensor]:
+    """Implement :func:`find_flats` with the vertices of the given simplices."""
     num_coordinates, (num_points, num_lanes) = len(columns), columns[0].shape
     dimension = torch.full((num_lanes,), num_coordinates, device=tolerance.device)
     members = torch.zeros((num_points, num_lanes), dtype=torch.bool, device=tolerance.device)
-    simplices = _simplices(num_points, min(num_coordinates, num_points - 1))
     vertices = [torch.tensor(vertex, device=tolerance.device) for vertex in simplices]
     origins = [column.index_select(0, vertices[0]) for column in columns]
     extent = torch.stack([column.abs().amax(dim=0) for column in columns]).amax(dim=0)

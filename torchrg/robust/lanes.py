@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg.linalg import eigh3, second_moments
-from torchrg.linalg.angles import at_most
 from torchrg.robust.scale import median_of_sorted, sort_rows, sum_points
 
 
@@ -32,6 +32,11 @@ def sorted_points(values: Tensor) -> Tensor:
     return sort_rows(values.t().contiguous())
 
 
+def is_in_kernels(columns: list[Tensor]) -> bool:
+    """Return whether kernels support columns ``(K, M)``: three of at least two points."""
+    return len(columns) == 3 and len(columns[0]) > 1 and kernels.serve(*columns, k=len(columns[0]))
+
+
 def median_points(values: Tensor) -> Tensor:
     """Median of each lane of ``(K, M)``, shape ``(M,)``."""
     return median_of_sorted(sorted_points(values))
@@ -40,22 +45,13 @@ def median_points(values: Tensor) -> Tensor:
 def smallest_points(distances: Tensor, size: int) -> Tensor:
     """Mark exactly ``size`` smallest values of each lane; ties go to the first points.
 
-    The values ``(K, M)`` contain no NaN. Returns 1 for marked points and 0 for others.
+    The values ``(K, M)`` are nonnegative. Returns 1 for marked points and 0 for others.
     """
-    num_points = len(distances)
-    if size == num_points:
-        return torch.ones_like(distances)
-    rows = sorted_points(distances)
-    bound = rows[:, size - 1].contiguous()
-    marked = at_most(distances, bound)
-    tied = torch.nonzero(rows[:, size] == bound).squeeze(1)
-    if len(tied):
-        # A threshold alone would mark too many, and C-steps on such subsets can cycle.
-        (lanes,), limit = take_lanes([distances], tied), bound[tied]
-        below, level = (lanes < limit).to(lanes.dtype), (lanes == limit).to(lanes.dtype)
-        room = size - sum_points(below)
-        marked[:, tied] = below + level * (level.cumsum(dim=0) <= room)
-    return marked
+    if kernels.serve(distances, k=len(distances)):
+        (marked,) = kernels.call("smallest_points", distances, size)
+        return marked
+    nearest = distances.argsort(dim=0, stable=True)[:size]
+    return torch.zeros_like(distances).scatter_(0, nearest, 1.0)
 
 
 def sum_products(parts: Sequence[Tensor], factors: Sequence[Tensor]) -> Tensor:

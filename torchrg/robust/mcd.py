@@ -6,17 +6,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import check_choices
-from torchrg._parallel import split_rows
 from torchrg.errors import ConfigError
 from torchrg.robust.lanes import (
     Ellipsoid,
     covariance_entries,
     determinant,
     fit_ellipsoid,
+    is_in_kernels,
     smallest_points,
     sq_distances,
-    take_lanes,
 )
 from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import sum_points
@@ -44,11 +44,6 @@ _NUM_RESAMPLED, _NUM_SUBSETS = 2, 4
 """Number of best sets from which ``starts="more"`` draws further starts, and of draws from each."""
 _LANES_IN_CACHE = 8192
 """Number of random starts processed at a time, so that their data fits into the cache."""
-_MAX_COMPARED_STARTS = 16
-"""Maximum number of starts per patch for which duplicate sets are detected; with more, comparing
-costs more than it saves."""
-_DIGITS = 24
-"""Number of points encoded exactly in one number, one binary digit each."""
 
 
 class _Settings(NamedTuple):
@@ -64,8 +59,7 @@ class _Settings(NamedTuple):
 class _Concentrated(NamedTuple):
     """Sets after concentration: masks ``(K, S, M)`` of 1 and 0.
 
-    The determinants ``(S, M)`` of their scatter over h - 1 are float64; inf for a start that
-    repeats an earlier one of its lane.
+    The determinants ``(S, M)`` of their scatter over h - 1 are float64.
     """
 
     members: Tensor
@@ -347,60 +341,24 @@ def _concentrate(
     """Iterate concentration steps from each start of each lane until the set is stable.
 
     A step computes mean and scatter of the set, and keeps the ``size`` nearest points; the
-    determinant never grows (Rousseeuw and Van Driessen 1999, theorem 1). Converged starts leave the
-    batch, and so do duplicates. Starts are sets of ``initial_size`` points, in the form of
-    :class:`_Concentrated`.
+    determinant never grows (Rousseeuw and Van Driessen 1999, theorem 1). Starts are sets of
+    ``initial_size`` points, in the form of :class:`_Concentrated`.
     """
-    num_points, num_starts, num_lanes = initial.shape
-    shape = (num_starts, num_lanes)
-    members = initial.reshape(num_points, -1)
-    final = torch.zeros_like(members)
-    best = torch.full_like(floor, torch.inf, dtype=torch.float64).repeat(num_starts)
-    indices = torch.arange(num_starts * num_lanes, device=floor.device)
-    distinct = _first_occurrences(members, indices, shape)
-    indices, members = indices[distinct], members.index_select(1, distinct)
-    points, floors = take_lanes(columns, indices % num_lanes), floor[indices % num_lanes]
-    distances, _ = _fit_sets(members, floor.new_tensor(initial_size), floors, *points)
-    members, full_size = smallest_points(distances, size), floor.new_tensor(size)
-    moving, previous = _first_occurrences(members, indices, shape), best[indices]
+    if is_in_kernels(columns):
+        sizes = initial_size, size, max_steps
+        return _Concentrated(*kernels.call("concentrate", *columns, initial, floor, *sizes))
+    num_starts = initial.shape[1]
+    columns, floor = [column.repeat(1, num_starts) for column in columns], floor.repeat(num_starts)
+    fit = fit_ellipsoid(columns, initial.flatten(1), initial_size, floor)
+    members = smallest_points(sq_distances(fit, initial_size - 1), size)
+    previous = torch.full_like(floor, torch.inf, dtype=torch.float64)
     for step in range(max_steps + 1):
-        points, members = take_lanes(points, moving), members.index_select(1, moving)
-        floors, indices, previous = floors[moving], indices[moving], previous[moving]
-        distances, value = _fit_sets(members, full_size, floors, *points)
-        candidate = smallest_points(distances, size)
+        fit = fit_ellipsoid(columns, members, size, floor)
+        value = determinant(fit, size - 1)
+        candidate = smallest_points(sq_distances(fit, size - 1), size)
         # Rounding may increase the determinant, or make two sets of tied points alternate.
-        converged = (sum_points(candidate * members) >= size) | ~(value < previous)
-        converged |= step == max_steps
-        done, moving = torch.nonzero(converged).squeeze(1), torch.nonzero(~converged).squeeze(1)
-        final.index_copy_(1, indices[done], members.index_select(1, done))
-        best[indices[done]] = value[done]
-        if len(moving) == 0:
+        moves = (sum_points(candidate * members) < size) & (value < previous)
+        if step == max_steps or not moves.any():
             break
-        members, previous = candidate, value
-    return _Concentrated(final.reshape(num_points, *shape), best.reshape(shape))
-
-
-def _fit_sets(
-    members: Tensor, size: Tensor, floor: Tensor, *columns: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return squared distances ``(K, M)`` to the scatters of sets, and their determinants."""
-    ellipsoid = fit_ellipsoid(list(columns), members, size, floor)
-    return sq_distances(ellipsoid, size - 1), determinant(ellipsoid, size - 1)
-
-
-def _first_occurrences(members: Tensor, indices: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return the first occurrences among sets ``(K, n)`` at ``indices`` of ``(S, M)``."""
-    num_starts, num_lanes = shape
-    if not 1 < num_starts <= _MAX_COMPARED_STARTS:
-        return torch.arange(len(indices), device=indices.device)
-    digits = 2.0 ** (torch.arange(len(members), device=members.device) % _DIGITS)
-    weighted = members * digits.to(members.dtype)[:, None]
-    parts = [sum_points(weighted[chunk]) for chunk in split_rows(len(members), _DIGITS)]
-    numbers = members.new_zeros(len(parts), num_starts * num_lanes)
-    numbers[:, indices] = torch.stack(parts)
-    numbers = numbers.reshape(-1, num_starts, num_lanes)
-    first = torch.ones(shape, dtype=torch.bool, device=members.device)
-    for start in range(1, num_starts):
-        same = (numbers[:, :start] == numbers[:, start : start + 1]).all(dim=0)
-        first[start] = ~same.any(dim=0)
-    return torch.nonzero(first.reshape(-1)[indices]).squeeze(1)
+        members, previous = torch.where(moves, candidate, members), value
+    return _Concentrated(members.view_as(initial), value.view(num_starts, -1))

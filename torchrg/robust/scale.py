@@ -274,8 +274,12 @@ def qn_of_sorted(rows: Tensor, *, finite_sample: bool) -> Tensor:
     n = rows.shape[1]
     if n < 2:
         return rows.new_zeros(len(rows)) if n else rows.new_full((len(rows),), torch.nan)
-    factor = _QN_REVISED_FACTOR * qn_sample_factor(n) if finite_sample else QN_FACTOR
-    return factor * _majority_difference(rows)
+    return (qn_factor(n) if finite_sample else QN_FACTOR) * _majority_difference(rows)
+
+
+def qn_factor(n: int) -> float:
+    """Return the factor of Qn of ``n`` values with its finite-sample factor."""
+    return _QN_REVISED_FACTOR * qn_sample_factor(n)
 
 
 def qn_sample_factor(n: int) -> float:

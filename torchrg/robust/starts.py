@@ -10,20 +10,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
 from torchrg.linalg.precision import machine_epsilon
 from torchrg.robust.lanes import (
     covariance_entries,
     eigenvectors,
+    is_in_kernels,
     map_values,
     median_points,
     smallest_points,
     sorted_points,
     sum_products,
     sum_squares,
+    take_lanes,
 )
 from torchrg.robust.scale import (
     median_of_sorted,
+    qn_factor,
     qn_of_sorted,
     sort_rows,
     sum_points,
@@ -35,15 +39,10 @@ MCDStarts = Literal[Starts, "more"]
 
 _MIN_TAU_VALUES = 1000
 """Number of values from which tau replaces Qn, as in robustbase, because Qn needs all pairs."""
-_LANES_PER_CHUNK = 12288
-"""Number of starts times axes times lanes processed at a time, so that their data fits into the
-cache."""
 _NUM_PLANES = 64
 """Number of candidate planes."""
 _NUM_PLANE_STARTS = 4
 """Number of planes used as starts."""
-_PLANES_PER_CHUNK = 8
-"""Number of planes processed at a time, so that their data fits into the cache."""
 
 
 def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> tuple[Tensor, int]:
@@ -57,23 +56,33 @@ def initial_sets(columns: list[Tensor], size: int, starts: Starts) -> tuple[Tens
 
 def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
     """Choose the six initial sets of each lane (Hubert, Rousseeuw, Verdonck 2012, section 3)."""
-    num_lanes = columns[0].shape[1]
-    together = _standardize(torch.cat(columns, dim=1))
-    standard = [part.contiguous() for part in torch.split(together, num_lanes, dim=1)]
-    starts_per_chunk = max(_LANES_PER_CHUNK // (len(columns) * num_lanes), 1)
-    distances = [
-        _sphered_distances(standard, eigenvectors(matrices))
-        for matrices in torch.split(_scatter_matrices(standard), starts_per_chunk)
-    ]
-    sets = [smallest_points(group.flatten(1), size).view_as(group) for group in distances]
-    return torch.cat(sets, dim=1)
+    center, scale = _centers_and_scales(torch.cat(columns, dim=1))
+    parts = zip(columns, center.chunk(len(columns)), scale.chunk(len(columns)), strict=True)
+    standard = [(column - median) / spread for column, median, spread in parts]
+    loadings = eigenvectors(_scatter_matrices(standard))
+    if not is_in_kernels(columns):
+        return _sphered_sets(standard, loadings, size)
+    factor = qn_factor(len(standard[0]))
+    sets, undefined = kernels.call("sphered_sets", *standard, loadings, factor, size)
+    lanes = torch.nonzero(undefined.any(dim=0)).squeeze(1)
+    if len(lanes):
+        sets[..., lanes] = _sphered_sets(take_lanes(standard, lanes), loadings[:, lanes], size)
+    return sets
 
 
-def _standardize(column: Tensor) -> Tensor:
-    """Subtract the median of each lane and divide by its Qn."""
-    rows = sorted_points(column)
-    center = median_of_sorted(rows)
-    return (column - center) / _positive_scale(rows, center)
+def _centers_and_scales(column: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the median and the positive scale of each lane."""
+    if not (len(column) > 1 and kernels.serve(column, k=len(column))):
+        rows = sorted_points(column)
+        center = median_of_sorted(rows)
+        return center, _positive_scale(rows, center)
+    center, difference = kernels.call("lane_scales", column)
+    scale = qn_factor(len(column)) * difference
+    lanes = torch.nonzero(~(scale > 0)).squeeze(1)
+    if len(lanes):
+        (unscaled,) = take_lanes([column], lanes)
+        scale[lanes] = _positive_scale(sorted_points(unscaled), center[lanes])
+    return center, scale
 
 
 def _scale(rows: Tensor) -> Tensor:
@@ -110,49 +119,63 @@ def _scatter_matrices(columns: list[Tensor]) -> Tensor:
 
     Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order.
     """
+    lengths = sum_squares(columns).sqrt()
+    lengths = torch.where(lengths > machine_epsilon(lengths.dtype), lengths, 1.0)
+    bounded = [map_values(np.tanh, torch.tanh, column) for column in columns]
+    scores = lengths.new_tensor(_score_table(len(lengths)))
+    if is_in_kernels(columns):
+        tables, factor = (*columns, *bounded, lengths, scores), qn_factor(len(lengths))
+        (matrices,) = kernels.call("scatter_matrices", *tables, factor)
+        lanes = torch.nonzero(matrices[-1].isnan().flatten(1).any(dim=1)).squeeze(1)
+        if len(lanes):
+            matrices[-1, lanes] = _pairwise_qn(take_lanes(columns, lanes))
+    else:
+        matrices = _covariances(columns, bounded, lengths, scores)
+    matrices[:3] = _correlation(matrices[:3])
+    return matrices
+
+
+def _covariances(
+    columns: list[Tensor], bounded: list[Tensor], lengths: Tensor, scores: Tensor
+) -> Tensor:
+    """Implement :func:`_scatter_matrices`, with covariances in place of the correlations."""
     ranks = [_double_ranks(column) for column in columns]
-    norms = sum_squares(columns)
-    scores = norms.new_tensor(_score_table(len(norms)))
-    half = smallest_points(norms, -(-len(norms) // 2))
-    lengths = norms.sqrt()
-    lengths = torch.where(lengths > machine_epsilon(norms.dtype), lengths, 1.0)
-    ones = torch.ones_like(norms)
-    zeros = [torch.zeros_like(norms[0]) for _ in columns]
-    inner = [sum_points(half * column) / sum_points(half) for column in columns]
+    half = smallest_points(sum_squares(columns), -(-len(lengths) // 2))
+    ones = torch.ones_like(lengths)
+
+    def covariance(columns: list[Tensor], weights: Tensor = ones) -> Tensor:
+        means = [sum_points(weights * column) / sum_points(weights) for column in columns]
+        return covariance_entries(columns, means, weights, 1.0)
+
+    zeros = [torch.zeros_like(lengths[0]) for _ in columns]
     return torch.stack(
         [
-            _correlation([map_values(np.tanh, torch.tanh, column) for column in columns]),
-            _correlation([rank.to(norms.dtype) for rank in ranks]),
-            _correlation([torch.take(scores, rank) for rank in ranks]),
+            covariance(bounded),
+            covariance([rank.to(lengths.dtype) for rank in ranks]),
+            covariance([torch.take(scores, rank) for rank in ranks]),
             covariance_entries([column / lengths for column in columns], zeros, ones, 1.0),
-            covariance_entries(columns, inner, half, 1.0),
+            covariance(columns, half),
             _pairwise_qn(columns),
         ]
     )
 
 
-def _sphered_distances(columns: list[Tensor], loadings: Tensor) -> Tensor:
-    """Squared distances ``(K, S, M)`` of points sphered by the eigenvectors ``(S, M, P, P)``."""
-    shape = (len(columns[0]), *loadings.shape[:2])
-    wide = [column[:, None] for column in columns]
-    axes = [
-        [factor.contiguous() for factor in axis.unbind(dim=2)] for axis in loadings.unbind(dim=3)
-    ]
-    scores = torch.cat([sum_products(wide, axis).flatten(1) for axis in axes], dim=1)
-    rows = sorted_points(scores)
-    scores /= _positive_scale(rows, median_of_sorted(rows))
-    parts = scores.chunk(len(axes), dim=1)
-    sphered = [
-        sum_products(parts, [factors.flatten() for factors in column])
-        for column in zip(*axes, strict=True)
-    ]
-    return sum_squares([values - median_points(values) for values in sphered]).view(shape)
+def _sphered_sets(columns: list[Tensor], loadings: Tensor, size: int) -> Tensor:
+    """Choose the points ``(K, S, M)`` nearest to the center after sphering.
+
+    Points are sphered along eigenvectors ``(S, M, P, P)``.
+    """
+    axes = [[factor.flatten() for factor in axis.unbind(dim=2)] for axis in loadings.unbind(dim=3)]
+    wide = [column.repeat(1, len(loadings)) for column in columns]
+    parts = [sum_products(wide, axis) for axis in axes]
+    parts = [part / _centers_and_scales(part)[1] for part in parts]
+    sphered = [sum_products(parts, column) for column in zip(*axes, strict=True)]
+    distances = sum_squares([values - median_points(values) for values in sphered])
+    return smallest_points(distances, size).view(len(distances), *loadings.shape[:2])
 
 
-def _correlation(columns: list[Tensor]) -> Tensor:
-    """Correlation matrices ``(M, P, P)``; a constant column is uncorrelated with the others."""
-    means = [sum_points(column) / len(column) for column in columns]
-    scatter = covariance_entries(columns, means, torch.ones_like(columns[0]), 1.0)
+def _correlation(scatter: Tensor) -> Tensor:
+    """Turn covariances ``(*, P, P)`` into correlations; constant columns are uncorrelated."""
     spread = scatter.diagonal(dim1=-2, dim2=-1).sqrt()
     spread = torch.where(spread > 0, spread, 1.0)
     correlation = scatter / (spread[..., :, None] * spread[..., None, :])
@@ -165,37 +188,19 @@ def _pairwise_qn(columns: list[Tensor]) -> Tensor:
     size = len(columns)
     matrix = columns[0].new_zeros(columns[0].shape[1], size, size)
     matrix.diagonal(dim1=-2, dim2=-1).fill_(1.0)
-    for i, column in enumerate(columns[:-1]):
-        others = columns[i + 1 :]
-        sums = [sorted_points(column + other) for other in others]
-        differences = [sorted_points(column - other) for other in others]
-        total, difference = _scale(torch.cat(sums + differences)).view(2, len(others), -1)
-        matrix[:, i, i + 1 :] = ((total * total - difference * difference) / 4).t()
-        matrix[:, i + 1 :, i] = matrix[:, i, i + 1 :]
+    for i, j in combinations(range(size), 2):
+        total = _scale(sorted_points(columns[i] + columns[j]))
+        difference = _scale(sorted_points(columns[i] - columns[j]))
+        matrix[:, i, j] = matrix[:, j, i] = (total * total - difference * difference) / 4
     return matrix
 
 
 def _double_ranks(column: Tensor) -> Tensor:
     """Twice the rank of each point within its lane, ties averaged, shape ``(K, M)``, int64."""
     rows = column.t().contiguous()
-    if rows.device.type == "cpu":
-        order = torch.from_numpy(np.argsort(rows.numpy(), axis=1))
-    else:
-        order = rows.argsort(dim=1)
-    ascending = rows.gather(1, order)
-    count = rows.shape[1]
-    first = torch.arange(count, device=rows.device).expand(rows.shape)
-    last = first
-    starts_run = ascending[:, 1:] != ascending[:, :-1]
-    tied = torch.nonzero(~starts_run.all(dim=1)).squeeze(1)
-    if len(tied):
-        edge = torch.ones(len(tied), 1, dtype=torch.bool, device=rows.device)
-        begins = torch.cat([edge, starts_run[tied]], dim=1)
-        ends = torch.cat([starts_run[tied], edge], dim=1)
-        low = torch.where(begins, first[tied], 0).cummax(dim=1).values
-        high = torch.where(ends, first[tied], count).flip(1).cummin(dim=1).values.flip(1)
-        first, last = first.index_copy(0, tied, low), last.index_copy(0, tied, high)
-    return torch.empty_like(order).scatter_(1, order, first + last + 2).t()
+    ascending = sort_rows(rows)
+    first = torch.searchsorted(ascending, rows)
+    return (first + torch.searchsorted(ascending, rows, right=True) + 1).t()
 
 
 @lru_cache(maxsize=256)
@@ -215,14 +220,11 @@ def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
     minority of outliers, some planes pass through clean points only, wherever the outliers are.
     This needs only sums and one sort per plane, while the published starts need 27 Qn.
     """
-    num_points, num_lanes = columns[0].shape
-    sets = elemental_sets(num_points, len(columns), _NUM_PLANES, seed=0).to(columns[0].device)
-    scores = []
-    for first in range(0, len(sets), _PLANES_PER_CHUNK):
-        tried = sets[first : first + _PLANES_PER_CHUNK]
-        nearest = sorted_points(_sq_residuals(columns, tried[:, :, None]))[:, size - 1]
-        scores.append(nearest.reshape(len(tried), num_lanes))
-    score = torch.cat(scores)
+    sets = elemental_sets(len(columns[0]), len(columns), _NUM_PLANES, seed=0)
+    sets = sets.to(columns[0].device)
+    score = torch.stack(
+        [sorted_points(_sq_residuals(columns, plane[None, :, None]))[:, size - 1] for plane in sets]
+    )
     starts = []
     for _ in range(min(_NUM_PLANE_STARTS, len(sets))):
         best = score.argmin(dim=0)

@@ -31,8 +31,7 @@ def room_walls(room: Frame, size: Triple) -> list[Frame]:
 def recess(kind: str, wall: Frame, hole: Hole, depth: float) -> Part:
     """Return the recess behind a hole in a wall: a panel at ``depth``, and the four sides.
 
-    The hole is given along the first two axes of the wall (along and up); the third points into the
-    room.
+    The hole is given along the first two axes of the wall (along and up); the third is inward.
     """
     left, right, low, high = hole
     leaf = rectangle(kind, wall.moved(left, low, -depth), right - left, high - low)

@@ -40,8 +40,7 @@ _AISLE = 0.75
 _DOORWAY_AISLE = 1.6
 """Minimum distance from the center of a doorway to objects on walls, in meters."""
 _DOORWAY_SPACE = 1.9
-"""Minimum distance from the center of a doorway to objects on the floor, in meters, for an open
-door."""
+"""Minimum distance from a doorway's center to objects on the floor, in meters, for a door."""
 _TRIES = 1000
 """Maximum number of attempts to create an object without a face in the plane of another."""
 _PARALLEL = 1 - 0.02**2 / 2
@@ -275,8 +274,7 @@ def _take(cells: list[T], where: str) -> T:
     """Take the next free position."""
     if not cells:
         raise ConfigError(
-            f"build_room: expected enough space on the {where}, got too many objects; enlarge the "
-            "room."
+            f"build_room: expected enough space on the {where}, got too many objects; enlarge it."
         )
     return cells.pop()
 
@@ -321,7 +319,5 @@ def scanner_positions(
                 positions.append(position)
                 break
     if len(positions) < layout.num_viewpoints:
-        raise ConfigError(
-            "build_room: expected free space for a scanner, got none; enlarge the room."
-        )
+        raise ConfigError("build_room: expected free space for a scanner, got none; enlarge it.")
     return np.stack(positions)

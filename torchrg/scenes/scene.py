@@ -33,8 +33,7 @@ class Scene(NamedTuple):
         points: Shape ``(N, 3)``, float32, in meters.
         labels: Face of each point as a row of the tables below, shape ``(N,)``, int64. Curved faces
             have labels too, see ``planar``.
-        normals: Unit normals of the faces at the noise-free points, toward free space, shape ``(N,
-            3)``, float32.
+        normals: Unit normals at the noise-free points, toward free space, ``(N, 3)``, float32.
         planar: Mask of planar faces, shape ``(M,)``, bool.
         face_normals: Normals of the planar faces, shape ``(M, 3)``, float64; zero for curved ones.
         face_offsets: Offsets of their planes, ``normal . x = offset``, shape ``(M,)``, float64.
@@ -119,12 +118,10 @@ def sample_scene(
     Args:
         model: The scene.
         num_points: Number of points.
-        noise: Standard deviation of the noise, in meters, relative to the cloud of the same seed
-            with ``noise=0``.
+        noise: Standard deviation, in meters, from the cloud of the same seed with ``noise=0``.
         seed: Identical arguments give identical clouds; on another processor, sines of slanted
             parts may differ in the last bit.
-        noise_direction: ``"normal"``: along the normal of the face. ``"isotropic"``: the same in
-            all directions.
+        noise_direction: ``"normal"``: along the face's normal. ``"isotropic"``: in all directions.
 
     Returns:
         The cloud and its ground truth, in random order.
@@ -142,9 +139,7 @@ def sample_scene(
             f"sample_scene: expected num_points from 1 to {MAX_POINTS:,}, got {num_points}."
         )
     if not 0 <= noise <= FARTHEST:
-        raise ConfigError(
-            f"sample_scene: expected noise from 0 to {FARTHEST:g} meters, got {noise}."
-        )
+        raise ConfigError(f"sample_scene: expected noise from 0 to {FARTHEST:g} m, got {noise}.")
     check_choices("sample_scene", noise_direction=(noise_direction, NoiseDirection))
     rng = seeded_generator(seed, POSITIONS)
     points, normals, labels = _sample_faces(model, num_points, rng)

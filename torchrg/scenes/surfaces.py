@@ -66,8 +66,7 @@ class Flat(Surface):
 
     Args:
         kind: Kind of the face.
-        frame: Local coordinate frame: the first two axes span the plane, the third is the outward
-            normal.
+        frame: Local frame: the first two axes span the plane, the third is the outward normal.
         cells: Corner and two edges of each cell, in the plane, shape ``(M, 3, 2)``.
     """
 

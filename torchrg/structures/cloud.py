@@ -29,8 +29,7 @@ class Cloud:
         header: File-level metadata: ``viewpoint`` of a PCD file (seven numbers, position and
             quaternion w x y z) and ``las`` (the header of a LAS file), which are written again;
             ``scans`` (names and poses) and ``coordinate_metadata`` of an E57 file.
-        notes: Human-readable notes on assumptions made and data skipped while reading, without a
-            period.
+        notes: Notes on assumptions made and data skipped while reading, without a period.
         front: Direction from each point toward the front of its surface (not normalized), zero if
             unknown, shape ``(N, 3)``, float32; None if the file has none. Computed from the faces
             of a mesh, or from the scanner positions. It is not written with the cloud;

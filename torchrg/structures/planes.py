@@ -37,36 +37,44 @@ class PlaneAdjacency(NamedTuple):
     dihedral_deg: Tensor
 
 
-class DeferredKind:
-    """Classes of planes that are computed on first access, with z up.
+class Deferred:
+    """A column that is computed on first access.
 
     Args:
-        classify: Function that returns the classes of a plane table. It is called once and then
-            dropped, with the points that it holds. A pickled object contains the classes alone.
+        compute: Function of the object that has the column. It is called once and then dropped,
+            with the points that it holds. A pickled object contains the value alone.
     """
 
-    def __init__(self, classify: Callable[["Planes"], Tensor]) -> None:
-        self._classify: Callable[[Planes], Tensor] | None = classify
-        self._kind: Tensor | None = None
+    def __init__(self, compute: Callable[[Any], object]) -> None:
+        self._compute: Callable[[Any], object] | None = compute
+        self._value: object = None
 
-    def get(self, planes: "Planes") -> Tensor | None:
-        """Return the class of each plane."""
-        if self._classify is not None:
-            self._kind, self._classify = self._classify(planes), None
-        return self._kind
+    def get(self, owner: object) -> object:
+        """Return the value in an object."""
+        if self._compute is not None:
+            self._value, self._compute = self._compute(owner), None
+        return self._value
 
 
-class _KindColumn:
-    """Descriptor of :attr:`Planes.kind`, which may be a :class:`DeferredKind`."""
+class _Column:
+    """Descriptor of a field that may be :class:`Deferred`."""
 
-    def __get__(self, planes: "Planes | None", owner: type | None = None) -> Tensor | None:
-        if planes is None:  # The default of the field.
-            return None
-        value: Tensor | DeferredKind | None = vars(planes)["kind"]
-        return value.get(planes) if isinstance(value, DeferredKind) else value
+    def __init__(self, *default: object) -> None:
+        self._default = default
 
-    def __set__(self, planes: "Planes", value: Tensor | DeferredKind | None) -> None:
-        vars(planes)["kind"] = value
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, table: object, owner: type | None = None) -> Any:  # noqa: ANN401
+        if table is None:
+            if not self._default:  # The field has no default.
+                raise AttributeError(self._name)
+            return self._default[0]
+        value = vars(table)[self._name]
+        return value.get(table) if isinstance(value, Deferred) else value
+
+    def __set__(self, table: object, value: object) -> None:
+        vars(table)[self._name] = value
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +132,22 @@ class _Movable:
 
     def to(self: Moved, device: torch.device | str) -> Moved:
         """Move all tensors to a device."""
-        columns = {name: moved(value, device) for name, value in vars(self).items()}
+
+        def move(name: str, value: object) -> object:
+            if isinstance(value, Deferred):
+                return Deferred(lambda _: moved(getattr(self, name), device))
+            return moved(value, device)
+
+        columns = {name: move(name, value) for name, value in vars(self).items()}
         return cast(Moved, replace(cast(Any, self), **columns))
 
     def cpu(self: Moved) -> Moved:
         """Move all tensors to the CPU."""
         return self.to("cpu")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all columns, instead of what defines deferred ones."""
+        return {name: getattr(self, name) for name in vars(self)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +166,10 @@ class Planes(_Movable):
         area: Area covered by the points on the plane, shape ``(M,)``.
         count: Number of points, including duplicates, shape ``(M,)``, int64.
         rms: RMS distance of the points to the plane, shape ``(M,)``.
-        extent: Long and short side of the minimum bounding rectangle of the projected points, shape
-            ``(M, 2)``.
+        extent: Long and short side of the points' minimum bounding rectangle, shape ``(M, 2)``.
         axes: Unit directions of those sides, shape ``(M, 2, 3)``.
         center: Center of that rectangle, shape ``(M, 3)``.
         curved: Mask of smooth but nonplanar regions (a column, a bent wall), shape ``(M,)``, bool.
-            Their plane is only a best fit.
         kind: Class of each plane as an index of :data:`PLANE_KINDS`, shape ``(M,)``, int64. Unless
             an up axis was set, :func:`torchrg.segment_planes` classifies on first access, with z
             up. None for depth images with an unknown up axis.
@@ -182,7 +198,7 @@ class Planes(_Movable):
     axes: Tensor
     center: Tensor
     curved: Tensor
-    kind: Tensor | None = cast("Tensor | None", _KindColumn())  # noqa: RUF009 A descriptor.
+    kind: Tensor | None = cast("Tensor | None", _Column(None))  # noqa: RUF009 A descriptor.
     outline: tuple[tuple[Tensor, ...], ...] | None = None
     adjacency: PlaneAdjacency | None = None
     object: Tensor | None = None
@@ -216,17 +232,6 @@ class Planes(_Movable):
         outline = None if self.outline is None else self.outline[row]
         within = None if self.object is None else int(self.object[row])
         return Plane(row, **values, kind=kind, outline=outline, object=within)
-
-    def to(self, device: torch.device | str) -> "Planes":
-        """Move the table to a device."""
-        columns = {name: moved(value, device) for name, value in vars(self).items()}
-        if isinstance(columns["kind"], DeferredKind):
-            columns["kind"] = DeferredKind(lambda _: cast(Tensor, moved(self.kind, device)))
-        return replace(self, **columns)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the columns with their classes, instead of the points that define them."""
-        return vars(self) | {"kind": self.kind}
 
     def to_pandas(self) -> Any:  # noqa: ANN401
         """Convert to a ``pandas.DataFrame`` with :data:`torchrg.io.plane_table.CSV_COLUMNS`.
@@ -266,13 +271,12 @@ class Segmentation(_Movable):
     """Plane segmentation: per-point labels and normals, and the plane table.
 
     Attributes:
-        labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or
-            :data:`UNLABELED`.
+        labels: Region of each point, shape ``(N,)``, int64: 0 to M-1 by descending size, or -1.
         normals: Unit normals, shape ``(N, 3)``; zero where not ``valid``.
         curvature: Surface variation in [0, 1/3], shape ``(N,)``; 0 where not ``valid``.
         sharp: Sharp feature points, shape ``(N,)``, bool.
         valid: Finite points with a normal, shape ``(N,)``, bool.
-        planes: The plane table, M rows.
+        planes: The plane table, M rows; of a depth image, it is measured on first access.
         points: Input points for visualization, shape ``(N, 3)``; None if unknown.
         neighbors: Neighbors of the distinct finite points in canonical order, as
             :func:`torchrg.search_knn` returns them; None if not kept. See
@@ -286,7 +290,7 @@ class Segmentation(_Movable):
     curvature: Tensor
     sharp: Tensor
     valid: Tensor
-    planes: Planes
+    planes: Planes = cast(Planes, _Column())  # noqa: RUF009 A descriptor.
     points: Tensor | None = None
     neighbors: Neighbors | None = None
     sampling: Sampling | None = None

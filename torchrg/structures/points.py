@@ -12,8 +12,7 @@ from torch import Tensor
 UNLABELED = -1
 """Label of points without a region."""
 FARTHEST = 1e12
-"""Maximum absolute coordinate of a point; files use 1e20, 1e30 or the largest float32 for missing
-points."""
+"""Maximum absolute coordinate; files use 1e20, 1e30 or the largest float32 for missing points."""
 MAX_POINTS = 2**31 - 1
 """Maximum number of points of a cloud; neighbor lists are int32."""
 Array = NDArray[Any]
@@ -75,8 +74,7 @@ class Neighbors(NamedTuple):
 
     Attributes:
         indices: Rows of the neighbors, shape ``(N, K)``, int32. The first column is the point
-            itself, the other columns are sorted by distance. Invalid entries contain the point
-            itself.
+            itself, the other columns are sorted by distance. Invalid entries are the point.
         valid: Mask of the valid entries, shape ``(N, K)``, bool; None if all are valid.
     """
 
@@ -120,11 +118,9 @@ class Sampling(NamedTuple):
         variation: Coefficient of variation of the distances to the nearest point: 0.25 to 0.35 for
             mesh vertices and grids, about 0.5 for points sampled at random.
         exactness: Fraction of points coplanar with their 8 nearest neighbors, within a thousandth
-            of their distance: 0.3 to 0.7 for points sampled from the triangles of a mesh, else near
-            0.
+            of their distance: 0.3 to 0.7 for points sampled from triangles of a mesh, else near 0.
         density: Number of points per unit of area on a surface.
-        height: Smallest extent along the principal axes, in units of the cloud; the height of most
-            rooms.
+        height: Smallest extent along the principal axes, in units of the cloud; a room's height.
         deviation: RMS distance of 100 neighboring points from their plane, in units of the cloud.
     """
 

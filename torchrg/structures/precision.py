@@ -16,8 +16,7 @@ from torch import Tensor
 from torchrg.errors import PrecisionWarning, UnitWarning, warn
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
-"""Rounding steps, in spacings of the points, above which there is a note: for float32, and for the
-scale of a file."""
+"""Rounding steps above which there is a note, in spacings: for float32, and for a file's scale."""
 _MAX_FINE_STEP = 1e-3
 """Rounding step, in spacings of a uniform surface, up to which no search is needed: for it to be
 too coarse, half of the points would have to be a hundred times closer."""
@@ -29,8 +28,7 @@ _CELL = 32
 """Side of the cells of the sample, in spacings of a uniform surface. Seven of eight points are away
 from the boundary of their cell, outside of which the nearest point may be."""
 _MIN_PLACEHOLDERS = 10
-"""Number of points at 0 0 0 from which they count as pixels without depth. Fewer may be measured
-there."""
+"""Points at 0 0 0 from which they count as pixels without depth. Fewer may be measured."""
 _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791])
 """Factors of the cell hash: M. Teschner et al. Optimized spatial hashing for collision detection of
 deformable objects. VMV, 2003."""

@@ -2,24 +2,23 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from torchrg._checks import as_tensor, check_choices, eager_only
-from torchrg.config import settings_of
-from torchrg.depth import DepthConfig, depth_to_points, segment_depth
-from torchrg.depth.camera import read_intrinsics
-from torchrg.depth.values import DepthKind, check_conversion, convert_depth
+from torchrg.config import DepthConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.normals import Orientation
 from torchrg.structures import UNLABELED, Planes
 from torchrg.transforms.rows import Entries, SampleDict, check_sample
 from torchrg.transforms.sample import SampleTransform
+
+if TYPE_CHECKING:
+    from torchrg.depth.values import DepthKind
 
 
 class DepthTransform(SampleTransform):
@@ -29,8 +28,7 @@ class DepthTransform(SampleTransform):
 
     Args:
         depth_scale: Depth units per meter, 1000 for millimeters. Default: 1, meters.
-        depth_kind: "z" for depth along the optical axis, "ray" for distances from the camera
-            center. Default: "z".
+        depth_kind: "z" for depth, "ray" for distances from the camera center. Default: "z".
         keys: Other names for some entries.
     """
 
@@ -43,15 +41,20 @@ class DepthTransform(SampleTransform):
         self,
         *,
         depth_scale: float = 1.0,
-        depth_kind: DepthKind = "z",
+        depth_kind: "DepthKind" = "z",
         keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(keys=keys)
+        # Loaded here, because other transforms do not need it.
+        from torchrg.depth.values import check_conversion
+
         check_conversion(type(self).__name__, depth_scale, depth_kind)
         self.depth_scale, self.depth_kind = depth_scale, depth_kind
 
     def read_images(self, sample: Entries) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return depth ``(B, H, W)``, intrinsics ``(B, 3, 3)`` and poses ``(B, 4, 4)`` or None."""
+        from torchrg.depth.camera import read_intrinsics
+
         example = "{'depth': depth, 'intrinsics': matrix}"
         check_sample(type(self).__name__, sample, example)
         key, depth = self.key(sample, "intrinsics"), self.read(sample, "depth")
@@ -114,6 +117,9 @@ class DepthToCloud(DepthTransform):
     @eager_only
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with the cloud."""
+        from torchrg.depth.camera import depth_to_points
+        from torchrg.depth.values import convert_depth
+
         depth, intrinsics, poses = self.read_images(sample)
         options = (self.depth_scale, self.depth_kind)
         depth = convert_depth("DepthToCloud", depth, intrinsics, *options)
@@ -183,7 +189,7 @@ class SegmentDepth(DepthTransform):
         orient: Orientation = "auto",
         planes: bool = False,
         depth_scale: float = 1.0,
-        depth_kind: DepthKind = "z",
+        depth_kind: "DepthKind" = "z",
         keys: Mapping[str, str] | None = None,
         **changes: Any,  # noqa: ANN401
     ) -> None:
@@ -195,16 +201,13 @@ class SegmentDepth(DepthTransform):
     @eager_only
     def forward(self, sample: Entries) -> SampleDict:
         """Return a new sample with labels, normals and curvature as images."""
+        from torchrg.depth import segment_depth
+
         depth, intrinsics, poses = self.read_images(sample)
-        segment = partial(
-            segment_depth,
-            config=self.config,
-            orient=self.orient,
-            depth_scale=self.depth_scale,
-            depth_kind=self.depth_kind,
-        )
+        names = ("config", "orient", "depth_scale", "depth_kind")
+        options: dict[str, Any] = {name: getattr(self, name) for name in names}
         segmentations = [
-            segment(image, camera, pose=None if poses is None else poses[i])
+            segment_depth(image, camera, pose=None if poses is None else poses[i], **options)
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
         ]
         batch, added = self.is_batch(sample), SampleDict(sample)
@@ -225,8 +228,7 @@ class FusedFrames(NamedTuple):
     """Cloud fused from several depth frames.
 
     Attributes:
-        coord: Points in world coordinates, shape ``(N, 3)``, float64: the pixels with depth, or one
-            per voxel.
+        coord: Points in world coordinates, shape ``(N, 3)``, float64: pixels with depth, or voxels.
         color: Colors, shape ``(N, 3)``, uint8; None if any frame has no color.
         frame: Frame index of each point, shape ``(N,)``, int64.
         pixel: Row-major pixel index of each point in its frame, shape ``(N,)``, int64.
@@ -256,9 +258,7 @@ class FusedFrames(NamedTuple):
             ShapeError: If ``values`` does not have one row per point.
         """
         if len(values) != len(self.coord):
-            raise ShapeError(
-                f"to_frames: expected values of {len(self.coord)} points, got {len(values)}."
-            )
+            raise ShapeError(f"to_frames: expected {len(self.coord)} values, got {len(values)}.")
         each = expand_to_points(values, self.inverse)
         images = [values.new_full((*seen.shape, *values.shape[1:]), fill) for seen in self.seen]
         parts = torch.split(each, [int(seen.sum()) for seen in self.seen])

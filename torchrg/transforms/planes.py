@@ -262,8 +262,7 @@ class MakeSuperpoints(CloudTransform):
 
     Args:
         config: Configuration. Default: :class:`torchrg.config.SuperpointsConfig`.
-        white: Maximum channel value of colors, 255 or 1; enables reading ``color`` ``(N, 3)``.
-            Default: colors are not used.
+        white: Maximum of ``color`` ``(N, 3)``, 255 or 1. Default: colors are not used.
         **changes: Single parameters, as in ``strengths=2.0``.
 
     Example:

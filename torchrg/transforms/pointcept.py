@@ -9,8 +9,7 @@ every process imports. Then
 * the data sets load ``plane.npy``, ``curvature.npy`` and ``superpoint.npy``, as written by
   ``torchrg convert``;
 * operations that remove points remove them from these entries too;
-* ``point_collate_fn`` with ``mix_prob`` offsets the plane IDs of two mixed rooms, so that they
-  stay distinct.
+* ``point_collate_fn`` with ``mix_prob`` keeps the plane IDs of two mixed rooms distinct.
 
 Without Pointcept, the import has no effect.
 """

@@ -63,8 +63,7 @@ def check_sample(caller: str, sample: Sample, example: str) -> None:
     is_data = callable(getattr(sample, "to_dict", None)) and hasattr(sample, "__setitem__")
     if not (isinstance(sample, Mapping) or is_data):
         raise ConfigError(
-            f"{caller}: expected a sample that is a dict or a PyG Data, got "
-            f"{type(sample).__name__}; pass {example}."
+            f"{caller}: expected a dict or a PyG Data, got {type(sample).__name__}; pass {example}."
         )
 
 
@@ -119,8 +118,7 @@ def _classify_keys(
 def check_lengths(caller: str, entries: Entries, num_points: int) -> None:
     """Raise ConfigError if a per-point entry has a wrong number of rows.
 
-    Checked are listed entries, and names that Pointcept and torchrg use, unless the entry has the
-    shape of an image.
+    Checked are listed entries, and names of Pointcept and torchrg, unless the entry is an image.
     """
     listed = get_list(entries) or []
     for key in {**dict.fromkeys(listed), **dict.fromkeys((*POINTCEPT_KEYS, *TORCHRG_KEYS))}:
@@ -149,8 +147,7 @@ def select_points(
     for key, repair in _INDEX_KEYS.items():
         if entries.get(key) is not None:
             raise ConfigError(
-                f"{caller}: cannot remove points from a sample with {key}; apply the transform "
-                f"{repair}."
+                f"{caller}: cannot remove points from samples with {key}; apply it {repair}."
             )
     in_rows, ambiguous = _classify_keys(entries, num_points, skip)
     if ambiguous:
@@ -182,16 +179,13 @@ def _cloud_ends(sample: Sample, num_points: int) -> list[int]:
     if entries.get("offset") is not None:
         ends: list[int] = torch.as_tensor(entries["offset"]).tolist()
         if sorted(ends) != ends or ends[-1:] != [num_points] or ends[0] < 0:
-            raise ConfigError(
-                f"expected offset to ascend to the number of points ({num_points}), got {ends}."
-            )
+            raise ConfigError(f"expected offset to ascend to {num_points} points, got {ends}.")
         return ends
     if entries.get("batch") is not None:
         batch = torch.as_tensor(entries["batch"])
         if len(batch) != num_points or bool((batch.diff() < 0).any()):
             raise ConfigError(
-                f"expected batch to ascend over {num_points} points, got {len(batch)} entries; "
-                "sort the points by cloud."
+                f"expected batch to ascend over {num_points}, got {len(batch)}; sort by cloud."
             )
         min_clouds = 0 if entries.get("ptr") is None else len(entries["ptr"]) - 1
         counts: list[int] = torch.bincount(batch, minlength=min_clouds).cumsum(0).tolist()

@@ -1,36 +1,27 @@
-"""Broken planes and paraboloids by kernels and by definition."""
+"""Broken planes make edges sharp, and paraboloids leave smooth surfaces smooth."""
 
 import pytest
-import torch
 
-from tests.kernels.clouds import MIN_EQUAL, assert_same_planes, both, needs_library
-from torchrg.normals.consensus.surfaces import _paraboloids, broken_planes
-
-pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+from tests.normals.test_consensus import consensus, errors, fit_all, shape
+from torchrg.normals.jet import fit_normals_jet
+from torchrg.normals.pca import fit_normals_pca
 
 
-def test_broken_planes(points, near, survey):
-    fit, (_, _, noise, _) = survey
-    # The kernel is for points of equally many neighbors.
-    count = near.mask().sum(dim=1)
-    rows = (fit.valid & noise.isfinite() & (count == count.mode().values)).nonzero().squeeze(1)
-    (voted, meeting), (voted_too, meeting_too) = (
-        both(broken_planes, points, near.select(rows), noise[rows], fit.normals[rows])
-        if near.valid is None
-        else both(
-            broken_planes, points, type(near)(*near.select(rows)), noise[rows], fit.normals[rows]
-        )
-    )
-    # To the bit: rounding would decide between planes that are as good.
-    for found, expected in zip((*voted, *meeting), (*voted_too, *meeting_too), strict=True):
-        assert torch.equal(found.nan_to_num(), expected.nan_to_num())
+@pytest.mark.parametrize("name", ["cube", "octahedron", "stairs", "cylinder"])
+@pytest.mark.parametrize("noise", [0.0, 0.0025])
+def test_edges_are_sharper_than_those_of_pca_and_jet(name, noise):
+    points, truth = shape(name, 3000, noise)
+    mean, rms = errors(consensus(points), truth)
+    for estimate in (fit_normals_pca, fit_normals_jet):
+        other_mean, other_rms = errors(fit_all(points, estimate), truth)
+        assert mean < 0.7 * other_mean
+        assert rms < other_rms
 
 
-def test_paraboloids(points, near, survey):
-    fit, (_, _, _, radius) = survey
-    rows = fit.valid.nonzero().squeeze(1)
-    found, expected = both(_paraboloids, points, *near, fit.normals, rows)
-    enough = near.mask()[rows].sum(dim=1) > 6
-    assert_same_planes(found[:2], expected[:2], radius[rows], MIN_EQUAL, enough)
-    error = ((found[2] - expected[2]).abs() / radius[rows])[enough]
-    assert (error < 1e-3).float().mean() >= MIN_EQUAL
+@pytest.mark.parametrize("name", ["sphere", "torus", "rounded_box"])
+@pytest.mark.parametrize("noise", [0.0, 0.0025])
+def test_smooth_surfaces_are_as_smooth_as_the_better_of_pca_and_jet(name, noise):
+    points, truth = shape(name, 5000, noise)
+    _, rms = errors(consensus(points), truth)
+    best = min(errors(fit_all(points, fit), truth)[1] for fit in (fit_normals_pca, fit_normals_jet))
+    assert rms <= 1.1 * best + 0.001

@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 
 from torchrg import version
-from torchrg.batch.records import RECORD, reason_to_convert
 from torchrg.batch.run import make_plan
-from torchrg.batch.scans import convert_scan
+from torchrg.batch.scans import RECORD, convert_scan, reason_to_convert
 from torchrg.config import load_config
 
 
@@ -52,12 +51,6 @@ def test_results_that_changed_or_are_gone_are_noticed(job):
     assert reason_to_convert(job) == "result.txt changed"
     result.unlink()
     assert reason_to_convert(job) == "result.txt missing"
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"outputs": 3}', "\x00"])
-def test_a_damaged_record_is_none(job, text):
-    (job.folder / RECORD).write_text(text)
-    assert reason_to_convert(job) == "new"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,457 @@
+// Robust fits of many patches, one patch per lane, bit-identical to torchrg/robust.
+//
+// Sums run over the points in order. Columns (K, M) hold point k of patch m at k * M + m.
+#include "plain.h"
+
+namespace {
+
+constexpr int QUICK_PASSES = 4;   // counting passes, at half the cost of the other passes
+constexpr int FREE_PASSES = 9;    // passes after which every second one bisects
+constexpr float TYPICAL = 0.42f;  // Qn's difference / length of the shortest half
+
+// One coordinate of the points of eight patches.
+struct Column {
+  alignas(32) float values[MAX_WIDTH * LANES];
+
+  INLINE_MEMBER Lanes operator[](int k) const { return load(values + k * LANES); }
+  INLINE_MEMBER void set(int k, Lanes lanes) { store(values + k * LANES, lanes); }
+  INLINE_MEMBER float& at(int k, int lane) { return values[k * LANES + lane]; }
+};
+
+struct Points {
+  Column columns[3];
+};
+
+// Patches m to m + 7 of a row; the last patch fills up lanes beyond the end.
+INLINE Lanes load_row(const float* row, int64_t m, int64_t num_patches) {
+  if (m + LANES <= num_patches) return load(row + m);
+  float lanes[LANES];
+  for (int64_t l = 0; l < LANES; l++) lanes[l] = row[smaller(m + l, num_patches - 1)];
+  return load(lanes);
+}
+INLINE void store_row(float* row, int64_t m, int64_t num_patches, Lanes lanes) {
+  if (m + LANES <= num_patches) return store(row + m, lanes);
+  for (int l = 0; m + l < num_patches; l++) row[m + l] = lanes[l];
+}
+INLINE void load_column(const float* values, int n, int64_t m, int64_t M, Column& column) {
+  for (int k = 0; k < n; k++) column.set(k, load_row(values + k * M, m, M));
+}
+INLINE void load_points(Floats x, Floats y, Floats z, int n, int64_t m, int64_t M, Points& points) {
+  load_column(x, n, m, M, points.columns[0]);
+  load_column(y, n, m, M, points.columns[1]);
+  load_column(z, n, m, M, points.columns[2]);
+}
+
+// Sorts each lane by merge exchange (Knuth 5.2.2, algorithm M).
+void sort_lanes(Column& rows, int n) {
+  int top = 1;
+  while (2 * top < n) top *= 2;
+  for (int p = top; p > 0; p /= 2)
+    for (int q = top, r = 0, d = p;; d = q - p, q /= 2, r = p) {
+      for (int from = r; from < n - d; from += 2 * p)
+        for (int i = from; i < smaller(from + p, n - d); i++) {
+          const Lanes a = rows[i], b = rows[i + d];
+          rows.set(i, smaller(a, b)), rows.set(i + d, larger(a, b));
+        }
+      if (q == p) break;
+    }
+}
+
+INLINE Lanes median_of_sorted(const Column& rows, int n) {
+  const Lanes low = rows[(n - 1) / 2], high = rows[n / 2];
+  return n % 2 ? low : low + (high - low) / all(2);
+}
+
+INLINE Lanes one_where(Flags flags) { return where(flags, all(1), all(0)); }
+INLINE bool is_any(Flags flags) { return total(flags) != 0; }
+
+struct Around {
+  Lanes count;         // differences at most the pivot
+  Lanes below, above;  // the largest of them, and the smallest above; the pivot if not searched
+};
+
+// Looks at lags until one has no difference within the pivot: larger lags have none either.
+template <bool looks>
+INLINE Around look_around(const Column& rows, int n, Lanes pivot) {
+  Around found{Lanes{}, looks ? Lanes{} : pivot, looks ? all(INFINITE) : pivot};
+  for (int lag = 1; lag <= n / 2; lag++) {
+    Flags at_lag{};
+    for (int i = 0; i < n - lag; i++) {
+      const Lanes difference = rows[i + lag] - rows[i];
+      const Flags within = difference <= pivot;
+      at_lag += within;
+      if (!looks) continue;
+      found.below = larger(found.below, where(within, difference, all(0)));
+      found.above = smaller(found.above, where(within, all(INFINITE), difference));
+    }
+    if (!is_any(at_lag)) break;
+    found.count -= to_float(at_lag);
+  }
+  return found;
+}
+
+// The C(h, 2)-th smallest difference of each lane of sorted rows; NaN if one may be infinite.
+//
+// Regula falsi (Illinois): differences up to `low` are too few, those up to `high` enough, such as
+// the length of the shortest half. Counts are `missing` and in `excess` there.
+Lanes majority_difference(const Column& rows, int n) {
+  const int lags = n / 2, rank = lags * (lags + 1) / 2;
+  const Lanes wanted = all(rank - 0.5f), spread = rows[n - 1] - rows[0];
+  Lanes low{}, high = spread, missing = wanted, excess = wanted;
+  for (int i = 0; i + lags < n; i++) high = smaller(high, rows[i + lags] - rows[i]);
+  Lanes pivot = high * TYPICAL;
+  Lanes result = where(spread < INFINITE, Lanes{}, all(__builtin_nanf("")));
+  Flags open = (high > 0) & (spread < INFINITE), was_few{}, was_many{};
+  bool looks = false;
+  for (int turn = 0; is_any(open); turn++) {
+    looks |= turn >= QUICK_PASSES;
+    const Around found =
+        looks ? look_around<true>(rows, n, pivot) : look_around<false>(rows, n, pivot);
+    const Lanes gap = found.count - wanted;
+    const Flags few = gap < 0, next_to = magnitude(gap) < 1;
+    const Flags ends = where(few, found.above >= high, found.below <= low);
+    const Lanes end = where(few, where(next_to, found.above, high), found.below);
+    const Flags done = open & (looks ? next_to | ends : ends & ~next_to);
+    result = where(done, end, result), open = open & ~done;
+    const Flags moves = open & ~next_to, moves_low = moves & few, moves_high = moves & ~few;
+    looks = !is_any(moves);
+    low = where(moves_low, pivot, low), high = where(moves_high, found.below, high);
+    // The limit that stays twice counts half.
+    missing = where(moves_low, -gap, where(moves_high & was_many, missing * 0.5f, missing));
+    excess = where(moves_high, gap, where(moves_low & was_few, excess * 0.5f, excess));
+    was_few = where(moves, few, was_few), was_many = where(moves, ~few, was_many);
+    const auto inside = [&](Lanes value) { return (value > low) & (value < high); };
+    Lanes next = low + (high - low) * (missing / (missing + excess));
+    if (turn > FREE_PASSES && turn % 2) next = low;
+    next = where(inside(next), next, low + (high - low) * 0.5f);
+    pivot = where(moves, where(inside(next), next, low), pivot);
+  }
+  return result;
+}
+
+Lanes sort_and_scale(Column& rows, int n, double factor) {
+  sort_lanes(rows, n);
+  return majority_difference(rows, n) * float(factor);
+}
+
+// lanes.smallest_points.
+void mark_smallest(const Column& values, int n, int size, Column& marks) {
+  marks = values;
+  sort_lanes(marks, n);
+  const Lanes bound = marks[size - 1];
+  Lanes room = all(size);
+  for (int k = 0; k < n; k++) room -= one_where(values[k] < bound);
+  for (int k = 0; k < n; k++) {
+    const Flags is_below = values[k] < bound;
+    const Lanes is_tied = one_where(~is_below & (values[k] <= bound) & (room > 0));
+    marks.set(k, one_where(is_below) + is_tied), room -= is_tied;
+  }
+}
+
+// Writes an entry of symmetric matrices (M, 3, 3).
+INLINE void write_entry(float* matrices, int i, int j, int64_t m, int64_t M, Lanes entry) {
+  for (int l = 0; l < LANES && m + l < M; l++)
+    matrices[(m + l) * 9 + 3 * i + j] = matrices[(m + l) * 9 + 3 * j + i] = entry[l];
+}
+
+// Writes weighted second moments, about the mean or zero, to matrices (M, 3, 3).
+void write_moments(const Points& points, const Column& weights, bool is_centered, int n, int64_t m,
+                   int64_t M, float* matrices) {
+  Lanes center[3], count{};
+  for (int k = 0; k < n; k++) count += weights[k];
+  for (int i = 0; i < 3; i++) {
+    Lanes sum{};
+    for (int k = 0; k < n; k++) sum += weights[k] * points.columns[i][k];
+    center[i] = is_centered ? sum / count : Lanes{};
+  }
+  for (int i = 0; i < 3; i++)
+    for (int j = i; j < 3; j++) {
+      const Column &a = points.columns[i], &b = points.columns[j];
+      Lanes sum{};
+      for (int k = 0; k < n; k++) sum += weights[k] * (a[k] - center[i]) * (b[k] - center[j]);
+      write_entry(matrices, i, j, m, M, sum);
+    }
+}
+
+// starts._double_ranks of each lane.
+void rank_points(const Column& values, int n, Column& ranks) {
+  for (int i = 0; i < n; i++) {
+    Flags rank = Flags{} + 1;
+    for (int k = 0; k < n; k++) rank -= (values[k] < values[i]) + (values[k] <= values[i]);
+    ranks.set(i, to_float(rank));
+  }
+}
+
+// lanes.fit_ellipsoid and lanes.sq_distances of weighted points.
+INLINE void fit_lanes(const Points& points, const Column& weights, int n, Lanes size, Lanes floor,
+                      Points& residuals, Column& distances, Lanes (&squares)[3]) {
+  const Column &x = points.columns[0], &y = points.columns[1], &z = points.columns[2];
+  Column &u = residuals.columns[0], &v = residuals.columns[1], &w = residuals.columns[2];
+  Lanes a{}, b{}, c{}, xx{}, xy{}, xz{}, yy{}, yz{}, zz{};
+  for (int k = 0; k < n; k++) {
+    const Lanes weight = weights[k];
+    a += weight * x[k], b += weight * y[k], c += weight * z[k];
+  }
+  a = a / size, b = b / size, c = c / size;
+  const Lanes minimum = floor * size;
+  for (int k = 0; k < n; k++) {
+    const Lanes first = x[k] - a, second = y[k] - b, third = z[k] - c, scaled = weights[k] * first;
+    u.set(k, first), v.set(k, second), w.set(k, third);
+    xx += scaled * first, xy += scaled * second, xz += scaled * third;
+  }
+  squares[0] = larger(xx, minimum);
+  const Lanes p = xy / squares[0], q = xz / squares[0];
+  for (int k = 0; k < n; k++) {
+    const Lanes second = v[k] - p * u[k], third = w[k] - q * u[k], scaled = weights[k] * second;
+    v.set(k, second), w.set(k, third);
+    yy += scaled * second, yz += scaled * third;
+  }
+  squares[1] = larger(yy, minimum);
+  const Lanes r = yz / squares[1];
+  for (int k = 0; k < n; k++) {
+    const Lanes third = w[k] - r * v[k];
+    w.set(k, third);
+    zz += weights[k] * third * third;
+  }
+  squares[2] = larger(zz, minimum);
+  const Lanes less = size - all(1);
+  const Lanes f = all(1) / squares[0] * less, g = all(1) / squares[1] * less,
+              h = all(1) / squares[2] * less;
+  for (int k = 0; k < n; k++) distances.set(k, u[k] * u[k] * f + v[k] * v[k] * g + w[k] * w[k] * h);
+}
+
+struct Job {
+  int64_t patch;  // -1 for none
+  int64_t start, step;
+  double previous;
+};
+
+}  // namespace
+
+// torchrg.robust.scale._majority_difference of sorted rows; NaN where a difference is not finite.
+KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, float* found) {
+  if (n < 2 || n > MAX_WIDTH) return TOO_WIDE;
+  static thread_local Column lanes;
+  for (int64_t i = 0; i < num_rows; i += LANES) {
+    for (int l = 0; l < LANES; l++)
+      for (int k = 0; k < n; k++) lanes.at(k, l) = rows[smaller(i + l, num_rows - 1) * n + k];
+    store_row(found, i, num_rows, majority_difference(lanes, int(n)));
+  }
+  return DONE;
+}
+
+// exact.find_flats: whether a simplex may lie on a flat. Limits are twice those of the definition,
+// whose roots round differently.
+KERNEL may_have_flats(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z, Longs vertices,
+                      Floats tolerance, bool* found) {
+  constexpr float MIN_EDGE = 0.009f;
+  if (n < 1 || n > MAX_WIDTH) return TOO_WIDE;
+  for (int64_t i = 0; i < 4 * S; i++)
+    if (vertices[i] < 0 || vertices[i] >= n) return NO_SUCH_ROW;
+  static thread_local Points points;
+  for (int64_t m = 0; m < M; m += LANES) {
+    load_points(x, y, z, int(n), m, M, points);
+    const Lanes limit = load_row(tolerance, m, M) * all(4);
+    Lanes extent{};
+    for (const Column& column : points.columns)
+      for (int k = 0; k < n; k++) extent = larger(extent, magnitude(column[k]));
+    Flags near{};
+    for (int64_t s = 0; s < S; s++) {
+      Lanes axes[3][3], reach = limit;
+      Flags steep = ~Flags{};
+      for (int edge = 0; edge < 3; edge++) {
+        Lanes(&across)[3] = axes[edge];
+        for (int i = 0; i < 3; i++)
+          across[i] = points.columns[i][int(vertices[(edge + 1) * S + s])] -
+                      points.columns[i][int(vertices[s])];
+        for (int a = 0; a < edge; a++) {
+          const Lanes along =
+              across[0] * axes[a][0] + across[1] * axes[a][1] + across[2] * axes[a][2];
+          for (int i = 0; i < 3; i++) across[i] = across[i] - along * axes[a][i];
+        }
+        float heights[LANES];
+        store(heights, across[0] * across[0] + across[1] * across[1] + across[2] * across[2]);
+        for (float& height : heights) height = square_root(height);
+        const Lanes height = load(heights);
+        near += steep & (height <= reach);
+        steep = steep & (height > extent * all(MIN_EDGE));
+        reach = larger(reach, limit * (all(1) + extent * all(2) / height));
+        for (Lanes& component : across) component = component / height;
+      }
+    }
+    for (int64_t l = 0; l < LANES && m + l < M; l++) found[m + l] = near[int(l)] != 0;
+  }
+  return DONE;
+}
+
+// starts._centers_and_scales: median and majority difference of each column.
+KERNEL lane_scales(int64_t n, int64_t M, Floats values, float* medians, float* differences) {
+  if (n < 2 || n > MAX_WIDTH) return TOO_WIDE;
+  static thread_local Column rows;
+  for (int64_t m = 0; m < M; m += LANES) {
+    load_column(values, int(n), m, M, rows);
+    sort_lanes(rows, int(n));
+    store_row(medians, m, M, median_of_sorted(rows, int(n)));
+    store_row(differences, m, M, majority_difference(rows, int(n)));
+  }
+  return DONE;
+}
+
+// lanes.smallest_points.
+KERNEL smallest_points(int64_t n, int64_t M, Floats values, int64_t size, float* marks) {
+  if (n < 1 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
+  static thread_local Column column, found;
+  for (int64_t m = 0; m < M; m += LANES) {
+    load_column(values, int(n), m, M, column);
+    mark_smallest(column, int(n), int(size), found);
+    for (int k = 0; k < n; k++) store_row(marks + k * M, m, M, found[k]);
+  }
+  return DONE;
+}
+
+// starts._scatter_matrices; the first three are covariances, not yet correlations.
+KERNEL scatter_matrices(int64_t n, int64_t M, int64_t T, Floats x, Floats y, Floats z, Floats tx,
+                        Floats ty, Floats tz, Floats lengths, Floats scores, double factor,
+                        float* matrices) {
+  if (n < 2 || n > MAX_WIDTH || T <= 2 * n) return TOO_WIDE;
+  static thread_local Points points, others;
+  static thread_local Column ones, half, norms;
+  const int count = int(n);
+  for (int k = 0; k < n; k++) ones.set(k, all(1));
+  for (int64_t m = 0; m < M; m += LANES) {
+    float* found = matrices;
+    const auto write = [&](const Points& moved, const Column& weights, bool is_centered = true) {
+      write_moments(moved, weights, is_centered, count, m, M, found);
+      found += 9 * M;
+    };
+    load_points(x, y, z, count, m, M, points), load_points(tx, ty, tz, count, m, M, others);
+    write(others, ones);
+    for (int i = 0; i < 3; i++) rank_points(points.columns[i], count, others.columns[i]);
+    write(others, ones);
+    for (Column& column : others.columns)
+      for (int k = 0; k < n * LANES; k++) column.values[k] = scores[int(column.values[k])];
+    write(others, ones);
+    for (int k = 0; k < n; k++) {
+      const Lanes length = load_row(lengths + k * M, m, M);
+      const Lanes u = points.columns[0][k], v = points.columns[1][k], w = points.columns[2][k];
+      for (int i = 0; i < 3; i++) others.columns[i].set(k, points.columns[i][k] / length);
+      norms.set(k, u * u + v * v + w * w);
+    }
+    write(others, ones, false);
+    mark_smallest(norms, count, (count + 1) / 2, half);
+    write(points, half);
+    for (int i = 0; i < 3; i++) {
+      write_entry(found, i, i, m, M, all(1));
+      for (int j = i + 1; j < 3; j++) {
+        const Column &a = points.columns[i], &b = points.columns[j];
+        for (int k = 0; k < n; k++) norms.set(k, a[k] + b[k]);
+        const Lanes sum = sort_and_scale(norms, count, factor);
+        for (int k = 0; k < n; k++) norms.set(k, a[k] - b[k]);
+        const Lanes difference = sort_and_scale(norms, count, factor);
+        write_entry(found, i, j, m, M, (sum * sum - difference * difference) / all(4));
+      }
+    }
+  }
+  return DONE;
+}
+
+// starts._sphered_distances, and the `size` nearest points; the sets of starts with a zero or
+// infinite scale are undefined.
+KERNEL sphered_sets(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z, Floats loadings,
+                    double factor, int64_t size, float* sets, bool* undefined) {
+  if (n < 2 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
+  static thread_local Points points, sphered;
+  static thread_local Column score, rows;
+  for (int64_t m = 0; m < M; m += LANES) {
+    load_points(x, y, z, int(n), m, M, points);
+    for (int64_t s = 0; s < S; s++) {
+      Flags unscaled{};
+      for (int d = 0; d < 3; d++) {
+        float axes[3][LANES];
+        for (int i = 0; i < 3; i++)
+          for (int64_t l = 0; l < LANES; l++)
+            axes[i][l] = loadings[((s * M + smaller(m + l, M - 1)) * 3 + i) * 3 + d];
+        const Lanes axis[3] = {load(axes[0]), load(axes[1]), load(axes[2])};
+        for (int k = 0; k < n; k++) {
+          const Lanes value = points.columns[0][k] * axis[0] + points.columns[1][k] * axis[1] +
+                              points.columns[2][k] * axis[2];
+          score.set(k, value), rows.set(k, value);
+        }
+        const Lanes scale = sort_and_scale(rows, int(n), factor);
+        unscaled += ~(scale > all(0));
+        for (int k = 0; k < n; k++) {
+          const Lanes value = score[k] / scale;
+          for (int i = 0; i < 3; i++) {
+            const Lanes part = value * axis[i];
+            sphered.columns[i].set(k, d ? sphered.columns[i][k] + part : part);
+          }
+        }
+      }
+      for (int i = 0; i < 3; i++) {
+        const Column& column = sphered.columns[i];
+        rows = column;
+        sort_lanes(rows, int(n));
+        const Lanes center = median_of_sorted(rows, int(n));
+        for (int k = 0; k < n; k++) {
+          const Lanes away = column[k] - center;
+          score.set(k, i ? score[k] + away * away : away * away);
+        }
+      }
+      mark_smallest(score, int(n), int(size), rows);
+      for (int k = 0; k < n; k++) store_row(sets + (k * S + s) * M, m, M, rows[k]);
+      for (int64_t l = 0; l < LANES && m + l < M; l++)
+        undefined[s * M + m + l] = unscaled[int(l)] != 0;
+    }
+  }
+  return DONE;
+}
+
+// mcd._concentrate. A start that converges makes room in its lane for the next one.
+KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z, Floats initial,
+                   Floats floor, int64_t initial_size, int64_t size, int64_t max_steps,
+                   float* final, double* best) {
+  if (n < 1 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
+  static thread_local Points points, residuals;
+  static thread_local Column members, distances, marks;
+  Job jobs[LANES];
+  float floors[LANES] = {}, sizes[LANES] = {};
+  int64_t next = 0;
+  int active = 0;
+  const auto enter = [&](int l) {
+    Job& job = jobs[l] = {next < M * S ? next / S : -1, next % larger(S, int64_t(1)), -1, INFINITE};
+    if (job.patch < 0) return;
+    next++, active++, floors[l] = floor[job.patch], sizes[l] = float(initial_size);
+    for (int k = 0; k < n; k++) {
+      const int64_t i = k * M + job.patch;
+      points.columns[0].at(k, l) = x[i], points.columns[1].at(k, l) = y[i];
+      points.columns[2].at(k, l) = z[i];
+      members.at(k, l) = initial[(k * S + job.start) * M + job.patch];
+    }
+  };
+  for (int l = 0; l < LANES; l++) enter(l);
+  while (active > 0) {
+    Lanes squares[3], common{};
+    fit_lanes(points, members, int(n), load(sizes), load(floors), residuals, distances, squares);
+    mark_smallest(distances, int(n), int(size), marks);
+    for (int k = 0; k < n; k++) common += marks[k] * members[k];
+    for (int l = 0; l < LANES; l++) {
+      Job& job = jobs[l];
+      if (job.patch < 0) continue;
+      const double denominator = double(sizes[l] - 1);
+      double value = 1;
+      for (const Lanes& square : squares) value = value * (double(square[l]) / denominator);
+      const bool moves = common[l] < float(size) && value < job.previous && job.step < max_steps;
+      if (job.step < 0 || moves) {
+        // The first step leads from the initial set to one of the full size.
+        if (job.step++ >= 0) job.previous = value;
+        sizes[l] = float(size);
+        for (int k = 0; k < n; k++) members.at(k, l) = marks.at(k, l);
+        continue;
+      }
+      for (int k = 0; k < n; k++) final[(k * S + job.start) * M + job.patch] = members.at(k, l);
+      best[job.start * M + job.patch] = value;
+      active--, enter(l);
+    }
+  }
+  return DONE;
+}
