@@ -149,7 +149,7 @@ def _free_gaps(at: NDArray[np.int32], steps: tuple[int, ...]) -> tuple[NDArray[n
     """
     if kernels.serve():
         size = 2 ** (2 * at.shape[1] + 8).bit_length()
-        table = torch.empty(size, dtype=torch.int64), torch.empty(size, dtype=torch.int32)
+        table = [torch.from_numpy(np.empty(size, kind)) for kind in (np.int64, np.int32)]
         found = kernels.call("free_gaps", torch.from_numpy(at), *steps, *table)
         return tuple(gaps.numpy() for gaps in found)
     a = next(axis for axis in range(3) if steps[axis])

@@ -269,10 +269,10 @@ def _length_on_line(points: Tensor, edges: _RegionEdges, along: Tensor, spacing:
 
     def find_cells(contacts: _Contacts) -> tuple[Tensor, ...]:
         if kernels.serve(points, contacts.source):
-            slots = torch.empty(2 ** (2 * len(contacts.pair)).bit_length(), dtype=torch.int32)
-            edges = contacts.source, contacts.target, contacts.pair
-            lines = along.double(), spacing, _MAX_CELL, slots
-            *found, count = kernels.call("line_cells", points, *edges, *lines)
+            size = 2 ** (2 * len(contacts.pair)).bit_length()
+            slots = contacts.pair.new_empty(size, dtype=torch.int32)
+            lines = contacts.source, contacts.target, contacts.pair, along.double(), spacing
+            *found, count = kernels.call("line_cells", points, *lines, _MAX_CELL, slots)
             return tuple(values[: int(count)].clone() for values in found)
         contacts = _select(contacts, spacing[contacts.pair].isfinite())
         ends = (contacts.source, contacts.target)

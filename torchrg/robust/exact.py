@@ -45,7 +45,9 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Ten
         return _find_flats(columns, tolerance, size, simplices)
     dimension = torch.full_like(tolerance, num_coordinates, dtype=torch.int64)
     members = torch.zeros_like(columns[0], dtype=torch.bool)
-    (candidates,) = kernels.call("may_have_flats", *columns, torch.tensor(simplices), tolerance)
+    (candidates,) = kernels.call(
+        "may_have_flats", *columns, torch.tensor(simplices, device="cpu"), tolerance
+    )
     lanes = torch.nonzero(candidates).squeeze(1)
     if len(lanes):
         lane_columns = take_lanes(columns, lanes)
