@@ -296,16 +296,3 @@ def nonzero_rows(mask: Tensor) -> Tensor:
         # Ten times faster than nonzero in torch, and than indexing with the mask.
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.reshape(-1).nonzero().squeeze(1)
-
-
-def split_rows_by(mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the indices of True and of False elements ``(n,)``, with one wait for a device.
-
-    Example:
-        >>> split_rows_by(torch.tensor([False, True, False]))
-        (tensor([1]), tensor([0, 2]))
-    """
-    if mask.device.type == "cpu":
-        return nonzero_rows(mask), nonzero_rows(~mask)
-    order, count = (~mask).to(torch.uint8).argsort(stable=True), int(mask.sum())
-    return order[:count], order[count:]

@@ -82,3 +82,15 @@ def test_tensors_of_two_devices_are_refused_with_both_names(name):
     message = rf"^{name}: expected \w+ and \w+ on one device, got cpu and pretend:0; move"
     with pytest.raises(ShapeError, match=message):
         MIXED[name](lambda tensor: tensor.to("pretend"))
+
+
+@pytest.mark.parametrize(
+    ("preset", "max_round_trips", "max_operators"),
+    [("classic", 90, 2300), ("consensus", 480, 29_000), ("paper", 150, 9000)],
+)
+def test_segmentations_ask_the_device_seldom(preset, max_round_trips, max_operators):
+    points = torchrg.scenes.make_room(num_points=20_000, noise=0.003, seed=0).points.to("pretend")
+    with pretend.Watch() as watch:
+        torchrg.segment_planes(points, preset)
+    assert watch.round_trips <= max_round_trips
+    assert watch.operators <= max_operators

@@ -159,18 +159,16 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     coefficients = torch.stack([values.reshape(-1) for values in (trace, minors, determinant)])
     root, step = _newton(torch.zeros_like(coefficients[0]), coefficients, _FIRST_STEPS)
     # Convergence is quadratic except near a double root, so few need more steps.
-    moving = step.abs() > _CONVERGED * coefficients[0]
-    rows = torch.arange(len(root), device=root.device)
-    for step_number in range(_MAX_MORE_STEPS):
-        if step_number % _STEPS_AT_ONCE == 0:
-            left = moving.nonzero().squeeze(1)
-            rows, moving = rows[left], moving[left]
-            if len(rows) == 0:
-                break
-        old, own = root[rows], coefficients[:, rows]
-        new, step = _newton(old, own, 1)
-        root[rows] = torch.where(moving, new, old)
-        moving &= step.abs() > _CONVERGED * own[0]
+    rows = (step.abs() > _CONVERGED * coefficients[0]).nonzero().squeeze(1)
+    for _ in range(_MAX_MORE_STEPS // _STEPS_AT_ONCE):
+        if len(rows) == 0:
+            break
+        near, own = root[rows], coefficients[:, rows]
+        limit, moving = _CONVERGED * own[0], torch.ones_like(near, dtype=torch.bool)
+        for _ in range(_STEPS_AT_ONCE):
+            new, step = _newton(near, own, 1)
+            near, moving = torch.where(moving, new, near), (step.abs() > limit) & moving
+        root[rows], rows = near, rows[moving]
     return root.view_as(trace)
 
 

@@ -106,7 +106,8 @@ def find_adjacency(
     length = _length_on_line(points, edges, along, sizes / on_line)
     meets = on_line + on_curve >= MIN_CONTACTS
     length = torch.where(crossing, length, lengths)
-    return PlaneAdjacency(pairs[meets], length[meets], angle[meets])
+    rows = nonzero_rows(meets)
+    return PlaneAdjacency(pairs[rows], length[rows], angle[rows])
 
 
 class KnnAdjacency:

@@ -196,15 +196,10 @@ def _occupied_cells(owner: Tensor, row: Tensor, column: Tensor, counts: Tensor) 
     owner = torch.searchsorted(ends, keys, right=True)
     width = widths[owner]
     sides = torch.stack([keys - 1, keys + 1, keys - width, keys + width])
-    num_open = (~grid[sides]).sum(dim=0)
-    inside = keys - starts[owner]
-    return _Cells(
-        owner,
-        inside // width - 1,
-        inside % width - 1,
-        torch.bincount(owner, minlength=num_regions),
-        torch.bincount(owner, weights=num_open.double(), minlength=num_regions),
-    )
+    inside, num_cells = keys - starts[owner], torch.searchsorted(keys, ends)
+    num_cells = num_cells.diff(prepend=num_cells.new_zeros(1))
+    num_open = reduce_runs((~grid[sides]).sum(dim=0), num_cells, "sum").double()
+    return _Cells(owner, inside // width - 1, inside % width - 1, num_cells, num_open)
 
 
 def _corrected_area(cells: _Cells, counts: Tensor, size: Tensor) -> Tensor:
