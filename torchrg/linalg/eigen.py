@@ -163,10 +163,10 @@ def _smallest_root(trace: Tensor, minors: Tensor, determinant: Tensor) -> Tensor
     for _ in range(_MAX_MORE_STEPS // _STEPS_AT_ONCE):
         if len(rows) == 0:
             break
-        near, own = root[rows], coefficients[:, rows]
-        limit, moving = _CONVERGED * own[0], torch.ones_like(near, dtype=torch.bool)
+        near, entries = root[rows], coefficients[:, rows]
+        limit, moving = _CONVERGED * entries[0], torch.ones_like(near, dtype=torch.bool)
         for _ in range(_STEPS_AT_ONCE):
-            new, step = _newton(near, own, 1)
+            new, step = _newton(near, entries, 1)
             near, moving = torch.where(moving, new, near), (step.abs() > limit) & moving
         root[rows], rows = near, rows[moving]
     return root.view_as(trace)

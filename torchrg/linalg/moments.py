@@ -136,8 +136,8 @@ class Segments:
             steps = (self.counts + (max_points - 1)) // max_points
             steps, first = steps.clamp(min=1), self.counts.cumsum(0) - self.counts
             self.labels = torch.repeat_interleave(self.counts, output_size=len(self.rows))
-            place = torch.arange(len(self.rows), device=labels.device) - self.broadcast(first)
-            self.rows = self.rows[place % self.broadcast(steps) == 0]
+            index = torch.arange(len(self.rows), device=labels.device) - self.broadcast(first)
+            self.rows = self.rows[index % self.broadcast(steps) == 0]
             self.counts = (self.counts + steps - 1) // steps
         self.labels = torch.repeat_interleave(self.counts, output_size=len(self.rows))
 
