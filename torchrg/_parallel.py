@@ -68,12 +68,7 @@ def limit_rows(num_rows: int, width: int) -> int:
 
 
 def rows_at_once(num_rows: int, device: torch.device) -> int:
-    """Return the number of rows to process at a time on a device instead of ``num_rows`` on a CPU.
-
-    Example:
-        >>> rows_at_once(8192, torch.device("cpu"))
-        8192
-    """
+    """Return the number of rows to process at a time on a device instead of ``num_rows`` on a CPU."""
     return num_rows if device.type == "cpu" else num_rows * _DEVICE_CHUNKS
 
 

@@ -17,6 +17,7 @@ from torchrg.robust.lanes import (
     is_in_kernels,
     smallest_points,
     sq_distances,
+    take_lanes,
 )
 from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import sum_points
@@ -351,14 +352,19 @@ def _concentrate(
     columns, floor = [column.repeat(1, num_starts) for column in columns], floor.repeat(num_starts)
     fit = fit_ellipsoid(columns, initial.flatten(1), initial_size, floor)
     members = smallest_points(sq_distances(fit, initial_size - 1), size)
-    previous = torch.full_like(floor, torch.inf, dtype=torch.float64)
+    best = previous = torch.full_like(floor, torch.inf, dtype=torch.float64)
+    final, sets = members.clone(), torch.arange(len(floor), device=floor.device)
     for step in range(max_steps + 1):
         fit = fit_ellipsoid(columns, members, size, floor)
         value = determinant(fit, size - 1)
         candidate = smallest_points(sq_distances(fit, size - 1), size)
+        final, best = final.index_copy(1, sets, members), best.index_copy(0, sets, value)
         # Rounding may increase the determinant, or make two sets of tied points alternate.
-        moves = (sum_points(candidate * members) < size) & (value < previous)
-        if step == max_steps or not moves.any():
+        moving = (
+            ((sum_points(candidate * members) < size) & (value < previous)).nonzero().squeeze(1)
+        )
+        if step == max_steps or len(moving) == 0:
             break
-        members, previous = torch.where(moves, candidate, members), value
-    return _Concentrated(members.view_as(initial), value.view(num_starts, -1))
+        columns, sets, floor = take_lanes(columns, moving), sets[moving], floor[moving]
+        members, previous = candidate.index_select(1, moving), value[moving]
+    return _Concentrated(final.view_as(initial), best.view(num_starts, -1))

@@ -188,10 +188,13 @@ def _pairwise_qn(columns: list[Tensor]) -> Tensor:
     size = len(columns)
     matrix = columns[0].new_zeros(columns[0].shape[1], size, size)
     matrix.diagonal(dim1=-2, dim2=-1).fill_(1.0)
-    for i, j in combinations(range(size), 2):
-        total = _scale(sorted_points(columns[i] + columns[j]))
-        difference = _scale(sorted_points(columns[i] - columns[j]))
-        matrix[:, i, j] = matrix[:, j, i] = (total * total - difference * difference) / 4
+    for i, column in enumerate(columns[:-1]):
+        others = columns[i + 1 :]
+        sums = [sorted_points(column + other) for other in others]
+        differences = [sorted_points(column - other) for other in others]
+        total, difference = _scale(torch.cat(sums + differences)).view(2, len(others), -1)
+        matrix[:, i, i + 1 :] = ((total * total - difference * difference) / 4).t()
+        matrix[:, i + 1 :, i] = matrix[:, i, i + 1 :]
     return matrix
 
 
