@@ -68,7 +68,7 @@ def limit_rows(num_rows: int, width: int) -> int:
 
 
 def rows_at_once(num_rows: int, device: torch.device) -> int:
-    """Return the number of rows to process at a time on a device instead of ``num_rows`` on a CPU."""
+    """Return the number of rows processed at a time on a device, if a CPU takes ``num_rows``."""
     return num_rows if device.type == "cpu" else num_rows * _DEVICE_CHUNKS
 
 
