@@ -179,7 +179,7 @@ def make_plan(
     threads: int = 1,
     on_scan: Callable[[], object] = lambda: None,
 ) -> Plan:
-    """Determine the scans to convert with :func:`reason_to_convert`.
+    """Determine the scans to convert, each with its reason.
 
     Each of ``threads`` checks one scan at a time, then calls ``on_scan``. ``force`` selects all.
     """

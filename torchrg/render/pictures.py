@@ -160,7 +160,7 @@ def render_cloud(
     *,
     normals: Points | None = None,
     labels: Labels | None = None,
-    view: "View | PinholeCamera" = "cutaway",
+    view: View | "PinholeCamera" = "cutaway",
     up: Sequence[float] | str = "z",
     azimuth_deg: float | None = None,
     elevation_deg: float | None = None,
