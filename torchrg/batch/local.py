@@ -172,11 +172,10 @@ def _serve(pipe: Connection, stderr: Connection | None) -> None:
     """Convert scans in a new process; from the first scan on, errors go to ``stderr``."""
     parent = parent_process()
     kept = {pipe.fileno(), *([] if stderr is None else [stderr.fileno()])}
-    if parent is not None:
-        kept.add(int(parent.sentinel))
-        Thread(target=_end_with, args=(parent,), daemon=True).start()
     if sys.platform == "linux":
-        _close_others(kept)
+        _close_others(kept | ({int(parent.sentinel)} if parent is not None else set()))
+    if parent is not None:
+        Thread(target=_end_with, args=(parent,), daemon=True).start()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     gc.freeze()  # Loaded modules are not garbage.
     gc.enable()
@@ -186,8 +185,8 @@ def _serve(pipe: Connection, stderr: Connection | None) -> None:
 def _close_others(kept: Collection[int]) -> None:
     """Close all file descriptors above standard error except ``kept``.
 
-    Among those of a forked process are the lock of the output directory and the pipes of other
-    workers: they would outlive the parent process.
+    A forked process inherits the lock of the output directory and the pipes of other workers, which
+    would outlive the parent process.
     """
     for descriptor in [int(path.name) for path in Path("/proc/self/fd").iterdir()]:
         if descriptor > _STDERR and descriptor not in kept:

@@ -148,7 +148,7 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
 
     Args:
         planes: The table.
-        origin: Origin of its coordinates in those of the data set, ``(3,)``. Default: zero.
+        origin: Origin of its coordinates, in coordinates of the data set, ``(3,)``. Default: zero.
 
     Returns:
         ``planes``: for each plane its ``id`` (the value in ``plane.npy``) and the columns of

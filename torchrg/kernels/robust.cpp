@@ -240,7 +240,7 @@ KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, float* fou
   return DONE;
 }
 
-// exact.find_flats: whether a simplex may lie on a flat. Limits are twice those of the definition,
+// exact.find_flats: whether a simplex may lie on a flat. Limits are twice the definition's limits,
 // whose roots round differently.
 KERNEL may_have_flats(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z, Longs vertices,
                       Floats tolerance, bool* found) {

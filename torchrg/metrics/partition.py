@@ -136,9 +136,9 @@ def _score_oracle(superpoints: Tensor, ground_truth: Tensor) -> tuple[int, float
     table = contingency_table(superpoints, ground_truth)
     # Ties go to the lowest label.
     largest = is_first(table.regions, -table.overlaps, table.faces)
-    most_frequent, num_right = table.faces[largest], table.overlaps[largest]
-    right = torch.zeros_like(table.face_sizes).index_add(0, most_frequent, num_right)
-    sizes = torch.zeros_like(right).index_add(0, most_frequent, table.region_sizes)
+    majority, num_right = table.faces[largest], table.overlaps[largest]
+    right = torch.zeros_like(table.face_sizes).index_add(0, majority, num_right)
+    sizes = torch.zeros_like(right).index_add(0, majority, table.region_sizes)
     iou = right.double() / (sizes + table.face_sizes - right)
     return int(right.sum()), fraction(float(iou.sum()), len(iou))
 

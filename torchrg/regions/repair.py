@@ -342,7 +342,7 @@ def _merge(
             adjacent[c].remove(b)
         joined_pairs = [(a, c) for c in (adjacent[a] | adjacent[b]) - {a}]
         offer(torch.tensor(joined_pairs, dtype=torch.int64).view(-1, 2))
-    # Regions join those of smaller labels, whose owner is known first.
+    # Regions join regions with smaller labels, whose owner is known first.
     for b, a in enumerate(owner.tolist()):
         owner[b] = owner[a]
     return remap_labels(labels, owner.to(labels.device))

@@ -51,8 +51,9 @@ class Deferred:
 
     def get(self, owner: object) -> object:
         """Return the value in an object."""
-        if self._compute is not None:
-            self._value, self._compute = self._compute(owner), None
+        if (compute := self._compute) is not None:  # Another thread may set it meanwhile.
+            self._value = compute(owner)
+            self._compute = None
         return self._value
 
 
