@@ -15,6 +15,9 @@ FX, FY, CX, CY = 832.0, 840.0, 505.0, 390.0
 ENLARGED = 8
 """Pixels of a color image along one of a depth image."""
 COLOR = (ENLARGED * WIDTH, ENLARGED * HEIGHT)
+UNSURE = np.zeros((HEIGHT, WIDTH), dtype=bool)
+UNSURE[20:40, 30:90] = True
+"""Pixels whose depth is wrong, and of confidence 0, in captures that have it."""
 
 
 class MadeFrame(NamedTuple):
@@ -64,8 +67,26 @@ def write_depth(path, depth, scale=1000.0):
     elif path.suffix == ".pgm":
         head = f"P5\n# made\n{WIDTH} {HEIGHT}\n65535\n".encode()
         path.write_bytes(head + values.astype(">u2").tobytes())
+    elif path.suffix == ".exr":
+        import OpenEXR
+
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"R": (depth * scale).astype(np.float32)}).write(str(path))
     else:
         np.save(path, (depth * scale).astype(np.float32))
+
+
+def write_confidence(path, high):
+    """Write a gray image of 8 bits: 0 where depth is not sure, ``high`` elsewhere."""
+    from PIL import Image
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.where(UNSURE, 0, high).astype(np.uint8)).save(path)
+
+
+def make_unsure(depth):
+    """Return depth that is wrong where it is not sure."""
+    return np.where(UNSURE, 0.7 * depth, depth)
 
 
 def write_text(path, text):
@@ -164,11 +185,141 @@ m_calibrationDepthIntrinsic = {fx} 0 {cx} 0 0 {fy} {cy} 0 0 0 1 0 0 0 0 1
     return root
 
 
+def quaternion_of(pose):
+    """Return the rotation of a pose as x y z w."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+
+
+def phone_intrinsics():
+    """Return fx, fy, cx, cy of an iPhone's color images of 1920 x 1440 pixels."""
+    larger = 1920 / COLOR[0]
+    return [FX * larger, FY * larger, CX * larger - 0.5, CY * larger - 0.5]
+
+
+def write_stray(root, per_frame=False):
+    """Write a recording of Stray Scanner.
+
+    Format: strayrobots/scanner, docs/format.md (``timestamp, frame, x, y, z, qx, qy, qz, qw``; later
+    versions add ``fx, fy, cx, cy`` and empty columns), and StrayScanner/Helpers: rows of the camera
+    matrix are rows of ``camera_matrix.csv``, of the last frame, and ``q_WA * q_AC`` turns ARKit's
+    axes into x right, y down, z forwards. Depth is in millimeters; confidence is 0, 1 or 2.
+    """
+    fx, fy, cx, cy = phone_intrinsics()
+    header = "timestamp, frame, x, y, z, qx, qy, qz, qw"
+    rows = [header + ", fx, fy, cx, cy, distortion_center_x" if per_frame else header]
+    for number, frame in reversed([*enumerate(FRAMES)]):
+        name = f"{5 * number:06d}"
+        write_depth(root / "depth" / f"{name}.png", make_unsure(frame.depth))
+        write_confidence(root / "confidence" / f"{name}.png", 2)
+        numbers = [*frame.place, *quaternion_of(frame.pose(*CV))]
+        row = ", ".join([str(100 + number / 60), name, *map(str, numbers)])
+        rows.append(f"{row}, {fx}, {fy}, {cx}, {cy}, " if per_frame else row)
+    if per_frame:
+        fx, cx = 0.9 * fx, 0.9 * cx
+    write_text(root / "odometry.csv", "\n".join(rows) + "\n")
+    write_text(root / "camera_matrix.csv", f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0")
+    (root / "rgb.mp4").write_bytes(b"")
+    return root
+
+
+def write_polycam(root):
+    """Write the raw data of Polycam, with optimized poses.
+
+    Format: PolyCam/polyform, README.md and polyform/core/capture_folder.py, and nerfstudio,
+    process_data/polycam_utils.py: ``t_ij`` is row i, column j, from the camera (x right, y up, z
+    backwards) to ARKit's world; intrinsics are of the color image; depth is in millimeters;
+    confidence is 0, 127 or 255.
+    """
+    inside = root / "keyframes"
+    fx, fy, cx, cy = FX, FY, CX - 0.5, CY - 0.5
+    camera = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": COLOR[0], "height": COLOR[1]}
+    for number, frame in enumerate(FRAMES):
+        name = f"{62910452125 + 33333 * number}"
+        write_depth(inside / "depth" / f"{name}.png", make_unsure(frame.depth))
+        write_confidence(inside / "confidence" / f"{name}.png", 127)
+        for folder, turn in (("corrected_cameras", np.eye(4)), ("cameras", np.eye(4)[[1, 0, 2, 3]])):
+            pose = (turn @ frame.pose(*GL)).tolist()
+            cells = {f"t_{i}{j}": pose[i][j] for i in range(3) for j in range(4)}
+            write_text(inside / folder / f"{name}.json", {**camera, **cells, "blur_score": 61.2})
+    write_text(root / "mesh_info.json", {"alignmentTransform": np.eye(4).ravel().tolist()})
+    return root
+
+
+def write_record3d(root, suffix=".npy", per_frame=False):
+    """Write an export of Record3D.
+
+    Format: marek-simonik/record3d, issues 36, 64 and 67, and nerfstudio,
+    process_data/record3d_utils.py: ``K`` is column-major, of color images of ``w`` x ``h`` pixels;
+    ``poses`` are ``qx qy qz qw tx ty tz`` from the camera (OpenGL's axes) to the world; depth is in
+    meters, as OpenEXR of one channel; ``perFrameIntrinsicCoeffs`` are rows of ``fx fy cx cy``.
+    """
+    fx, fy, cx, cy = FX, FY, CX - 0.5, CY - 0.5
+    scan = root / "EXR_RGBD"
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    metadata = {"w": COLOR[0], "h": COLOR[1], "fps": 60, "initPose": [0, 0, 0, 1, 0, 0, 0]}
+    metadata["poses"] = [[*quaternion_of(frame.turn), *frame.place] for frame in FRAMES]
+    if per_frame:
+        metadata["perFrameIntrinsicCoeffs"] = [[fx, fy, cx, cy]] * len(FRAMES)
+        matrix[0] *= 0.9
+    metadata["K"] = matrix.T.ravel().tolist()
+    write_text(scan / "metadata.json", metadata)
+    scale = 1000.0 if suffix == ".png" else 1.0
+    for number, frame in enumerate(FRAMES):
+        write_depth(scan / "depth" / f"{number}{suffix}", frame.depth, scale)
+    return root
+
+
+def write_rtabmap(root, is_by_id=True):
+    """Write what ``rtabmap-export --images_id --poses_camera --poses_format 11`` does.
+
+    Format: introlab/rtabmap, tools/Export/main.cpp and corelib/src/CameraModel.cpp, issues 749 and
+    1253: images and cameras are named by ID, or with ``--images`` by time (``%f``); poses are ``stamp
+    x y z qx qy qz qw id`` of the optical axes; ``camera_matrix`` was wrong for years, so the
+    projection counts; depth is in millimeters.
+    """
+    fx, fy, cx, cy = FX, FY, CX - 0.5, CY - 0.5
+    rows = ["#timestamp x y z qx qy qz qw id"]
+    for number, frame in enumerate(FRAMES):
+        stamp, node = 1.0 + number, 3 - number
+        name = f"{node}" if is_by_id else f"{stamp:f}"
+        write_depth(root / "map_depth" / f"{name}.png", frame.depth)
+        numbers = " ".join(map(str, [*frame.place, *quaternion_of(frame.pose(*CV))]))
+        rows.append(f"{stamp:f} {numbers} {node}")
+        text = f"""%YAML:1.0
+---
+camera_name: "{name}"
+image_width: {COLOR[0]}
+image_height: {COLOR[1]}
+camera_matrix:
+   rows: 3
+   cols: 3
+   data: [ {fx}, 0., {cx}, 0., 0., {fy}, {cy}, 0., 0. ]
+projection_matrix:
+   rows: 3
+   cols: 4
+   data: [ {fx}, 0., {cx}, 0., 0.,
+       {fy}, {cy}, 0., 0., 0., 1., 0. ]
+local_transform:
+   rows: 3
+   cols: 4
+   data: [ 0., 0., 1., 0., -1., 0., 0., 0., 0., -1., 0., 0. ]
+"""
+        write_text(root / "map_calib" / f"{name}.yaml", text)
+    write_text(root / "map_camera_poses.txt", "\n".join(rows))
+    return root
+
+
 WRITERS = {
     "nerfstudio": write_nerfstudio,
     "arkitscenes": write_arkitscenes,
     "replica": write_replica,
     "scannetpp": write_scannetpp,
     "3rscan": write_3rscan,
+    "stray": write_stray,
+    "polycam": write_polycam,
+    "record3d": write_record3d,
+    "rtabmap": write_rtabmap,
 }
 """What writes each kind of capture below a folder and returns it."""

@@ -11,6 +11,7 @@ from tests.datasets.captures_tree import (
     COLOR,
     FRAMES,
     SIZE,
+    UNSURE,
     WRITERS,
     write_depth,
     write_nerfstudio,
@@ -32,7 +33,12 @@ NAMES = {
     "replica": ["room0/000000", "room0/000001"],
     "scannetpp": [f"data/0a5c013435/iphone/frame_0000{tens}" for tens in ("00", "10")],
     "3rscan": ["0988ea72/sequence/frame-000000", "0988ea72/sequence/frame-000001"],
+    "stray": ["capture/000000", "capture/000005"],
+    "polycam": ["capture/62910452125", "capture/62910485458"],
+    "record3d": ["EXR_RGBD/0", "EXR_RGBD/1"],
+    "rtabmap": ["capture/2", "capture/3"],
 }
+APPS = ["stray", "polycam", "record3d", "rtabmap"]
 
 
 def points_of(sample):
@@ -47,9 +53,12 @@ def test_frames_lie_on_the_walls_that_they_were_taken_of(tmp_path, layout):
     assert find_layout(root) == layout
     data = RGBDFrames.from_folder(root)
     assert [scene.name for scene in data.scenes] == NAMES[layout]
-    for sample, frame in zip(data, FRAMES, strict=True):
+    frames = reversed(FRAMES) if layout == "rtabmap" else FRAMES
+    for sample, frame in zip(data, frames, strict=True):
+        unsure = sample["depth"][0].numpy() == 0
+        assert np.array_equal(unsure, UNSURE if layout in ("stray", "polycam") else 0 * UNSURE)
         # Half a millimeter of rounding, and what a ray of it moves sideways.
-        np.testing.assert_allclose(points_of(sample), frame.points, atol=1e-3)
+        np.testing.assert_allclose(points_of(sample)[~unsure], frame.points[~unsure], atol=1e-3)
     assert all(root in path.parents for path in data.scenes[0].files)
 
 
@@ -214,7 +223,7 @@ def test_layouts_are_found_by_what_is_there(tmp_path):
     with pytest.raises(FormatError, match="expected a folder of frames, got a file; pass its fol"):
         RGBDFrames.from_folder(roots[0] / "transforms.json")
     (tmp_path / "capture").mkdir()
-    with pytest.raises(FormatError, match=r"expected depth images \(.png .npy .pgm\), got none"):
+    with pytest.raises(FormatError, match=r"expected depth images \(.png .npy .pgm .exr\), got none"):
         RGBDFrames.from_folder(tmp_path / "capture")
 
 

@@ -183,7 +183,10 @@ class RGBDSource(Source):
             self.data.read_sample(0)
         count = self.data.count_points
         return [
-            scene._replace(files=(scene.path, *scene.item.sources), num_points=count(scene))
+            scene._replace(
+                files=tuple(file for file in scene.files if file != scene.item.color),
+                num_points=count(scene),
+            )
             for scene in self.data.scenes
         ]
 

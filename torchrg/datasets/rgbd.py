@@ -30,7 +30,7 @@ class RGBDFrame:
     """Depth frame on disk.
 
     Args:
-        depth: Depth image: 16-bit gray PNG or PGM, or ``.npy`` of shape ``(H, W)``.
+        depth: Depth image: 16-bit gray PNG or PGM, OpenEXR, or ``.npy`` of shape ``(H, W)``.
         intrinsics: Camera matrix, shape ``(3, 3)``; the center of pixel (0, 0) is at (0, 0).
         depth_scale: Depth units per meter: 1000 for millimeters, 5000 for TUM, 1 for meters.
         name: Unique name within a data set, usable as a path below an output folder, with forward
@@ -40,6 +40,8 @@ class RGBDFrame:
         depth_kind: ``"z"`` for depth, ``"ray"`` for distances from the camera center.
         sources: Further files that intrinsics and pose were read from.
         origin: Description of where the intrinsics come from.
+        confidence: Gray image of the size of the depth, PNG, or None. Pixels of confidence 0 have
+            no depth.
 
     Raises:
         ShapeError: If a matrix has a wrong shape, or the pose is no rigid motion.
@@ -55,6 +57,7 @@ class RGBDFrame:
     depth_kind: DepthKind = "z"
     sources: tuple[Path, ...] = ()
     origin: str = ""
+    confidence: Path | None = None
 
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
@@ -72,13 +75,15 @@ class RGBDFrame:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All input files: depth, color if present, and the files of intrinsics and pose."""
-        color = () if self.color is None else (self.color,)
-        return (self.depth, *color, *self.sources)
+        """All input files: images, and the files of intrinsics and pose."""
+        images = (self.depth, self.color, self.confidence)
+        return (*(image for image in images if image is not None), *self.sources)
 
     def read_depth(self) -> Tensor:
         """Return the depth in meters along the optical axis, shape ``(H, W)``, float32."""
-        return rgbd_files.read_depth(self.depth, self.depth_scale, self.depth_kind, self.intrinsics)
+        options = (self.depth_scale, self.depth_kind, self.intrinsics)
+        depth = rgbd_files.read_depth(self.depth, *options)
+        return depth if self.confidence is None else rgbd_files.drop_unsure(depth, self.confidence)
 
 
 class RGBDFrames(SceneDataset):
@@ -154,8 +159,9 @@ class RGBDFrames(SceneDataset):
             root: The folder of one recording, or of several.
             layout: A key of :data:`~torchrg.datasets.rgbd_layouts.FRAME_LAYOUTS`: ``tum``,
                 ``icl-nuim``, ``scannet``, ``7-scenes``, ``nerfstudio``, ``arkitscenes``,
-                ``replica``, ``scannetpp``, ``3rscan``, or ``images`` for any folder of depth
-                images. Default: detected from the folder.
+                ``replica``, ``scannetpp``, ``3rscan``, ``stray``, ``polycam``, ``record3d``,
+                ``rtabmap``, or ``images`` for any folder of depth images. Default: detected from
+                the folder.
             intrinsics: Camera matrix, shape ``(3, 3)``, or a camera of images of another size.
                 Default: from the frames or a camera file next to them, else the built-in camera of
                 ``tum``, ``icl-nuim`` and ``7-scenes``.
@@ -274,9 +280,10 @@ def _find_frames(
             origin = files[0].name if files else "given" if camera else f"built in, {name}"
             scales = (depth_scale, *(c.depth_scale for c in (chosen, frame.camera) if c))
             scale = next((value for value in scales if value is not None), None)
-            # A layout has no unit of floating point.
-            is_assumed = scale is None and frame.depth.suffix.lower() != ".npy"
-            scale = layout.depth_scale if is_assumed else scale
+            is_array = frame.depth.suffix.lower() in (".npy", ".exr")
+            assumed = layout.array_scale if is_array else layout.depth_scale
+            is_assumed = scale is None and assumed is not None
+            scale = assumed if is_assumed else scale
             is_known = chosen is frame.camera or any(f.match(sign) for f in files for sign in signs)
             if chosen is None or scale is None:
                 missing, example = "depth_scale", "1000 for millimeters"
@@ -302,7 +309,15 @@ def _find_frames(
             pose, files = frame.pose, tuple(dict.fromkeys((*files, *frame.sources)))
             if pose is not None and not bool((pose.abs() <= FARTHEST).all()):
                 pose = None  # Tracking was lost.
-            options = (prefix + frame.name, frame.color, pose, kind, files, origin)
+            options = (
+                prefix + frame.name,
+                frame.color,
+                pose,
+                kind,
+                files,
+                origin,
+                frame.confidence,
+            )
             with wrap_errors(f"{[root, *files][-1]}: ", ShapeError):
                 check_rigid(frame.name, "pose", pose)
             frames.append(RGBDFrame(frame.depth, matrix, scale, *options))

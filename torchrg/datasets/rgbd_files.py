@@ -6,6 +6,7 @@ import re
 import struct
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor
+from torchrg._optional import require
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.errors import FormatError
 from torchrg.io.files import (
@@ -29,18 +31,21 @@ from torchrg.structures.colors import BYTE, WORD, narrow_colors
 from torchrg.structures.points import Array
 
 Value = TypeVar("Value")
-DEPTH_SUFFIXES = (".png", ".npy", ".pgm")
+DEPTH_SUFFIXES = (".png", ".npy", ".pgm", ".exr")
 """Suffixes of depth images."""
 _CONVERTERS = {
     ".bag": "extract its frames with Open3D's RGBDVideoReader",
     ".mkv": "extract its frames with Open3D's azure_kinect_mkv_reader.py",
     ".r3d": "unzip it, read its .depth files with pyliblzfse, save them as .npy in meters",
-    ".exr": "read it with OpenEXR, save it as .npy, usually in meters",
 }
 """How to convert unsupported recordings and images to frames, by suffix."""
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
 """Header of a binary PGM: width, height and maximum value."""
-_MAX_HEADER_BYTES = 512
+_EXR_WINDOW = re.compile(rb"dataWindow\0box2i\0\x10\0{3}(.{16})", re.DOTALL)
+"""Entry of an OpenEXR header: first and last column and row, as 32-bit integers."""
+_EXR_CHANNELS = ("Z", "Y", "R")
+"""Names of the channel with depth, in this order: renderers, gray images, and Record3D."""
+_MAX_HEADER_BYTES = 4096
 MAX_PIXELS = 1 << 26
 """Maximum pixels of an image, 8192 x 8192. No depth camera has more, and converting them to
 meters takes 1.5 GB. Running out of memory in a library would end the process."""
@@ -54,7 +59,7 @@ def read_depth(
     depth_kind: DepthKind = "z",
     intrinsics: Tensor | None = None,
 ) -> Tensor:
-    """Read depth in meters, ``(H, W)``, float32, from 16-bit gray PNG or PGM, or ``.npy``.
+    """Read depth in meters, ``(H, W)``, float32, from 16-bit gray PNG or PGM, ``.npy`` or OpenEXR.
 
     Pixels without depth are 0. ``depth_scale`` is the number of depth units per meter: 1000 for
     millimeters, 5000 for TUM, 1 for meters. It is not stored in the files and never guessed.
@@ -63,7 +68,7 @@ def read_depth(
     """
     source = local_path(path)
     refuse_form(source)
-    readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16}
+    readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16, ".exr": _read_exr}
     stored = as_tensor(f"{source}", "depth", readers[source.suffix.lower()](source))
     return convert_depth(f"{source}", stored, intrinsics, depth_scale, depth_kind).float()
 
@@ -81,6 +86,17 @@ def refuse_form(path: Path, *others: str) -> None:
             f"{path}: expected a depth image that ends in one of {' '.join(DEPTH_SUFFIXES)}, got "
             f"{path.suffix!r}; convert it to a 16-bit .png, or save its values with numpy.save."
         )
+
+
+def drop_unsure(depth: Tensor, source: Path) -> Tensor:
+    """Return depth ``(H, W)``, with 0 where a confidence image of its size, a gray PNG, is 0."""
+    image = _read_image(source, "PNG")
+    if image.shape != (*depth.shape, 1):
+        raise FormatError(
+            f"{source}: expected a gray image of shape {tuple(depth.shape)}, as its depth, got "
+            f"{image.shape}; remove it to use all depth."
+        )
+    return torch.where(torch.from_numpy(image[..., 0] > 0), depth, 0.0)
 
 
 def read_color(source: Path) -> Tensor:
@@ -115,15 +131,35 @@ def _read_image(source: Path, kinds: str) -> Array:
     """Return the pixels of an image, shape ``(H, W, C)``."""
     from kornia_rs import io
 
+    _check_size(source)
+    with wrap_errors(f"{source}: expected a {kinds} image, got: ", Exception):
+        # Without a mode argument, the library detects bit depth and channels.
+        return np.asarray(io.read_image(str(source)))
+
+
+def _check_size(source: Path) -> None:
+    """Raise FormatError if an image file is missing, or too large by its header."""
     check_file(source)
-    if source.suffix.lower() == ".png" and (count := num_pixels(source)) > MAX_PIXELS:
+    if source.suffix.lower() in (".png", ".exr") and (count := num_pixels(source)) > MAX_PIXELS:
         raise FormatError(
             f"{source}: expected an image of at most {MAX_PIXELS:,} pixels, got {count:,} in its "
             "header; resize it, unless the file is corrupt."
         )
-    with wrap_errors(f"{source}: expected a {kinds} image, got: ", Exception):
-        # Without a mode argument, the library detects bit depth and channels.
-        return np.asarray(io.read_image(str(source)))
+
+
+def _read_exr(source: Path) -> Array:
+    """Return the depth channel of an OpenEXR image, shape ``(H, W)``, float32."""
+    library = require("OpenEXR", extra="exr", purpose="read .exr depth images")
+    _check_size(source)
+    with wrap_errors(f"{source}: expected an OpenEXR image, got: ", Exception):
+        channels = library.File(str(source), separate_channels=True).channels()
+    names = [name for name in _EXR_CHANNELS if name in channels] or [*channels]
+    if names[0] not in _EXR_CHANNELS and len(channels) > 1:
+        raise FormatError(
+            f"{source}: expected a channel {' or '.join(_EXR_CHANNELS)} with depth, got "
+            f"{', '.join(channels)}; save it alone."
+        )
+    return np.asarray(channels[names[0]].pixels, dtype=np.float32)
 
 
 def _read_pgm16(source: Path) -> NDArray[np.uint16]:
@@ -159,6 +195,9 @@ def image_size(path: Path) -> tuple[int, int] | None:
         if head.startswith(b"\x89PNG"):
             width, height = struct.unpack_from(">II", head, offset=16)
             return width, height
+        if window := _EXR_WINDOW.search(head):
+            left, top, right, bottom = struct.unpack("<4i", window[1])
+            return max(right - left, 0) + 1, max(bottom - top, 0) + 1
     except (OSError, *PARSE_ERRORS):
         return None
     header = _PGM.match(head)
@@ -214,7 +253,7 @@ def read_trajectory(path: Path) -> tuple[list[float], list[Tensor]]:
     """
     rows = _rows_by_time(path, 8, "time tx ty tz qx qy qz qw")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
-    return _poses_by_time(values, _rotations(values[:, 4:]), values[:, 1:4])
+    return values[:, 0].tolist(), make_poses(values[:, 1:4], values[:, 4:])
 
 
 def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor]]:
@@ -224,16 +263,26 @@ def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor]]:
     rows = _rows_by_time(path, 7, "time rx ry rz tx ty tz")
     values = torch.tensor(_numbers(path, rows), dtype=torch.float64)
     back = torch.from_numpy(Rotation.from_rotvec(values[:, 1:4].numpy()).as_matrix()).mT
-    return _poses_by_time(values, back, -(back @ values[:, 4:, None])[..., 0])
+    return values[:, 0].tolist(), make_poses(-(back @ values[:, 4:, None])[..., 0], back)
 
 
-def _poses_by_time(
-    values: Tensor, rotations: Tensor, translations: Tensor
-) -> tuple[list[float], list[Tensor]]:
-    """Return the times of rows, and poses from rotations and translations ``(n, 3)``."""
-    poses = torch.eye(4, dtype=torch.float64).repeat(len(values), 1, 1)
-    poses[:, :3, :3], poses[:, :3, 3] = rotations, translations
-    return values[:, 0].tolist(), [*poses]
+def read_columns(path: Path, *names: str) -> Tensor:
+    """Return columns of a CSV table by name, shape ``(n, C)``, float64; NaN for empty cells."""
+    text = StringIO(decode_file(path))
+    with wrap_errors(f"{path}: expected columns {', '.join(names)}: ", ValueError, LookupError):
+        table = np.atleast_1d(np.genfromtxt(text, delimiter=",", names=True, autostrip=True))
+        return torch.from_numpy(np.stack([table[name] for name in names], axis=1))
+
+
+def make_poses(translations: Tensor, rotations: Tensor) -> list[Tensor]:
+    """Return matrices ``(4, 4)`` from translations ``(n, 3)`` and rotations.
+
+    Rotations are matrices ``(n, 3, 3)``, or quaternions x y z w ``(n, 4)``, see :func:`_rotations`.
+    """
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(translations), 1, 1)
+    poses[:, :3, :3] = _rotations(rotations) if rotations.ndim == 2 else rotations
+    poses[:, :3, 3] = translations
+    return [*poses]
 
 
 def read_nearest(

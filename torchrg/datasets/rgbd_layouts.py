@@ -4,8 +4,10 @@ A new layout needs a function that lists the frames of a recording, a row of :da
 a choice of ``torchrg convert rgbd``, and a test.
 """
 
+import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchrg.datasets.camera_files import (
+    Entries,
     parse_camera,
     parse_matrix,
     parse_number,
@@ -23,7 +26,9 @@ from torchrg.datasets.camera_files import (
 from torchrg.datasets.folder import check_folder, find_files, list_dir, natural_key, warn_skipped
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
+    make_poses,
     read_axis_angles,
+    read_columns,
     read_matrix,
     read_nearest,
     read_numbers,
@@ -32,7 +37,7 @@ from torchrg.datasets.rgbd_files import (
 )
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import DepthWarning, FormatError, warn
-from torchrg.io.files import wrap_errors
+from torchrg.io.files import PARSE_ERRORS, wrap_errors
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 _TUM_INTRINSICS = {
@@ -55,8 +60,9 @@ _NON_DEPTH_WORDS = frozenset(
     )
 )
 """Words in the names of files and folders of images that are not depth."""
-_SCANNETPP_COLOR = {"width": 1920, "height": 1440}
-"""Size of the color images, to which ScanNet++ intrinsics refer."""
+_PHONE_COLOR = {"width": 1920, "height": 1440}
+"""Size of an iPhone's color images, to which intrinsics of ScanNet++ and Stray Scanner refer."""
+_INTRINSICS = ("fx", "fy", "cx", "cy")
 _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 """Conversion between torchrg's camera axes and OpenGL's: x right, y up, z backwards."""
 
@@ -73,6 +79,7 @@ class ListedFrame(NamedTuple):
     pose: Tensor | None = None
     sources: tuple[Path, ...] = ()
     camera: Pinhole | None = None
+    confidence: Path | None = None
 
 
 class FrameLayout(NamedTuple):
@@ -84,6 +91,7 @@ class FrameLayout(NamedTuple):
         camera: Function that returns the camera of a recording without a camera file, if it is
             known; None if it never is, or is per frame.
         depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
+        array_scale: The same for ``.npy`` and ``.exr``.
         locations: Path patterns of recordings below the root folder.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
             ``("",)`` if the mark is enough, empty if the layout cannot be detected.
@@ -93,6 +101,7 @@ class FrameLayout(NamedTuple):
     mark: str = ""
     camera: Callable[[Path], Pinhole | None] | None = None
     depth_scale: float | None = None
+    array_scale: float | None = None
     locations: tuple[str, ...] = ("", "*/")
     signs: tuple[str, ...] = ("",)
 
@@ -131,10 +140,9 @@ def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
     An optional trajectory ``*.gt.freiburg`` has the image number in its first column.
     """
     tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
-    numbers, matrices = read_trajectory(tracks[0]) if tracks else ([], [])
-    poses = {f"{number:.0f}": pose for number, pose in zip(numbers, matrices, strict=True)}
+    poses = dict(zip(*read_trajectory(tracks[0]), strict=True)) if tracks else {}
     for frame in _list_frames(folder, "depth/*", "rgb/*"):
-        yield frame._replace(pose=poses.get(frame.name), sources=tracks)
+        yield frame._replace(pose=poses.get(_number(frame)), sources=tracks)
 
 
 def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterator[ListedFrame]]:
@@ -150,8 +158,10 @@ def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterato
     return frames
 
 
-def _list_frames(folder: Path, depth: str, color: str) -> Iterator[ListedFrame]:
-    """Yield the depth images of a folder with their color images, in natural order.
+def _list_frames(
+    folder: Path, depth: str, color: str = "", confidence: str = ""
+) -> Iterator[ListedFrame]:
+    """Yield the depth images of a folder with their other images, in natural order.
 
     ``*`` in the patterns, which have no suffix, is the name of a frame.
     """
@@ -162,8 +172,43 @@ def _list_frames(folder: Path, depth: str, color: str) -> Iterator[ListedFrame]:
         fits = path.stem.startswith(before) and path.stem.endswith(after)
         if path.suffix.lower() in DEPTH_SUFFIXES and fits:
             name = path.stem.removeprefix(before).removesuffix(after)
-            colors = (folder / f"{color.replace('*', name)}{end}" for end in _COLOR_SUFFIXES)
-            yield ListedFrame(name, path, next(filter(Path.is_file, colors), None))
+            stems = (folder / pattern.replace("*", name) for pattern in (color, confidence))
+            paths = ([path.with_name(path.name + end) for end in _COLOR_SUFFIXES] for path in stems)
+            images = [next(filter(Path.is_file, endings), None) for endings in paths]
+            yield ListedFrame(name, path, images[0], confidence=images[1])
+
+
+def _number(frame: ListedFrame) -> float:
+    """Return the number that names a frame, or NaN: its index, ID or time."""
+    return float(frame.name) if re.fullmatch(r"\d+(\.\d*)?", frame.name) else math.nan
+
+
+def _by_row(poses: Tensor) -> dict[float, Tensor]:
+    """Return poses ``(n, 4, 4)`` by their row, from 0."""
+    return {float(row): pose for row, pose in enumerate(poses)}
+
+
+def _numbered_frames(
+    frames: Iterable[ListedFrame],
+    track: Path,
+    poses: Mapping[float, Tensor],
+    camera: Callable[[ListedFrame], tuple[Path, Entries]],
+) -> Iterator[ListedFrame]:
+    """Yield frames with the poses of their numbers in a file, and a camera from a file's entries.
+
+    Raises:
+        FormatError: If no frame has a pose there.
+    """
+    listed = [*frames]
+    if listed and not any(_number(frame) in poses for frame in listed):
+        raise FormatError(
+            f"{track}: expected a pose of one of {len(listed):,} images, {listed[0].name} first, "
+            "got none; export the images and poses of one recording."
+        )
+    for frame in listed:
+        path, entries = camera(frame)
+        pose, pinhole = poses.get(_number(frame)), parse_camera(path, entries)
+        yield frame._replace(pose=pose, sources=(path, track), camera=pinhole)
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
@@ -229,7 +274,7 @@ def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
 
     Cameras are files of the same name, up to a millisecond; poses are in ``lowres_wide.traj``.
     """
-    frames = [*_list_frames(folder, "lowres_depth/*", "lowres_wide/*")]
+    frames = [*_list_frames(folder, "lowres_depth/*", "lowres_wide/*", "confidence/*")]
     with wrap_errors(
         f"{folder / 'lowres_depth'}: expected seconds at the ends of names: ", ValueError
     ):
@@ -253,15 +298,12 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     locations = [folder / "cam_params.json", folder.resolve().parent / "cam_params.json"]
     calibration = next((path for path in locations if path.is_file()), locations[0])
     record = read_entries(calibration)
-    scale = parse_number(calibration, record, "scale")
-    camera = parse_camera(calibration, {**record, "depth_scale": scale})
+    entries = {**record, "depth_scale": parse_number(calibration, record, "scale")}
     track = folder / "traj.txt"
     rows = read_numbers(track, 16, "16 numbers, those of a matrix,")
-    poses = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
-    for frame in _list_frames(folder, "results/depth*", "results/frame*"):
-        row = int(frame.name) if frame.name.isdecimal() else len(poses)
-        pose = poses[row] if row < len(poses) else None
-        yield frame._replace(pose=pose, sources=(calibration, track), camera=camera)
+    matrices = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
+    frames = _list_frames(folder, "results/depth*", "results/frame*")
+    return _numbered_frames(frames, track, _by_row(matrices), lambda _: (calibration, entries))
 
 
 def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -280,10 +322,97 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
         record = records.get(frame.name)
         if not isinstance(record, dict):
             raise FormatError(f"{path}: expected an entry for {frame.name}, got none.")
-        camera = parse_camera(path, _SCANNETPP_COLOR | record)
+        camera = parse_camera(path, _PHONE_COLOR | record)
         has_pose = record.get("aligned_pose") is not None
         pose = parse_matrix(path, record, "aligned_pose", 4) if has_pose else None
         yield frame._replace(pose=pose, sources=(path,), camera=camera)
+
+
+def _stray_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of Stray Scanner: ``depth/000000.png``, with rows of ``odometry.csv``.
+
+    Cameras are columns there in later versions, else ``camera_matrix.csv`` is the camera.
+    """
+    track, shared = folder / "odometry.csv", folder / "camera_matrix.csv"
+    table = read_columns(track, "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+    poses = dict(zip(table[:, 0].tolist(), make_poses(table[:, 1:4], table[:, 4:]), strict=True))
+    own: dict[float, Entries] = {}
+    with suppress(FormatError):
+        for number, *row in read_columns(track, "frame", *_INTRINSICS).tolist():
+            own[number] = dict(zip(_INTRINSICS, row, strict=True))
+
+    def camera(frame: ListedFrame) -> tuple[Path, Entries]:
+        entries = own.get(_number(frame)) or read_entries(shared)
+        return track if own else shared, {**entries, **_PHONE_COLOR}
+
+    frames = _list_frames(folder, "depth/*", "", "confidence/*")
+    return _numbered_frames(frames, track, poses, camera)
+
+
+def _polycam_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of Polycam's raw data: ``keyframes/depth/<time>.png``, in OpenGL's axes.
+
+    If poses are optimized (``corrected_cameras``), frames without an optimized pose have none.
+    """
+    inside = folder / "keyframes"
+    corrected, cameras = inside / "corrected_cameras", inside / "cameras"
+    is_optimized = any(corrected.glob("*.json"))
+    for frame in _list_frames(inside, "depth/*", "images/*", "confidence/*"):
+        paths = [parent / f"{frame.name}.json" for parent in (corrected, cameras)]
+        path = next(filter(Path.is_file, paths), paths[1])
+        record = read_mapping(path)
+        cells = [parse_number(path, record, f"t_{i // 4}{i % 4}") for i in range(12)]
+        pose = torch.tensor([*cells, 0, 0, 0, 1], dtype=torch.float64).view(4, 4) @ _OPENGL_AXES
+        yield frame._replace(
+            pose=None if is_optimized and path.parent == cameras else pose,
+            sources=(path,),
+            camera=parse_camera(path, record),
+        )
+
+
+def _record3d_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames of Record3D, ``depth/0.exr``, whose cameras have OpenGL's axes.
+
+    Poses in ``metadata.json`` are rows of ``qx qy qz qw tx ty tz``. Intrinsics per frame, if
+    present, replace the shared matrix.
+    """
+    path = folder / "metadata.json"
+    record = read_mapping(path)
+    rows, cameras = (record.get(name) or [] for name in ("poses", "perFrameIntrinsicCoeffs"))
+    with wrap_errors(f"{path}: expected poses of 7 and intrinsics of 4 numbers: ", *PARSE_ERRORS):
+        table = torch.tensor(rows, dtype=torch.float64).view(len(rows), 7)
+        own = [dict(zip(_INTRINSICS, row, strict=True)) for row in cameras]
+        matrices = torch.stack(make_poses(table[:, 4:], table[:, :4])) @ _OPENGL_AXES
+
+    def camera(frame: ListedFrame) -> tuple[Path, Entries]:
+        number = _number(frame)
+        return path, {**record, **(own[int(number)] if number < len(own) else {})}
+
+    frames = _list_frames(folder, "depth/*", "rgb/*", "confidence/*")
+    return _numbered_frames(frames, path, _by_row(matrices), camera)
+
+
+def _rtabmap_frames(folder: Path) -> Iterator[ListedFrame]:
+    """Yield the frames that ``rtabmap-export`` writes: ``<map>_depth/<ID or time>.png``.
+
+    Cameras are ``<map>_calib/<ID or time>.yaml``, and poses ``<map>_camera_poses.txt``.
+    """
+    for images in sorted(folder.glob("*_depth")):
+        base = images.name.removesuffix("_depth")
+        track, calibration = folder / f"{base}_camera_poses.txt", folder / f"{base}_calib"
+        columns = "stamp x y z qx qy qz qw id (--poses_camera --poses_format 11)"
+        table = torch.tensor(read_numbers(track, 9, columns), dtype=torch.float64)
+        frames = [*_list_frames(folder, f"{images.name}/*", f"{base}_rgb/*")]
+        names = {_number(frame) for frame in frames}
+        # The more frequent kind of name.
+        numbers = max(table[:, [8, 0]].T.tolist(), key=lambda column: len(names & {*column}))
+        poses = dict(zip(numbers, make_poses(table[:, 1:4], table[:, 4:8]), strict=True))
+
+        def camera(frame: ListedFrame, parent: Path = calibration) -> tuple[Path, Entries]:
+            path = parent / f"{frame.name}.yaml"
+            return path, read_mapping(path)
+
+        yield from _numbered_frames(frames, track, poses, camera)
 
 
 _DOTTED_FRAMES = _named_frames("*.depth", "*.color", "*.pose.txt")
@@ -304,6 +433,25 @@ FRAME_LAYOUTS = {
         _DOTTED_FRAMES, "_info.txt", depth_scale=1000.0, locations=("", "*/", "*/sequence/")
     ),
     "replica": FrameLayout(_replica_frames, "traj.txt"),
+    "stray": FrameLayout(
+        _stray_frames,
+        "odometry.csv",
+        depth_scale=1000.0,
+        array_scale=1000.0,
+        signs=("camera_matrix.csv",),
+    ),
+    "polycam": FrameLayout(
+        _polycam_frames, "keyframes", depth_scale=1000.0, signs=("keyframes/*cameras",)
+    ),
+    "record3d": FrameLayout(
+        _record3d_frames,
+        "metadata.json",
+        depth_scale=1000.0,
+        array_scale=1.0,
+        locations=("", "*/", "*/*/"),
+        signs=("depth/0.*",),
+    ),
+    "rtabmap": FrameLayout(_rtabmap_frames, "*_depth", depth_scale=1000.0, signs=("*_calib",)),
     "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
     "icl-nuim": FrameLayout(
         _icl_nuim_frames, "depth", lambda folder: _ICL_NUIM_CAMERA, 5000.0, signs=()
@@ -330,7 +478,8 @@ ARKitScenes (NeurIPS, 2021); 3RScan (RIO, ICCV, 2019); Replica as in NICE-SLAM (
 J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS, 2012; A. Handa et al.,
 A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM, ICRA, 2014; ScanNet (CVPR, 2017)
 as its reader exports it; J. Shotton et al., Scene coordinate regression forests, CVPR, 2013;
-Nerfstudio (SIGGRAPH, 2023); and any other folder."""
+Nerfstudio (SIGGRAPH, 2023); and any other folder. Stray Scanner, Polycam and Record3D are apps,
+and ``rtabmap-export`` belongs to RTAB-Map."""
 
 
 def find_layout(root: Path) -> str:
