@@ -1,7 +1,7 @@
 """``torchrg convert``: segment a whole data set, on one machine or a Ray cluster."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -31,10 +31,11 @@ from torchrg.cli import ending, flags
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.loop import Progress, print_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
-from torchrg.config import DepthConfig, SuperpointsConfig
+from torchrg.config import DepthConfig, SelectionConfig, SuperpointsConfig, load_config
 from torchrg.datasets import S3DIS, FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.datasets.folder import SceneDataset
 from torchrg.datasets.provenance import read_record
+from torchrg.datasets.rgbd import FusedRecordings
 from torchrg.datasets.s3dis import ClassOrder, find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
@@ -54,6 +55,7 @@ _Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
 _MEMORY_FRACTION = 0.8
 """Fraction of the available memory for all scans by default; other programs get the remainder."""
 _Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]
+_App = Literal["stray", "polycam", "record3d", "rtabmap"]
 
 
 @dataclass(frozen=True)
@@ -207,20 +209,29 @@ class RGBDArguments(Arguments):
     Examples:
         torchrg convert rgbd frames results --intrinsics 525,525,319.5,239.5 --depth-scale 1000
         torchrg convert rgbd capture results
+        torchrg convert rgbd capture map --fuse 0.02
     """
 
-    layout: Literal["auto", _Benchmark, _Capture, "images"] = "auto"
+    layout: Literal["auto", _Benchmark, _Capture, _App, "images"] = "auto"
     """Directory structure of ROOT. auto: detected from its files. nerfstudio: transforms.json, also
-    from Polycam and COLMAP. images: all depth images below ROOT, from one camera."""
+    from COLMAP. stray, polycam, record3d, rtabmap: exports of Stray Scanner, Polycam (raw data),
+    Record3D (EXR) and RTAB-Map. images: all depth images below ROOT, from one camera."""
+    fuse: float | None = None
+    """Voxel size in meters, such as 0.02: fuse the frames of each recording into one cloud, and
+    write its planes, and their IDs for the pixels of each frame. Default: planes of each frame."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
     depth_kind: flags.DepthKindFlag = "z"
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """Planes of depth images."""
     orient: flags.ImageOrientFlag = "auto"
-    unit: ClassVar[str] = "frame"
     seconds_per_million: ClassVar[tuple[float, str]] = (0.4, "pixels")
     """Measured on frames of 640 x 480 pixels, 0.12 s each (``scripts/bench.py steady``)."""
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        """Name of a frame, or of a fused recording, in messages."""
+        return "frame" if self.fuse is None else "scan"
 
     def source(self, root: Path) -> Source:
         """Open the frames."""
@@ -228,7 +239,14 @@ class RGBDArguments(Arguments):
         names = ("layout", "depth_scale", "depth_kind")
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         data = RGBDFrames.from_folder(root, intrinsics=camera, **options)
-        return RGBDSource(data, self.depth, orient=self.orient, table=self.table)
+        output: dict[str, Any] = {"orient": self.orient, "table": self.table}
+        if self.fuse is None:
+            return RGBDSource(data, self.depth, **output)
+        selection = {f.name: getattr(self.depth, f.name) for f in fields(SelectionConfig)}
+        settings = load_config({**selection, "planes.up": self.depth.up})
+        return CloudSource(
+            FusedRecordings(data, self.fuse, self.depth.max_depth), settings, **output
+        )
 
 
 KINDS: dict[str, type[Arguments]] = {

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchrg.datasets.folder import list_dir
-from torchrg.datasets.rgbd_files import read_array
+from torchrg.datasets.rgbd_files import make_poses, read_array
 from torchrg.depth.camera import Pinhole, check_camera
 from torchrg.errors import DepthWarning, FormatError, TorchrgError, warn
 from torchrg.io.files import PARSE_ERRORS, decode_file, wrap_errors
@@ -46,6 +46,8 @@ _MATRICES = (
     *("intrinsic_matrix", "intrinsic", "intrinsics", "m_calibrationDepthIntrinsic"),
 )
 """Names of camera matrices. ROS's rectified matrix comes first: depth images are rectified."""
+_QUATERNION = (("x", "y", "z"), ("qx", "qy", "qz", "qw"))
+"""Names of the position and the rotation of a camera."""
 _SIDES = (
     *(("w", "h"), ("W", "H"), ("width", "height"), ("image_width", "image_height")),
     *(("m_depthWidth", "m_depthHeight"), ("depthWidth", "depthHeight")),
@@ -220,6 +222,20 @@ def parse_camera(path: Path, record: Entries) -> Pinhole:
     scales = (parse_number(path, record, name) for name in _SCALES if name in record)
     scale = next(scales, None)
     return Pinhole(fx, fy, cx, cy, size, 1 / scale if scale and 0 < scale < 1 else scale)
+
+
+def parse_pose(path: Path, record: Entries) -> Tensor | None:
+    """Return the pose in a record, camera to world, ``(4, 4)``; None if it has no known name."""
+    if "qx" in record:
+        place, turn = ([parse_number(path, record, n) for n in names] for names in _QUATERNION)
+        return make_poses(*(torch.tensor([n], dtype=torch.float64) for n in (place, turn)))[0]
+    key = "transform_matrix" if "transform_matrix" in record else "pose"
+    if key == "pose" and record.get(key) is None:
+        return None
+    pose = torch.eye(4, dtype=torch.float64)
+    rows = parse_matrix(path, record, key, columns=4)
+    pose[: len(rows)] = rows
+    return pose
 
 
 def _read_pinhole(path: Path, record: Entries) -> tuple[float, float, float, float]:

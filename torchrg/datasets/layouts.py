@@ -187,6 +187,9 @@ def write_scan(
             sample = {**fields, "coord": cloud.coordinates}
             return write_pointcept_scene(folder, sample, seg, superpoint=superpoint, origin=origin)
         fields |= {} if superpoint is None else {"superpoint": superpoint}
+        # Labels of the images of a fused cloud.
+        images = cloud.header.get("images", lambda labels: ())(seg.labels.int())
+        fields |= {f"{name}/plane": image.numpy() for name, image in images}
         return write_results(folder, cloud.coordinates, seg, fields=fields, origin=origin)
     if num_bad := int(np.count_nonzero(superpoint < 0)):
         raise FormatError(

@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +16,14 @@ from torchrg._checks import as_tensor, check_shapes
 from torchrg.datasets import rgbd_files
 from torchrg.datasets.camera_files import find_camera
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform
-from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, ListedFrame, find_layout, find_recordings
+from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS, find_layout, find_recordings
 from torchrg.depth.camera import Pinhole, check_camera, describe_improbable_view, unproject_image
 from torchrg.depth.values import DepthKind, check_conversion
 from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError, warn
 from torchrg.io.files import local_path, wrap_errors
 from torchrg.linalg.rigid import check_rigid
 from torchrg.structures import FARTHEST, Cloud
+from torchrg.transforms.depth import fuse_depth
 from torchrg.transforms.rows import SampleDict
 
 
@@ -42,6 +44,7 @@ class RGBDFrame:
         origin: Description of where the intrinsics come from.
         confidence: Gray image of the size of the depth, PNG, or None. Pixels of confidence 0 have
             no depth.
+        recording: Name of the recording with the frame, or "".
 
     Raises:
         ShapeError: If a matrix has a wrong shape, or the pose is no rigid motion.
@@ -58,6 +61,7 @@ class RGBDFrame:
     sources: tuple[Path, ...] = ()
     origin: str = ""
     confidence: Path | None = None
+    recording: str = ""
 
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))
@@ -157,11 +161,8 @@ class RGBDFrames(SceneDataset):
 
         Args:
             root: The folder of one recording, or of several.
-            layout: A key of :data:`~torchrg.datasets.rgbd_layouts.FRAME_LAYOUTS`: ``tum``,
-                ``icl-nuim``, ``scannet``, ``7-scenes``, ``nerfstudio``, ``arkitscenes``,
-                ``replica``, ``scannetpp``, ``3rscan``, ``stray``, ``polycam``, ``record3d``,
-                ``rtabmap``, or ``images`` for any folder of depth images. Default: detected from
-                the folder.
+            layout: A key of :data:`~torchrg.datasets.rgbd_layouts.FRAME_LAYOUTS`, such as ``tum``,
+                or ``images`` for any folder of depth images. Default: detected from the folder.
             intrinsics: Camera matrix, shape ``(3, 3)``, or a camera of images of another size.
                 Default: from the frames or a camera file next to them, else the built-in camera of
                 ``tum``, ``icl-nuim`` and ``7-scenes``.
@@ -254,6 +255,63 @@ class RGBDFrames(SceneDataset):
         return sample
 
 
+class FusedRecordings(SceneDataset):
+    """Recordings of depth frames, each fused into one cloud.
+
+    Clouds have ``color`` if all frames do, and their front towards the cameras. Frames without a
+    pose are left out.
+
+    Args:
+        data: Frames of a folder; see :meth:`RGBDFrames.from_folder`.
+        voxel_size: Size of voxels with one point each; see :func:`torchrg.transforms.fuse_depth`.
+        max_depth: Depth to ignore beyond, in meters. Default: none.
+    """
+
+    kind = "rgbd-fused"
+
+    def __init__(self, data: RGBDFrames, voxel_size: float, max_depth: float | None = None) -> None:
+        self.root, groups = data.root, defaultdict[str, list[RGBDFrame]](list)
+        self.options = {**data.options, "voxel_size": voxel_size, "max_depth": max_depth}
+        for frame in data.frames:
+            groups[frame.recording or self.root.resolve().name].append(frame)
+        files = {k: dict.fromkeys(f for frame in v for f in frame.files) for k, v in groups.items()}
+        self.scenes = [SceneFiles(k, v[0].depth, (*files[k],), item=v) for k, v in groups.items()]
+
+    def count_points(self, scene: SceneFiles) -> int:
+        """Return the number of pixels of a recording."""
+        return sum(rgbd_files.num_pixels(frame.depth) for frame in scene.item)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the JSON-serializable parameters that affect the samples."""
+        return dict(self.options)
+
+    def read_scene(self, scene: SceneFiles) -> Cloud:
+        """Return the cloud of a recording; ``images`` in its header maps labels to frames.
+
+        Raises:
+            FormatError: If no frame has a pose, or a file is corrupt.
+        """
+        frames = [frame for frame in scene.item if frame.pose is not None]
+        if not frames:
+            raise FormatError(f"{scene.name}: expected frames with poses, got none; omit --fuse.")
+        limit = self.options["max_depth"] or math.inf
+        data = RGBDFrames(
+            frames, transform=lambda s: s | {"depth": s["depth"] * (s["depth"] <= limit)}
+        )
+        fused = fuse_depth(data, voxel_size=self.options["voxel_size"])
+        centers = torch.stack([frame.pose[:3, 3] for frame in frames])[fused.frame]
+        fields = {} if fused.color is None else {"color": fused.color.numpy()}
+        coord, front = fused.coord.numpy(), (centers - fused.coord).float().numpy()
+        names = [frame.name.removeprefix(f"{scene.name}/") for frame in frames]
+        images = {"images": lambda labels: zip(names, fused.to_frames(labels), strict=True)}
+        return Cloud(coord, fields, source=scene.name, front=front, header=images)
+
+    def _limit(self, sample: SampleDict) -> SampleDict:
+        """Return a sample without depth beyond the maximum."""
+        limit = self.options["max_depth"] or math.inf
+        return sample | {"depth": sample["depth"] * (sample["depth"] <= limit)}
+
+
 def _find_frames(
     root: Path, name: str, camera: Pinhole | None, depth_scale: float | None, kind: DepthKind
 ) -> list[RGBDFrame]:
@@ -262,7 +320,7 @@ def _find_frames(
     Warns:
         DepthWarning: See :meth:`RGBDFrames.from_folder`; once per kind, of cameras per recording.
     """
-    layout, listed, frames = FRAME_LAYOUTS[name], list[ListedFrame](), list[RGBDFrame]()
+    layout, frames, is_posed = FRAME_LAYOUTS[name], list[RGBDFrame](), False
     signs = [sign for sign in layout.signs if sign]
     notes: dict[object, str] = {}
     for prefix, folder in find_recordings(root, layout):
@@ -274,7 +332,9 @@ def _find_frames(
             elif camera is None:
                 if images not in shared:
                     found = find_camera(images, root)
-                    built_in = layout.camera(folder) if layout.camera and not found else None
+                    place = folder.resolve().name.lower()
+                    matches = (known for part, known in layout.cameras.items() if part in place)
+                    built_in = None if found else next(matches, None)
                     shared[images] = (found[0], found[1:]) if found else (built_in, ())
                 chosen, files = shared[images]
             origin = files[0].name if files else "given" if camera else f"built in, {name}"
@@ -307,26 +367,20 @@ def _find_frames(
             matrix, doubt = scale_camera(frame.depth, chosen, *files[:1])
             notes[folder] = notes.get(folder) or doubt
             pose, files = frame.pose, tuple(dict.fromkeys((*files, *frame.sources)))
+            pose = pose if pose is None or layout.axes is None else pose @ layout.axes
             if pose is not None and not bool((pose.abs() <= FARTHEST).all()):
                 pose = None  # Tracking was lost.
-            options = (
-                prefix + frame.name,
-                frame.color,
-                pose,
-                kind,
-                files,
-                origin,
-                frame.confidence,
-            )
+            options = (prefix + frame.name, frame.color, pose, kind, files, origin)
             with wrap_errors(f"{[root, *files][-1]}: ", ShapeError):
                 check_rigid(frame.name, "pose", pose)
-            frames.append(RGBDFrame(frame.depth, matrix, scale, *options))
-            listed.append(frame)
+            more = (frame.confidence, prefix[:-1])
+            frames.append(RGBDFrame(frame.depth, matrix, scale, *options, *more))
+            is_posed |= frame.pose is not None or frame.camera is not None
     num_lost = sum(frame.pose is None for frame in frames)
-    if num_lost and any(frame.pose is not None for frame in listed):
+    if num_lost and is_posed:
         notes["pose"] = (
             f"{root}: {num_lost:,} of {len(frames):,} frames have no pose; their results are in "
-            "camera coordinates."
+            "camera coordinates, and --fuse leaves them out."
         )
     for note in filter(None, notes.values()):
         warn(note, DepthWarning)

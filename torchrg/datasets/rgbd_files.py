@@ -266,12 +266,14 @@ def read_axis_angles(path: Path) -> tuple[list[float], list[Tensor]]:
     return values[:, 0].tolist(), make_poses(-(back @ values[:, 4:, None])[..., 0], back)
 
 
-def read_columns(path: Path, *names: str) -> Tensor:
-    """Return columns of a CSV table by name, shape ``(n, C)``, float64; NaN for empty cells."""
+def read_table(path: Path, key: str) -> list[dict[str, float]]:
+    """Read a CSV table with a header that names a column ``key``; rows omit their empty cells."""
     text = StringIO(decode_file(path))
-    with wrap_errors(f"{path}: expected columns {', '.join(names)}: ", ValueError, LookupError):
+    with wrap_errors(f"{path}: expected a table with a column {key}, got: ", ValueError, KeyError):
         table = np.atleast_1d(np.genfromtxt(text, delimiter=",", names=True, autostrip=True))
-        return torch.from_numpy(np.stack([table[name] for name in names], axis=1))
+        rows = table[table[key] >= 0].tolist()
+    named = (zip(table.dtype.names or (), row, strict=True) for row in rows)
+    return [{name: value for name, value in row if not math.isnan(value)} for row in named]
 
 
 def make_poses(translations: Tensor, rotations: Tensor) -> list[Tensor]:

@@ -7,8 +7,8 @@ a choice of ``torchrg convert rgbd``, and a test.
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -17,8 +17,8 @@ from torch import Tensor
 from torchrg.datasets.camera_files import (
     Entries,
     parse_camera,
-    parse_matrix,
     parse_number,
+    parse_pose,
     read_camera,
     read_entries,
     read_mapping,
@@ -26,12 +26,11 @@ from torchrg.datasets.camera_files import (
 from torchrg.datasets.folder import check_folder, find_files, list_dir, natural_key, warn_skipped
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
-    make_poses,
     read_axis_angles,
-    read_columns,
     read_matrix,
     read_nearest,
     read_numbers,
+    read_table,
     read_timed,
     read_trajectory,
 )
@@ -40,14 +39,14 @@ from torchrg.errors import DepthWarning, FormatError, warn
 from torchrg.io.files import PARSE_ERRORS, wrap_errors
 
 _COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
-_TUM_INTRINSICS = {
-    "freiburg1": (517.3, 516.5, 318.6, 255.3),
-    "freiburg2": (520.9, 521.0, 325.1, 249.7),
-    "freiburg3": (535.4, 539.2, 320.1, 247.6),
-}
-"""fx, fy, cx, cy of the three cameras, from the data set's documentation."""
 _KINECT_SIZE = (640, 480)
 """Width and height of the images of all built-in cameras, in pixels."""
+_TUM_CAMERAS = {
+    "freiburg1": Pinhole(517.3, 516.5, 318.6, 255.3, _KINECT_SIZE),
+    "freiburg2": Pinhole(520.9, 521.0, 325.1, 249.7, _KINECT_SIZE),
+    "freiburg3": Pinhole(535.4, 539.2, 320.1, 247.6, _KINECT_SIZE),
+}
+"""The three cameras in the data set's documentation."""
 _ICL_NUIM_CAMERA = Pinhole(481.2, -480.0, 319.5, 239.5, _KINECT_SIZE)
 """The scenes were rendered with y up, so the vertical focal length is negative."""
 _SEVEN_SCENES_CAMERA = Pinhole(585.0, 585.0, 320.0, 240.0, _KINECT_SIZE)
@@ -62,7 +61,6 @@ _NON_DEPTH_WORDS = frozenset(
 """Words in the names of files and folders of images that are not depth."""
 _PHONE_COLOR = {"width": 1920, "height": 1440}
 """Size of an iPhone's color images, to which intrinsics of ScanNet++ and Stray Scanner refer."""
-_INTRINSICS = ("fx", "fy", "cx", "cy")
 _OPENGL_AXES = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 """Conversion between torchrg's camera axes and OpenGL's: x right, y up, z backwards."""
 
@@ -88,22 +86,23 @@ class FrameLayout(NamedTuple):
     Attributes:
         frames: Function that yields the frames of a recording in natural order.
         mark: Name pattern of an entry in every recording; empty if any folder is a recording.
-        camera: Function that returns the camera of a recording without a camera file, if it is
-            known; None if it never is, or is per frame.
         depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
         array_scale: The same for ``.npy`` and ``.exr``.
-        locations: Path patterns of recordings below the root folder.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
             ``("",)`` if the mark is enough, empty if the layout cannot be detected.
+        levels: Maximum depth of recordings below the root folder.
+        axes: Turn from torchrg's camera axes to those of the poses, ``(4, 4)``. Default: the same.
+        cameras: Cameras of recordings without a camera file, by a part of the recording's name.
     """
 
     frames: Callable[[Path], Iterable[ListedFrame]]
     mark: str = ""
-    camera: Callable[[Path], Pinhole | None] | None = None
     depth_scale: float | None = None
     array_scale: float | None = None
-    locations: tuple[str, ...] = ("", "*/")
     signs: tuple[str, ...] = ("",)
+    levels: int = 1
+    axes: Tensor | None = None
+    cameras: Mapping[str, Pinhole] = MappingProxyType({})
 
 
 def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -125,13 +124,6 @@ def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
 def _listed_path(folder: Path, name: object) -> Path:
     """Return the path of a file listed by a program, which may run on Windows."""
     return folder / str(name).replace("\\", "/")
-
-
-def _tum_camera(folder: Path) -> Pinhole | None:
-    """Return the camera of a recording from its name, or None."""
-    name = folder.resolve().name.lower()
-    cameras = (values for camera, values in _TUM_INTRINSICS.items() if camera in name)
-    return next((Pinhole(*values, _KINECT_SIZE) for values in cameras), None)
 
 
 def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -179,36 +171,14 @@ def _list_frames(
 
 
 def _number(frame: ListedFrame) -> float:
-    """Return the number that names a frame, or NaN: its index, ID or time."""
-    return float(frame.name) if re.fullmatch(r"\d+(\.\d*)?", frame.name) else math.nan
+    """Return the number that names a frame, its index, ID or time; infinite if none does."""
+    return float(frame.name) if re.fullmatch(r"\d+(\.\d*)?", frame.name) else math.inf
 
 
-def _by_row(poses: Tensor) -> dict[float, Tensor]:
-    """Return poses ``(n, 4, 4)`` by their row, from 0."""
-    return {float(row): pose for row, pose in enumerate(poses)}
-
-
-def _numbered_frames(
-    frames: Iterable[ListedFrame],
-    track: Path,
-    poses: Mapping[float, Tensor],
-    camera: Callable[[ListedFrame], tuple[Path, Entries]],
-) -> Iterator[ListedFrame]:
-    """Yield frames with the poses of their numbers in a file, and a camera from a file's entries.
-
-    Raises:
-        FormatError: If no frame has a pose there.
-    """
-    listed = [*frames]
-    if listed and not any(_number(frame) in poses for frame in listed):
-        raise FormatError(
-            f"{track}: expected a pose of one of {len(listed):,} images, {listed[0].name} first, "
-            "got none; export the images and poses of one recording."
-        )
-    for frame in listed:
-        path, entries = camera(frame)
-        pose, pinhole = poses.get(_number(frame)), parse_camera(path, entries)
-        yield frame._replace(pose=pose, sources=(path, track), camera=pinhole)
+def _placed(frame: ListedFrame, record: Entries, path: Path, *others: Path) -> ListedFrame:
+    """Return a frame with the camera and the pose in a record, which is from these files."""
+    camera, pose = parse_camera(path, record), parse_pose(path, record)
+    return frame._replace(pose=pose, sources=(path, *others), camera=camera)
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
@@ -239,7 +209,7 @@ def _all_images(folder: Path) -> Iterator[ListedFrame]:
 def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames in ``transforms.json`` of nerfstudio and its importers.
 
-    Its cameras have OpenGL's axes, and values of a frame override shared values.
+    Values of a frame override shared values.
     """
     path = folder / "transforms.json"
     shared = read_mapping(path)
@@ -250,23 +220,15 @@ def _nerfstudio_frames(folder: Path) -> Iterator[ListedFrame]:
             f"{path}: expected a list of frames, each with depth_file_path; add the depth images "
             "there, as ns-process-data polycam --use-depth does, and remove frames without."
         )
-    for frame in sorted(frames, key=lambda frame: natural_key(str(frame["depth_file_path"]))):
-        record = {**shared, **frame}
+    for entry in sorted(frames, key=lambda entry: natural_key(str(entry["depth_file_path"]))):
+        record = {**shared, **entry, "transform_matrix": entry.get("transform_matrix")}
         image = _listed_path(Path(), record["depth_file_path"])
         name = Path(image.as_posix().removesuffix(image.suffix))
         parts = [step for step in name.parts if step not in ("..", name.anchor)]
         color = _listed_path(folder, record.get("file_path"))
-        pose = torch.eye(4, dtype=torch.float64)
-        rows = parse_matrix(path, record, "transform_matrix", columns=4)
-        pose[: len(rows)] = rows
-        yield ListedFrame(
-            "/".join(parts),
-            folder / image,
-            color if color.suffix.lower() in _COLOR_SUFFIXES and color.is_file() else None,
-            pose @ _OPENGL_AXES,
-            (path,),
-            parse_camera(path, record),
-        )
+        is_color = color.suffix.lower() in _COLOR_SUFFIXES and color.is_file()
+        frame = ListedFrame("/".join(parts), folder / image, color if is_color else None)
+        yield _placed(frame, record, path)
 
 
 def _arkitscenes_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -300,10 +262,10 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     record = read_entries(calibration)
     entries = {**record, "depth_scale": parse_number(calibration, record, "scale")}
     track = folder / "traj.txt"
-    rows = read_numbers(track, 16, "16 numbers, those of a matrix,")
-    matrices = torch.tensor(rows, dtype=torch.float64).view(-1, 4, 4)
-    frames = _list_frames(folder, "results/depth*", "results/frame*")
-    return _numbered_frames(frames, track, _by_row(matrices), lambda _: (calibration, entries))
+    table = enumerate(read_numbers(track, 16, "16 numbers, those of a matrix,"))
+    rows = {float(number): {"pose": row} for number, row in table}
+    for frame in _list_frames(folder, "results/depth*", "results/frame*"):
+        yield _placed(frame, {**entries, **rows.get(_number(frame), {})}, calibration, track)
 
 
 def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -322,35 +284,25 @@ def _scannetpp_frames(folder: Path) -> Iterator[ListedFrame]:
         record = records.get(frame.name)
         if not isinstance(record, dict):
             raise FormatError(f"{path}: expected an entry for {frame.name}, got none.")
-        camera = parse_camera(path, _PHONE_COLOR | record)
-        has_pose = record.get("aligned_pose") is not None
-        pose = parse_matrix(path, record, "aligned_pose", 4) if has_pose else None
-        yield frame._replace(pose=pose, sources=(path,), camera=camera)
+        # Poses before alignment are in another world.
+        aligned = {"pose": record.get("aligned_pose")}
+        yield _placed(frame, {**_PHONE_COLOR, **record, **aligned}, path)
 
 
 def _stray_frames(folder: Path) -> Iterator[ListedFrame]:
     """Yield the frames of Stray Scanner: ``depth/000000.png``, with rows of ``odometry.csv``.
 
-    Cameras are columns there in later versions, else ``camera_matrix.csv`` is the camera.
+    Rows of later versions have cameras, which precede the one in ``camera_matrix.csv``.
     """
-    track, shared = folder / "odometry.csv", folder / "camera_matrix.csv"
-    table = read_columns(track, "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
-    poses = dict(zip(table[:, 0].tolist(), make_poses(table[:, 1:4], table[:, 4:]), strict=True))
-    own: dict[float, Entries] = {}
-    with suppress(FormatError):
-        for number, *row in read_columns(track, "frame", *_INTRINSICS).tolist():
-            own[number] = dict(zip(_INTRINSICS, row, strict=True))
-
-    def camera(frame: ListedFrame) -> tuple[Path, Entries]:
-        entries = own.get(_number(frame)) or read_entries(shared)
-        return track if own else shared, {**entries, **_PHONE_COLOR}
-
-    frames = _list_frames(folder, "depth/*", "", "confidence/*")
-    return _numbered_frames(frames, track, poses, camera)
+    path, track = folder / "camera_matrix.csv", folder / "odometry.csv"
+    shared, rows = read_entries(path), {row["frame"]: row for row in read_table(track, "frame")}
+    for frame in _list_frames(folder, "depth/*", "", "confidence/*"):
+        record = {**shared, **rows.get(_number(frame), {}), **_PHONE_COLOR}
+        yield _placed(frame, record, path, track)
 
 
 def _polycam_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of Polycam's raw data: ``keyframes/depth/<time>.png``, in OpenGL's axes.
+    """Yield the frames of Polycam's raw data, ``keyframes/depth/<time>.png``.
 
     If poses are optimized (``corrected_cameras``), frames without an optimized pose have none.
     """
@@ -361,35 +313,27 @@ def _polycam_frames(folder: Path) -> Iterator[ListedFrame]:
         paths = [parent / f"{frame.name}.json" for parent in (corrected, cameras)]
         path = next(filter(Path.is_file, paths), paths[1])
         record = read_mapping(path)
-        cells = [parse_number(path, record, f"t_{i // 4}{i % 4}") for i in range(12)]
-        pose = torch.tensor([*cells, 0, 0, 0, 1], dtype=torch.float64).view(4, 4) @ _OPENGL_AXES
-        yield frame._replace(
-            pose=None if is_optimized and path.parent == cameras else pose,
-            sources=(path,),
-            camera=parse_camera(path, record),
-        )
+        if path == paths[0] or not is_optimized:
+            record["pose"] = [record.get(f"t_{cell // 4}{cell % 4}") for cell in range(12)]
+        yield _placed(frame, record, path)
 
 
 def _record3d_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of Record3D, ``depth/0.exr``, whose cameras have OpenGL's axes.
+    """Yield the frames of Record3D, ``depth/0.exr``; their numbers are rows of ``metadata.json``.
 
-    Poses in ``metadata.json`` are rows of ``qx qy qz qw tx ty tz``. Intrinsics per frame, if
-    present, replace the shared matrix.
+    Intrinsics per frame, if any, precede the shared matrix.
     """
     path = folder / "metadata.json"
-    record = read_mapping(path)
-    rows, cameras = (record.get(name) or [] for name in ("poses", "perFrameIntrinsicCoeffs"))
-    with wrap_errors(f"{path}: expected poses of 7 and intrinsics of 4 numbers: ", *PARSE_ERRORS):
-        table = torch.tensor(rows, dtype=torch.float64).view(len(rows), 7)
-        own = [dict(zip(_INTRINSICS, row, strict=True)) for row in cameras]
-        matrices = torch.stack(make_poses(table[:, 4:], table[:, :4])) @ _OPENGL_AXES
-
-    def camera(frame: ListedFrame) -> tuple[Path, Entries]:
-        number = _number(frame)
-        return path, {**record, **(own[int(number)] if number < len(own) else {})}
-
-    frames = _list_frames(folder, "depth/*", "rgb/*", "confidence/*")
-    return _numbered_frames(frames, path, _by_row(matrices), camera)
+    shared = read_mapping(path)
+    columns = {"poses": "qx qy qz qw x y z", "perFrameIntrinsicCoeffs": "fx fy cx cy"}
+    rows: dict[float, Entries] = {}
+    with wrap_errors(f"{path}: expected {columns}, got: ", *PARSE_ERRORS):
+        for key, names in columns.items():
+            for number, row in enumerate(shared.get(key) or ()):
+                named = dict(zip(names.split(), row, strict=True))
+                rows[number] = {**rows.get(number, {}), **named}
+    for frame in _list_frames(folder, "depth/*", "rgb/*", "confidence/*"):
+        yield _placed(frame, {**shared, **rows.get(_number(frame), {})}, path)
 
 
 def _rtabmap_frames(folder: Path) -> Iterator[ListedFrame]:
@@ -397,80 +341,51 @@ def _rtabmap_frames(folder: Path) -> Iterator[ListedFrame]:
 
     Cameras are ``<map>_calib/<ID or time>.yaml``, and poses ``<map>_camera_poses.txt``.
     """
-    for images in sorted(folder.glob("*_depth")):
-        base = images.name.removesuffix("_depth")
-        track, calibration = folder / f"{base}_camera_poses.txt", folder / f"{base}_calib"
-        columns = "stamp x y z qx qy qz qw id (--poses_camera --poses_format 11)"
-        table = torch.tensor(read_numbers(track, 9, columns), dtype=torch.float64)
-        frames = [*_list_frames(folder, f"{images.name}/*", f"{base}_rgb/*")]
-        names = {_number(frame) for frame in frames}
-        # The more frequent kind of name.
-        numbers = max(table[:, [8, 0]].T.tolist(), key=lambda column: len(names & {*column}))
-        poses = dict(zip(numbers, make_poses(table[:, 1:4], table[:, 4:8]), strict=True))
-
-        def camera(frame: ListedFrame, parent: Path = calibration) -> tuple[Path, Entries]:
-            path = parent / f"{frame.name}.yaml"
-            return path, read_mapping(path)
-
-        yield from _numbered_frames(frames, track, poses, camera)
+    names = "stamp x y z qx qy qz qw id"
+    for track in sorted(folder.glob("*_camera_poses.txt")):
+        base = track.name.removesuffix("_camera_poses.txt")
+        table = read_numbers(track, 9, f"{names} (--poses_format 11)")
+        rows = [dict(zip(names.split(), row, strict=True)) for row in table]
+        frames = [*_list_frames(folder, f"{base}_depth/*", f"{base}_rgb/*")]
+        numbers = {_number(frame) for frame in frames}
+        by_key = [{row[key]: row for row in rows} for key in ("id", "stamp")]
+        poses = max(by_key, key=lambda poses: len(numbers & poses.keys()))
+        for frame in frames:
+            path = folder / f"{base}_calib" / f"{frame.name}.yaml"
+            yield _placed(
+                frame, {**read_mapping(path), **poses.get(_number(frame), {})}, path, track
+            )
 
 
 _DOTTED_FRAMES = _named_frames("*.depth", "*.color", "*.pose.txt")
 FRAME_LAYOUTS = {
-    "scannetpp": FrameLayout(
-        _scannetpp_frames,
-        "pose_intrinsic_imu.json",
-        depth_scale=1000.0,
-        locations=("", "iphone/", "*/iphone/", "data/*/iphone/"),
-    ),
-    "arkitscenes": FrameLayout(
-        _arkitscenes_frames,
-        "lowres_depth",
-        depth_scale=1000.0,
-        locations=("", "*/", "*/*/", "*/*/*/"),
-    ),
-    "3rscan": FrameLayout(
-        _DOTTED_FRAMES, "_info.txt", depth_scale=1000.0, locations=("", "*/", "*/sequence/")
-    ),
+    "scannetpp": FrameLayout(_scannetpp_frames, "pose_intrinsic_imu.json", 1000.0, levels=3),
+    "arkitscenes": FrameLayout(_arkitscenes_frames, "lowres_depth", 1000.0, levels=3),
+    "3rscan": FrameLayout(_DOTTED_FRAMES, "_info.txt", 1000.0, levels=2),
     "replica": FrameLayout(_replica_frames, "traj.txt"),
-    "stray": FrameLayout(
-        _stray_frames,
-        "odometry.csv",
-        depth_scale=1000.0,
-        array_scale=1000.0,
-        signs=("camera_matrix.csv",),
-    ),
+    "stray": FrameLayout(_stray_frames, "odometry.csv", 1000.0, 1000.0, ("camera_matrix.csv",)),
     "polycam": FrameLayout(
-        _polycam_frames, "keyframes", depth_scale=1000.0, signs=("keyframes/*cameras",)
+        _polycam_frames, "keyframes", 1000.0, signs=("keyframes/*cameras",), axes=_OPENGL_AXES
     ),
     "record3d": FrameLayout(
-        _record3d_frames,
-        "metadata.json",
-        depth_scale=1000.0,
-        array_scale=1.0,
-        locations=("", "*/", "*/*/"),
-        signs=("depth/0.*",),
+        _record3d_frames, "metadata.json", 1000.0, 1.0, ("depth/0.*",), 2, _OPENGL_AXES
     ),
-    "rtabmap": FrameLayout(_rtabmap_frames, "*_depth", depth_scale=1000.0, signs=("*_calib",)),
-    "tum": FrameLayout(_tum_frames, "depth.txt", _tum_camera, 5000.0),
+    "rtabmap": FrameLayout(_rtabmap_frames, "*_camera_poses.txt", 1000.0, signs=("*_calib",)),
+    "tum": FrameLayout(_tum_frames, "depth.txt", 5000.0, cameras=_TUM_CAMERAS),
     "icl-nuim": FrameLayout(
-        _icl_nuim_frames, "depth", lambda folder: _ICL_NUIM_CAMERA, 5000.0, signs=()
+        _icl_nuim_frames, "depth", 5000.0, signs=(), cameras={"": _ICL_NUIM_CAMERA}
     ),
     "scannet": FrameLayout(
         _named_frames("depth/*", "color/*", "pose/*.txt"),
         "depth",
-        depth_scale=1000.0,
-        locations=("", "*/", "*/*/"),
+        1000.0,
         signs=("intrinsic*_depth.txt", "intrinsic*/intrinsic*_depth.txt"),
+        levels=2,
     ),
     "7-scenes": FrameLayout(
-        _DOTTED_FRAMES,
-        "frame-*.depth.png",
-        lambda folder: _SEVEN_SCENES_CAMERA,
-        1000.0,
-        locations=("", "*/", "*/*/"),
+        _DOTTED_FRAMES, "frame-*.depth.png", 1000.0, levels=2, cameras={"": _SEVEN_SCENES_CAMERA}
     ),
-    "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json", depth_scale=1000.0),
+    "nerfstudio": FrameLayout(_nerfstudio_frames, "transforms.json", 1000.0, axes=_OPENGL_AXES),
     "images": FrameLayout(_all_images),
 }
 """Layouts by name, in the order that :func:`find_layout` tries them: ScanNet++ (ICCV, 2023);
@@ -519,4 +434,5 @@ def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path
 
 def _marked_folders(root: Path, layout: FrameLayout) -> Iterator[Path]:
     """Return the folders with the mark of a layout, possibly with duplicates."""
-    return (path.parent for prefix in layout.locations for path in root.glob(prefix + layout.mark))
+    patterns = ("*/" * level + layout.mark for level in range(layout.levels + 1))
+    return (path.parent for pattern in patterns for path in root.glob(pattern))

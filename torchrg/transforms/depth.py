@@ -1,7 +1,7 @@
 """Transforms of depth images: conversion to clouds, segmentation, and fusion."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -267,11 +267,11 @@ class FusedFrames(NamedTuple):
         return images
 
 
-def fuse_depth(samples: Sequence[Entries], *, voxel_size: float | None = None) -> FusedFrames:
+def fuse_depth(samples: Iterable[Entries], *, voxel_size: float | None = None) -> FusedFrames:
     """Fuse depth frames with poses into one cloud.
 
     Args:
-        samples: Samples as returned by :class:`torchrg.datasets.RGBDFrames`: ``depth``
+        samples: Samples, or a data set, of :class:`torchrg.datasets.RGBDFrames`: ``depth``
             ``(1, H, W)`` or ``(H, W)``, ``intrinsics`` ``(3, 3)``, ``pose`` ``(4, 4)``, and
             optionally ``color``. Frames may differ in size.
         voxel_size: Keep only the point nearest to the center of each voxel of this size; see
