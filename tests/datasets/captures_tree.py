@@ -201,10 +201,10 @@ def phone_intrinsics():
 def write_stray(root, per_frame=False):
     """Write a recording of Stray Scanner.
 
-    Format: strayrobots/scanner, docs/format.md (``timestamp, frame, x, y, z, qx, qy, qz, qw``; later
-    versions add ``fx, fy, cx, cy`` and empty columns), and StrayScanner/Helpers: rows of the camera
-    matrix are rows of ``camera_matrix.csv``, of the last frame, and ``q_WA * q_AC`` turns ARKit's
-    axes into x right, y down, z forwards. Depth is in millimeters; confidence is 0, 1 or 2.
+    Format: strayrobots/scanner, docs/format.md and StrayScanner/Helpers: columns are ``timestamp,
+    frame, x, y, z, qx, qy, qz, qw``, in later versions with ``fx, fy, cx, cy`` and empty cells;
+    ``camera_matrix.csv`` has the rows of the matrix of the last frame; ``q_WA * q_AC`` turns
+    ARKit's axes into x right, y down, z forwards; depth is in millimeters; confidence is 0 to 2.
     """
     fx, fy, cx, cy = phone_intrinsics()
     header = "timestamp, frame, x, y, z, qx, qy, qz, qw"
@@ -239,7 +239,10 @@ def write_polycam(root):
         name = f"{62910452125 + 33333 * number}"
         write_depth(inside / "depth" / f"{name}.png", make_unsure(frame.depth))
         write_confidence(inside / "confidence" / f"{name}.png", 127)
-        for folder, turn in (("corrected_cameras", np.eye(4)), ("cameras", np.eye(4)[[1, 0, 2, 3]])):
+        for folder, turn in (
+            ("corrected_cameras", np.eye(4)),
+            ("cameras", np.eye(4)[[1, 2, 0, 3]]),
+        ):
             pose = (turn @ frame.pose(*GL)).tolist()
             cells = {f"t_{i}{j}": pose[i][j] for i in range(3) for j in range(4)}
             write_text(inside / folder / f"{name}.json", {**camera, **cells, "blur_score": 61.2})
@@ -275,9 +278,9 @@ def write_rtabmap(root, is_by_id=True):
     """Write what ``rtabmap-export --images_id --poses_camera --poses_format 11`` does.
 
     Format: introlab/rtabmap, tools/Export/main.cpp and corelib/src/CameraModel.cpp, issues 749 and
-    1253: images and cameras are named by ID, or with ``--images`` by time (``%f``); poses are ``stamp
-    x y z qx qy qz qw id`` of the optical axes; ``camera_matrix`` was wrong for years, so the
-    projection counts; depth is in millimeters.
+    1253: images and cameras are named by ID, or with ``--images`` by time (``%f``); poses are
+    ``stamp x y z qx qy qz qw id`` of the optical axes; ``camera_matrix`` was wrong for years, so
+    the projection counts; depth is in millimeters.
     """
     fx, fy, cx, cy = FX, FY, CX - 0.5, CY - 0.5
     rows = ["#timestamp x y z qx qy qz qw id"]

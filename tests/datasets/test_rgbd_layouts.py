@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -9,12 +10,21 @@ import torch
 
 from tests.datasets.captures_tree import (
     COLOR,
+    CV,
+    ENLARGED,
     FRAMES,
+    FX,
+    HEIGHT,
     SIZE,
     UNSURE,
+    WIDTH,
     WRITERS,
     write_depth,
     write_nerfstudio,
+    write_polycam,
+    write_record3d,
+    write_rtabmap,
+    write_stray,
     write_text,
 )
 from torchrg.batch.run import list_jobs
@@ -23,8 +33,9 @@ from torchrg.batch.sources import RGBDSource
 from torchrg.config import DepthConfig
 from torchrg.datasets import RGBDFrames
 from torchrg.datasets.rgbd_layouts import find_layout
+from torchrg.depth import segment_depth
 from torchrg.depth.camera import unproject_image
-from torchrg.errors import ConfigError, DepthWarning, FormatError
+from torchrg.errors import ConfigError, DepthWarning, FormatError, MissingDependencyError
 from torchrg.pipeline import segment_planes
 
 NAMES = {
@@ -85,6 +96,141 @@ def test_a_capture_in_opengl_axes_has_the_planes_of_its_cloud(tmp_path, suffix, 
             assert abs(plane["normal"][axis]) > np.cos(np.radians(0.1))
             wall = plane["offset"] * np.sign(plane["normal"][axis])
             assert min(abs(wall), abs(wall - SIZE[axis])) < 1e-3
+
+
+def write_variant(name, root):
+    """Write a capture as another version or another option of its program does."""
+    return {
+        "stray": lambda: write_stray(root, per_frame=True),
+        "record3d": lambda: write_record3d(root, ".png", per_frame=True),
+        "rtabmap": lambda: write_rtabmap(root, is_by_id=False),
+        "polycam": lambda: without_corrected(write_polycam(root)),
+        "exr": lambda: write_record3d(root, ".exr"),
+    }[name]()
+
+
+def without_corrected(root):
+    """Keep the poses before optimization, which are in another world."""
+    shutil.rmtree(root / "keyframes" / "corrected_cameras")
+    return root
+
+
+@pytest.mark.parametrize("name", [*APPS, "exr"])
+def test_other_versions_of_apps_are_read(tmp_path, name):
+    if name == "exr":
+        pytest.importorskip("OpenEXR")
+    data = RGBDFrames.from_folder(write_variant(name, tmp_path / "capture"))
+    turn = np.eye(3)[[1, 2, 0]] if name == "polycam" else np.eye(3)
+    for sample, frame in zip(data, FRAMES, strict=True):
+        seen = sample["depth"][0].numpy() > 0
+        assert np.array_equal(seen, ~UNSURE if name in ("stray", "polycam") else seen | True)
+        np.testing.assert_allclose(points_of(sample)[seen], frame.points[seen] @ turn.T, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", APPS)
+def test_planes_of_apps_are_those_of_the_room_in_every_frame(tmp_path, name):
+    data = RGBDFrames.from_folder(WRITERS[name](tmp_path / "capture"))
+    walls = [set(), set()]
+    for number, sample in enumerate(data):
+        options = {"pose": sample["pose"], "noise": (0.0005, 0.0)}
+        planes = segment_depth(sample["depth"], sample["intrinsics"], **options).planes
+        for normal, offset in zip(planes.normal.double(), planes.offset.tolist(), strict=True):
+            axis = int(normal.abs().argmax())
+            assert np.degrees(np.arccos(min(float(normal[axis].abs()), 1))) < 0.05
+            place = offset * float(normal[axis].sign())
+            assert min(abs(place), abs(place - SIZE[axis])) < 1e-3
+            walls[number].add((axis, round(place, 1)))
+    assert min(map(len, walls)) == 3
+    assert walls[0] & walls[1]
+
+
+@pytest.mark.parametrize("name", APPS)
+def test_poses_of_apps_are_exact_and_in_the_axes_of_torchrg(tmp_path, name):
+    frames = RGBDFrames.from_folder(WRITERS[name](tmp_path / "capture")).frames
+    for frame, made in zip(frames, FRAMES[:: -1 if name == "rtabmap" else 1], strict=True):
+        np.testing.assert_allclose(frame.pose, made.pose(*CV), rtol=0, atol=1e-14)
+
+
+def test_frames_without_an_optimized_pose_have_none(tmp_path):
+    root = write_polycam(tmp_path / "capture")
+    next((root / "keyframes" / "corrected_cameras").iterdir()).unlink()
+    with pytest.warns(DepthWarning, match="1 of 2 frames have no pose"):
+        frames = RGBDFrames.from_folder(root).frames
+    assert sum(frame.pose is None for frame in frames) == 1
+
+
+def test_numbers_of_other_images_are_no_poses(tmp_path):
+    root = write_rtabmap(tmp_path / "capture")
+    path = root / "map_camera_poses.txt"
+    path.write_text(path.read_text().replace(" 3\n", " 7\n"))
+    with pytest.warns(DepthWarning, match="1 of 2 frames have no pose"):
+        RGBDFrames.from_folder(root)
+    path.write_text("# none\n9.5 0 0 0 0 0 0 1 9\n")
+    with pytest.warns(DepthWarning, match="2 of 2 frames have no pose"):
+        RGBDFrames.from_folder(root)
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "old", "new", "message"),
+    [
+        ("stray", "odometry.csv", "frame", "image", "expected a table with a column frame, got: "),
+        ("stray", "odometry.csv", " qw", " qv", "expected a number for qw, got None"),
+        ("stray", "odometry.csv", " 000000,", "", "expected a table with a column frame, got: "),
+        ("stray", "camera_matrix.csv", "0.0", "", "expected a matrix of 3 x 3"),
+        (
+            "polycam",
+            "keyframes/corrected_cameras/62910452125.json",
+            "t_12",
+            "t",
+            "expected pose to",
+        ),
+        ("record3d", "EXR_RGBD/metadata.json", "]], ", ", 0]], ", "expected {'poses': 'qx qy"),
+        ("rtabmap", "map_camera_poses.txt", " 3\n", "\n", "expected stamp x y z qx qy qz qw id"),
+        ("rtabmap", "map_calib/3.yaml", "matrix:", "m:", "expected a camera, as fl_x"),
+    ],
+)
+def test_spoilt_captures_of_apps_are_refused_with_their_file(
+    tmp_path, name, file, old, new, message
+):
+    path = WRITERS[name](tmp_path / "capture") / file
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(FormatError) as caught:
+        RGBDFrames.from_folder(tmp_path / "capture")
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+
+
+def test_confidence_of_another_size_is_refused_and_determines_results(tmp_path):
+    root = write_stray(tmp_path / "capture")
+    source, out = RGBDSource(RGBDFrames.from_folder(root), DepthConfig()), tmp_path / "out"
+    path = root / "confidence" / "000000.png"
+    assert path in source.list_scans(out)[0].files
+    write_depth(path, np.ones((4, 6)))
+    with pytest.raises(
+        FormatError, match=r"000000.png: expected a gray image of shape \(96, 128\)"
+    ):
+        source.data[0]
+    path.unlink()
+    assert not np.array_equal(RGBDFrames.from_folder(root)[0]["depth"][0] == 0, UNSURE)
+
+
+def test_openexr_is_asked_for_by_name(tmp_path, monkeypatch):
+    root = write_record3d(tmp_path / "capture")
+    header = (
+        b"v/1\x01\x02\0\0\0dataWindow\0box2i\0\x10\0\0\0"
+        + np.array([0, 0, WIDTH - 1, HEIGHT - 1], "<i4").tobytes()
+    )
+    for path in (root / "EXR_RGBD" / "depth").iterdir():
+        path.with_suffix(".exr").write_bytes(header)
+        path.unlink()
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    data = RGBDFrames.from_folder(root)
+    assert data.frames[0].depth_scale == 1.0
+    assert data.frames[0].intrinsics[0, 0] == FX / ENLARGED
+    with pytest.raises(
+        MissingDependencyError, match=r"OpenEXR is needed to read .exr depth im.*exr"
+    ):
+        data[0]
 
 
 def test_frames_may_have_cameras_of_their_own(tmp_path):
@@ -223,7 +369,9 @@ def test_layouts_are_found_by_what_is_there(tmp_path):
     with pytest.raises(FormatError, match="expected a folder of frames, got a file; pass its fol"):
         RGBDFrames.from_folder(roots[0] / "transforms.json")
     (tmp_path / "capture").mkdir()
-    with pytest.raises(FormatError, match=r"expected depth images \(.png .npy .pgm .exr\), got none"):
+    with pytest.raises(
+        FormatError, match=r"expected depth images \(.png .npy .pgm .exr\), got none"
+    ):
         RGBDFrames.from_folder(tmp_path / "capture")
 
 

@@ -1,6 +1,7 @@
 """``torchrg convert``: segment a whole data set, on one machine or a Ray cluster."""
 
 import dataclasses
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -225,13 +226,16 @@ class RGBDArguments(Arguments):
     depth: DepthConfig = dataclasses.field(default_factory=DepthConfig)
     """Planes of depth images."""
     orient: flags.ImageOrientFlag = "auto"
-    seconds_per_million: ClassVar[tuple[float, str]] = (0.4, "pixels")
-    """Measured on frames of 640 x 480 pixels, 0.12 s each (``scripts/bench.py steady``)."""
 
     @property
     def unit(self) -> str:  # type: ignore[override]
         """Name of a frame, or of a fused recording, in messages."""
-        return "frame" if self.fuse is None else "scan"
+        return "frame" if self.fuse is None else super().unit
+
+    @property
+    def seconds_per_million(self) -> tuple[float, str]:  # type: ignore[override]
+        """Time for frames of 640 x 480 pixels, 0.12 s each (``scripts/bench.py steady``)."""
+        return (0.4, "pixels") if self.fuse is None else super().seconds_per_million
 
     def source(self, root: Path) -> Source:
         """Open the frames."""
@@ -239,10 +243,20 @@ class RGBDArguments(Arguments):
         names = ("layout", "depth_scale", "depth_kind")
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         data = RGBDFrames.from_folder(root, intrinsics=camera, **options)
-        output: dict[str, Any] = {"orient": self.orient, "table": self.table}
         if self.fuse is None:
-            return RGBDSource(data, self.depth, **output)
+            return RGBDSource(data, self.depth, orient=self.orient, table=self.table)
+        is_inward = self.orient in ("viewpoint", "none")
+        output: dict[str, Any] = {
+            "orient": "auto" if is_inward else self.orient,
+            "table": self.table,
+        }
         selection = {f.name: getattr(self.depth, f.name) for f in fields(SelectionConfig)}
+        of_cloud = DepthConfig(**selection, up=self.depth.up, max_depth=self.depth.max_depth)
+        if not 0 < self.fuse < math.inf or self.depth != of_cloud:
+            raise ConfigError(
+                f"expected --fuse > 0 without --depth.noise, max-angle-deg, max-step or min-size, "
+                f"which are of single images, got {self.fuse:g} and {self.depth}; omit these."
+            )
         settings = load_config({**selection, "planes.up": self.depth.up})
         return CloudSource(
             FusedRecordings(data, self.fuse, self.depth.max_depth), settings, **output

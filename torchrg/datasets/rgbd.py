@@ -282,8 +282,8 @@ class FusedRecordings(SceneDataset):
         return sum(rgbd_files.num_pixels(frame.depth) for frame in scene.item)
 
     def describe(self) -> dict[str, Any]:
-        """Return the JSON-serializable parameters that affect the samples."""
-        return dict(self.options)
+        """Return the JSON-serializable parameters that affect the clouds."""
+        return self.options
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
         """Return the cloud of a recording; ``images`` in its header maps labels to frames.
@@ -305,11 +305,6 @@ class FusedRecordings(SceneDataset):
         names = [frame.name.removeprefix(f"{scene.name}/") for frame in frames]
         images = {"images": lambda labels: zip(names, fused.to_frames(labels), strict=True)}
         return Cloud(coord, fields, source=scene.name, front=front, header=images)
-
-    def _limit(self, sample: SampleDict) -> SampleDict:
-        """Return a sample without depth beyond the maximum."""
-        limit = self.options["max_depth"] or math.inf
-        return sample | {"depth": sample["depth"] * (sample["depth"] <= limit)}
 
 
 def _find_frames(

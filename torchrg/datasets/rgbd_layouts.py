@@ -176,9 +176,10 @@ def _number(frame: ListedFrame) -> float:
 
 
 def _placed(frame: ListedFrame, record: Entries, path: Path, *others: Path) -> ListedFrame:
-    """Return a frame with the camera and the pose in a record, which is from these files."""
-    camera, pose = parse_camera(path, record), parse_pose(path, record)
-    return frame._replace(pose=pose, sources=(path, *others), camera=camera)
+    """Return a frame with the camera in a record from a file, and the pose from the last file."""
+    sources = (path, *others)
+    camera, pose = parse_camera(path, record), parse_pose(sources[-1], record)
+    return frame._replace(pose=pose, sources=sources, camera=camera)
 
 
 def _all_images(folder: Path) -> Iterator[ListedFrame]:
@@ -314,7 +315,8 @@ def _polycam_frames(folder: Path) -> Iterator[ListedFrame]:
         path = next(filter(Path.is_file, paths), paths[1])
         record = read_mapping(path)
         if path == paths[0] or not is_optimized:
-            record["pose"] = [record.get(f"t_{cell // 4}{cell % 4}") for cell in range(12)]
+            names = (f"t_{cell // 4}{cell % 4}" for cell in range(12))
+            record["pose"] = [parse_number(path, record, name) for name in names]
         yield _placed(frame, record, path)
 
 
