@@ -182,7 +182,7 @@ def test_numbers_of_other_images_are_no_poses(tmp_path):
             "keyframes/corrected_cameras/62910452125.json",
             "t_12",
             "t",
-            "expected pose to",
+            "expected a number for t_12",
         ),
         ("record3d", "EXR_RGBD/metadata.json", "]], ", ", 0]], ", "expected {'poses': 'qx qy"),
         ("rtabmap", "map_camera_poses.txt", " 3\n", "\n", "expected stamp x y z qx qy qz qw id"),
