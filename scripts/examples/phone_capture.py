@@ -2,8 +2,8 @@
 
 python scripts/examples/phone_capture.py capture/ room.ply
 
-The capture is a folder with transforms.json, as nerfstudio writes it for Polycam and Record3D, or a
-video of ARKitScenes.
+The capture is an export of Stray Scanner, Polycam, Record3D or RTAB-Map, a folder with
+transforms.json, or a video of ARKitScenes. For all frames: torchrg convert rgbd --fuse 0.02.
 """
 
 import sys

@@ -77,7 +77,7 @@ def write_depth(path, depth, scale=1000.0):
 
 
 def write_confidence(path, high):
-    """Write a gray image of 8 bits: 0 where depth is not sure, ``high`` elsewhere."""
+    """Write a gray image of 8 bits: 0 where depth is not sure, ``high`` otherwise."""
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -44,6 +44,12 @@ class Source:
     """Number of levels of superpoints into which conversion also partitions clouds."""
     bytes_per_point: ClassVar[int]
     """Disk space of the results per point, to check the free space in advance."""
+    unit: ClassVar[str] = "scan"
+    """Name of a scan in messages."""
+    seconds_per_million: ClassVar[tuple[float, str]] = (10.0, "points, as consensus takes")
+    """Time in seconds for a million points on one core of an AMD EPYC, and the name of the points.
+    Measured with ``torchrg segment`` on a synthetic room of four million points. ``classic`` takes
+    0.6 times as long, ``paper`` 1.5 times, and every preset about three times without kernels."""
 
     @property
     def root(self) -> Path:

@@ -170,6 +170,9 @@ class RGBDSource(Source):
     orient: Orientation = "auto"
     table: str | None = None
     bytes_per_point: ClassVar[int] = 12 + 12 + 4 + 4
+    unit: ClassVar[str] = "frame"
+    seconds_per_million: ClassVar[tuple[float, str]] = (0.4, "pixels")
+    """Measured on frames of 640 x 480 pixels, 0.12 s each (``scripts/bench.py steady``)."""
 
     def describe(self) -> Record:
         """Return the type of the source and its options that affect results."""

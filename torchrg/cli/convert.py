@@ -4,7 +4,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from tqdm import tqdm
 
@@ -88,12 +88,6 @@ class Arguments:
     results are listed and the command stops."""
     dry_run: bool = False
     """Print the plan, write nothing."""
-    unit: ClassVar[str] = "scan"
-    """Name of a scan in messages."""
-    seconds_per_million: ClassVar[tuple[float, str]] = (10.0, "points, as consensus takes")
-    """Time in seconds for a million points on one core of an AMD EPYC, and the name of the points.
-    Measured with ``torchrg segment`` on a synthetic room of four million points. ``classic`` takes
-    0.6 times as long, ``paper`` 1.5 times, and every preset about three times without kernels."""
 
     def source(self, root: Path) -> Source:
         """Return the source to convert; ``root`` is absolute."""
@@ -227,16 +221,6 @@ class RGBDArguments(Arguments):
     """Planes of depth images."""
     orient: flags.ImageOrientFlag = "auto"
 
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        """Name of a frame, or of a fused recording, in messages."""
-        return "frame" if self.fuse is None else super().unit
-
-    @property
-    def seconds_per_million(self) -> tuple[float, str]:  # type: ignore[override]
-        """Time for frames of 640 x 480 pixels, 0.12 s each (``scripts/bench.py steady``)."""
-        return (0.4, "pixels") if self.fuse is None else super().seconds_per_million
-
     def source(self, root: Path) -> Source:
         """Open the frames."""
         camera = flags.parse_intrinsics(self.intrinsics)
@@ -245,22 +229,17 @@ class RGBDArguments(Arguments):
         data = RGBDFrames.from_folder(root, intrinsics=camera, **options)
         if self.fuse is None:
             return RGBDSource(data, self.depth, orient=self.orient, table=self.table)
-        is_inward = self.orient in ("viewpoint", "none")
-        output: dict[str, Any] = {
-            "orient": "auto" if is_inward else self.orient,
-            "table": self.table,
-        }
         selection = {f.name: getattr(self.depth, f.name) for f in fields(SelectionConfig)}
-        of_cloud = DepthConfig(**selection, up=self.depth.up, max_depth=self.depth.max_depth)
-        if not 0 < self.fuse < math.inf or self.depth != of_cloud:
+        used = DepthConfig(**selection, up=self.depth.up, max_depth=self.depth.max_depth)
+        if not 0 < self.fuse < math.inf or self.depth != used:
             raise ConfigError(
                 f"expected --fuse > 0 without --depth.noise, max-angle-deg, max-step or min-size, "
                 f"which are of single images, got {self.fuse:g} and {self.depth}; omit these."
             )
+        fused = FusedRecordings(data, self.fuse, self.depth.max_depth)
         settings = load_config({**selection, "planes.up": self.depth.up})
-        return CloudSource(
-            FusedRecordings(data, self.fuse, self.depth.max_depth), settings, **output
-        )
+        orient = "auto" if self.orient in ("viewpoint", "none") else self.orient
+        return CloudSource(fused, settings, orient=orient, table=self.table)
 
 
 KINDS: dict[str, type[Arguments]] = {
@@ -309,7 +288,7 @@ def run(argv: list[str]) -> int:
         for result in stale:
             if result.paths and (result.scan is not None or arguments.prune):
                 ending.print_lines(f"remove {result.name}: {result.reason}")
-        print(format_costs(plan, *resources, arguments.seconds_per_million))
+        print(format_costs(plan, *resources, scans[0].source.seconds_per_million))
         check_stale(stale, root, prune=arguments.prune)
         check_free_space(plan)
         return 0
@@ -407,12 +386,13 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
         from torchrg.batch.ray_tasks import run_ray
 
         reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
-    unit = "frame" if arguments.unit == "frame" else "pt"
+    kind = scans[0].source.unit
+    unit = "frame" if kind == "frame" else "pt"
     sizes = {job.name: 1 if unit == "frame" else job.scan.num_points for job in jobs}
     total = sum(sizes.values())
     # No smoothing: scans finish rarely, and a recent rate would jump with each.
     with tqdm(total=total, unit=unit, unit_scale=True, smoothing=0, disable=None) as bar:
-        shown = Progress(bar, sizes, unit=arguments.unit)
+        shown = Progress(bar, sizes, unit=kind)
         report = run_plan(plan, reports, engine=arguments.engine, workers=workers, on_report=shown)
     for job in jobs:
         remove_empty(job.folder, {out})  # Scans that failed leave empty folders.
@@ -424,7 +404,7 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
         unreported = str(error)
     if not report.disk_full:
         plan.jobs[0].source.write_lists(out)
-    code = _finish(report, out, unit=arguments.unit)
+    code = _finish(report, out, unit=kind)
     if unreported:
         code = ending.fail(unreported, code=code or ending.USAGE_ERROR)
     pages = _page_folder(arguments)

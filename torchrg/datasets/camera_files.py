@@ -227,8 +227,8 @@ def parse_camera(path: Path, record: Entries) -> Pinhole:
 def parse_pose(path: Path, record: Entries) -> Tensor | None:
     """Return the pose in a record, camera to world, ``(4, 4)``; None if it has no known name."""
     if "qx" in record:
-        place, turn = ([parse_number(path, record, n) for n in names] for names in _QUATERNION)
-        return make_poses(*(torch.tensor([n], dtype=torch.float64) for n in (place, turn)))[0]
+        parts = ([[parse_number(path, record, n) for n in names]] for names in _QUATERNION)
+        return make_poses(*(torch.tensor(part, dtype=torch.float64) for part in parts))[0]
     key = "transform_matrix" if "transform_matrix" in record else "pose"
     if key == "pose" and record.get(key) is None:
         return None

@@ -256,15 +256,12 @@ class RGBDFrames(SceneDataset):
 
 
 class FusedRecordings(SceneDataset):
-    """Recordings of depth frames, each fused into one cloud.
-
-    Clouds have ``color`` if all frames do, and their front towards the cameras. Frames without a
-    pose are left out.
+    """Recordings in a folder of frames, each fused into one cloud, without frames without a pose.
 
     Args:
-        data: Frames of a folder; see :meth:`RGBDFrames.from_folder`.
-        voxel_size: Size of voxels with one point each; see :func:`torchrg.transforms.fuse_depth`.
-        max_depth: Depth to ignore beyond, in meters. Default: none.
+        data: Result of :meth:`RGBDFrames.from_folder`.
+        voxel_size: Voxel size in meters; see :func:`torchrg.transforms.fuse_depth`.
+        max_depth: Maximum depth, in meters. Default: no limit.
     """
 
     kind = "rgbd-fused"
@@ -286,19 +283,14 @@ class FusedRecordings(SceneDataset):
         return self.options
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
-        """Return the cloud of a recording; ``images`` in its header maps labels to frames.
-
-        Raises:
-            FormatError: If no frame has a pose, or a file is corrupt.
-        """
+        """Return a cloud, its front towards the cameras; ``images`` maps labels to named frames."""
         frames = [frame for frame in scene.item if frame.pose is not None]
         if not frames:
             raise FormatError(f"{scene.name}: expected frames with poses, got none; omit --fuse.")
         limit = self.options["max_depth"] or math.inf
-        data = RGBDFrames(
-            frames, transform=lambda s: s | {"depth": s["depth"] * (s["depth"] <= limit)}
-        )
-        fused = fuse_depth(data, voxel_size=self.options["voxel_size"])
+        depths = ((sample, sample["depth"]) for sample in RGBDFrames(frames))
+        near = (sample | {"depth": depth * (depth <= limit)} for sample, depth in depths)
+        fused = fuse_depth(near, voxel_size=self.options["voxel_size"])
         centers = torch.stack([frame.pose[:3, 3] for frame in frames])[fused.frame]
         fields = {} if fused.color is None else {"color": fused.color.numpy()}
         coord, front = fused.coord.numpy(), (centers - fused.coord).float().numpy()
@@ -327,8 +319,8 @@ def _find_frames(
             elif camera is None:
                 if images not in shared:
                     found = find_camera(images, root)
-                    place = folder.resolve().name.lower()
-                    matches = (known for part, known in layout.cameras.items() if part in place)
+                    lower = folder.resolve().name.lower()
+                    matches = (known for part, known in layout.cameras.items() if part in lower)
                     built_in = None if found else next(matches, None)
                     shared[images] = (found[0], found[1:]) if found else (built_in, ())
                 chosen, files = shared[images]

@@ -127,39 +127,34 @@ def _read_png16(source: Path) -> NDArray[np.uint16]:
     return values
 
 
-def _read_image(source: Path, kinds: str) -> Array:
-    """Return the pixels of an image, shape ``(H, W, C)``."""
+def _read_image(source: Path, kinds: str, read: Callable[[str], Array] | None = None) -> Array:
+    """Return the pixels of an image, shape ``(H, W, C)``; ``read`` replaces the library."""
     from kornia_rs import io
 
-    _check_size(source)
-    with wrap_errors(f"{source}: expected a {kinds} image, got: ", Exception):
-        # Without a mode argument, the library detects bit depth and channels.
-        return np.asarray(io.read_image(str(source)))
-
-
-def _check_size(source: Path) -> None:
-    """Raise FormatError if an image file is missing, or too large by its header."""
     check_file(source)
     if source.suffix.lower() in (".png", ".exr") and (count := num_pixels(source)) > MAX_PIXELS:
         raise FormatError(
             f"{source}: expected an image of at most {MAX_PIXELS:,} pixels, got {count:,} in its "
             "header; resize it, unless the file is corrupt."
         )
+    with wrap_errors(f"{source}: expected a {kinds} image, got: ", Exception):
+        # Without a mode argument, the library detects bit depth and channels.
+        return np.asarray((read or io.read_image)(str(source)))
 
 
 def _read_exr(source: Path) -> Array:
     """Return the depth channel of an OpenEXR image, shape ``(H, W)``, float32."""
     library = require("OpenEXR", extra="exr", purpose="read .exr depth images")
-    _check_size(source)
-    with wrap_errors(f"{source}: expected an OpenEXR image, got: ", Exception):
-        channels = library.File(str(source), separate_channels=True).channels()
-    names = [name for name in _EXR_CHANNELS if name in channels] or [*channels]
-    if names[0] not in _EXR_CHANNELS and len(channels) > 1:
-        raise FormatError(
-            f"{source}: expected a channel {' or '.join(_EXR_CHANNELS)} with depth, got "
-            f"{', '.join(channels)}; save it alone."
-        )
-    return np.asarray(channels[names[0]].pixels, dtype=np.float32)
+
+    def read(path: str) -> Array:
+        channels = library.File(path, separate_channels=True).channels()
+        known = [name for name in _EXR_CHANNELS if name in channels]
+        (name,) = [*channels] if len(channels) == 1 else known[:1]
+        pixels: Array = channels[name].pixels
+        return pixels
+
+    kinds = f"OpenEXR (one channel, or {', '.join(_EXR_CHANNELS)})"
+    return _read_image(source, kinds, read).astype(np.float32)
 
 
 def _read_pgm16(source: Path) -> NDArray[np.uint16]:
