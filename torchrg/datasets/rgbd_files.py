@@ -36,7 +36,7 @@ DEPTH_SUFFIXES = (".png", ".npy", ".pgm", ".exr")
 _CONVERTERS = {
     ".bag": "extract its frames with Open3D's RGBDVideoReader",
     ".mkv": "extract its frames with Open3D's azure_kinect_mkv_reader.py",
-    ".r3d": "unzip it, read its .depth files with pyliblzfse, save them as .npy in meters",
+    ".r3d": "export it as EXR + JPG in Record3D",
 }
 """How to convert unsupported recordings and images to frames, by suffix."""
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+?([1-9]\d{0,8})\s+([1-9]\d{0,8})\s+(\d{1,9})\s")
@@ -220,14 +220,6 @@ def read_array(source: Path) -> Array:
         if values.dtype.kind not in "fiu":
             raise TypeError(f"{values.dtype}")
     return values
-
-
-def read_matrix(path: Path) -> Tensor:
-    """Read a 4 x 4 matrix, shape ``(4, 4)``, float64."""
-    rows = _words(path)
-    if [len(row) for row in rows] != [4] * 4:
-        raise FormatError(f"{path}: expected 4 rows of 4 numbers, got {len(rows)} rows.")
-    return torch.tensor(_numbers(path, rows), dtype=torch.float64)
 
 
 def read_numbers(path: Path, count: int, what: str) -> list[list[float]]:

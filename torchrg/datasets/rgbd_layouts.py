@@ -27,7 +27,6 @@ from torchrg.datasets.folder import check_folder, find_files, list_dir, natural_
 from torchrg.datasets.rgbd_files import (
     DEPTH_SUFFIXES,
     read_axis_angles,
-    read_matrix,
     read_nearest,
     read_numbers,
     read_table,
@@ -143,9 +142,11 @@ def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterato
     def frames(folder: Path) -> Iterator[ListedFrame]:
         for frame in _list_frames(folder, depth, color):
             path = folder / pose.replace("*", frame.name)
-            is_posed = path.is_file()
+            if path.is_file():
+                rows = read_numbers(path, 4, "4 numbers, those of a 4 x 4 matrix,")
+                frame = frame._replace(pose=parse_pose(path, {"pose": rows}), sources=(path,))
             if not frame.name.endswith(".rendered"):
-                yield frame._replace(pose=read_matrix(path), sources=(path,)) if is_posed else frame
+                yield frame
 
     return frames
 
