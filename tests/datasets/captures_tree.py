@@ -126,7 +126,8 @@ def write_arkitscenes(root):
     scan, rows = root / "Training" / "40753679", []
     fx, fy, cx, cy = camera_of_depth(0)
     for time, off, frame in zip((6791.2, 6791.3), (0.0, 0.001), FRAMES, strict=True):
-        write_depth(scan / "lowres_depth" / f"40753679_{time:.3f}.png", frame.depth)
+        write_depth(scan / "lowres_depth" / f"40753679_{time:.3f}.png", make_unsure(frame.depth))
+        write_confidence(scan / "confidence" / f"40753679_{time:.3f}.png", 2)
         name = f"40753679_{time + off:.3f}.pincam"
         text = f"{WIDTH} {HEIGHT} {fx} {fy} {cx} {cy}"
         write_text(scan / "lowres_wide_intrinsics" / name, text)

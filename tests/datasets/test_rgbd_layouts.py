@@ -67,7 +67,8 @@ def test_frames_lie_on_the_walls_that_they_were_taken_of(tmp_path, layout):
     frames = reversed(FRAMES) if layout == "rtabmap" else FRAMES
     for sample, frame in zip(data, frames, strict=True):
         unsure = sample["depth"][0].numpy() == 0
-        assert np.array_equal(unsure, UNSURE if layout in ("stray", "polycam") else 0 * UNSURE)
+        has_confidence = layout in ("arkitscenes", "stray", "polycam")
+        assert np.array_equal(unsure, UNSURE if has_confidence else 0 * UNSURE)
         # Half a millimeter of rounding, and what a ray of it moves sideways.
         np.testing.assert_allclose(points_of(sample)[~unsure], frame.points[~unsure], atol=1e-3)
     assert all(root in path.parents for path in data.scenes[0].files)
@@ -364,6 +365,7 @@ def test_layouts_are_found_by_what_is_there(tmp_path):
     roots = [write(tmp_path / name) for name, write in WRITERS.items()]
     assert [find_layout(root) for root in roots] == [*WRITERS]
     write_depth(tmp_path / "plain" / "depth" / "0.png", FRAMES[0].depth)
+    write_text(tmp_path / "plain" / "metadata.json", {"camera": "kinect"})
     assert find_layout(tmp_path / "plain") == "images"
     assert find_layout(tmp_path / "missing") == "images"
     with pytest.raises(FormatError, match="expected a folder of frames, got a file; pass its fol"):

@@ -87,8 +87,8 @@ class FrameLayout(NamedTuple):
         mark: Name pattern of an entry in every recording; empty if any folder is a recording.
         depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
         array_scale: The same for ``.npy`` and ``.exr``.
-        signs: Patterns of further entries, one of which distinguishes layouts with the same mark;
-            ``("",)`` if the mark is enough, empty if the layout cannot be detected.
+        signs: Patterns of further entries, one of which distinguishes layouts with the same mark,
+            or ``file:text``; ``("",)`` if the mark is enough, empty if it cannot be detected.
         levels: Maximum depth of recordings below the root folder.
         axes: Turn from torchrg's camera axes to those of the poses, ``(4, 4)``. Default: the same.
         cameras: Cameras of recordings without a camera file, by a part of the recording's name.
@@ -371,7 +371,7 @@ FRAME_LAYOUTS = {
         _polycam_frames, "keyframes", 1000.0, signs=("keyframes/*cameras",), axes=_OPENGL_AXES
     ),
     "record3d": FrameLayout(
-        _record3d_frames, "metadata.json", 1000.0, 1.0, ("depth/0.*",), 2, _OPENGL_AXES
+        _record3d_frames, "metadata.json", 1000.0, 1.0, ('metadata.json:"poses"',), 2, _OPENGL_AXES
     ),
     "rtabmap": FrameLayout(_rtabmap_frames, "*_camera_poses.txt", 1000.0, signs=("*_calib",)),
     "tum": FrameLayout(_tum_frames, "depth.txt", 5000.0, cameras=_TUM_CAMERAS),
@@ -407,9 +407,15 @@ def find_layout(root: Path) -> str:
     """
     for name, layout in FRAME_LAYOUTS.items():
         for folder in _marked_folders(root, layout) if layout.mark and layout.signs else ():
-            if any(not sign or any(folder.glob(sign)) for sign in layout.signs):
+            if any(not sign or _has_sign(folder, sign) for sign in layout.signs):
                 return name
     return "images"
+
+
+def _has_sign(folder: Path, sign: str) -> bool:
+    """Whether a folder has an entry by its pattern, with the text after a colon in it, if any."""
+    pattern, _, text = sign.partition(":")
+    return any(not text or text.encode() in path.read_bytes() for path in folder.glob(pattern))
 
 
 def find_recordings(root: Path, layout: FrameLayout) -> Iterator[tuple[str, Path]]:
