@@ -203,7 +203,6 @@ class RGBDArguments(Arguments):
 
     Examples:
         torchrg convert rgbd frames results --intrinsics 525,525,319.5,239.5 --depth-scale 1000
-        torchrg convert rgbd capture results
         torchrg convert rgbd capture map --fuse 0.02
     """
 
@@ -212,8 +211,8 @@ class RGBDArguments(Arguments):
     from COLMAP. stray, polycam, record3d, rtabmap: exports of Stray Scanner, Polycam (raw data),
     Record3D (EXR) and RTAB-Map. images: all depth images below ROOT, from one camera."""
     fuse: float | None = None
-    """Voxel size in meters, such as 0.02: fuse the frames of each recording into one cloud, and
-    write its planes, and their IDs for the pixels of each frame. Default: planes of each frame."""
+    """Voxel size in meters: write the planes of the fused cloud of each recording, and their IDs for
+    the pixels of each frame. Default: no fusion."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
     depth_kind: flags.DepthKindFlag = "z"
