@@ -211,8 +211,8 @@ class RGBDArguments(Arguments):
     from COLMAP. stray, polycam, record3d, rtabmap: exports of Stray Scanner, Polycam (raw data),
     Record3D (EXR) and RTAB-Map. images: all depth images below ROOT, from one camera."""
     fuse: float | None = None
-    """Voxel size in meters: write the planes of the fused cloud of each recording, and their IDs for
-    the pixels of each frame. Default: no fusion."""
+    """Voxel size in meters: write the planes of the fused cloud of each recording, and their IDs
+    for the pixels of each frame. Default: no fusion."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
     depth_kind: flags.DepthKindFlag = "z"

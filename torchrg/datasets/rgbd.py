@@ -85,9 +85,8 @@ class RGBDFrame:
 
     def read_depth(self) -> Tensor:
         """Return the depth in meters along the optical axis, shape ``(H, W)``, float32."""
-        options = (self.depth_scale, self.depth_kind, self.intrinsics)
-        depth = rgbd_files.read_depth(self.depth, *options)
-        return depth if self.confidence is None else rgbd_files.drop_unsure(depth, self.confidence)
+        options = (self.depth_scale, self.depth_kind, self.intrinsics, self.confidence)
+        return rgbd_files.read_depth(self.depth, *options)
 
 
 class RGBDFrames(SceneDataset):

@@ -58,19 +58,29 @@ def read_depth(
     depth_scale: float,
     depth_kind: DepthKind = "z",
     intrinsics: Tensor | None = None,
+    confidence: Path | None = None,
 ) -> Tensor:
     """Read depth in meters, ``(H, W)``, float32, from 16-bit gray PNG or PGM, ``.npy`` or OpenEXR.
 
-    Pixels without depth are 0. ``depth_scale`` is the number of depth units per meter: 1000 for
-    millimeters, 5000 for TUM, 1 for meters. It is not stored in the files and never guessed.
-    Distances along the ray, ``"ray"``, need the camera; see
+    Pixels without depth are 0, also where ``confidence``, a gray PNG, is 0. ``depth_scale`` is the
+    number of depth units per meter: 1000 for millimeters, 5000 for TUM, 1 for meters. It is not
+    stored in the files and never guessed. Distances along the ray, ``"ray"``, need the camera; see
     :func:`torchrg.depth.values.convert_depth`.
     """
     source = local_path(path)
     refuse_form(source)
     readers = {".png": _read_png16, ".npy": _read_npy, ".pgm": _read_pgm16, ".exr": _read_exr}
     stored = as_tensor(f"{source}", "depth", readers[source.suffix.lower()](source))
-    return convert_depth(f"{source}", stored, intrinsics, depth_scale, depth_kind).float()
+    depth = convert_depth(f"{source}", stored, intrinsics, depth_scale, depth_kind).float()
+    if confidence is None:
+        return depth
+    image = _read_image(confidence, "PNG")
+    if image.shape != (*depth.shape, 1):
+        raise FormatError(
+            f"{confidence}: expected a gray image of shape {tuple(depth.shape)}, as its depth, got "
+            f"{image.shape}; remove it to use all depth."
+        )
+    return torch.where(torch.from_numpy(image[..., 0] > 0), depth, 0.0)
 
 
 def refuse_form(path: Path, *others: str) -> None:
@@ -86,17 +96,6 @@ def refuse_form(path: Path, *others: str) -> None:
             f"{path}: expected a depth image that ends in one of {' '.join(DEPTH_SUFFIXES)}, got "
             f"{path.suffix!r}; convert it to a 16-bit .png, or save its values with numpy.save."
         )
-
-
-def drop_unsure(depth: Tensor, source: Path) -> Tensor:
-    """Return depth ``(H, W)``, with 0 where a confidence image of its size, a gray PNG, is 0."""
-    image = _read_image(source, "PNG")
-    if image.shape != (*depth.shape, 1):
-        raise FormatError(
-            f"{source}: expected a gray image of shape {tuple(depth.shape)}, as its depth, got "
-            f"{image.shape}; remove it to use all depth."
-        )
-    return torch.where(torch.from_numpy(image[..., 0] > 0), depth, 0.0)
 
 
 def read_color(source: Path) -> Tensor:
