@@ -33,7 +33,7 @@ from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_dets, fit_fastm
 from torchrg.robust.mm import Target
 from torchrg.robust.starts import MCDStarts, Starts
 from torchrg.robust.weights import Inliers, Scaling
-from torchrg.structures import NormalFit
+from torchrg.structures.points import NormalFit, format_fields
 
 __all__ = [
     "MVE",
@@ -89,6 +89,9 @@ class Eigen(NamedTuple):
 
     values: Tensor
     vectors: Tensor
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 @dataclass(eq=False, repr=False)

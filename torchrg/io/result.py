@@ -39,7 +39,7 @@ from torchrg.structures import (
     Superpoints,
 )
 from torchrg.structures.colors import narrow_colors, read_colors
-from torchrg.structures.points import FilePath, are_integers
+from torchrg.structures.points import FilePath, are_integers, format_fields
 
 __all__ = ["Result", "read_result", "write_table"]
 __dir__ = __all__.copy
@@ -99,6 +99,9 @@ class Result:
     plane_of_superpoint: Tensor | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     neighbors: Neighbors | None = None
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
     @classmethod
     def from_segmentation(

@@ -22,7 +22,7 @@ from torchrg.metrics.sphere import (
     unit_vectors,
 )
 from torchrg.neighbors import canonical_order
-from torchrg.structures import UNLABELED
+from torchrg.structures.points import UNLABELED, format_fields
 
 _COINCIDENT = 1e-12
 """Angle in radians below which centers or directions of two clusters differ only by rounding."""
@@ -58,6 +58,9 @@ class ClusterScore(NamedTuple):
     invalid: int
     sampled_clusters: int
     dvi_exact: bool
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 def score_clusters(

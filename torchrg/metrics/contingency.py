@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.structures import UNLABELED
+from torchrg.structures.points import UNLABELED, format_fields
 
 INTEGERS = (
     *(torch.int8, torch.int16, torch.int32, torch.int64),
@@ -38,6 +38,9 @@ class ContingencyTable(NamedTuple):
     faces: Tensor
     overlaps: Tensor
     num_points: int
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
     @property
     def iou(self) -> Tensor:

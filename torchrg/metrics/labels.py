@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.metrics.contingency import ContingencyTable, count_overlaps, fraction, is_first
+from torchrg.structures.points import format_fields
 
 
 class LabelScore(NamedTuple):
@@ -46,6 +47,9 @@ class LabelScore(NamedTuple):
     fraction_labeled: float
     covering: float
     ari: float
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 def score_labels(

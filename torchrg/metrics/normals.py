@@ -11,6 +11,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics.sphere import unit_vectors
+from torchrg.structures.points import format_fields
 
 _CHUNK = 2**20
 """Number of points evaluated at a time; bounds the memory."""
@@ -40,6 +41,9 @@ class NormalScore(NamedTuple):
     under_20_deg: float
     points: int
     invalid: int
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 def score_normals(

@@ -18,7 +18,7 @@ from torchrg.metrics.contingency import (
 )
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.order import distinct_rows
-from torchrg.structures import UNLABELED
+from torchrg.structures.points import UNLABELED, format_fields
 
 _NUM_NEIGHBORS = 8
 """Number of neighbors of a surface point; a boundary separates it from at least one of them."""
@@ -48,6 +48,9 @@ class PartitionScore(NamedTuple):
     count: int  # type: ignore[assignment]
     points_per_superpoint: float
     points: int
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 def score_partition(

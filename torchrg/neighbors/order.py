@@ -11,8 +11,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
-from torchrg.structures import UNLABELED
-from torchrg.structures.points import Points, bounding_box
+from torchrg.structures.points import UNLABELED, Points, bounding_box, format_fields
 
 MORTON_BITS = 21
 """Bits per coordinate in a Morton code: three of them fit int64."""
@@ -105,6 +104,9 @@ class DistinctPoints(NamedTuple):
     points: Tensor
     rows: Tensor
     inverse: Tensor
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
     @property
     def num_copies(self) -> int:

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ConfigError
-from torchrg.structures import UNLABELED
-from torchrg.structures.points import Points
+from torchrg.structures.points import UNLABELED, Points, format_fields
 
 _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
@@ -28,6 +27,9 @@ class Voxels(NamedTuple):
 
     rows: Tensor
     inverse: Tensor
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 def sample_voxels(points: Points, size: float) -> Voxels:

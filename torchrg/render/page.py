@@ -48,6 +48,7 @@ from torchrg.render.content import (
 )
 from torchrg.render.cutaway import MIN_FACING, View, choose_viewpoint
 from torchrg.structures import PLANE_KINDS, Cloud
+from torchrg.structures.points import format_fields
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -73,6 +74,9 @@ class Page(NamedTuple):
 
     html: str
     num_points: tuple[int, ...]
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
     def _repr_html_(self) -> str:
         """Return the viewer in an iframe, as displayed by notebooks."""

@@ -14,7 +14,7 @@ from torchrg._checks import check_choices
 from torchrg.errors import ConfigError
 from torchrg.scenes.geometry import Doubles, Floats
 from torchrg.scenes.surfaces import Solid, Surface
-from torchrg.structures import FARTHEST, MAX_POINTS
+from torchrg.structures.points import FARTHEST, MAX_POINTS, format_fields
 
 NoiseDirection = Literal["normal", "isotropic"]
 
@@ -51,6 +51,9 @@ class Scene(NamedTuple):
     face_areas: Tensor
     kinds: tuple[str, ...]
     objects: Tensor
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,24 @@
 import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, TypeVar, cast, get_args
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    NamedTuple,
+    SupportsIndex,
+    TypeVar,
+    cast,
+    get_args,
+    overload,
+)
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.structures.points import Neighbors, Sampling
+from torchrg.structures.points import Neighbors, Sampling, format_fields
 
 if TYPE_CHECKING:
     from torchrg.render.page import Page
@@ -20,6 +30,9 @@ PlaneKind = Literal["other", "floor", "ceiling", "wall", "horizontal", "vertical
 PLANE_KINDS: tuple[PlaneKind, ...] = get_args(PlaneKind)
 """Classes of planes; see :func:`torchrg.regions.classes.classify_planes`. Curved planes are
 "other"; "horizontal" and "vertical" planes are neither floor nor ceiling nor wall."""
+_NOUNS = ("plane", "floor", "ceiling", "wall")
+_SHOWN_KINDS = (*PLANE_KINDS[1:], PLANE_KINDS[0])
+"""Classes in the order of a summary."""
 Moved = TypeVar("Moved", bound="_Movable")
 
 
@@ -35,6 +48,9 @@ class PlaneAdjacency(NamedTuple):
     pairs: Tensor
     boundary_length: Tensor
     dihedral_deg: Tensor
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
 
 class Deferred:
@@ -106,6 +122,11 @@ class Plane:
     kind: str | None = None
     outline: tuple[Tensor, ...] | None = None
     object: int | None = None
+
+    @property
+    def equation(self) -> Tensor:
+        """Coefficients a, b, c, d with a x + b y + c z + d = 0, as in Open3D; shape ``(4,)``."""
+        return torch.cat([self.normal, self.normal.new_tensor([-self.offset])])
 
     def __repr__(self) -> str:
         normal = ", ".join(f"{value + 0:.3f}" for value in self.normal.tolist())
@@ -207,26 +228,34 @@ class Planes(_Movable):
     def __len__(self) -> int:
         return len(self.normal)
 
+    @property
+    def equation(self) -> Tensor:
+        """Coefficients a, b, c, d with a x + b y + c z + d = 0, as in Open3D; ``(M, 4)``."""
+        return torch.cat([self.normal, -self.offset[:, None]], dim=1)
+
     def __repr__(self) -> str:
+        return f"Planes({_plural(len(self), 'plane')}{self.describe_kinds()})"
+
+    def describe_kinds(self) -> str:
+        """Return the number of planes of each class after a colon, or "" without classes."""
         counts = [] if self.kind is None else torch.bincount(self.kind).tolist()
-        named = sorted((-count, kind) for count, kind in zip(counts, PLANE_KINDS, strict=False))
-        classes = ", ".join(f"{-count:,} {kind}" for count, kind in named if count)
-        return f"Planes({len(self):,} planes{': ' * bool(classes)}{classes})"
+        number = dict(zip(PLANE_KINDS, counts, strict=False))
+        named = [(number.get(kind, 0), kind) for kind in _SHOWN_KINDS]
+        classes = ", ".join(_plural(count, kind) for count, kind in named if count)
+        return f": {classes}" if classes else ""
 
     def __iter__(self) -> Iterator[Plane]:
         return map(self.__getitem__, range(len(self)))
 
-    def __getitem__(self, row: SupportsIndex) -> Plane:
-        """Return a plane by its row."""
-        try:
-            row = range(len(self))[operator.index(row)]
-        except TypeError:
-            raise TypeError(
-                f"Planes: expected an integer row, got {type(row).__name__}; index columns with "
-                "slices and masks, as in planes.normal[planes.area > 1]."
-            ) from None
-        except IndexError:
-            raise IndexError(f"Planes: expected a row below {len(self)}, got {row}.") from None
+    @overload
+    def __getitem__(self, row: SupportsIndex) -> Plane: ...
+    @overload
+    def __getitem__(self, row: slice) -> list[Plane]: ...
+    def __getitem__(self, row: SupportsIndex | slice) -> Plane | list[Plane]:
+        """Return a plane by its row, or a list of the planes of a slice."""
+        if isinstance(row, slice):
+            return [self[index] for index in range(len(self))[row]]
+        row = _find_row("Planes", row, len(self))
         columns = {name: getattr(self, name)[row] for name in PLANE_COLUMNS}
         values = {name: value if value.ndim else value.item() for name, value in columns.items()}
         kind = None if self.kind is None else PLANE_KINDS[int(self.kind[row])]
@@ -243,6 +272,24 @@ class Planes(_Movable):
         from torchrg.render.notebook import as_frame
 
         return as_frame(self)
+
+
+def _find_row(caller: str, row: SupportsIndex, num_planes: int) -> int:
+    """Return the row of a plane, counted from the end if negative, or raise."""
+    try:
+        return range(num_planes)[operator.index(row)]
+    except TypeError:
+        raise TypeError(
+            f"{caller}: expected an integer row or a slice, got {type(row).__name__}; index "
+            "columns with masks, as in planes.normal[planes.area > 1]; a plane has an id."
+        ) from None
+    except IndexError:
+        raise IndexError(f"{caller}: expected a row below {num_planes}, got {row}.") from None
+
+
+def _plural(count: int, noun: str) -> str:
+    """Return a count with a noun; adjectives, and "other", have no plural."""
+    return f"{count:,} {noun}{'s' * (count != 1 and noun in _NOUNS)}"
 
 
 def _count_points(labels: Tensor) -> str:
@@ -298,11 +345,43 @@ class Segmentation(_Movable):
     num_copies: int = 0
 
     def __repr__(self) -> str:
-        labeled = 100 * torch.count_nonzero(self.labels >= 0).item() / max(self.labels.numel(), 1)
-        return (
-            f"Segmentation({_count_points(self.labels)}, {len(self.planes):,} planes, "
-            f"{labeled:.1f} % labeled)"
-        )
+        return f"Segmentation({_count_points(self.labels)}, {self._describe(self.labels.numel())})"
+
+    def _describe(self, num_points: int) -> str:
+        """Return the number of planes, and the percentage of points that are labeled."""
+        percent = 100 * torch.count_nonzero(self.labels >= 0).item() / max(num_points, 1)
+        return f"{_plural(len(self.planes), 'plane')}, {percent:.1f} % labeled"
+
+    def describe(self, num_points: int | None = None) -> str:
+        """Return the number of planes, in all and by class, and the percentage of labeled points.
+
+        Args:
+            num_points: Number of points that count as all. Default: all points or pixels.
+
+        Example:
+            >>> from torchrg import segment_planes
+            >>> floor = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
+            >>> segment_planes(floor, "classic").describe()
+            '1 plane, 100.0 % labeled: 1 floor'
+        """
+        num_points = self.labels.numel() if num_points is None else num_points
+        return f"{self._describe(num_points)}{self.planes.describe_kinds()}"
+
+    def inliers(self, plane: SupportsIndex) -> Tensor:
+        """Return the rows of the points of a plane, as from Open3D's ``segment_plane``.
+
+        Args:
+            plane: ID of the plane; negative IDs count from the last.
+
+        Returns:
+            Rows of ``labels``, ascending, shape ``(n,)``, int64; of its flattened pixels for a
+            depth image.
+
+        Raises:
+            IndexError: If there is no such plane.
+        """
+        row = _find_row("inliers", plane, len(self.planes))
+        return (self.labels.flatten() == row).nonzero().squeeze(1)
 
     def show(self, **settings: Any) -> "Page":  # noqa: ANN401
         """Return an interactive viewer, displayed by notebooks; needs ``torchrg[view]``.

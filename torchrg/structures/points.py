@@ -1,7 +1,7 @@
 """Points, their neighbors and fits as tensors and arrays."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +15,8 @@ FARTHEST = 1e12
 """Maximum absolute coordinate; files use 1e20, 1e30 or the largest float32 for missing points."""
 MAX_POINTS = 2**31 - 1
 """Maximum number of points of a cloud; neighbor lists are int32."""
+_MAX_SHOWN = 100
+"""Maximum length of a value that a result prints, in characters."""
 Array = NDArray[Any]
 """Array of numbers or text of any shape."""
 Rows = slice | Tensor
@@ -69,6 +71,29 @@ def are_integers(values: Array) -> bool:
     return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
+def format_fields(record: Any) -> str:  # noqa: ANN401
+    """Format a result in one line, with the shapes of its tensors and without fields that are None.
+
+    Example:
+        >>> Neighbors(torch.zeros(4, 3, dtype=torch.int32))
+        Neighbors(indices=int32 (4, 3))
+    """
+    values = {name: getattr(record, name) for name in record.__match_args__}
+    shown = (f"{key}={_format(value)}" for key, value in values.items() if value is not None)
+    return f"{type(record).__name__}({', '.join(shown)})"
+
+
+def _format(value: Any) -> str:  # noqa: ANN401
+    """Format a tensor by its dtype and shape, a number in four digits, and a long value briefly."""
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    text = "" if isinstance(value, Mapping) else repr(value)
+    is_long = not text or len(text) > _MAX_SHOWN
+    return f"{type(value).__name__} of length {len(value):,}" if is_long else text
+
+
 class Neighbors(NamedTuple):
     """Nearest neighbors of each point; see :func:`torchrg.search_knn`.
 
@@ -80,6 +105,9 @@ class Neighbors(NamedTuple):
 
     indices: Tensor
     valid: Tensor | None = None
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
     def select(self, rows: Rows) -> "Neighbors":
         """Return the neighbors of the selected points."""
@@ -149,6 +177,9 @@ class NormalFit(NamedTuple):
     valid: Tensor
     residual_rms: Tensor
     sharp: Tensor | None = None
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
         """Apply a function to all tensors; None stays None."""

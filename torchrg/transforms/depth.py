@@ -14,6 +14,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.normals import Orientation
 from torchrg.structures import UNLABELED, Planes
+from torchrg.structures.points import format_fields
 from torchrg.transforms.rows import Entries, SampleDict, check_sample
 from torchrg.transforms.sample import SampleTransform
 
@@ -243,6 +244,9 @@ class FusedFrames(NamedTuple):
     pixel: Tensor
     inverse: Tensor
     seen: tuple[Tensor, ...]
+
+    def __repr__(self) -> str:
+        return format_fields(self)
 
     def to_frames(self, values: Tensor, *, fill: int = UNLABELED) -> list[Tensor]:
         """Map per-point values, such as labels, to images of the frames.
