@@ -1,5 +1,6 @@
 """Argument checks that never read tensor values, and so need no device synchronization."""
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
@@ -11,31 +12,66 @@ from torch import Tensor
 
 from torchrg._parallel import sequential_operations
 from torchrg.errors import ConfigError, ShapeError
+from torchrg.structures import AnyCloud, Cloud
+from torchrg.structures.points import Points
 
 Arguments = ParamSpec("Arguments")
 Returned = TypeVar("Returned")
+_POINTS = ("points", "vertices", "cloud")
+"""Arguments that take a cloud or the path of a file, too; its points are relative to its origin."""
 
 
 def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
     """Return a tensor unchanged, and a NumPy array as a tensor that shares its memory.
 
-    Big-endian and read-only arrays are copied. In all checks, ``caller`` is the public function
-    that starts the message. Invalid tensors raise ShapeError, invalid settings ConfigError.
+    Points can also be a cloud or the path of a file, in every function that takes them. Big-endian
+    and read-only arrays are copied. In all checks, ``caller`` is the public function that starts
+    the message. Invalid tensors raise ShapeError, invalid settings ConfigError.
     """
+    if name in _POINTS and isinstance(values := as_cloud(values), Cloud):
+        return values.points
     if isinstance(values, Tensor):
         return values
     if isinstance(values, np.ndarray) and values.dtype.kind in "fiub":
         native = values.astype(values.dtype.newbyteorder("="), copy=False)
         return torch.from_numpy(np.require(native, requirements=["C", "W"]))
+    expected = "a tensor or a NumPy array" + (", a Cloud or a path" if name in _POINTS else "")
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
-    fix = ""
+    fix = _repair(caller, name, values)
+    raise ShapeError(f"{caller}: expected {name} to be {expected}, got {kind}{fix}.")
+
+
+def as_cloud(points: AnyCloud) -> Points | Cloud:
+    """Return the cloud of a path; return anything else unchanged."""
+    if not isinstance(points, str | os.PathLike):
+        return points
+    from torchrg.io import read_cloud
+
+    return read_cloud(points)
+
+
+def to_cloud(caller: str, cloud: AnyCloud) -> Cloud:
+    """Return a cloud of points or of the file of a path, and a cloud unchanged."""
+    if isinstance(opened := as_cloud(cloud), Cloud):
+        return opened
+    points = as_tensor(caller, "cloud", opened)
+    check_shapes(caller, cloud=(points, "N 3"))
+    return Cloud(points.numpy(force=True))
+
+
+def _repair(caller: str, name: str, values: object) -> str:
+    """Return how to make a tensor of an object of another type, after a semicolon, or ""."""
+    if type(values).__module__.startswith("open3d"):
+        return "; pass numpy.asarray(cloud.points)"
+    if has := [key for key in (name, "points", "labels") if hasattr(values, key)]:
+        return f"; pass its {has[0]}"
+    if isinstance(values, list | tuple) and values and getattr(values[0], "ndim", 0) > 1:
+        return f"; pass one at a time, as [{caller}(p) for p in {name}]"
     if isinstance(values, list | tuple):
-        fix = "; use torch.tensor, or with_format('torch') for a data set"
-    elif type(values).__name__ == "Cloud":
-        fix = "; pass its points"
-    elif name == "points" and not isinstance(values, np.ndarray):
-        fix = "; use read_cloud(path).points, or numpy.asarray(cloud.points) for Open3D"
-    raise ShapeError(f"{caller}: expected {name} to be a tensor or a NumPy array, got {kind}{fix}.")
+        return "; use torch.tensor, or with_format('torch') for a data set"
+    if hasattr(values, "to_numpy"):
+        return "; pass its columns of coordinates, as in frame[['x', 'y', 'z']].to_numpy()"
+    return ""
 
 
 def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
@@ -77,17 +113,17 @@ def check_floating(caller: str, **arguments: Tensor | None) -> None:
         raise ShapeError(f"{caller}: expected {names} of one dtype, got {' and '.join(kinds)}.")
 
 
-def check_points(caller: str, points: Tensor) -> None:
+def check_points(caller: str, points: Tensor, name: str = "points") -> None:
     """Check that points are one cloud; suggest a fix for batches, images and extra columns."""
-    loop = f"[{caller}(p) for p in points]" if caller.isidentifier() else "points[i]"
-    check_batch(caller, "points", points, f"pass one cloud at a time, as {loop}")
+    loop = f"[{caller}(p) for p in {name}]" if caller.isidentifier() else f"{name}[i]"
+    check_batch(caller, name, points, f"pass one cloud at a time, as {loop}")
     if points.ndim == 2 and points.shape[1] > 3:
-        repair = "points.T" if len(points) == 3 else "points[:, :3]"
+        repair = f"{name}.T" if len(points) == 3 else f"{name}[:, :3]"
         raise ShapeError(
-            f"{caller}: expected points of shape (N, 3), got {tuple(points.shape)}; pass {repair}."
+            f"{caller}: expected {name} of shape (N, 3), got {tuple(points.shape)}; pass {repair}."
         )
-    check_shapes(caller, points=(points, "N 3"))
-    check_floating(caller, points=points)
+    check_shapes(caller, **{name: (points, "N 3")})
+    check_floating(caller, **{name: points})
 
 
 def check_batch(caller: str, name: str, points: Tensor, repair: str) -> None:

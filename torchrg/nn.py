@@ -33,7 +33,7 @@ from torchrg.robust import RobustFit, fit_detmcd, fit_detmm, fit_dets, fit_fastm
 from torchrg.robust.mm import Target
 from torchrg.robust.starts import MCDStarts, Starts
 from torchrg.robust.weights import Inliers, Scaling
-from torchrg.structures.points import NormalFit, format_fields
+from torchrg.structures.points import NormalFit, short_repr
 
 __all__ = [
     "MVE",
@@ -84,14 +84,12 @@ class Covariance(_Function[Tensor]):
         return covariance(patches, mask)[1]
 
 
+@short_repr
 class Eigen(NamedTuple):
     """Eigenvalues, ascending ``(*, P)``, and unit eigenvectors as columns ``(*, P, P)``."""
 
     values: Tensor
     vectors: Tensor
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
 
 @dataclass(eq=False, repr=False)

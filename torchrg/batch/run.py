@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import filelock
 
@@ -36,6 +36,7 @@ __all__ = [
     "lock_folder",
     "make_plan",
     "match_jobs",
+    "read_failed",
     "run_plan",
     "write_report",
 ]
@@ -328,9 +329,23 @@ def write_report(out: Path, report: BatchReport) -> None:
         temporary.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")
 
 
-def read_root(out: Path) -> Path | None:
-    """Return the directory of the data set in the last report, None if it is unknown."""
+def read_report(out: Path) -> Record:
+    """Return the last report of an output directory; empty if there is none, or it is damaged."""
     try:
-        return Path(json.loads((out / REPORT).read_bytes())["root"])
+        report: Any = json.loads((out / REPORT).read_bytes())
     except (OSError, *PARSE_ERRORS):
-        return None
+        return {}
+    return report if isinstance(report, dict) else {}
+
+
+def read_failed(out: Path) -> set[str]:
+    """Return the names of the scans that failed in the last run.
+
+    Raises:
+        ConfigError: If there is no report of a run.
+    """
+    if "scans" not in (report := read_report(out)):
+        raise ConfigError(
+            f"{out / REPORT}: expected the report of an earlier run, got none; omit --only-failed."
+        )
+    return {scan["name"] for scan in report["scans"] if scan["status"] == "failed"}

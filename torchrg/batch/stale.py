@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from torchrg.batch.run import LOCK, read_root
+from torchrg.batch.run import LOCK, read_report
 from torchrg.batch.scans import Job
 from torchrg.datasets.folder import natural_key
 from torchrg.datasets.provenance import Record, check_source, read_record, recorded_paths
@@ -89,7 +89,7 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
     scans = {name: by_path.get(path) for name, path in paths.items() if name not in names}
     missing = [n for n in scans if scans[n] is None and not (inputs[n][0] and paths[n].exists())]
     scans |= (renamed := _find_renamed(files, inputs, missing))
-    is_same = not records or renamed or source.root in (out, read_root(out))
+    is_same = not records or renamed or str(source.root) in (str(out), read_report(out).get("root"))
     if not is_same and not any(is_unchanged(paths[name], inputs[name][1]) for name in records):
         raise FormatError(
             f"{out}: expected results of {source.root}, got another data set "

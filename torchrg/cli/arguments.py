@@ -130,7 +130,7 @@ def parse(kind: type[Command], arguments: Sequence[str], *, prog: str) -> Comman
 
 def _read(flags: Sequence[Flag], arguments: Sequence[str]) -> dict[str, Any]:
     """Return the words of the arguments by path."""
-    named = {name: flag for flag in flags for name in (flag.name, *ALIASES.get(flag.name, ()))}
+    named = {name: flag for flag in flags for name in _names(flag)}
     words, inputs, waiting = dict[str, Any](), list[str](), [*reversed(arguments)]
     while waiting:
         name, equals, word = (argument := waiting.pop()).partition("=")
@@ -152,12 +152,13 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str]) -> dict[str, Any]:
             values = [word if equals else waiting.pop()]
             while waiting and _continues(values, flag.hint, waiting[-1]):
                 values.append(waiting.pop())
-            words[flag.path] = ",".join(values)
+            earlier = [words[flag.path]] if flag.path in words and _is_list(flag.hint) else []
+            words[flag.path] = ",".join([*earlier, *values])
         else:
             example = f", as in {flag.name} true" if flag.hint is bool else ""
             raise ConfigError(f"expected a value for {flag.name}{example}.")
     for flag in flags:
-        if flag.is_positional and inputs:
+        if flag.is_positional and inputs and flag.path not in words:
             is_list = typing.get_origin(flag.hint) is tuple
             words[flag.path], inputs = (inputs, []) if is_list else (inputs[0], inputs[1:])
     if inputs:
@@ -165,9 +166,20 @@ def _read(flags: Sequence[Flag], arguments: Sequence[str]) -> dict[str, Any]:
     return words
 
 
+def _names(flag: Flag) -> list[str]:
+    """Return the spellings of an argument; one without a flag may also follow its own name."""
+    name = f"--{flag.path.replace('_', '-')}" if flag.is_positional else flag.name
+    return [flag.name, name, *ALIASES.get(name, ())]
+
+
 def _is_name(argument: str) -> bool:
     """Return whether an argument is an option rather than a value, such as -y or -3."""
     return argument.startswith("--") or argument in itertools.chain(*ALIASES.values())
+
+
+def _is_list(hint: object) -> bool:
+    """Return whether an argument takes any number of values, so that repeating it adds to them."""
+    return any(... in typing.get_args(kind) for kind in kinds_of(hint))
 
 
 def _continues(values: Sequence[str], hint: object, argument: str) -> bool:

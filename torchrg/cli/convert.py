@@ -21,6 +21,7 @@ from torchrg.batch.run import (
     lock_folder,
     make_plan,
     match_jobs,
+    read_failed,
     run_plan,
     write_report,
 )
@@ -81,6 +82,8 @@ class Arguments:
     segment --table does; for example planes.csv. planes.json is always written."""
     only: str | None = None
     """Shell pattern of scans to convert, such as "Area_5/*". Results of missing scans are kept."""
+    only_failed: bool = False
+    """Convert only the scans that failed in the last run, as listed in OUT/report.json."""
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False
@@ -143,6 +146,8 @@ class FolderArguments(CloudArguments):
     """
 
     columns: flags.ColumnsFlag = None
+    exclude: tuple[str, ...] = ()
+    """Shell patterns of files below ROOT that are no scans, as in readme.txt "old/*"."""
     suffixes: tuple[str, ...] = FOLDER_SUFFIXES
     """File extensions of clouds. Default: all formats of torchrg segment except .csv. Pass fewer if
     two files differ only in their extension."""
@@ -150,7 +155,8 @@ class FolderArguments(CloudArguments):
     def data(self, root: Path) -> SceneDataset:
         """Open the folder."""
         columns = flags.split_columns(self.columns)
-        data = FolderOfClouds(root, suffixes=self.suffixes, columns=columns)
+        options: dict[str, Any] = {"suffixes": self.suffixes, "exclude": self.exclude}
+        data = FolderOfClouds(root, columns=columns, **options)
         flags.check_columns(self.columns, [s.path for s in data.scenes if not s.path.is_dir()])
         return data
 
@@ -280,6 +286,12 @@ def run(argv: list[str]) -> int:
     with listing, ending.print_warnings():
         scans = list_jobs(arguments.source(root), out)
     jobs = match_jobs(scans, arguments.only)
+    if arguments.only_failed:
+        failed = read_failed(out)
+        jobs = [job for job in jobs if job.name in failed]
+        if not jobs:
+            ending.print_lines(f"nothing to do: {out / REPORT} lists no failed scan of {root}")
+            return 0
     if arguments.dry_run:
         plan, stale = _plan_with_bar(jobs, arguments), _find_stale(scans, arguments)
         resources = (arguments.workers or num_cores(), _memory_limit(arguments), free_space(out))
@@ -347,8 +359,8 @@ def _plan_with_bar(jobs: list[Job], arguments: Arguments) -> Plan:
 
 
 def _find_stale(scans: list[Job], arguments: Arguments) -> list[StaleResult]:
-    """Return the stale results; with --only, results of missing scans are kept."""
-    is_whole = arguments.only is None or arguments.prune
+    """Return the stale results; with --only or --only-failed, those of missing scans are kept."""
+    is_whole = (arguments.only is None and not arguments.only_failed) or arguments.prune
     return [result for result in find_stale(scans) if is_whole or result.scan is not None]
 
 
@@ -403,7 +415,7 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
         unreported = str(error)
     if not report.disk_full:
         plan.jobs[0].source.write_lists(out)
-    code = _finish(report, out, unit=kind)
+    code = _finish(report, out, arguments, unit=kind)
     if unreported:
         code = ending.fail(unreported, code=code or ending.USAGE_ERROR)
     pages = _page_folder(arguments)
@@ -443,14 +455,14 @@ def _index_pages(folder: Path, scans: list[Job]) -> Path:
     return write_index(folder, scans[0].source.root.name, entries)
 
 
-def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
+def _finish(report: BatchReport, out: Path, arguments: Arguments, *, unit: str) -> int:
     """Print the report, and return the exit code; results removed meanwhile are not complete."""
-    if report.with_status("kept") == list(report.scans):
-        print("nothing to do")
-    else:
-        print(format_report(report, unit=unit))
     for scan in report.scans:
         print_failure(scan)
+    if report.with_status("kept") == list(report.scans):
+        print("nothing to do")
+    elif report.complete:
+        print(format_report(report, unit=unit))
     num_complete = sum((out / scan.name / RECORD).is_file() for scan in report.complete)
     state = f"{num_complete:,} of {len(report.scans):,} scans are complete"
     hint = "Rerun the same command to resume."
@@ -461,6 +473,8 @@ def _finish(report: BatchReport, out: Path, *, unit: str) -> int:
     if report.interrupted:
         return ending.fail(f"interrupted; {state}. {hint}", code=ending.INTERRUPTED)
     if num_complete < len(report.scans):
-        return ending.fail(f"{state}; see {out / REPORT}.", code=ending.SOME_FAILED)
+        hint = f"see {out / REPORT}. Rerun with --only-failed for the others alone"
+        hint += ", with --exclude if they are no scans" * isinstance(arguments, FolderArguments)
+        return ending.fail(f"{state}; {hint}.", code=ending.SOME_FAILED)
     ending.print_lines(f"{state} -> {out}")
     return 0

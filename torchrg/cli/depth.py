@@ -16,8 +16,15 @@ from torchrg.batch.memory import available_memory
 from torchrg.batch.sources import write_frame
 from torchrg.cli import flags
 from torchrg.cli.arguments import Argument, parse
-from torchrg.cli.ending import print_lines, print_warnings, warn
-from torchrg.cli.loop import check_distinct, note_input, output_paths, run_each, sidecar_paths
+from torchrg.cli.ending import print_warnings, warn
+from torchrg.cli.loop import (
+    check_distinct,
+    note_input,
+    output_paths,
+    report_planes,
+    run_each,
+    sidecar_paths,
+)
 from torchrg.datasets import RGBDFrame, RGBDFrames
 from torchrg.datasets.provenance import describe_run
 from torchrg.datasets.rgbd import scale_camera
@@ -175,9 +182,6 @@ def _label(
         warnings.simplefilter("ignore", DepthWarning)
         seg = segment_depth(depth, camera, arguments.depth, pose=pose, orient=arguments.orient)
     points = cloud.points.view(*depth.shape, 3)
-    num_planes = len(seg.planes)
-    if num_planes == 0:
-        warn(f"{source}: no plane found: {flags.reason_for_no_plane(arguments.depth)}.")
     if picture is not None:
         step = -(-max(points.shape) // _COLORING_PIXELS)
         sparse = torch.full_like(points, torch.nan)
@@ -201,11 +205,9 @@ def _label(
     for table in tables:
         write_table(table, describe_planes(seg.planes, origin=origin.tolist()))
     num_seen, (height, width) = int((depth > 0).sum()), depth.shape
-    percent = 100 * int((seg.labels >= 0).sum()) / max(num_seen, 1)
-    print_lines(
-        f"{source}: {width} x {height} pixels, {num_seen:,} with depth, {num_planes:,} planes, "
-        f"{percent:.1f} % of these labeled, {time.perf_counter() - begin:.1f} s -> {target}"
-    )
+    size = f"{width} x {height} pixels, {num_seen:,} with depth, in"
+    written = f"{size} {time.perf_counter() - begin:.1f} s -> {target}"
+    report_planes(f"{source}", seg, num_seen, flags.reason_for_no_plane(arguments.depth), written)
 
 
 def _check_memory(image: Path) -> None:

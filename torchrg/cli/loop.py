@@ -9,14 +9,14 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from torchrg.batch.task import Begin, TaskReport, report_on
-from torchrg.cli.ending import SOME_FAILED, fail, printable, warn
+from torchrg.cli.ending import SOME_FAILED, fail, print_lines, printable, warn
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
 from torchrg.io.fields import describe_renamed_fields
 from torchrg.io.files import check_writable, create_folder, list_some, normalize_file_name
 from torchrg.io.npy import DISPLAYED_FIELDS
 from torchrg.render.page import read_library
-from torchrg.structures import Cloud
+from torchrg.structures import Cloud, Segmentation
 
 # In Python 3.14 the default lock of tqdm starts a process that imports from the working directory.
 tqdm.set_lock(RLock())
@@ -185,8 +185,23 @@ def note_input(
 
 def dropped_fields_note(target: Path, fields: Collection[str]) -> str:
     """Describe the fields of a cloud that its result omits."""
-    names = [name for name in fields if name not in DISPLAYED_FIELDS and is_archive(target)]
+    kept = (*DISPLAYED_FIELDS, *RESULT_FIELDS)  # Results replace earlier results.
+    names = [name for name in fields if name not in kept and is_archive(target)]
     return f" (without the input fields {', '.join(names)})" if names else ""
+
+
+def report_planes(
+    source: str, seg: Segmentation, num_points: int, reason: str, written: str
+) -> None:
+    """Print the planes of a result and where they were written; warn if there are none.
+
+    ``num_points`` is the number that counts as all points, ``reason`` why there is no plane.
+    """
+    if len(seg.planes) == 0:
+        warn(f"{source}: no plane found: {reason}.")
+    number, colon, kinds = str(seg.planes).partition(": ")
+    percent = 100 * int((seg.labels >= 0).sum()) / max(num_points, 1)
+    print_lines(f"{source}: {number}, {percent:.1f} % labeled{colon}{kinds}; {written}")
 
 
 @contextlib.contextmanager

@@ -51,26 +51,22 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
 
 
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:
-    """Format a report: one row per scan, notes, then the totals.
+    """Format a report: one row per complete scan, notes, then the totals.
 
-    With more than :data:`MAX_ROWS` scans, only failures are listed. ``unit`` names a scan.
+    With more than :data:`MAX_ROWS` scans, only the totals. ``unit`` names a scan.
     """
-    stages = list(report.stage_seconds)
-    shown = report.scans if len(report.scans) <= MAX_ROWS else report.with_status("failed")
-    head = ["scan", "status", "points", "planes", *(f"{stage} (s)" for stage in stages), "GB"]
-    rows = [_row(scan, stages) for scan in shown]
+    shown = report.complete if len(report.scans) <= MAX_ROWS else []
+    rows = [_row(scan) for scan in shown]
     totals = report.with_status("converted")
     peak = max((scan.peak_memory for scan in totals), default=0) / 1e9
     planes = sum(scan.num_regions for scan in totals)
-    times = [f"{seconds:.1f}" for seconds in report.stage_seconds.values()]
     sums = [f"{len(totals)} converted", f"{report.num_points:,}", f"{planes:,}"]
-    rows.append(["all", *sums, *times, f"{peak:.2f}"])
+    rows.append(["all", *sums, f"{peak:.2f}"])
     notes = []
     for scan in shown:
-        if scan.status != "failed":
-            again = [f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []
-            lines = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
-            notes += [printable(f"{scan.name}: {note}") for note in lines]
+        again = [f"done at attempt {scan.attempts}"] if scan.attempts > 1 else []
+        lines = (*(f"repaired: {text}" for text in scan.repairs), *scan.warnings, *again)
+        notes += [printable(f"{scan.name}: {note}") for note in lines]
     if len(report.scans) > MAX_ROWS and (num_noted := sum(bool(s.warnings) for s in report.scans)):
         notes.append(f"{num_noted:,} {unit}s have notes; see report.json")
     seconds = report.seconds or math.inf
@@ -78,6 +74,7 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
         f"{report.num_points:,} points in {report.seconds:,.1f} s: "
         f"{report.num_points / seconds:,.0f} points, {len(totals) / seconds:,.2f} {unit}s a second"
     )
+    head = ["scan", "status", "points", "planes", "GB"]
     return "\n".join([format_table(head, rows), *notes, speed])
 
 
@@ -94,17 +91,10 @@ def _format_time(seconds: float) -> str:
     return f"{minutes:.0f} min" if minutes < _MIN_NEXT_UNIT else f"{minutes / 60:,.1f} h"
 
 
-def _row(scan: TaskReport, stages: Sequence[str]) -> list[str]:
-    """Return the table row of a scan."""
-    points = f"{scan.num_points:,}" if scan.num_points else ""
-    return [
-        scan.name,
-        scan.status,
-        points,
-        f"{scan.num_regions:,}" if points else "",
-        *(f"{scan.seconds[stage]:.1f}" if stage in scan.seconds else "" for stage in stages),
-        f"{scan.peak_memory / 1e9:.2f}" if scan.peak_memory else "",
-    ]
+def _row(scan: TaskReport) -> list[str]:
+    """Return the table row of a complete scan."""
+    memory = f"{scan.peak_memory / 1e9:.2f}" if scan.peak_memory else ""
+    return [scan.name, scan.status, f"{scan.num_points:,}", f"{scan.num_regions:,}", memory]
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

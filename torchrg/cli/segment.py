@@ -97,6 +97,8 @@ class Arguments(flags.PlaneSettings):
     within: flags.WithinFlag = None
     merge: bool = False
     """Concatenate all inputs into one cloud, keeping the fields they share."""
+    verbose: bool = False
+    """Also print the measured kind of noise and the settings chosen from it."""
     limit_memory: float | None = None
     """Memory limit per cloud, in GB. Beyond it, the largest arrays go to disk (about 450 bytes per
     point, next to OUT or in TMPDIR); the result is identical. Default: half of the free memory."""
@@ -224,12 +226,15 @@ def _segment(
         levels = superpoints.by_level().values()
         counts = " ".join(f"{int(level.max()) + 1:,}" for level in levels)
         print_lines(f"{source}: superpoints of each level: {counts}")
-    if seg.sampling is not None:
+    if arguments.verbose and seg.sampling is not None:
         settings = arguments.settings.measured(seg.sampling)["settings"]
         print_lines(f"{source}: {flags.describe_sampling(seg.sampling, settings)}")
-    destination = f"{target}{loop.dropped_fields_note(target, cloud.fields)}"
+    dropped = loop.dropped_fields_note(target, cloud.fields)
     reason = flags.reason_for_no_plane(arguments.settings)
-    _report(source, seg, cloud, destination, reason, time.perf_counter() - begin)
+    if seg.num_copies + 1 == int(cloud.finite.sum()):
+        reason = "all points are identical"
+    seconds = f"{len(cloud):,} points in {time.perf_counter() - begin:.1f} s"
+    loop.report_planes(source, seg, len(cloud), reason, f"{seconds} -> {target}{dropped}")
 
 
 def _check_limit(arguments: Arguments, source: str, num_points: int, limit: int) -> None:
@@ -330,19 +335,3 @@ def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
         write_page(picture, make_page(result))
     else:
         write_planes(picture, result)
-
-
-def _report(
-    source: str, seg: Segmentation, cloud: Cloud, target: str, reason: str, seconds: float
-) -> None:
-    """Print the summary line of a result, and a warning if it has no plane."""
-    if len(seg.planes) == 0:
-        finite = cloud.coordinates[cloud.finite]
-        are_equal = (finite == finite[0]).all()
-        warn(f"{source}: no plane found: {'all points are identical' if are_equal else reason}.")
-    num_points, num_planes = len(seg.labels), len(seg.planes)
-    percent = int(torch.count_nonzero(seg.labels >= 0)) / num_points * 100
-    print_lines(
-        f"{source}: {num_points:,} points, {num_planes:,} planes, {percent:.1f} % of the points "
-        f"labeled, {seconds:.1f} s -> {target}"
-    )

@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, overload
 
@@ -170,6 +171,8 @@ class FolderOfClouds(SceneDataset):
     Args:
         root: The folder.
         suffixes: Suffixes of cloud files. Default: all formats except ``.csv``.
+        exclude: Shell patterns of names, or of paths below the folder, that are no clouds, such as
+            ``"readme.txt"`` or ``"old/*"``.
         columns: Column names of text and ``.npy``; see :func:`torchrg.read_cloud`.
         transform: Applied to each sample.
 
@@ -190,6 +193,7 @@ class FolderOfClouds(SceneDataset):
         root: str | os.PathLike[str],
         *,
         suffixes: Sequence[str] = FOLDER_SUFFIXES,
+        exclude: Sequence[str] = (),
         columns: Sequence[str] | None = None,
         transform: Transform | None = None,
     ) -> None:
@@ -201,6 +205,7 @@ class FolderOfClouds(SceneDataset):
             path
             for path in find_files(self.root, is_item=is_scene)
             if path.is_dir() or path.suffix.lower() in endings
+            if not _is_matched(path.relative_to(self.root), exclude)
         ]
         for path in paths:
             if path.suffix == ".npy" and path.stem in POINT_ARRAYS:
@@ -305,6 +310,11 @@ def is_other(path: Path) -> bool:
         if path.suffix.lower() in TEXT_SUFFIXES and 0 < path.stat().st_size <= _MAX_PROSE_BYTES:
             return _THREE_NUMBERS.search(decode_file(path)) is None
     return False
+
+
+def _is_matched(path: Path, patterns: Sequence[str]) -> bool:
+    """Whether a name, or a path with ``*`` also for slashes, matches one of the patterns."""
+    return any(fnmatchcase(name, p) for name in (path.name, path.as_posix()) for p in patterns)
 
 
 def is_scene(folder: Path) -> bool:

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrg._checks import as_tensor, check_shapes
 from torchrg._optional import require
 from torchrg.errors import MissingDependencyError, ShapeError
-from torchrg.structures import Superpoints
-from torchrg.structures.points import Array, Points
+from torchrg.structures import AnyCloud, Superpoints
+from torchrg.structures.points import Array
 
 
 class Cluster(NamedTuple):
@@ -29,7 +29,7 @@ class Cluster(NamedTuple):
 
 
 def make_nag(
-    points: Points,
+    points: AnyCloud,
     superpoints: Superpoints,
     *,
     data: Callable[..., Any] | None = None,

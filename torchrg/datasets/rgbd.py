@@ -23,12 +23,13 @@ from torchrg.errors import ConfigError, DepthWarning, FormatError, ShapeError, w
 from torchrg.io.files import local_path, wrap_errors
 from torchrg.linalg.rigid import check_rigid
 from torchrg.structures import FARTHEST, Cloud
-from torchrg.structures.points import format_fields
+from torchrg.structures.points import short_repr
 from torchrg.transforms.depth import fuse_depth
 from torchrg.transforms.rows import SampleDict
 
 
-@dataclass(frozen=True, eq=False)
+@short_repr
+@dataclass(frozen=True, eq=False, repr=False)
 class RGBDFrame:
     """Depth frame on disk.
 
@@ -63,9 +64,6 @@ class RGBDFrame:
     origin: str = ""
     confidence: Path | None = None
     recording: str = ""
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
     def __post_init__(self) -> None:
         check_shapes("RGBDFrame", intrinsics=(self.intrinsics, "3 3"), pose=(self.pose, "4 4"))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchrg._checks import as_tensor, check_shapes
+from torchrg._checks import to_cloud
 from torchrg.errors import FormatError
 from torchrg.io.columns import check_field
 from torchrg.io.e57 import count_e57, read_e57
@@ -22,8 +22,8 @@ from torchrg.io.plane_table import planes_to_arrays
 from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.text import count_text, read_text, write_text
 from torchrg.io.vg import write_vg
-from torchrg.structures import Cloud, Segmentation, Superpoints
-from torchrg.structures.points import FilePath, Points
+from torchrg.structures import AnyCloud, Cloud, Segmentation, Superpoints
+from torchrg.structures.points import FilePath
 
 __all__ = ["FOLDER_SUFFIXES", "FORMATS", "RESULT_FIELDS", "read_cloud", "write_cloud"]
 __dir__ = __all__.copy
@@ -152,7 +152,7 @@ def takes_columns(path: FilePath) -> bool:
 
 def write_cloud(
     path: FilePath,
-    cloud: Cloud | Points,
+    cloud: AnyCloud,
     segmentation: Segmentation | None = None,
     *,
     superpoints: Superpoints | None = None,
@@ -179,7 +179,7 @@ def write_cloud(
     Args:
         path: The file; an existing one is replaced. Its suffix is ``.vg`` or one of :data:`FORMATS`
             except ``.e57``, ``.pts`` and ``.csv``.
-        cloud: The cloud, or its points, shape ``(N, 3)``.
+        cloud: The cloud, its points, shape ``(N, 3)``, or the path of another file.
         segmentation: Result of :func:`torchrg.segment_planes` for ``cloud.points``.
         superpoints: Result of :func:`torchrg.make_superpoints` for ``cloud.points``.
         provenance: How the result was made; any JSON-serializable mapping. Stored in ``.npz`` only.
@@ -197,10 +197,7 @@ def write_cloud(
         [0, 0, -1]
     """
     target = Path(path)
-    if not isinstance(cloud, Cloud):
-        points = as_tensor("write_cloud", "cloud", cloud)
-        check_shapes("write_cloud", cloud=(points, "N 3"))
-        cloud = Cloud(points.numpy(force=True))
+    cloud = to_cloud("write_cloud", cloud)
     check_output(target, cloud)
     for name, values in cloud.fields.items():
         check_field(target, name, values, len(cloud))

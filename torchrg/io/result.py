@@ -39,7 +39,7 @@ from torchrg.structures import (
     Superpoints,
 )
 from torchrg.structures.colors import narrow_colors, read_colors
-from torchrg.structures.points import FilePath, are_integers, format_fields
+from torchrg.structures.points import FilePath, are_integers, short_repr
 
 __all__ = ["Result", "read_result", "write_table"]
 __dir__ = __all__.copy
@@ -73,7 +73,8 @@ _NUM_NEIGHBORS = 50
 """Number of neighbors: the default for normals, so that small clouds get their own adjacency."""
 
 
-@dataclass(frozen=True, eq=False)
+@short_repr
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """A cloud, its per-point results, and its plane table.
 
@@ -99,9 +100,6 @@ class Result:
     plane_of_superpoint: Tensor | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     neighbors: Neighbors | None = None
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
     @classmethod
     def from_segmentation(

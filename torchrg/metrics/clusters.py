@@ -22,7 +22,7 @@ from torchrg.metrics.sphere import (
     unit_vectors,
 )
 from torchrg.neighbors import canonical_order
-from torchrg.structures.points import UNLABELED, format_fields
+from torchrg.structures.points import UNLABELED, short_repr
 
 _COINCIDENT = 1e-12
 """Angle in radians below which centers or directions of two clusters differ only by rounding."""
@@ -34,6 +34,7 @@ _QUERIES = 65536
 """Number of directions per tree query. Each result shortens the next query."""
 
 
+@short_repr
 class ClusterScore(NamedTuple):
     """Internal indices on the Gaussian sphere; see :func:`score_clusters`.
 
@@ -58,9 +59,6 @@ class ClusterScore(NamedTuple):
     invalid: int
     sampled_clusters: int
     dvi_exact: bool
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
 
 def score_clusters(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrg._checks import as_tensor, check_shapes
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.structures.points import UNLABELED, format_fields
+from torchrg.structures.points import UNLABELED, short_repr
 
 INTEGERS = (
     *(torch.int8, torch.int16, torch.int32, torch.int64),
@@ -16,6 +16,7 @@ INTEGERS = (
 )
 
 
+@short_repr
 class ContingencyTable(NamedTuple):
     """Sparse table of overlaps between regions and ground-truth planes (faces).
 
@@ -38,9 +39,6 @@ class ContingencyTable(NamedTuple):
     faces: Tensor
     overlaps: Tensor
     num_points: int
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
     @property
     def iou(self) -> Tensor:

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.metrics.contingency import ContingencyTable, count_overlaps, fraction, is_first
-from torchrg.structures.points import format_fields
+from torchrg.structures.points import short_repr
 
 
+@short_repr
 class LabelScore(NamedTuple):
     """External indices of a segmentation; see :func:`score_labels`.
 
@@ -47,9 +48,6 @@ class LabelScore(NamedTuple):
     fraction_labeled: float
     covering: float
     ari: float
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
 
 def score_labels(

@@ -3,11 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg._checks import to_cloud
 from torchrg.neighbors.knn import search_nearest
-from torchrg.structures import Cloud
+from torchrg.structures import AnyCloud
 
 
-def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
+def differing_rows(ours: AnyCloud, theirs: AnyCloud) -> NDArray[np.int64]:
     """Return the rows with different points in two clouds of equal length, ascending.
 
     Coordinates are compared in the narrower type of both clouds, so a float32 copy equals its
@@ -21,7 +22,7 @@ def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
         >>> differing_rows(Cloud(exact[::-1]), Cloud(exact)).tolist()
         [0, 1]
     """
-    clouds = (ours, theirs)
+    ours, theirs = clouds = [to_cloud("differing_rows", cloud) for cloud in (ours, theirs)]
     dtype = min((cloud.coordinates.dtype for cloud in clouds), key=lambda dtype: dtype.itemsize)
     with np.errstate(over="ignore"):
         first, second = (cloud.coordinates.astype(dtype, copy=False) for cloud in clouds)
@@ -29,7 +30,7 @@ def differing_rows(ours: Cloud, theirs: Cloud) -> NDArray[np.int64]:
     return np.flatnonzero(~same & (ours.finite | theirs.finite))
 
 
-def match_points(ours: Cloud, theirs: Cloud, max_distance: float) -> NDArray[np.int64]:
+def match_points(ours: AnyCloud, theirs: AnyCloud, max_distance: float) -> NDArray[np.int64]:
     """Return the nearest point of ours for each of theirs, as rows of ours, shape ``(M,)``.
 
     The entry is -1 for points not finite, or farther than ``max_distance``, in units of the clouds.
@@ -39,6 +40,7 @@ def match_points(ours: Cloud, theirs: Cloud, max_distance: float) -> NDArray[np.
         >>> match_points(Cloud(room[[2, 0]]), Cloud(room), 0.001).tolist()
         [1, -1, 0]
     """
+    ours, theirs = (to_cloud("match_points", cloud) for cloud in (ours, theirs))
     ours_kept, theirs_kept = np.flatnonzero(ours.finite), np.flatnonzero(theirs.finite)
     rows = np.full(len(theirs), -1)
     if len(ours_kept):

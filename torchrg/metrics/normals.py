@@ -11,7 +11,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg.errors import ShapeError
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics.sphere import unit_vectors
-from torchrg.structures.points import format_fields
+from torchrg.structures.points import short_repr
 
 _CHUNK = 2**20
 """Number of points evaluated at a time; bounds the memory."""
@@ -19,6 +19,7 @@ _LIMITS_DEG = (5, 10, 20)
 """Limits of the fractions of small errors, in degrees."""
 
 
+@short_repr
 class NormalScore(NamedTuple):
     """Errors of normals; see :func:`score_normals`. ``METRICS["normals"]`` lists the units.
 
@@ -41,9 +42,6 @@ class NormalScore(NamedTuple):
     under_20_deg: float
     points: int
     invalid: int
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
 
 def score_normals(

@@ -18,12 +18,14 @@ from torchrg.metrics.contingency import (
 )
 from torchrg.neighbors import search_knn
 from torchrg.neighbors.order import distinct_rows
-from torchrg.structures.points import UNLABELED, format_fields
+from torchrg.structures import AnyCloud
+from torchrg.structures.points import UNLABELED, short_repr
 
 _NUM_NEIGHBORS = 8
 """Number of neighbors of a surface point; a boundary separates it from at least one of them."""
 
 
+@short_repr
 class PartitionScore(NamedTuple):
     """Quality of superpoints; see :func:`score_partition`.
 
@@ -49,14 +51,11 @@ class PartitionScore(NamedTuple):
     points_per_superpoint: float
     points: int
 
-    def __repr__(self) -> str:
-        return format_fields(self)
-
 
 def score_partition(
     superpoints: Tensor | NDArray[Any],
     ground_truth: Tensor | NDArray[Any],
-    points: Tensor | NDArray[np.floating] | None = None,
+    points: AnyCloud | None = None,
     *,
     boundary_distance: float | None = None,
     ignore: int | None = None,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only, is_tensor
+from torchrg._checks import as_tensor, check_points, check_shapes, eager_only, is_tensor
 from torchrg._parallel import (
     ROWS_AT_ONCE,
     ROWS_IN_CACHE,
@@ -27,8 +27,8 @@ from torchrg._parallel import (
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors.blocks import search_blocks
 from torchrg.neighbors.order import canonical_order, distinct_rows, mark_distinct
-from torchrg.structures import MAX_POINTS, Neighbors
-from torchrg.structures.points import Points, Rows, bounding_box
+from torchrg.structures import MAX_POINTS, AnyCloud, Neighbors
+from torchrg.structures.points import Rows, bounding_box
 
 _SAMPLE_SIZE = 400
 """Number of sampled points that estimate the distance of the k-th neighbor."""
@@ -47,7 +47,7 @@ _MAX_CELLS_PER_POINT = 8
 
 @eager_only
 def search_knn(
-    points: Points,
+    points: AnyCloud,
     k: int,
     *,
     max_distance: float | None = None,
@@ -82,8 +82,7 @@ def search_knn(
         [[0, 1], [1, 0], [2, 1]]
     """
     tensor = as_tensor("search_knn", "points", points)
-    check_shapes("search_knn", points=(tensor, "N 3"))
-    check_floating("search_knn", points=tensor)
+    check_points("search_knn", tensor)
     if len(tensor) > MAX_POINTS:
         raise ShapeError(
             f"search_knn: expected at most {MAX_POINTS:,} points, got {len(tensor):,}. Split "

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_points
 from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
-from torchrg.structures.points import UNLABELED, Points, bounding_box, format_fields
+from torchrg.structures import UNLABELED, AnyCloud
+from torchrg.structures.points import bounding_box, short_repr
 
 MORTON_BITS = 21
 """Bits per coordinate in a Morton code: three of them fit int64."""
@@ -25,7 +26,7 @@ _SPREADS = (
 """Shifts that halve the runs of adjacent bits, and the resulting bit masks."""
 
 
-def canonical_order(points: Points, ties: Sequence[Tensor] = ()) -> Tensor:
+def canonical_order(points: AnyCloud, ties: Sequence[Tensor] = ()) -> Tensor:
     """Return an order of finite points ``(N, 3)`` that depends on their coordinates alone.
 
     Points are sorted along a Morton curve through the bounding box, and lexicographically within
@@ -47,8 +48,7 @@ def canonical_order(points: Points, ties: Sequence[Tensor] = ()) -> Tensor:
         [1, 2, 0]
     """
     tensor = as_tensor("canonical_order", "points", points)
-    check_shapes("canonical_order", points=(tensor, "N 3"))
-    check_floating("canonical_order", points=tensor)
+    check_points("canonical_order", tensor)
     coordinates = tensor.detach().cpu().numpy()
     if len(coordinates) == 0:
         return torch.zeros(0, dtype=torch.int64, device=tensor.device)
@@ -92,6 +92,7 @@ def mark_distinct(*columns: Tensor) -> Tensor:
     return is_first
 
 
+@short_repr
 class DistinctPoints(NamedTuple):
     """The distinct finite points of a cloud, in canonical order.
 
@@ -105,9 +106,6 @@ class DistinctPoints(NamedTuple):
     rows: Tensor
     inverse: Tensor
 
-    def __repr__(self) -> str:
-        return format_fields(self)
-
     @property
     def num_copies(self) -> int:
         """Number of duplicates, i.e. points after the first one of each position."""
@@ -118,7 +116,7 @@ class DistinctPoints(NamedTuple):
         return expand_to_points(values, self.inverse, fill=fill)
 
 
-def distinct_points(points: Tensor, ties: Sequence[Tensor] = ()) -> DistinctPoints:
+def distinct_points(points: AnyCloud, ties: Sequence[Tensor] = ()) -> DistinctPoints:
     """Find the distinct points of ``(N, 3)``, which represent their duplicates.
 
     Duplicates would displace other points in a neighborhood, so neighbors are searched among
@@ -131,6 +129,7 @@ def distinct_points(points: Tensor, ties: Sequence[Tensor] = ()) -> DistinctPoin
         >>> distinct.rows.tolist(), distinct.inverse.tolist(), distinct.num_copies
         ([1, 0], [1, 0, 1, -1], 1)
     """
+    points = as_tensor("distinct_points", "points", points)
     rows = finite_rows(points, ties)
     # Three times faster than indexing.
     ordered = points.index_select(0, rows)

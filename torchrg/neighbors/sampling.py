@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._checks import as_tensor
 from torchrg.neighbors.knn import SomeNeighbors
-from torchrg.structures import Neighbors, Sampling
+from torchrg.structures import AnyCloud, Neighbors, Sampling
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ _DIGITS = 3
 """Significant digits of a measure; another unit or origin changes only further digits."""
 
 
-def measure_sampling(points: Tensor, neighbors: Neighbors | SomeNeighbors) -> Sampling:
+def measure_sampling(points: AnyCloud, neighbors: Neighbors | SomeNeighbors) -> Sampling:
     """Measure the surface sampling of a cloud at 600 points along the canonical order.
 
     Let ``s_k`` be the deviation of the k nearest points from their plane, with k - 3 degrees of
@@ -56,6 +57,7 @@ def measure_sampling(points: Tensor, neighbors: Neighbors | SomeNeighbors) -> Sa
         >>> sampling.whiteness > 0.9, 3500 < sampling.density < 4500
         (True, True)
     """
+    points = as_tensor("measure_sampling", "points", points)
     rows = _evenly(len(points), _NUM_SAMPLES)
     lists_of = neighbors if callable(neighbors) else neighbors.indices.cpu().numpy().__getitem__
     lists = lists_of(rows)

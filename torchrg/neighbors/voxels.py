@@ -7,9 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_points
 from torchrg.errors import ConfigError
-from torchrg.structures.points import UNLABELED, Points, format_fields
+from torchrg.structures import UNLABELED, AnyCloud
+from torchrg.structures.points import short_repr
 
 _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
@@ -17,6 +18,7 @@ _MAX_KEYS = 2**62
 """Maximum number of cells with distinct int64 keys; above the squared number of points."""
 
 
+@short_repr
 class Voxels(NamedTuple):
     """Representative points of the voxels of a cloud.
 
@@ -28,11 +30,8 @@ class Voxels(NamedTuple):
     rows: Tensor
     inverse: Tensor
 
-    def __repr__(self) -> str:
-        return format_fields(self)
 
-
-def sample_voxels(points: Points, size: float) -> Voxels:
+def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     """Select one point of each occupied cell of a cubic grid with cell width ``size``.
 
     The point nearest to the center of its cell is selected. The result consists of points of the
@@ -48,8 +47,7 @@ def sample_voxels(points: Points, size: float) -> Voxels:
         Voxels(rows=tensor([1, 2]), inverse=tensor([0, 0, 1]))
     """
     tensor = as_tensor("sample_voxels", "points", points)
-    check_shapes("sample_voxels", points=(tensor, "N 3"))
-    check_floating("sample_voxels", points=tensor)
+    check_points("sample_voxels", tensor)
     if not 0 < size < float("inf"):
         raise ConfigError(f"sample_voxels: expected size > 0, got {size!r}.")
     inverse = torch.full((len(tensor),), UNLABELED, device=tensor.device)

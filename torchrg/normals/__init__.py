@@ -28,7 +28,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, eager_only
+from torchrg._checks import as_cloud, as_tensor, eager_only
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
@@ -47,7 +47,7 @@ from torchrg.normals.orient import (
 )
 from torchrg.normals.paper import find_sharp_points, fit_normals_robust
 from torchrg.normals.pca import fit_normals_pca
-from torchrg.structures import Cloud, Neighbors, NormalFit
+from torchrg.structures import AnyCloud, Cloud, Neighbors, NormalFit
 from torchrg.structures.points import Points
 from torchrg.structures.precision import warn_about_coordinates
 
@@ -69,7 +69,7 @@ __dir__ = __all__.copy
 
 @eager_only
 def estimate_normals(
-    points: Points | Cloud,
+    points: AnyCloud,
     config: NormalsConfig | AnyConfig | None = None,
     *,
     orient: Orientation = "none",
@@ -95,8 +95,8 @@ def estimate_normals(
         duplicates, gradients flow to the first.
 
     Args:
-        points: Points, shape ``(N, 3)``, or a cloud. Points with NaN or Inf are skipped and not
-            ``valid``.
+        points: Points, shape ``(N, 3)``, a cloud or the path of a file. Points with NaN or Inf are
+            skipped and not ``valid``.
         config: A normals configuration, a dictionary, a complete configuration, or a preset name.
             Default: that of :func:`torchrg.load_config`.
         orient: Normal orientation, as in :func:`orient_normals`, with the same neighbors. Default:
@@ -128,6 +128,7 @@ def estimate_normals(
         >>> estimate_normals(floor, method="pca", k=20).normals.abs()[0]
         tensor([0., 0., 1.])
     """
+    points = as_cloud(points)
     is_cloud = isinstance(points, Cloud)  # It warns on access to its points.
     positions, directions = find_directions(
         "estimate_normals", points, orient, viewpoint=viewpoint, front=front

@@ -17,7 +17,7 @@ from torchrg.linalg.eigen import PrincipalFrame
 from torchrg.linalg.moments import Columns, project, sq_lengths, sum_neighbors
 from torchrg.linalg.precision import rank_tolerance, rounded_sqrt, safe_sqrt
 from torchrg.normals.pca import center_on_first, check_patches, fit_plane, patch_resolution
-from torchrg.structures.points import NormalFit, format_fields
+from torchrg.structures.points import NormalFit, short_repr
 
 _NUM_TERMS = 6
 """Number of terms of a quadratic in two coordinates, and the minimum number of points."""
@@ -45,6 +45,7 @@ def fit_normals_jet(
     return NormalFit(fit.normals, fit.curvature, fit.valid, fit.residual_rms)
 
 
+@short_repr
 class JetFit(NamedTuple):
     """A quadratic surface per neighborhood, zero if not valid; see :func:`fit_jet`.
 
@@ -68,9 +69,6 @@ class JetFit(NamedTuple):
     curvature: Tensor
     valid: Tensor
     residual_rms: Tensor
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
 
 @disable_autocast

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import (
+    as_cloud,
     as_tensor,
     check_choices,
     check_floating,
@@ -24,7 +25,7 @@ from torchrg.neighbors.knn import check_neighbors
 from torchrg.neighbors.order import distinct_rows
 from torchrg.normals.faces import find_faces, find_surfaces
 from torchrg.normals.free_space import cell_width, vote_free_side
-from torchrg.structures import UNLABELED, Cloud, Neighbors
+from torchrg.structures import UNLABELED, AnyCloud, Cloud, Neighbors
 from torchrg.structures.points import Points
 
 Orientation = Literal[
@@ -53,7 +54,7 @@ _AS_NEAR = 1 + 1e-6
 
 @eager_only
 def orient_normals(
-    points: Points | Cloud,
+    points: AnyCloud,
     normals: Points,
     *,
     orient: Orientation = "auto",
@@ -82,7 +83,7 @@ def orient_normals(
         axis, the first nonzero coordinate of z, y, x is made positive.
 
     Args:
-        points: Points, shape ``(N, 3)``, or a cloud.
+        points: Points, shape ``(N, 3)``, a cloud or the path of a file.
         normals: Unit normals, shape ``(N, 3)``; zero for points without a normal.
         orient: Orientation mode, see above. Default: ``"auto"``.
         viewpoint: Scanner position, shape ``(3,)``, or ``(N, 3)`` for several scans, in the
@@ -138,7 +139,7 @@ def orient_normals(
 
 def find_directions(
     caller: str,
-    points: Points | Cloud,
+    points: AnyCloud,
     orient: Orientation,
     *,
     viewpoint: Points | Sequence[float] | None = None,
@@ -150,6 +151,7 @@ def find_directions(
     """
     check_choices(caller, orient=(orient, Orientation))
     origin = torch.zeros(3, dtype=torch.float64)
+    points = as_cloud(points)
     if isinstance(points, Cloud):
         caller, origin = points.source or caller, torch.from_numpy(points.origin)
         if viewpoint is None and front is None and (orient == "auto" or "scans" in points.header):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrg import scratch
-from torchrg._checks import as_tensor, check_shapes, eager_only
+from torchrg._checks import as_cloud, as_tensor, check_shapes, eager_only
 from torchrg._parallel import return_freed_memory
 from torchrg.config import AnyConfig, PipelineConfig, settings_of
 from torchrg.errors import CloudWarning, ShapeError, warn
@@ -31,9 +30,9 @@ from torchrg.regions import grow_regions, summarize_planes
 from torchrg.regions.classes import find_kinds
 from torchrg.regions.growth import needs_sampling, rank_by_count
 from torchrg.regions.selection import keep_planes, selected_rows
-from torchrg.structures import UNLABELED, Cloud, Neighbors, Planes, Segmentation
+from torchrg.structures import UNLABELED, AnyCloud, Cloud, Neighbors, Planes, Segmentation
 from torchrg.structures.planes import Deferred
-from torchrg.structures.points import FilePath, Labels, Points, Rows
+from torchrg.structures.points import Labels, Points, Rows
 from torchrg.structures.precision import warn_about_coordinates
 
 _MIN_NEIGHBORHOODS = 2
@@ -46,7 +45,7 @@ _MIN_SITES = 3
 
 @eager_only
 def segment_planes(
-    points: Points | Cloud | FilePath,
+    points: AnyCloud,
     config: AnyConfig | None = None,
     *,
     orient: Orientation = "auto",
@@ -126,10 +125,7 @@ def segment_planes(
         >>> halves.count.tolist(), halves.object.tolist()
         ([200, 200], [5, 6])
     """
-    if isinstance(points, str | os.PathLike):
-        from torchrg.io import read_cloud
-
-        points = read_cloud(points)
+    points = as_cloud(points)
     is_cloud = isinstance(points, Cloud)  # It warns on access to its points.
     points, directions = find_directions(
         "segment_planes", points, orient, viewpoint=viewpoint, front=front

@@ -9,16 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_points, check_shapes, eager_only
+from torchrg._checks import as_tensor, check_points, check_shapes, eager_only
 from torchrg.config import AnyConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError, warn
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.pipeline.planes import segment_planes
 from torchrg.regions import partition_points
 from torchrg.regions.superpoints import merge_duplicates
-from torchrg.structures import UNLABELED, Segmentation, Superpoints
+from torchrg.structures import UNLABELED, AnyCloud, Segmentation, Superpoints
 from torchrg.structures.colors import read_colors
-from torchrg.structures.points import Colors, Labels, Points
+from torchrg.structures.points import Colors, Labels
 
 _STRENGTH_OF_K = 100.0
 """Superpoint strength per unit of the threshold of ScanNet's Segmentator. At its default of 0.01,
@@ -27,7 +27,7 @@ meshed depth frames get about the same number of superpoints as Segmentator's se
 
 @eager_only
 def make_superpoints(
-    points: Points,
+    points: AnyCloud,
     seg: Segmentation | None = None,
     config: SuperpointsConfig | Mapping[str, Any] | None = None,
     *,
@@ -127,7 +127,7 @@ def _unit_colors(caller: str, points: Tensor, colors: Colors | None) -> Tensor |
 
 @eager_only
 def segment_mesh(
-    vertices: Points,
+    vertices: AnyCloud,
     faces: Labels | None = None,
     k_thresh: float = 0.01,
     seg_min_verts: int = 20,
@@ -166,8 +166,7 @@ def segment_mesh(
         [200, 200]
     """
     tensor = as_tensor("segment_mesh", "vertices", vertices).detach()
-    check_shapes("segment_mesh", vertices=(tensor, "V 3"))
-    check_floating("segment_mesh", vertices=tensor)
+    check_points("segment_mesh", tensor, "vertices")
     corners = None if faces is None else as_tensor("segment_mesh", "faces", faces)
     check_shapes("segment_mesh", faces=(corners, "F 3"))
     if corners is not None and len(corners):

@@ -25,7 +25,7 @@ from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, 
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
 from torchrg.regions.repair import merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
-from torchrg.structures import UNLABELED, Neighbors
+from torchrg.structures import UNLABELED, AnyCloud, Neighbors
 from torchrg.structures.points import Colors, Points, Values
 
 _ROOTS_AT_ONCE = 1024
@@ -35,7 +35,7 @@ neighbor lists."""
 
 @eager_only
 def grow_regions(
-    points: Points,
+    points: AnyCloud,
     normals: Points,
     curvature: Values,
     neighbors: Neighbors,
@@ -172,7 +172,7 @@ def label_regions(
 
 def checked_cloud(
     config: GrowingConfig,
-    points: Points,
+    points: AnyCloud,
     normals: Points,
     curvature: Values,
     neighbors: Neighbors,

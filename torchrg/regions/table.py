@@ -21,14 +21,14 @@ from torchrg.regions.classes import find_kinds
 from torchrg.regions.extents import covered_areas, fit_rectangles
 from torchrg.regions.fit import POINTS_AT_ONCE, RegionPlanes, fit_planes
 from torchrg.regions.polygons import trace_polygon
-from torchrg.structures import Neighbors, PlaneAdjacency, Planes
+from torchrg.structures import AnyCloud, Neighbors, PlaneAdjacency, Planes
 from torchrg.structures.points import Labels, Points, Rows
 
 _Polygons = tuple[tuple[Tensor, ...], ...]
 
 
 def summarize_planes(
-    points: Points,
+    points: AnyCloud,
     normals: Points,
     labels: Labels,
     *,

@@ -14,6 +14,7 @@ from torchrg.neighbors import search_knn
 from torchrg.neighbors.voxels import sample_voxels
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
 from torchrg.regions.directions import horizontal_toward, unit_axis
+from torchrg.structures import AnyCloud
 from torchrg.structures.points import Array, Labels, Points, Values
 
 
@@ -242,7 +243,7 @@ _NEIGHBORHOODS = ((256, 1.0), (48, 0.2))
 
 def color_planes(
     labels: Labels,
-    points: Points | None = None,
+    points: AnyCloud | None = None,
     *,
     reference: Labels | None = None,
 ) -> Tensor:

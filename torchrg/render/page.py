@@ -48,7 +48,7 @@ from torchrg.render.content import (
 )
 from torchrg.render.cutaway import MIN_FACING, View, choose_viewpoint
 from torchrg.structures import PLANE_KINDS, Cloud
-from torchrg.structures.points import format_fields
+from torchrg.structures.points import short_repr
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -64,6 +64,7 @@ _LIBRARY = "nbextension/static/index.js"
 """File of deck.gl in pydeck, which pydeck itself embeds in offline pages."""
 
 
+@short_repr
 class Page(NamedTuple):
     """A viewer.
 
@@ -74,9 +75,6 @@ class Page(NamedTuple):
 
     html: str
     num_points: tuple[int, ...]
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
     def _repr_html_(self) -> str:
         """Return the viewer in an iframe, as displayed by notebooks."""

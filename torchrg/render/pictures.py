@@ -19,6 +19,7 @@ from torchrg.render import raster
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides
 from torchrg.render.surface import VisibleSurface, sample_surface
+from torchrg.structures import AnyCloud
 from torchrg.structures.points import Labels, Points
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ def _reduce(image: Tensor, size: int, combine: Callable[[Tensor, Tensor], Tensor
 
 
 def render_cloud(
-    points: Points,
+    points: AnyCloud,
     colors: Tensor | NDArray[np.uint8],
     *,
     normals: Points | None = None,
@@ -297,7 +298,7 @@ def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic])
 
 
 def _check_cloud(
-    points: Points, colors: Tensor | NDArray[np.uint8], normals: Points | None
+    points: AnyCloud, colors: Tensor | NDArray[np.uint8], normals: Points | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return the arguments as tensors, after checking shapes and dtypes."""
     caller = "render_cloud"

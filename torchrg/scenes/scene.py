@@ -14,7 +14,7 @@ from torchrg._checks import check_choices
 from torchrg.errors import ConfigError
 from torchrg.scenes.geometry import Doubles, Floats
 from torchrg.scenes.surfaces import Solid, Surface
-from torchrg.structures.points import FARTHEST, MAX_POINTS, format_fields
+from torchrg.structures.points import FARTHEST, MAX_POINTS, short_repr
 
 NoiseDirection = Literal["normal", "isotropic"]
 
@@ -26,6 +26,7 @@ _OVERSAMPLING = 1.02
 """Oversampling factor, which avoids repetitions."""
 
 
+@short_repr
 class Scene(NamedTuple):
     """A point cloud with exact ground truth.
 
@@ -51,9 +52,6 @@ class Scene(NamedTuple):
     face_areas: Tensor
     kinds: tuple[str, ...]
     objects: Tensor
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchrg.structures.cloud import Cloud
+from torchrg.structures.cloud import AnyCloud, Cloud
 from torchrg.structures.planes import (
     PLANE_KINDS,
     Plane,
@@ -26,6 +26,7 @@ __all__ = [
     "MAX_POINTS",
     "PLANE_KINDS",
     "UNLABELED",
+    "AnyCloud",
     "Cloud",
     "Neighbors",
     "NormalFit",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning, warn
-from torchrg.structures.points import FARTHEST, bounding_box, local_origin
+from torchrg.structures.points import FARTHEST, FilePath, Points, bounding_box, local_origin
 from torchrg.structures.precision import describe_steps, describe_units
 
 
@@ -65,7 +65,7 @@ class Cloud:
         if not isinstance(coordinates, np.ndarray):
             raise ShapeError(
                 "Cloud: expected coordinates to be a tensor or a NumPy array, got "
-                f"{type(self.coordinates).__name__}; use numpy.array."
+                f"{type(self.coordinates).__name__}; use numpy.array, or torchrg.read_cloud(path)."
             )
         if self.front is not None and self.front.shape != (len(self), 3):
             raise ShapeError(
@@ -161,3 +161,7 @@ class Cloud:
 def _as_array(values: Any) -> Any:  # noqa: ANN401
     """Convert a tensor to an array; return anything else unchanged."""
     return values.numpy(force=True) if isinstance(values, Tensor) else values
+
+
+AnyCloud = Points | Cloud | FilePath
+"""Points ``(N, 3)`` as a tensor or an array, a cloud, or the path of a file."""

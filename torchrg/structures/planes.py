@@ -1,26 +1,17 @@
 """Planes, segmentations and superpoints."""
 
 import operator
+import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Literal,
-    NamedTuple,
-    SupportsIndex,
-    TypeVar,
-    cast,
-    get_args,
-    overload,
-)
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, TypeVar, cast, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.structures.points import Neighbors, Sampling, format_fields
+from torchrg.structures.points import Neighbors, Sampling, short_repr
 
 if TYPE_CHECKING:
     from torchrg.render.page import Page
@@ -30,12 +21,10 @@ PlaneKind = Literal["other", "floor", "ceiling", "wall", "horizontal", "vertical
 PLANE_KINDS: tuple[PlaneKind, ...] = get_args(PlaneKind)
 """Classes of planes; see :func:`torchrg.regions.classes.classify_planes`. Curved planes are
 "other"; "horizontal" and "vertical" planes are neither floor nor ceiling nor wall."""
-_NOUNS = ("plane", "floor", "ceiling", "wall")
-_SHOWN_KINDS = (*PLANE_KINDS[1:], PLANE_KINDS[0])
-"""Classes in the order of a summary."""
 Moved = TypeVar("Moved", bound="_Movable")
 
 
+@short_repr
 class PlaneAdjacency(NamedTuple):
     """Pairs of adjacent planes.
 
@@ -48,9 +37,6 @@ class PlaneAdjacency(NamedTuple):
     pairs: Tensor
     boundary_length: Tensor
     dihedral_deg: Tensor
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
 
 class Deferred:
@@ -233,23 +219,21 @@ class Planes(_Movable):
         """Coefficients a, b, c, d with a x + b y + c z + d = 0, as in Open3D; ``(M, 4)``."""
         return torch.cat([self.normal, -self.offset[:, None]], dim=1)
 
-    def __repr__(self) -> str:
-        return f"Planes({_plural(len(self), 'plane')}{self.describe_kinds()})"
+    def __str__(self) -> str:
+        counts = [0] * len(PLANE_KINDS) if self.kind is None else torch.bincount(self.kind).tolist()
+        named = [*zip(PLANE_KINDS, counts, strict=False)]
+        kinds = [_plural(count, kind) for kind, count in (*named[1:], *named[:1]) if count]
+        return f"{_plural(len(self), 'plane')}{': ' * bool(kinds)}{', '.join(kinds)}"
 
-    def describe_kinds(self) -> str:
-        """Return the number of planes of each class after a colon, or "" without classes."""
-        counts = [] if self.kind is None else torch.bincount(self.kind).tolist()
-        number = dict(zip(PLANE_KINDS, counts, strict=False))
-        named = [(number.get(kind, 0), kind) for kind in _SHOWN_KINDS]
-        classes = ", ".join(_plural(count, kind) for count, kind in named if count)
-        return f": {classes}" if classes else ""
+    def __repr__(self) -> str:
+        return f"Planes({self})"
 
     def __iter__(self) -> Iterator[Plane]:
         return map(self.__getitem__, range(len(self)))
 
-    @overload
+    @typing.overload
     def __getitem__(self, row: SupportsIndex) -> Plane: ...
-    @overload
+    @typing.overload
     def __getitem__(self, row: slice) -> list[Plane]: ...
     def __getitem__(self, row: SupportsIndex | slice) -> Plane | list[Plane]:
         """Return a plane by its row, or a list of the planes of a slice."""
@@ -288,8 +272,9 @@ def _find_row(caller: str, row: SupportsIndex, num_planes: int) -> int:
 
 
 def _plural(count: int, noun: str) -> str:
-    """Return a count with a noun; adjectives, and "other", have no plural."""
-    return f"{count:,} {noun}{'s' * (count != 1 and noun in _NOUNS)}"
+    """Return a count with a noun, or with an adjective, which has no plural."""
+    has_plural = noun in ("plane", "floor", "ceiling", "wall")
+    return f"{count:,} {noun}{'s' * (count != 1 and has_plural)}"
 
 
 def _count_points(labels: Tensor) -> str:
@@ -345,41 +330,12 @@ class Segmentation(_Movable):
     num_copies: int = 0
 
     def __repr__(self) -> str:
-        return f"Segmentation({_count_points(self.labels)}, {self._describe(self.labels.numel())})"
-
-    def _describe(self, num_points: int) -> str:
-        """Return the number of planes, and the percentage of points that are labeled."""
-        percent = 100 * torch.count_nonzero(self.labels >= 0).item() / max(num_points, 1)
-        return f"{_plural(len(self.planes), 'plane')}, {percent:.1f} % labeled"
-
-    def describe(self, num_points: int | None = None) -> str:
-        """Return the number of planes, in all and by class, and the percentage of labeled points.
-
-        Args:
-            num_points: Number of points that count as all. Default: all points or pixels.
-
-        Example:
-            >>> from torchrg import segment_planes
-            >>> floor = torch.cartesian_prod(torch.arange(9.0), torch.arange(9.0), torch.ones(1))
-            >>> segment_planes(floor, "classic").describe()
-            '1 plane, 100.0 % labeled: 1 floor'
-        """
-        num_points = self.labels.numel() if num_points is None else num_points
-        return f"{self._describe(num_points)}{self.planes.describe_kinds()}"
+        labeled = 100 * torch.count_nonzero(self.labels >= 0).item() / max(self.labels.numel(), 1)
+        size = f"{_count_points(self.labels)}, {_plural(len(self.planes), 'plane')}"
+        return f"Segmentation({size}, {labeled:.1f} % labeled)"
 
     def inliers(self, plane: SupportsIndex) -> Tensor:
-        """Return the rows of the points of a plane, as from Open3D's ``segment_plane``.
-
-        Args:
-            plane: ID of the plane; negative IDs count from the last.
-
-        Returns:
-            Rows of ``labels``, ascending, shape ``(n,)``, int64; of its flattened pixels for a
-            depth image.
-
-        Raises:
-            IndexError: If there is no such plane.
-        """
+        """Return the rows of the points of a plane (of flattened pixels), ``(n,)``, int64."""
         row = _find_row("inliers", plane, len(self.planes))
         return (self.labels.flatten() == row).nonzero().squeeze(1)
 

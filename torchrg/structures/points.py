@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ _MAX_SHOWN = 100
 """Maximum length of a value that a result prints, in characters."""
 Array = NDArray[Any]
 """Array of numbers or text of any shape."""
+Kind = TypeVar("Kind")
 Rows = slice | Tensor
 """A block of points, or row indices."""
 Points = Tensor | NDArray[np.floating]
@@ -71,29 +72,34 @@ def are_integers(values: Array) -> bool:
     return bool(np.isfinite(values).all() and (values == np.floor(values)).all())
 
 
-def format_fields(record: Any) -> str:  # noqa: ANN401
-    """Format a result in one line, with the shapes of its tensors and without fields that are None.
+def short_repr(kind: type[Kind]) -> type[Kind]:
+    """Decorate a class of results so that it prints in one line, with the shapes of its tensors.
 
     Example:
         >>> Neighbors(torch.zeros(4, 3, dtype=torch.int32))
         Neighbors(indices=int32 (4, 3))
     """
-    values = {name: getattr(record, name) for name in record.__match_args__}
-    shown = (f"{key}={_format(value)}" for key, value in values.items() if value is not None)
-    return f"{type(record).__name__}({', '.join(shown)})"
+
+    def describe(result: Any) -> str:  # noqa: ANN401
+        values = {name: getattr(result, name) for name in result.__match_args__}
+        shown = (f"{key}={_format(value)}" for key, value in values.items() if value is not None)
+        return f"{kind.__name__}({', '.join(shown)})"
+
+    kind.__repr__ = describe  # type: ignore[method-assign]
+    return kind
 
 
-def _format(value: Any) -> str:  # noqa: ANN401
-    """Format a tensor by its dtype and shape, a number in four digits, and a long value briefly."""
+def _format(value: object) -> str:
+    """Format a tensor by its dtype and shape, a number in four digits, and long values briefly."""
     if isinstance(value, Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
     if isinstance(value, float):
         return f"{value:.4g}"
     text = "" if isinstance(value, Mapping) else repr(value)
-    is_long = not text or len(text) > _MAX_SHOWN
-    return f"{type(value).__name__} of length {len(value):,}" if is_long else text
+    return text if 0 < len(text) <= _MAX_SHOWN else f"a {type(value).__name__}"
 
 
+@short_repr
 class Neighbors(NamedTuple):
     """Nearest neighbors of each point; see :func:`torchrg.search_knn`.
 
@@ -105,9 +111,6 @@ class Neighbors(NamedTuple):
 
     indices: Tensor
     valid: Tensor | None = None
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
     def select(self, rows: Rows) -> "Neighbors":
         """Return the neighbors of the selected points."""
@@ -160,6 +163,7 @@ class Sampling(NamedTuple):
     deviation: float = 0.0
 
 
+@short_repr
 class NormalFit(NamedTuple):
     """Fit of a plane to each neighborhood.
 
@@ -177,9 +181,6 @@ class NormalFit(NamedTuple):
     valid: Tensor
     residual_rms: Tensor
     sharp: Tensor | None = None
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "NormalFit":
         """Apply a function to all tensors; None stays None."""

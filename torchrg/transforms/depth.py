@@ -14,7 +14,7 @@ from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import expand_to_points, sample_voxels
 from torchrg.normals import Orientation
 from torchrg.structures import UNLABELED, Planes
-from torchrg.structures.points import format_fields
+from torchrg.structures.points import short_repr
 from torchrg.transforms.rows import Entries, SampleDict, check_sample
 from torchrg.transforms.sample import SampleTransform
 
@@ -225,6 +225,7 @@ class SegmentDepth(DepthTransform):
 default_collate_fn_map[Planes] = lambda tables, **_: list(tables)
 
 
+@short_repr
 class FusedFrames(NamedTuple):
     """Cloud fused from several depth frames.
 
@@ -244,9 +245,6 @@ class FusedFrames(NamedTuple):
     pixel: Tensor
     inverse: Tensor
     seen: tuple[Tensor, ...]
-
-    def __repr__(self) -> str:
-        return format_fields(self)
 
     def to_frames(self, values: Tensor, *, fill: int = UNLABELED) -> list[Tensor]:
         """Map per-point values, such as labels, to images of the frames.
