@@ -29,6 +29,8 @@ Example:
     (torch.Size([2000]), torch.Size([2000, 3]), True)
 """
 
+import sys
+
 from torchrg.version import __version__ as __version__
 
 TYPE_CHECKING = False  # Like typing.TYPE_CHECKING, without importing typing.
@@ -74,13 +76,23 @@ else:
                 raise
             module = None
         if module is None:
-            repair = "; seg.show() shows a result" if name == "show" else ""
-            near = [word for word in __all__ if word.startswith(f"{name}_")]
-            if near:
-                repair = f". Did you mean {' or '.join(map(repr, reversed(near)))}?"
-            raise AttributeError(f"module 'torchrg' has no attribute {name!r}{repair}")
+            from torchrg._synonyms import describe_missing
+
+            raise AttributeError(describe_missing("module 'torchrg'", name, _public_names()))
         globals()[name] = getattr(module, name) if name in _MODULES else module
         return globals()[name]
+
+    def _public_names():  # noqa: ANN202
+        """Return the names of all public functions and classes with their modules."""
+        from importlib import import_module
+
+        packages = [*_PACKAGES, *(name for name in __all__ if name not in _MODULES)]
+        modules = [import_module(path) for path in map("torchrg.{}".format, packages)]
+        names = {name: f"{module.__name__}.{name}" for module in modules for name in module.__all__}
+        return names | {name: f"torchrg.{name}" for name in __all__}
+
+    if "torch" in sys.modules:  # Otherwise torch.load does not know saved results.
+        from torchrg import structures as structures
 
     def __dir__():  # noqa: ANN202
         """Return the public names, loaded or not."""

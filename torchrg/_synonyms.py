@@ -1,10 +1,12 @@
 """Suggestions for misspelled names, and for names of other libraries."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 _MIN_SIMILARITY = 0.75
 """Similarity to a misspelled name from which a name is suggested, as in difflib."""
+_MAX_LISTED = 30
+"""Maximum number of attributes that a message lists."""
 _OUTPUT = "destination output output_dir output_file save"
 _SEED = "random_seed random_state"
 _THREADS = "jobs n_jobs num_threads num_workers"
@@ -43,6 +45,8 @@ _ADVICE = {
     "epsilon",
     "all planes are detected; min_area and growing.min_size drop small ones": "max_planes n_planes "
     "num_planes",
+    "an estimator is a method, as method='pca' of estimate_normals, {'normals.method': 'pca'} of "
+    "other functions, or --normals.method pca": "detmcd fastmcd irls jet mve pca",
     "regions grow without random samples; leave it out": "max_iterations num_iterations "
     "probability ransac_n",
     "results are deterministic; leave it out": f"seed {_SEED}",
@@ -56,6 +60,79 @@ _ADVICE = {
     "pass voxel to segment_planes, SegmentPlanes or torchrg segment": f"voxel {_VOXEL}",
 }
 """Words of other libraries by how to do without them, for words without such a name."""
+
+_ATTRIBUTES = {
+    "torchrg.segment_planes(points), whose planes[0] has the most points": "detect_planar_patches "
+    "detect_planes extract_planes find_planes fit_plane plane_segmentation ransac region_growing "
+    "sacsegmentation segment segment_plane",
+    "torchrg.estimate_normals(points)": "compute_normals estimate_normal estimate_normals "
+    "normal_estimation",
+    "torchrg.normals.orient_normals(points, normals)": "flip_normals "
+    "orient_normals_consistent_tangent_plane orient_normals_to_align_with_direction "
+    "orient_normals_towards_camera_location",
+    "torchrg.read_cloud(path)": "load load_cloud load_pcd load_pcd_file load_ply load_point_cloud "
+    "open point_cloud read read_file read_las read_laz read_pcd read_ply read_point_cloud read_xyz",
+    "torchrg.read_result(path)": "from_file load_result read_planes read_segmentation",
+    "torchrg.write_cloud(path, cloud, seg)": "dump export save save_cloud save_pcd save_ply to_csv "
+    "to_file to_ply write write_file write_result write_las write_pcd write_ply write_point_cloud",
+    "voxel, as in torchrg.segment_planes(points, voxel=0.02)": "down_sample downsample "
+    "random_down_sample uniform_down_sample voxel_down_sample voxel_grid voxelize",
+    "torchrg.make_superpoints(points, seg)": "cluster cluster_dbscan dbscan euclidean_cluster "
+    "superpoints supervoxel_clustering supervoxels",
+    "torchrg.render.color_planes(seg.labels, points)": "color_by_label colorize paint "
+    "paint_uniform_color",
+    "seg.show()": "draw draw_geometries plot render show view visualize",
+    "torchrg.scenes.make_room(num_points)": "demo_data example make_room sample_data",
+    "seg.inliers(i), or seg.labels == i": "indices inlier inlier_indices inlier_mask mask masks "
+    "points_of select_by_index",
+    "seg.labels, where -1 is no plane": "instances label plane_ids plane_labels point_labels "
+    "segment_ids segments",
+    "plane.equation of seg.planes, a, b, c and d": "a abcd b c coefficients coeffs d model models "
+    "params plane_model plane_models",
+    "points[seg.inliers(plane.id)]": "inliers points",
+    "plane.outline, with {'planes.outline': True}": "boundary contour convex_hull corners hull "
+    "polygon vertices",
+    "plane.rms": "error residual rmse std thickness",
+    "plane.count": "n_points num_inliers num_points size",
+    "plane.kind": "category class_name semantic type",
+    "seg.planes, whose columns are tensors": "area areas equation kind kinds offset to_pandas",
+    "plane.extent and plane.axes, or cloud.points.amin(0) and amax(0)": "bbox bounding_box "
+    "get_axis_aligned_bounding_box get_oriented_bounding_box height length width",
+    "len(seg.planes), or the shape of a tensor, as points.shape": "n_planes num_planes shape",
+    "a tensor, as seg.labels.numpy(), or the array cloud.coordinates": "array detach numpy tolist "
+    "xyz",
+    "seg.to(device)": "cuda gpu",
+    "cloud.fields, as in 'normals' in cloud.fields": "has_colors has_normals",
+    "a new torchrg.Cloud of other coordinates": "crop remove_statistical_outlier rotate scale "
+    "transform translate",
+}
+"""Names of other libraries by what to use in place of an attribute."""
+
+
+def describe_missing(owner: str, name: str, known: Mapping[str, str]) -> str:
+    """Return the message about an attribute that ``owner`` lacks, with what to use.
+
+    ``known`` has the attributes by name, in the form in which they are used.
+
+    Example:
+        >>> describe_missing("Plane", "polygons", {"kind": "kind", "polygon": "outline"})
+        "Plane has no attribute 'polygons'; use outline."
+        >>> describe_missing("Cloud", "save", {})
+        "Cloud has no attribute 'save'; use torchrg.write_cloud(path, cloud, seg)."
+    """
+    word = _squeezed(name)
+    use = [known[name]] if name in known else []
+    use += [advice for advice, words in _ATTRIBUTES.items() if word in _squeezed(words).split()]
+    near = difflib.get_close_matches(name, known, 1, _MIN_SIMILARITY)
+    use += [known[each] for each in near]
+    has = ", ".join(known.values()) if len(known) <= _MAX_LISTED else ""
+    shown = f"; use {use[0]}" if use else f"; it has {has}" if has else ""
+    return f"{owner} has no attribute {name!r}{shown}."
+
+
+def _squeezed(text: str) -> str:
+    """Return text in lower case without underscores, as names of libraries differ in both."""
+    return text.lower().replace("_", "")
 
 
 def nearest_name(word: str, names: Iterable[str]) -> str:

@@ -209,10 +209,10 @@ def test_what_gives_way_to_a_result_is_told(room_file, tmp_path, run):
     expected, fields = read_cloud(room_file).fields, read_cloud(out).fields
     np.testing.assert_array_equal(fields["label_input"], expected["labels"])
     np.testing.assert_array_equal(fields["normals_input"], expected["normals"])
-    # Archives hold the result alone, which the line about it says.
+    # Archives hold the result alone, in place of earlier ones.
     shown = run("segment", room_file, *CLASSIC, "--out", tmp_path / "a.npz")
     assert shown.err == ""
-    assert shown.out.endswith("a.npz (without the input fields labels, normals)\n")
+    assert shown.out.endswith("a.npz\n")
 
 
 def test_single_points_far_off_that_cost_precision_are_told(room_file, tmp_path, run):

@@ -82,6 +82,7 @@ def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tm
     assert "2 scans to convert, 1 done" in shown
     done = convert(*command, "--workers", 1)
     assert done.code == 3
+    assert done.out.splitlines()[1].split()[:2] == ["bad", "failed"]
     first, last = done.err.splitlines()
     assert first.startswith(f"torchrg: bad: {tmp_path / 'in' / 'bad.ply'}: line 2: ")
     assert "2 of 3 scans are complete" in last
@@ -90,6 +91,14 @@ def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tm
     assert status == {"bad": "failed", "hall": "converted", "east/office": "kept"}
     assert all(name in done.out for name in status)
     assert results_of(tmp_path / "out") == results_of(converted)
+    assert "seconds" not in done.out
+    assert set(report["stage_seconds"]) >= {"read", "normals", "write"}
+    assert "\n1 scans to convert, 0 done" in convert(*command, "--only-failed", "--dry-run").out
+    (tmp_path / "in" / "bad.ply").rename(tmp_path / "in" / "good.txt")
+    assert convert(*command, "--only-failed").out.startswith("nothing to do: ")
+    done = convert(*command, "--exclude", "no.ply", "--exclude", "go*.txt", "east/*")
+    assert (done.code, done.err) == (0, "")
+    assert "1 of 1 scans are complete" in done.out
 
 
 def test_a_dry_run_writes_nothing(rooms, tmp_path, convert):
@@ -143,8 +152,8 @@ def test_another_converter_in_the_same_directory_is_refused(rooms, tmp_path, con
         (["folder", "IN", "OUT", "--workers", "0"], "expected --workers >= 1, got 0"),
         (["folder", "IN", "OUT", "--limit-memory", "0"], "expected --limit-memory above 0"),
         (["folder", "IN", "OUT", "--chunk-size", "0"], "expected --chunk-size >= 1"),
-        (["folder", "IN", "OUT", "--ray-address", "auto"], "with --engine ray"),
-        (["folder", "IN", "OUT", "--engine", "spark"], "engine"),
+        (["folder", "IN", "OUT", "--engine", "spark"], "local, ray, auto or HOST:PORT"),
+        (["folder", "IN", "OUT", "--only-failed"], "expected the report of an earlier run"),
         (["folder", "IN", "OUT", "--only", "west/*"], "they are east/office, hall"),
         (["folder", "IN", "IN/out"], "expected a directory outside"),
         (["folder", "IN", "IN"], "for the results of office.npy"),

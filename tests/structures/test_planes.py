@@ -21,8 +21,8 @@ def seg():
 
 
 def test_results_are_shown_in_one_line(seg):
-    assert repr(seg) == "Segmentation(1,602 points, 1 planes, 99.9 % labeled)"
-    assert repr(seg.planes) == "Planes(1 planes: 1 floor)"
+    assert repr(seg) == "Segmentation(1,602 points, 1 plane, 99.9 % labeled)"
+    assert repr(seg.planes) == "Planes(1 plane: 1 floor)"
     parts = torchrg.make_superpoints(seg.points, seg, counts=(10, 2))
     assert repr(parts).startswith("Superpoints(1,602 points, ")
     assert "\n" not in repr(parts)
@@ -35,7 +35,7 @@ def test_results_are_shown_in_one_line(seg):
 def test_images_are_shown_by_their_size():
     camera = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
     seg = segment_depth(torch.full((30, 40), 2.0), camera)
-    assert repr(seg) == "Segmentation(30 x 40 pixels, 1 planes, 100.0 % labeled)"
+    assert repr(seg) == "Segmentation(30 x 40 pixels, 1 plane, 100.0 % labeled)"
 
 
 def test_a_segmentation_is_no_tuple(seg):
@@ -64,8 +64,45 @@ def test_a_table_is_gone_through_plane_by_plane():
     assert planes[torch.tensor(2)].id == 2
     with pytest.raises(IndexError, match=f"expected a row below {len(planes)}, got 99"):
         planes[99]
-    with pytest.raises(TypeError, match="got slice; index columns with slices and masks"):
-        planes[:3]
+    assert [plane.id for plane in planes[:3]] == [0, 1, 2]
+    assert [plane.id for plane in planes[-2:]] == [len(planes) - 2, len(planes) - 1]
+    with pytest.raises(TypeError, match="got Tensor; index columns with masks"):
+        planes[planes.area > 1]
+    with pytest.raises(TypeError, match=r"got Plane; .* a plane has an id"):
+        seg.inliers(planes[0])
+
+
+def test_missing_attributes_name_what_to_use(seg):
+    cloud = torchrg.Cloud(np.zeros((3, 3)), {"intensity": np.zeros(3)})
+    for owner, name, use in [
+        (seg, "save", r"torchrg.write_cloud\(path, cloud, seg\)"),
+        (seg, "label", "seg.labels"),
+        (seg.planes, "kinds", "seg.planes"),
+        (seg.planes[0], "plane_model", "plane.equation"),
+        (seg.planes[0], "points", r"points\[seg.inliers\(plane.id\)\]"),
+        (cloud, "voxel_down_sample", "voxel, as in"),
+        (cloud, "intensities", r"fields\['intensity'\]"),
+    ]:
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'; use {use}"):
+            getattr(owner, name)
+    with pytest.raises(AttributeError, match=r"'hue'; it has .*finite.* fields.'intensity'"):
+        _ = cloud.hue
+
+
+def test_equations_and_inliers_are_those_of_open3d(seg):
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 4
+    points[:, 2] = 5 + points[:, 0] / 2
+    seg = segment_planes(points, "classic")
+    a, b, c, d = seg.planes[0].equation
+    assert (c, -a / c, b, -d / c) == pytest.approx((2 / 5**0.5, 0.5, 0, 5), abs=1e-5)
+    assert torch.equal(seg.planes.equation[0], seg.planes[0].equation)
+    assert seg.inliers(0).tolist() == [*range(500)]
+    image = segment_depth(
+        torch.full((30, 40), 2.0), torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+    )
+    assert len(image.inliers(-1)) == 1200
+    with pytest.raises(IndexError, match="inliers: expected a row below 1, got 3"):
+        seg.inliers(3)
 
 
 def test_a_segmentation_goes_to_a_device_whole():

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
+import torchrg
 from torchrg.structures.points import are_integers, bounding_box, local_origin
 
 
@@ -30,3 +32,38 @@ def test_integers_stored_as_floats_are_integers():
     assert are_integers(np.array([True]))
     assert not are_integers(np.array([1.5, 2]))
     assert not are_integers(np.array([np.nan, 2]))
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Return a result of every public kind."""
+    room = torchrg.scenes.make_room(1500, seed=0)
+    seg = torchrg.segment_planes(room.points, "classic")
+    fit = torchrg.estimate_normals(room.points, method="pca")
+    patches = room.points[:40].view(2, 20, 3)
+    return [
+        *(room, seg, fit, seg.planes, seg.planes[0], seg.planes.adjacency, seg.sampling),
+        torchrg.search_knn(room.points, 3),
+        torchrg.make_superpoints(room.points, seg),
+        torchrg.nn.DetMCD()(patches),
+        torchrg.nn.Eigh()(torchrg.nn.Covariance()(patches)),
+        torchrg.normals.fit_jet(patches),
+        torchrg.neighbors.sample_voxels(room.points, 0.1),
+        torchrg.neighbors.distinct_points(room.points),
+        torchrg.metrics.score_labels(seg.labels, room.labels),
+        torchrg.metrics.score_normals(seg.normals, room.normals),
+        torchrg.metrics.contingency_table(seg.labels, room.labels),
+        torchrg.metrics.score_partition(seg.labels, room.labels, room.points),
+        torchrg.io.result.Result(torchrg.Cloud(room.points), provenance={"a": 1}),
+        torchrg.datasets.RGBDFrame("a.png", torch.diag(torch.tensor([9.0, 9, 1])), 1.0),
+    ]
+
+
+def test_every_result_prints_in_a_short_line(results):
+    for result in results:
+        line = repr(result)
+        assert line.startswith((type(result).__name__, "None"))
+        assert "\n" not in line
+        assert "tensor(" not in line
+        assert len(line) < 300
+    assert repr(results[7]) == "Neighbors(indices=int32 (1500, 3))"

@@ -30,13 +30,11 @@ Command = TypeVar("Command")
 
 ADVANCED = (
     *("--pages", "--level", "--layout", "--columns", "--viewpoint", "--within", "--merge"),
-    *("--config", "--angle-deg", "--sort", "--chunk-size", "--engine", "--ray-address"),
-    *("--ignore", "--boundary-distance", "--azimuth-deg"),
+    *("--config", "--angle-deg", "--sort", "--chunk-size", "--engine"),
+    *("--ignore", "--boundary-distance", "--azimuth-deg", "--class-order"),
 )
 """Command flags that appear only in ``--help-all``."""
-RESOURCES = (
-    *("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine", "--ray-address"),
-)
+RESOURCES = (*("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine"),)
 """Flags that set where and how fast a command runs, and do not change its result."""
 _STARTS = ("--preset", "--config", "--angle-deg")
 """Flags that set several settings."""

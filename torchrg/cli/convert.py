@@ -70,11 +70,10 @@ class Arguments:
     """Output directory of one data set in one layout; finished scans are skipped."""
     workers: int | None = None
     """Number of scans processed at a time. Default: one per core; on a cluster, by memory."""
-    engine: Literal["local", "ray"] = "local"
-    """Execution: processes on this machine (local), or on Ray (ray; pip install 'torchrg[ray]')."""
-    ray_address: str | None = None
-    """Address of the Ray cluster; auto: the cluster of this machine. ROOT and OUT must have the
-    same paths on every node. Default: starts a cluster for this command."""
+    engine: str = "local"
+    """Execution: processes on this machine (local), or Ray (pip install 'torchrg[ray]'): a cluster
+    for this command (ray), that of this machine (auto), or the address of one, as HOST:PORT, where
+    ROOT and OUT have the same paths on every node."""
     limit_memory: float | None = None
     """Memory limit for all concurrent scans, in GB. Default: 80 % of the free memory."""
     table: str | None = None
@@ -83,7 +82,7 @@ class Arguments:
     only: str | None = None
     """Shell pattern of scans to convert, such as "Area_5/*". Results of missing scans are kept."""
     only_failed: bool = False
-    """Convert only the scans that failed in the last run, as listed in OUT/report.json."""
+    """Convert only scans that failed in the last run, by OUT/report.json."""
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False
@@ -329,8 +328,10 @@ def _check(arguments: Arguments) -> None:
         raise ConfigError(
             f"expected --table to be a name ending in .csv or .json, got {table}; use planes.csv."
         )
-    if arguments.ray_address is not None and arguments.engine != "ray":
-        raise ConfigError("expected --ray-address with --engine ray, got --engine local; add it.")
+    if arguments.engine not in ("local", "ray", "auto") and ":" not in arguments.engine:
+        raise ConfigError(
+            f"expected --engine local, ray, auto or HOST:PORT of a cluster, got {arguments.engine}."
+        )
     if _page_folder(arguments) is not None:
         read_library()
     if isinstance(arguments, CloudArguments):
@@ -396,7 +397,8 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     else:
         from torchrg.batch.ray_tasks import run_ray
 
-        reports = run_ray(jobs, workers=workers, memory_limit=limit, address=arguments.ray_address)
+        address = None if arguments.engine == "ray" else arguments.engine
+        reports = run_ray(jobs, workers=workers, memory_limit=limit, address=address)
     kind = scans[0].source.unit
     unit = "frame" if kind == "frame" else "pt"
     sizes = {job.name: 1 if unit == "frame" else job.scan.num_points for job in jobs}
@@ -461,7 +463,7 @@ def _finish(report: BatchReport, out: Path, arguments: Arguments, *, unit: str) 
         print_failure(scan)
     if report.with_status("kept") == list(report.scans):
         print("nothing to do")
-    elif report.complete:
+    else:
         print(format_report(report, unit=unit))
     num_complete = sum((out / scan.name / RECORD).is_file() for scan in report.complete)
     state = f"{num_complete:,} of {len(report.scans):,} scans are complete"

@@ -51,11 +51,13 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
 
 
 def format_report(report: BatchReport, *, unit: str = "scan") -> str:
-    """Format a report: one row per complete scan, notes, then the totals.
+    """Format a report: one row per scan, failed ones first, notes, then the totals.
 
-    With more than :data:`MAX_ROWS` scans, only the totals. ``unit`` names a scan.
+    With more than :data:`MAX_ROWS` scans, only failures are listed. ``unit`` names a scan.
     """
-    shown = report.complete if len(report.scans) <= MAX_ROWS else []
+    failed = report.with_status("failed")
+    shown = [*failed, *(scan for scan in report.scans if scan.status != "failed")]
+    shown = shown if len(shown) <= MAX_ROWS else failed
     rows = [_row(scan) for scan in shown]
     totals = report.with_status("converted")
     peak = max((scan.peak_memory for scan in totals), default=0) / 1e9
@@ -92,9 +94,10 @@ def _format_time(seconds: float) -> str:
 
 
 def _row(scan: TaskReport) -> list[str]:
-    """Return the table row of a complete scan."""
+    """Return the table row of a scan; empty cells are unknown."""
+    counts = [f"{scan.num_points:,}", f"{scan.num_regions:,}"] if scan.num_points else ["", ""]
     memory = f"{scan.peak_memory / 1e9:.2f}" if scan.peak_memory else ""
-    return [scan.name, scan.status, f"{scan.num_points:,}", f"{scan.num_regions:,}", memory]
+    return [scan.name, scan.status, *counts, memory]
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

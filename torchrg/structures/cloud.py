@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,12 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning, warn
-from torchrg.structures.points import FARTHEST, FilePath, Points, bounding_box, local_origin
+from torchrg.structures.points import (
+    FARTHEST,
+    Explained,
+    FilePath,
+    Points,
+    bounding_box,
+    local_origin,
+)
 from torchrg.structures.precision import describe_steps, describe_units
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(Explained):
     """A point cloud with its original coordinates, and a float32 copy shifted near the origin.
 
     Args:
@@ -79,12 +86,9 @@ class Cloud:
         parts = [*sorted(self.fields), *["front"] * (self.front is not None)]
         return f"Cloud({', '.join([f'{len(self):,} points', *parts])})"
 
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name):  # noqa: ANN001, ANN204
-            """Raise an error that lists the fields."""
-            names = ", ".join(f"fields[{field!r}]" for field in vars(self).get("fields", ()))
-            raise AttributeError(f"Cloud has no attribute {name!r}; it has {names or 'no fields'}.")
+    def _attributes(self) -> dict[str, str]:
+        """Return the fields by name; the other attributes are found by :func:`dir`."""
+        return super()._attributes() | {name: f"fields[{name!r}]" for name in self.fields}
 
     @cached_property
     def finite(self) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.structures.points import Neighbors, Sampling, short_repr
+from torchrg.structures.points import Explained, Neighbors, Sampling, short_repr
 
 if TYPE_CHECKING:
     from torchrg.render.page import Page
@@ -81,7 +81,7 @@ class _Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class Plane(Explained):
     """One plane: a row of :class:`Planes`, with the same names, as returned by ``seg.planes[0]``.
 
     Attributes:
@@ -135,7 +135,7 @@ def moved(value: Any, device: torch.device | str) -> Any:  # noqa: ANN401
     return value
 
 
-class _Movable:
+class _Movable(Explained):
     """Base of dataclasses of tensors on one device."""
 
     def to(self: Moved, device: torch.device | str) -> Moved:

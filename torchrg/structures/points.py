@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -97,6 +97,27 @@ def _format(value: object) -> str:
         return f"{value:.4g}"
     text = "" if isinstance(value, Mapping) else repr(value)
     return text if 0 < len(text) <= _MAX_SHOWN else f"a {type(value).__name__}"
+
+
+class Explained:
+    """Base of classes that name what to use in place of an attribute that they lack."""
+
+    def _attributes(self) -> dict[str, str]:
+        """Return the public attributes by name, in the form in which they are used."""
+        return {name: name for name in dir(self) if not name.startswith("_")}
+
+
+def _raise_missing(owner: Explained, name: str) -> NoReturn:
+    """Raise an error that names the nearest attribute, or what replaces a name of others."""
+    if name.startswith("_"):
+        raise AttributeError(name)
+    from torchrg._synonyms import describe_missing
+
+    known = owner._attributes()  # noqa: SLF001 Part of this class.
+    raise AttributeError(describe_missing(type(owner).__name__, name, known))
+
+
+Explained.__getattr__ = _raise_missing  # type: ignore[attr-defined]
 
 
 @short_repr
