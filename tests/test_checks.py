@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_floating, check_shapes, is_concrete
 from torchrg.errors import ShapeError
 
 
@@ -70,3 +70,14 @@ def test_masks_of_other_types_are_refused_with_the_repair(mask, kind):
     repair = f"f: expected mask to be a tensor of bool, got {kind}; pass torch.as_tensor"
     with pytest.raises(ShapeError, match=repair):
         check_shapes("f", points=(torch.zeros(8, 3), "N 3"), mask=(mask, "N"))
+
+
+def test_is_concrete_by_example():
+    assert (is_concrete(torch.zeros(2)), is_concrete(torch.zeros(2, device="meta"))) == (
+        True,
+        False,
+    )
+    assert torch.vmap(lambda row: torch.tensor(is_concrete(row)))(torch.zeros(2, 3)).tolist() == [
+        False,
+        False,
+    ]

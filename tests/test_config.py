@@ -380,3 +380,7 @@ def test_settings_are_shown_as_the_call_that_makes_them(config):
     names = (load_config, NormalsConfig, SuperpointsConfig, DepthConfig)
     assert eval(repr(config), {name.__name__: name for name in names}) == config
     assert len(repr(config)) < 100
+
+
+def test_settings_of_by_example():
+    assert settings_of("f", NormalsConfig, "classic", {"k": 30}).method == "pca"

@@ -25,3 +25,9 @@ def test_a_limit_of_threads_names_the_repair(what):
 def test_other_errors_have_no_limit():
     assert system_limit(RuntimeError("shape mismatch")) == ""
     assert system_limit(ValueError("out of memory")) == ""
+
+
+def test_system_limit_by_example():
+    assert system_limit(MemoryError()) == OUT_OF_MEMORY
+    assert system_limit(RuntimeError("can't start new thread"))[:24] == "no further thread can be"
+    assert system_limit(RuntimeError("shape mismatch")) == ""

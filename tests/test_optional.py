@@ -11,3 +11,7 @@ def test_missing_package_names_the_extra():
         require("no_such_package", extra="las", purpose="read LAS files")
     assert isinstance(info.value, TorchrgError)
     assert isinstance(info.value, ImportError)
+
+
+def test_require_by_example():
+    assert require("math", extra="las", purpose="read LAS files").pi > 3

@@ -13,7 +13,15 @@ import pytest
 import torch
 
 import torchrg
-from torchrg._parallel import map_tasks, sequential_operations
+from torchrg._parallel import (
+    limit_rows,
+    map_chunks,
+    map_rows,
+    map_tasks,
+    nonzero_rows,
+    sequential_operations,
+    split_rows,
+)
 from torchrg.robust import fit_detmcd
 
 ALL_WORK = """
@@ -220,3 +228,27 @@ threading.Thread(target=segment).start()
 """
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert run.stdout == "20000\n", run.stderr
+
+
+def test_split_rows_by_example():
+    assert repr(split_rows(5, 2)) == "[slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]"
+
+
+def test_limit_rows_by_example():
+    assert (limit_rows(16384, 50), limit_rows(16384, 640)) == (16384, 1638)
+
+
+def test_map_chunks_by_example():
+    assert map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu")) == [3, 5]
+    assert repr(map_chunks(lambda rows: rows, 0, 3, torch.device("cpu"))) == "[slice(0, 0, None)]"
+
+
+def test_map_rows_by_example():
+    assert (
+        repr(map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3)))
+        == "[tensor([4., 4.])]"
+    )
+
+
+def test_nonzero_rows_by_example():
+    assert repr(nonzero_rows(torch.tensor([[True, False], [False, True]]))) == "tensor([0, 3])"

@@ -192,14 +192,7 @@ def is_jit_traced() -> bool:
 
 
 def is_concrete(*tensors: Tensor | None) -> bool:
-    """Return whether tensors have concrete data: not traced, vmapped or on the meta device.
-
-    Example:
-        >>> is_concrete(torch.zeros(2)), is_concrete(torch.zeros(2, device="meta"))
-        (True, False)
-        >>> torch.vmap(lambda row: torch.tensor(is_concrete(row)))(torch.zeros(2, 3)).tolist()
-        [False, False]
-    """
+    """Return whether tensors have concrete data: not traced, vmapped or on the meta device."""
     if torch.compiler.is_compiling() or is_jit_traced():
         return False
     try:

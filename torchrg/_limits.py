@@ -14,16 +14,7 @@ _LIMITS = {
 
 
 def system_limit(error: BaseException) -> str:
-    """Return the message of an error at a limit of the system, or "" for other errors.
-
-    Example:
-        >>> system_limit(MemoryError()) == OUT_OF_MEMORY
-        True
-        >>> system_limit(RuntimeError("can't start new thread"))[:24]
-        'no further thread can be'
-        >>> system_limit(RuntimeError("shape mismatch"))
-        ''
-    """
+    """Return the message of an error at a limit of the system, or "" for other errors."""
     if isinstance(error, MemoryError):
         return OUT_OF_MEMORY
     found = [message for words, message in _LIMITS.items() if words in str(error)]

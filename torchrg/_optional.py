@@ -14,10 +14,6 @@ def require(module: str, *, extra: str, purpose: str) -> ModuleType:
 
     Raises:
         MissingDependencyError: If the module is not installed.
-
-    Example:
-        >>> require("math", extra="las", purpose="read LAS files").pi > 3
-        True
     """
     try:
         return importlib.import_module(module)

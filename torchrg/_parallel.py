@@ -43,12 +43,7 @@ _RETAINED_BYTES = 31 * 2**20
 
 
 def split_rows(num_rows: int, chunk_size: int) -> list[slice]:
-    """Split ``num_rows`` rows into slices of at most ``chunk_size`` rows.
-
-    Example:
-        >>> split_rows(5, 2)
-        [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
-    """
+    """Split ``num_rows`` rows into slices of at most ``chunk_size`` rows."""
     return [
         slice(start, min(start + chunk_size, num_rows)) for start in range(0, num_rows, chunk_size)
     ]
@@ -59,10 +54,6 @@ def limit_rows(num_rows: int, width: int) -> int:
 
     At least 1 and at most ``num_rows``. Rows that wide, such as neighborhoods, may be wider than
     the memory allows for all of ``num_rows``.
-
-    Example:
-        >>> limit_rows(16384, 50), limit_rows(16384, 640)
-        (16384, 1638)
     """
     return max(num_rows * TYPICAL_WIDTH // max(width, TYPICAL_WIDTH), 1)
 
@@ -83,12 +74,6 @@ def map_chunks(
     """Call ``work`` on slices that cover all rows, in order; see :func:`map_tasks`.
 
     Without rows it is called once, on an empty slice. ``min_rows`` is the minimum per thread.
-
-    Example:
-        >>> map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu"))
-        [3, 5]
-        >>> map_chunks(lambda rows: rows, 0, 3, torch.device("cpu"))
-        [slice(0, 0, None)]
     """
     num_threads = allowed_threads() if device.type == "cpu" else 1
     chunk_size = rows_at_once(chunk_size, device)
@@ -105,10 +90,6 @@ def map_rows(
 
     It receives the rows of each of the ``columns``, which have the same length, then the ``others``
     unchanged, and returns tensors of rows.
-
-    Example:
-        >>> map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3))
-        [tensor([4., 4.])]
     """
     first, *more = map_chunks(
         lambda rows: work(*(column[rows] for column in columns), *others),
@@ -281,12 +262,7 @@ def return_freed_memory() -> None:
 
 
 def nonzero_rows(mask: Tensor) -> Tensor:
-    """Return the flat indices of True elements, shape ``(n,)``, int64.
-
-    Example:
-        >>> nonzero_rows(torch.tensor([[True, False], [False, True]]))
-        tensor([0, 3])
-    """
+    """Return the flat indices of True elements, shape ``(n,)``, int64."""
     if mask.device.type == "cpu":
         # Ten times faster than nonzero in torch, and than indexing with the mask.
         return torch.from_numpy(np.flatnonzero(mask.numpy()))

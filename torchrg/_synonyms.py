@@ -139,12 +139,6 @@ def nearest_name(word: str, names: Iterable[str]) -> str:
     """Return the name that a misspelled or foreign word stands for, or "".
 
     Names are dotted; a word may omit the section, for which the first section that has it counts.
-
-    Example:
-        >>> nearest_name("min_points", ["up", "growing.min_size"])
-        'growing.min_size'
-        >>> nearest_name("gpu", ["up"])
-        ''
     """
     known = {name.rpartition(".")[2]: name for name in reversed([*names])}
     known |= {name: name for name in names}
@@ -158,11 +152,6 @@ def nearest_name(word: str, names: Iterable[str]) -> str:
 
 
 def advice_on(word: str) -> str:
-    """Return how to do without a name of other libraries, or "".
-
-    Example:
-        >>> advice_on("gpu")
-        'the device is that of the points, for commands the CPU; leave it out'
-    """
+    """Return how to do without a name of other libraries, or ""."""
     last = word.rpartition(".")[2]
     return next((advice for advice, words in _ADVICE.items() if last in words.split()), "")

@@ -618,10 +618,6 @@ def settings_of(
 
     Raises:
         ConfigError: If a preset or setting does not exist, or a value is invalid.
-
-    Example:
-        >>> settings_of("f", NormalsConfig, "classic", {"k": 30}).method
-        'pca'
     """
     is_part = kind in (PipelineConfig, *_SECTIONS.values())
     if isinstance(config, str | Path) and is_part:
@@ -777,12 +773,6 @@ def convert(value: Any, hint: Any, name: str, where: str = "") -> Any:  # noqa: 
 
     Raises:
         SettingError: If the value is none of the type; ``where`` and ``name`` begin the message.
-
-    Example:
-        >>> convert("0.3,3", tuple[float, ...] | None, "strengths")
-        (0.3, 3.0)
-        >>> convert("no", bool, "absorb"), convert("none", float | None, "max_distance")
-        (False, None)
     """
     plain = value.item() if getattr(value, "ndim", None) == 0 else value
     kinds = kinds_of(hint)

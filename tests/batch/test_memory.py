@@ -169,3 +169,10 @@ def test_the_least_limit_of_nested_groups_counts(
     restrict("other", 10, 0)
     restrict("slurm/job_7/step_0", 100_000, 40_000, 5000)
     assert available_memory() == 65_000
+
+
+def test_scan_memory_by_example():
+    assert (scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)) == (
+        900000000,
+        4400000000,
+    )

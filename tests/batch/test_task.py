@@ -1,8 +1,11 @@
 """Task reports of failed scans."""
 
+import warnings
+
 import pytest
 
 from torchrg.batch.scans import convert_scan
+from torchrg.batch.task import collecting_notes
 
 
 @pytest.mark.parametrize(
@@ -30,3 +33,9 @@ def test_an_input_that_is_gone_is_named(faults, tmp_path):
     (job,) = faults.make_jobs(tmp_path, {"12_a": "plain"})
     job.scan.files[0].unlink()
     assert convert_scan(job).reason == f"{job.scan.files[0]}: No such file or directory."
+
+
+def test_collecting_notes_by_example():
+    with collecting_notes() as notes:
+        warnings.warn("no labels", stacklevel=1)
+    assert notes == ["no labels"]

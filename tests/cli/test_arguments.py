@@ -12,7 +12,8 @@ import pytest
 from command_page import PROGS as KINDS
 
 from torchrg.cli import main
-from torchrg.cli.arguments import Argument, example_lines, list_flags, parse
+from torchrg.cli.arguments import Argument, example_lines, list_flags, parse, plain
+from torchrg.cli.sample import Arguments
 from torchrg.config import check_values
 from torchrg.errors import ConfigError
 
@@ -232,3 +233,14 @@ def test_commands_have_few_options(prog, most, capsys):
 def test_quick_answers_load_nothing_heavy(argument):
     done = subprocess.run([sys.executable, "-c", QUICK, argument], capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == "loaded:"
+
+
+def test_parse_by_example():
+    assert parse(Arguments, ["room.npz", "--noise=0.01"], prog="torchrg sample").noise == 0.01
+
+
+def test_plain_by_example():
+    assert (
+        plain("With ``absorb``; see :func:`torchrg.segment_planes`.")
+        == "With absorb; see torchrg.segment_planes."
+    )

@@ -9,6 +9,8 @@ import time
 import numpy as np
 import pytest
 
+from torchrg.cli.ending import printable
+
 LINE = "torchrg: interrupted; every file written is complete.\n"
 RUN = """
 import os, runpy, signal, sys
@@ -177,3 +179,7 @@ def test_the_garbage_collector_runs_again_once_a_command_is_loaded(tmp_path):
     command = [sys.executable, "-c", code, "info", str(tmp_path / "a.npy")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "False True True"
+
+
+def test_printable_by_example():
+    assert printable("caf\u00e9 \x1b[31m\n\u202e\udce9") == "café \\x1b[31m\\n\\u202e\\udce9"

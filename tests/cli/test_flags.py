@@ -7,11 +7,18 @@ import pytest
 
 from tests.cli.test_cli import CLASSIC, config_of
 from tests.cli.test_depth import INTRINSICS
-from torchrg.cli.flags import parse_intrinsics
+from torchrg.cli.flags import (
+    describe_sampling,
+    parse_intrinsics,
+    reason_for_no_plane,
+    split_columns,
+)
+from torchrg.config import SelectionConfig
 from torchrg.depth.camera import Pinhole
 from torchrg.errors import FormatError
 from torchrg.io import read_cloud, write_cloud
 from torchrg.structures import Cloud
+from torchrg.structures.points import Sampling
 
 
 def test_flags_win_over_the_file_and_the_file_over_the_defaults(room_file, tmp_path, run):
@@ -128,3 +135,21 @@ def test_a_matrix_of_numpy_is_a_camera(tmp_path):
         np.save(tmp_path / "K.npy", array)
         with pytest.raises(FormatError, match=rf"K\.npy: expected {message}"):
             parse_intrinsics(f"{tmp_path / 'K.npy'}")
+
+
+def test_describe_sampling_by_example():
+    assert (
+        describe_sampling(Sampling(0.06, 0.5, 0.6, 4000.0, 2.7), {"growing.min_size": 173})
+        == "faces in facets or bent (whiteness 0.06): min_size 173"
+    )
+
+
+def test_reason_for_no_plane_by_example():
+    assert (
+        reason_for_no_plane(SelectionConfig(min_area=9.0))
+        == "no plane passes --min-area and --kinds"
+    )
+
+
+def test_split_columns_by_example():
+    assert split_columns("x, y,z,_") == ("x", "y", "z", "_")

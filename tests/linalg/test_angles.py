@@ -5,7 +5,13 @@ import pytest
 import torch
 
 from torchrg.linalg import unsigned_angle_deg
-from torchrg.linalg.angles import deg_to_sq_chord, sq_chord_to_deg, sq_chords
+from torchrg.linalg.angles import (
+    at_most,
+    deg_to_sq_chord,
+    sq_chord_to_deg,
+    sq_chords,
+    unit_direction,
+)
 
 
 def test_angles_are_those_of_the_arc_cosine():
@@ -30,3 +36,26 @@ def test_chords_are_those_of_the_angles(rng):
     assert torch.allclose(sq_chord_to_deg(chords), unsigned_angle_deg(a, b), atol=1e-6)
     limits = torch.tensor([deg_to_sq_chord(float(angle)) for angle in unsigned_angle_deg(a, b)])
     assert torch.allclose(chords, limits.double(), atol=1e-7)
+
+
+def test_unit_direction_by_example():
+    assert (unit_direction("f", "-y").tolist(), unit_direction("f", (0, 0, 1e-300)).tolist()) == (
+        [0.0, -1.0, 0.0],
+        [0.0, 0.0, 1.0],
+    )
+
+
+def test_deg_to_sq_chord_by_example():
+    assert round(deg_to_sq_chord(60.0), 6) == 1.0
+
+
+def test_sq_chords_by_example():
+    a = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
+    assert (
+        repr((sq_chords(a, -a), sq_chords(a, -a, signed=True)))
+        == "(tensor([[0.]]), tensor([[4.]]))"
+    )
+
+
+def test_at_most_by_example():
+    assert repr(at_most(torch.tensor([1.0, 2.0, 3.0]), 2.0)) == "tensor([1., 1., 0.])"

@@ -10,7 +10,10 @@ from torchrg.linalg.moments import (
     eigh3_lapack,
     fit_planes_to_each,
     fit_weighted_planes,
+    kth_smallest,
+    reduce_runs,
     residuals,
+    sum_neighbors,
     unbind_columns,
 )
 
@@ -88,3 +91,18 @@ def test_a_matrix_that_is_not_finite_spoils_itself_alone():
     assert vectors[0, :, 0].abs().tolist() == [0.0, 1.0, 0.0]
     assert values[1].isnan().all()
     assert vectors[1].isnan().all()
+
+
+def test_reduce_runs_by_example():
+    assert (
+        repr(reduce_runs(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([2, 1]), "min"))
+        == "tensor([1., 2.])"
+    )
+
+
+def test_kth_smallest_by_example():
+    assert repr(kth_smallest(torch.tensor([3.0, 1.0, 2.0]), 1)) == "tensor(2.)"
+
+
+def test_sum_neighbors_by_example():
+    assert repr(sum_neighbors(torch.arange(10.0))) == "tensor(45.)"

@@ -8,7 +8,7 @@ import torch
 
 import torchrg
 from torchrg import kernels
-from torchrg.linalg.precision import flatness_tolerance, to_single
+from torchrg.linalg.precision import coordinate_resolution, flatness_tolerance, is_single, to_single
 from torchrg.neighbors import search_knn
 from torchrg.scenes import make_room
 
@@ -147,3 +147,12 @@ def test_tolerances_stand_here_alone():
         if "finfo" in path.read_text() and path.parent.name != "linalg"
     }
     assert asking <= MAY_ASK_FOR_PRECISION
+
+
+def test_coordinate_resolution_by_example():
+    assert repr(coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6) == "tensor([True])"
+
+
+def test_is_single_by_example():
+    assert is_single(torch.tensor([0.1, torch.nan]).double())
+    assert not is_single(torch.tensor([0.1], dtype=torch.float64))

@@ -7,7 +7,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.metrics import adjusted_rand_index, contingency_table, segmentation_covering
-from torchrg.metrics.contingency import ContingencyTable
+from torchrg.metrics.contingency import ContingencyTable, is_not_ignored
 
 
 def random_labels(rng, count, num_labels):
@@ -177,3 +177,10 @@ def test_covering_is_the_sum_over_faces_by_loops(seed):
 
 def test_covering_without_a_face_is_zero():
     assert segmentation_covering(contingency_table(torch.tensor([0]), torch.tensor([-1]))) == 0
+
+
+def test_is_not_ignored_by_example():
+    assert (
+        repr((is_not_ignored(torch.tensor([0, 1]), 1), is_not_ignored(torch.tensor([0]), 10**23)))
+        == "(tensor([ True, False]), tensor([True]))"
+    )

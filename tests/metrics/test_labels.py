@@ -16,6 +16,8 @@ from torchrg.metrics import (
     PartitionScore,
     score_labels,
 )
+from torchrg.metrics.contingency import contingency_table
+from torchrg.metrics.labels import paired_precision_recall
 
 SHARES = [name for name, index in METRICS["labels"].items() if index.unit != "count"]
 
@@ -142,3 +144,8 @@ def test_labels_that_do_not_fit_are_refused():
         score_labels(whole.float(), whole)
     with pytest.raises(ConfigError, match="score_labels: expected min_size >= 1, got 0"):
         score_labels(whole, whole, min_size=0)
+
+
+def test_paired_precision_recall_by_example():
+    table = contingency_table(torch.tensor([4, 4, 4, 5]), torch.tensor([0, 0, 1, 1]))
+    assert paired_precision_recall(table) == (83.33333333333334, 75.0, 2)

@@ -4,7 +4,12 @@ import torch
 
 from tests.metrics.sphere_clusters import scattered
 from torchrg.metrics import score_clusters
-from torchrg.metrics.sphere import _diameter_candidates
+from torchrg.metrics.sphere import (
+    _diameter_candidates,
+    find_centers,
+    merge_directions,
+    unit_vectors,
+)
 
 
 def test_distinct_directions_merge_parallel_walls():
@@ -34,3 +39,18 @@ def test_only_the_rim_of_an_arc_can_hold_its_diameter():
     angles = torch.linspace(-0.1, 0.1, 101, dtype=torch.float64)
     arc = torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], dim=1)
     assert len(_diameter_candidates(arc, arc[50])) == 2
+
+
+def test_unit_vectors_by_example():
+    unit, exists = unit_vectors(torch.tensor([[0.0, 3, 4], [0, 0, 0], [torch.nan, 0, 0]]))
+    assert (unit[0].tolist(), exists.tolist()) == ([0.0, 0.6, 0.8], [True, False, False])
+
+
+def test_find_centers_by_example():
+    directions = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]], dtype=torch.float64)
+    assert find_centers(directions, torch.tensor([0, 0]))[0].abs().tolist() == [[0.0, 0.0, 1.0]]
+
+
+def test_merge_directions_by_example():
+    axes = torch.eye(3, dtype=torch.float64)
+    assert merge_directions(torch.stack([axes[0], axes[1], -axes[0]])).tolist() == [0, 1, 0]

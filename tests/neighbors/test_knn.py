@@ -7,7 +7,7 @@ import torch
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.neighbors import knn as knn_module
-from torchrg.neighbors.knn import gather_patches
+from torchrg.neighbors.knn import gather_columns, gather_patches, prepare_search, search_nearest
 
 
 def brute_force(points, k):
@@ -106,3 +106,18 @@ def test_more_points_than_lists_of_int32_can_name_are_refused():
 def test_arguments_that_do_not_fit_are_refused(points, settings, error, message):
     with pytest.raises(error, match=f"search_knn: expected {message}"):
         search_knn(points, 2, **settings)
+
+
+def test_search_nearest_by_example():
+    points = np.array([[0.0, 0, 0], [1, 0, 0]])
+    assert search_nearest(points, np.array([[0.9, 0, 0], [3, 0, 0]]), 0.2).tolist() == [1, -1]
+
+
+def test_prepare_search_by_example():
+    search = prepare_search(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
+    assert search(np.array([2, 0])).tolist() == [[2, 1], [0, 1]]
+
+
+def test_gather_columns_by_example():
+    points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])
+    assert gather_columns(points, torch.tensor([[0, 1]]))[0].tolist() == [[0.0, 2.0]]

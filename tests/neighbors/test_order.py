@@ -5,7 +5,15 @@ import pytest
 import torch
 
 from tests.kernels.clouds import definitions, needs_library
-from torchrg.neighbors.order import canonical_order, morton_codes, spread_bits
+from torchrg.neighbors.order import (
+    ascending_rows,
+    canonical_order,
+    distinct_rows,
+    mark_distinct,
+    morton_codes,
+    scatter_rows,
+    spread_bits,
+)
 
 
 def test_morton_codes_hold_the_bits_of_three_numbers(rng):
@@ -38,3 +46,25 @@ def test_duplicates_are_side_by_side_in_the_order_they_came_in(rng):
     for row in order:
         first.setdefault(places[row], len(first))
     assert order == sorted(range(len(places)), key=lambda row: (first[places[row]], row))
+
+
+def test_mark_distinct_by_example():
+    assert mark_distinct(
+        torch.tensor([1.0, 1.0, 2.0, 2.0]), torch.tensor([0, 0, 0, 1])
+    ).tolist() == [True, False, True, True]
+
+
+def test_distinct_rows_by_example():
+    assert distinct_rows(torch.ones(4, 3), torch.tensor([7, 5, 7, 5])).tolist() == [1, 0]
+
+
+def test_ascending_rows_by_example():
+    assert ascending_rows(torch.tensor([0.5, -2.0, 0.0, -0.0, 0.5])).tolist() == [1, 2, 3, 0, 4]
+
+
+def test_scatter_rows_by_example():
+    assert scatter_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist() == [
+        8,
+        -1,
+        7,
+    ]

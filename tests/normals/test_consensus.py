@@ -12,7 +12,7 @@ from torchrg.errors import ConfigError
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.normals import estimate_normals
-from torchrg.normals.consensus import estimate_consensus
+from torchrg.normals.consensus import adapted_count, estimate_consensus
 from torchrg.normals.jet import fit_normals_jet
 from torchrg.normals.pca import fit_normals_pca, fit_points
 from torchrg.structures import Neighbors
@@ -130,3 +130,8 @@ def test_kernels_find_the_normals_of_the_definition(name, masked):
     for one, other in zip(found, expected, strict=True):
         same = one.nan_to_num() == other.nan_to_num()
         assert same.float().mean() > 0.9995
+
+
+def test_adapted_count_by_example():
+    fractions = torch.full((500,), 0.3)
+    assert adapted_count(fractions, 50, NormalsConfig(adaptive_k=300)) == 200

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ from torchrg.regions.directions import (
     are_vertical,
     find_heading,
     horizontal_toward,
+    likely_up,
     unit_axis,
 )
 
@@ -39,3 +41,11 @@ def test_planes_are_horizontal_or_vertical_to_within_fifteen_degrees(off_deg):
     assert are_horizontal(floor, Z).tolist() == are_vertical(wall, Z).tolist() == [off_deg < 0]
     assert not are_horizontal(wall, Z)
     assert not are_vertical(floor, Z)
+
+
+def test_likely_up_by_example():
+    normals, positions = np.eye(3), np.array([[0, 1.0, 1], [2, 0, 1], [2, 1, 0]])
+    both = np.concatenate([positions, [4, 2, 2] - positions])
+    assert (
+        likely_up(np.concatenate([normals] * 2), both, np.array([4, 40, 8] * 2), normals[2]) == "y"
+    )

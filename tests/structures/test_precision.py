@@ -13,7 +13,7 @@ from torchrg.batch.sources import CloudSource
 from torchrg.datasets import FolderOfClouds
 from torchrg.errors import PrecisionWarning
 from torchrg.pipeline.clouds import check_finite
-from torchrg.structures.precision import describe_placeholders, describe_steps
+from torchrg.structures.precision import describe_placeholders, describe_steps, is_fine_step
 from torchrg.transforms import SegmentPlanes
 
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -193,3 +193,8 @@ def test_points_that_stand_for_missing_pixels_are_said(count, is_said):
         segment_planes(torch.from_numpy(points))
     said = [str(warning.message) for warning in caught if "0 0 0" in str(warning.message)]
     assert len(said) == is_said
+
+
+def test_is_fine_step_by_example():
+    points = np.arange(12.0).reshape(4, 3)
+    assert (is_fine_step(1e-6, points), is_fine_step(1.0, points)) == (True, False)

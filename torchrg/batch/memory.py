@@ -28,10 +28,6 @@ def scan_memory(num_points: int, *, k: int = _K, num_levels: int = 0, on_disk: b
 
     ``k``: number of neighbors; ``num_levels``: levels of superpoints, 0 without superpoints;
     ``on_disk``: large arrays are spilled to disk.
-
-    Example:
-        >>> scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)
-        (900000000, 4400000000)
     """
     more = max(min(k, num_points) - _K, 0)
     per_point = _BYTES_PER_POINT[num_levels > 0, on_disk] + _BYTES_PER_NEIGHBOR[on_disk] * more

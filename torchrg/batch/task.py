@@ -91,14 +91,7 @@ def report_on(name: str, work: Callable[[Begin], TaskReport]) -> TaskReport:
 
 @contextmanager
 def collecting_notes() -> Iterator[list[str]]:
-    """Collect warnings as notes for a report, one per line.
-
-    Example:
-        >>> with collecting_notes() as notes:
-        ...     warnings.warn("no labels")
-        >>> notes
-        ['no labels']
-    """
+    """Collect warnings as notes for a report, one per line."""
     notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

@@ -108,11 +108,6 @@ def parse(kind: type[Command], arguments: Sequence[str], *, prog: str) -> Comman
 
     Raises:
         ConfigError: If an argument is invalid, with a one-line message.
-
-    Example:
-        >>> from torchrg.cli.sample import Arguments
-        >>> parse(Arguments, ["room.npz", "--noise=0.01"], prog="torchrg sample").noise
-        0.01
     """
     flags = list(list_flags(kind))
     if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
@@ -360,12 +355,7 @@ def _fields(kind: Any) -> Iterator[tuple["dataclasses.Field[Any]", object, Argum
 
 
 def plain(text: str) -> str:
-    """Strip markup from a docstring.
-
-    Example:
-        >>> plain("With ``absorb``; see :func:`torchrg.segment_planes`.")
-        'With absorb; see torchrg.segment_planes.'
-    """
+    """Strip markup from a docstring."""
     return _ROLE.sub(r"\1", text).replace("`", "")
 
 

@@ -76,10 +76,6 @@ def printable(text: str) -> str:
     r"""Escape characters that move the cursor, reverse or hide text.
 
     File and field names may contain such characters, and undecodable bytes.
-
-    Example:
-        >>> printable("caf\u00e9 \x1b[31m\n\u202e\udce9")
-        'café \\x1b[31m\\n\\u202e\\udce9'
     """
     return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
 

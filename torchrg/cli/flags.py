@@ -164,12 +164,7 @@ class PlaneSettings:
 
 
 def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
-    """Describe the measured sampling of a cloud and the settings selected by it.
-
-    Example:
-        >>> describe_sampling(Sampling(0.06, 0.5, 0.6, 4000.0, 2.7), {"growing.min_size": 173})
-        'faces in facets or bent (whiteness 0.06): min_size 173'
-    """
+    """Describe the measured sampling of a cloud and the settings selected by it."""
     low, high = WHITENESS
     kind = "faces partly bent, noise partly white"
     if sampling.whiteness <= low:
@@ -184,23 +179,13 @@ def describe_sampling(sampling: Sampling, settings: Mapping[str, Any]) -> str:
 
 
 def reason_for_no_plane(settings: SelectionConfig) -> str:
-    """Return the reason why a result has no plane.
-
-    Example:
-        >>> reason_for_no_plane(SelectionConfig(min_area=9.0))
-        'no plane passes --min-area and --kinds'
-    """
+    """Return the reason why a result has no plane."""
     is_chosen = settings.min_area > 0 or settings.kinds is not None
     return "no plane passes --min-area and --kinds" if is_chosen else "no region is large enough"
 
 
 def split_columns(columns: str | None) -> tuple[str, ...] | None:
-    """Split the value of ``--columns`` into names.
-
-    Example:
-        >>> split_columns("x, y,z,_")
-        ('x', 'y', 'z', '_')
-    """
+    """Split the value of ``--columns`` into names."""
     return None if columns is None else tuple(name.strip() for name in columns.split(","))
 
 

@@ -81,12 +81,7 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
 
 
 def _format_time(seconds: float) -> str:
-    """Format a duration in a suitable unit.
-
-    Example:
-        >>> _format_time(8), _format_time(500), _format_time(9000)
-        ('8 s', '8 min', '2.5 h')
-    """
+    """Format a duration in a suitable unit."""
     if seconds < _MIN_NEXT_UNIT:
         return f"{math.ceil(seconds)} s"
     minutes = seconds / 60
@@ -101,14 +96,7 @@ def _row(scan: TaskReport) -> list[str]:
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Format rows as aligned columns, with numbers right-aligned.
-
-    Example:
-        >>> print(format_table(["scan", "points"], [["hall", "1,000"], ["office", "20"]]))
-        scan    points
-        hall     1,000
-        office      20
-    """
+    """Format rows as aligned columns, with numbers right-aligned."""
     columns = []
     for cells in zip(*(map(printable, row) for row in (head, *rows)), strict=True):
         width = max(map(len, cells))

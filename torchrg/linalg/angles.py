@@ -19,10 +19,6 @@ def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
 
     Raises:
         ConfigError: If the direction is invalid.
-
-    Example:
-        >>> unit_direction("f", "-y").tolist(), unit_direction("f", (0, 0, 1e-300)).tolist()
-        ([0.0, -1.0, 0.0], [0.0, 0.0, 1.0])
     """
     numbers: Sequence[float] | str = up
     if isinstance(up, str):
@@ -74,12 +70,7 @@ def sq_chord_to_deg(sq_chord: Tensor) -> Tensor:
 
 
 def deg_to_sq_chord(angle_deg: float) -> float:
-    """Convert an angle to the squared chord ``(2 sin(a / 2))^2`` of the unit sphere.
-
-    Example:
-        >>> round(deg_to_sq_chord(60.0), 6)
-        1.0
-    """
+    """Convert an angle to the squared chord ``(2 sin(a / 2))^2`` of the unit sphere."""
     return (2 * math.sin(math.radians(angle_deg) / 2)) ** 2
 
 
@@ -92,11 +83,6 @@ def sq_chords(
     that an angle limit of 0 accepts them. Without gradient. Three components of shape ``(n, 1)``
     and three of ``(n, K)`` give ``(n, K)``, in [0, 2]. With ``signed``, opposite normals are far
     apart, in [0, 4].
-
-    Example:
-        >>> a = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
-        >>> sq_chords(a, -a), sq_chords(a, -a, signed=True)
-        (tensor([[0.]]), tensor([[4.]]))
     """
     pairs = list(zip(normals, neighbor_normals, strict=True))
     if signed:
@@ -130,12 +116,7 @@ def above(values: Tensor, bounds: Tensor | float) -> Tensor:
 
 
 def at_most(values: Tensor, bounds: Tensor | float) -> Tensor:
-    """Return 1 where values are at most their bounds, else 0; see :func:`above`.
-
-    Example:
-        >>> at_most(torch.tensor([1.0, 2.0, 3.0]), 2.0)
-        tensor([1., 1., 0.])
-    """
+    """Return 1 where values are at most their bounds, else 0; see :func:`above`."""
     return torch.le(values.detach(), bounds, out=torch.empty_like(values, requires_grad=False))
 
 

@@ -304,10 +304,6 @@ def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
     """Return the "sum", "min" or "max" ``(M,)`` of runs with ``counts`` values each.
 
     Integers must be below 2^53: float64 represents them on devices other than the CPU.
-
-    Example:
-        >>> reduce_runs(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([2, 1]), "min")
-        tensor([1., 2.])
     """
     if values.device.type != "cpu" or not bool(counts.all()):
         # segment_reduce needs a value, and floats. Its checks, off if unsafe, wait for a device.
@@ -332,12 +328,7 @@ def _ascending(labels: Tensor) -> Tensor:
 
 
 def kth_smallest(values: Tensor, k: int) -> Tensor:
-    """Return the value with index k in sorted order of ``(n,)``, NaN last; NaN if empty.
-
-    Example:
-        >>> kth_smallest(torch.tensor([3.0, 1.0, 2.0]), 1)
-        tensor(2.)
-    """
+    """Return the value with index k in sorted order of ``(n,)``, NaN last; NaN if empty."""
     if len(values) == 0:
         return values.new_tensor(torch.nan)
     if values.device.type == "cpu":
@@ -365,10 +356,6 @@ def sum_neighbors(values: Tensor) -> Tensor:
     Every eighth value is added to one of eight accumulators, as in a vector register; these are
     added pairwise. Rounding that decides between equally good planes is therefore the same with and
     without the library.
-
-    Example:
-        >>> sum_neighbors(torch.arange(10.0))
-        tensor(45.)
     """
     first, *others = torch.split(_pad_lanes(values), _NUM_LANES, dim=-1)
     first = first.clone()

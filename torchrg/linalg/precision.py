@@ -33,12 +33,7 @@ def rank_tolerance(num_values: int, dtype: torch.dtype) -> float:
 
 
 def coordinate_resolution(points: Tensor) -> Tensor:
-    """Return the rounding error of differences of coordinates ``(*, P)`` per point, shape ``(*)``.
-
-    Example:
-        >>> coordinate_resolution(torch.tensor([[0.0, -2.0, 1.0]])) < 1e-6
-        tensor([True])
-    """
+    """Return the rounding error of differences of coordinates ``(*, P)``, per point ``(*)``."""
     return points.abs().amax(dim=-1) * (4 * machine_epsilon(points.dtype))
 
 
@@ -88,13 +83,6 @@ def to_single(points: Tensor) -> Tensor:
 
 
 def is_single(values: Tensor) -> bool:
-    """Return whether values of any dtype are float32 numbers, as those computed by kernels.
-
-    Example:
-        >>> is_single(torch.tensor([0.1, torch.nan]).double())
-        True
-        >>> is_single(torch.tensor([0.1], dtype=torch.float64))
-        False
-    """
+    """Return whether values of any dtype are float32 numbers, as those computed by kernels."""
     same = values.float().to(values.dtype) == values
     return bool((same | values.isnan()).all())

@@ -138,12 +138,7 @@ def check_labels(caller: str, **arguments: Tensor | NDArray[Any]) -> list[Tensor
 
 
 def is_not_ignored(ground_truth: Tensor, ignore: int | None) -> Tensor:
-    """Return the mask of points without the ignored label; labels beyond int64 never match.
-
-    Example:
-        >>> is_not_ignored(torch.tensor([0, 1]), 1), is_not_ignored(torch.tensor([0]), 10**23)
-        (tensor([ True, False]), tensor([True]))
-    """
+    """Return the mask of points without the ignored label; labels beyond int64 never match."""
     if ignore is None or not -(2**63) <= ignore < 2**63:
         return torch.ones_like(ground_truth, dtype=torch.bool)
     return ground_truth != ignore

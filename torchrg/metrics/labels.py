@@ -109,12 +109,6 @@ def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]
 
     ``P = 100 |C & G| / |C|`` and ``R = 100 |C & G| / |G|`` for each pair of :func:`match_regions`;
     0 without pairs.
-
-    Example:
-        >>> from torchrg.metrics.contingency import contingency_table
-        >>> table = contingency_table(torch.tensor([4, 4, 4, 5]), torch.tensor([0, 0, 1, 1]))
-        >>> paired_precision_recall(table)
-        (83.33333333333334, 75.0, 2)
     """
     pairs = match_regions(table)
     shared = 100 * table.overlaps[pairs].double()

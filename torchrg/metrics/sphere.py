@@ -22,11 +22,6 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """Normalize vectors ``(*, 3)`` in float64; return also the mask ``(*)`` of valid ones.
 
     Zero and non-finite vectors have no direction and become zero.
-
-    Example:
-        >>> unit, exists = unit_vectors(torch.tensor([[0.0, 3, 4], [0, 0, 0], [torch.nan, 0, 0]]))
-        >>> unit[0].tolist(), exists.tolist()
-        ([0.0, 0.6, 0.8], [True, False, False])
     """
     unit = vectors.double()
     size = unit.abs().amax(dim=-1, keepdim=True)
@@ -70,11 +65,6 @@ def find_centers(directions: Tensor, clusters: Tensor) -> tuple[Tensor, Tensor]:
     which maximizes the sum of ``(n . axis)^2``. The mean of the aligned vectors cannot vanish. The
     largest entry of a center is positive. Clusters ``(N,)`` are 0 to M-1, none empty. Returns
     centers ``(M, 3)`` and aligned directions ``(N, 3)``.
-
-    Example:
-        >>> directions = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]], dtype=torch.float64)
-        >>> find_centers(directions, torch.tensor([0, 0]))[0].abs().tolist()
-        [[0.0, 0.0, 1.0]]
     """
     columns = directions.unbind(dim=1)
     products = [
@@ -96,11 +86,6 @@ def merge_directions(centers: Tensor, *, max_angle_deg: float = 5.0) -> Tensor:
     """Group centers ``(M, 3)`` connected by steps of at most an angle.
 
     Groups are numbered by their first members, shape ``(M,)``, int64.
-
-    Example:
-        >>> axes = torch.eye(3, dtype=torch.float64)
-        >>> merge_directions(torch.stack([axes[0], axes[1], -axes[0]])).tolist()
-        [0, 1, 0]
     """
     max_chord = 2 * math.sin(math.radians(max_angle_deg) / 2)
     groups = torch.full((len(centers),), -1, device=centers.device)

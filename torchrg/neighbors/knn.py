@@ -222,11 +222,6 @@ def search_nearest(
 
     Points and queries are finite, ``(N, 3)`` and ``(M, 3)`` in the same coordinates. Ties go to the
     first point in :func:`canonical_order`.
-
-    Example:
-        >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
-        >>> search_nearest(points, np.array([[0.9, 0, 0], [3, 0, 0]]), 0.2).tolist()
-        [1, -1]
     """
     from scipy.spatial import cKDTree
 
@@ -261,11 +256,6 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
     """Return a function that finds the neighbors of some rows only, as :func:`search_knn` does.
 
     ``points`` ``(N, 3)`` are distinct and in canonical order, at least ``k``.
-
-    Example:
-        >>> search = prepare_search(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
-        >>> search(np.array([2, 0])).tolist()
-        [[2, 1], [0, 1]]
     """
     from scipy.spatial import cKDTree
 
@@ -479,13 +469,7 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
 
 
 def gather_columns(points: Tensor, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the columns of :func:`gather_patches`, each ``(n, K)`` and contiguous.
-
-    Example:
-        >>> points = torch.tensor([[5.0, 0, 0], [7, 1, 0]])
-        >>> gather_columns(points, torch.tensor([[0, 1]]))[0].tolist()
-        [[0.0, 2.0]]
-    """
+    """Return the columns of :func:`gather_patches`, each ``(n, K)`` and contiguous."""
     flat = indices.reshape(-1)
     x, y, z = (points[:, axis].index_select(0, flat).view(indices.shape) for axis in range(3))
     return x - x[:, :1], y - y[:, :1], z - z[:, :1]

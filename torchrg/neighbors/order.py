@@ -79,12 +79,7 @@ def finite_rows(points: Tensor, ties: Sequence[Tensor] = ()) -> Tensor:
 
 
 def mark_distinct(*columns: Tensor) -> Tensor:
-    """Return a mask of rows that differ from the previous row of columns ``(N,)``, shape ``(N,)``.
-
-    Example:
-        >>> mark_distinct(torch.tensor([1.0, 1.0, 2.0, 2.0]), torch.tensor([0, 0, 0, 1])).tolist()
-        [True, False, True, True]
-    """
+    """Return a mask ``(N,)`` of rows that differ from the previous row of columns ``(N,)``."""
     is_first = torch.ones_like(columns[0], dtype=torch.bool)
     is_first[1:] = columns[0][1:] != columns[0][:-1]
     for column in columns[1:]:
@@ -145,10 +140,6 @@ def distinct_rows(points: Tensor, *values: Tensor) -> Tensor:
     """Return the rows of distinct finite points ``(N, 3)``, in canonical order, int64.
 
     Points also differ if one of the ``values`` ``(N,)`` differs.
-
-    Example:
-        >>> distinct_rows(torch.ones(4, 3), torch.tensor([7, 5, 7, 5])).tolist()
-        [1, 0]
     """
     rows = finite_rows(points, values)
     columns = points[rows].unbind(dim=1)
@@ -160,10 +151,6 @@ def ascending_rows(values: Tensor) -> Tensor:
     """Return the rows that sort values ``(N,)`` in ascending order, ties by row, int64.
 
     The position of NaN is undefined.
-
-    Example:
-        >>> ascending_rows(torch.tensor([0.5, -2.0, 0.0, -0.0, 0.5])).tolist()
-        [1, 2, 3, 0, 4]
     """
     if values.dtype != torch.float32 or values.device.type != "cpu":
         return values.argsort(stable=True)
@@ -177,12 +164,7 @@ def ascending_rows(values: Tensor) -> Tensor:
 
 
 def scatter_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
-    """Scatter values ``(n, ...)`` to their rows, with ``fill`` at all other rows.
-
-    Example:
-        >>> scatter_rows(torch.tensor([7, 8]), torch.tensor([2, 0]), 3, fill=-1).tolist()
-        [8, -1, 7]
-    """
+    """Scatter values ``(n, ...)`` to their rows, with ``fill`` at all other rows."""
     result = values.new_full((num_points, *values.shape[1:]), fill)
     return result.index_copy_(0, rows, values)
 

@@ -107,12 +107,6 @@ def likely_up(
 
     Planes or points have unit ``normals`` and ``positions``, both ``(M, 3)``, and ``areas``
     ``(M,)``; ``up`` is the assumed upward direction, ``(3,)``.
-
-    Example:
-        >>> normals, positions = np.eye(3), np.array([[0, 1.0, 1], [2, 0, 1], [2, 1, 0]])
-        >>> both = np.concatenate([positions, [4, 2, 2] - positions])
-        >>> likely_up(np.concatenate([normals] * 2), both, np.array([4, 40, 8] * 2), normals[2])
-        'y'
     """
     if len(normals) == 0:
         return ""

@@ -52,10 +52,6 @@ def local_origin(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArr
     A cloud is far away if centering makes its largest coordinate less than a quarter as large. A
     near cloud is not shifted, so that float32 coordinates stay bit-identical. A box that is not
     finite counts as near.
-
-    Example:
-        >>> local_origin(np.array([10.0, 10.0, 0.0]), np.array([12.0, 12.0, 3.0])).tolist()
-        [11.0, 11.0, 1.5]
     """
     low, high = low.astype(np.float64), high.astype(np.float64)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -73,12 +69,7 @@ def are_integers(values: Array) -> bool:
 
 
 def short_repr(kind: type[Kind]) -> type[Kind]:
-    """Decorate a class of results so that it prints in one line, with the shapes of its tensors.
-
-    Example:
-        >>> Neighbors(torch.zeros(4, 3, dtype=torch.int32))
-        Neighbors(indices=int32 (4, 3))
-    """
+    """Decorate a class of results so that it prints in one line, with the shapes of its tensors."""
 
     def describe(result: Any) -> str:  # noqa: ANN401
         values = {name: getattr(result, name) for name in result.__match_args__}

@@ -100,13 +100,7 @@ def describe_steps(
 
 
 def is_fine_step(step: float, points: NDArray[np.floating]) -> bool:
-    """Return whether a rounding step is fine for finite points ``(N, 3)`` without measuring them.
-
-    Example:
-        >>> points = np.arange(12.0).reshape(4, 3)
-        >>> is_fine_step(1e-6, points), is_fine_step(1.0, points)
-        (True, False)
-    """
+    """Return whether a rounding step is surely fine for finite points ``(N, 3)``."""
     low, high = _middle_half(points)
     return step <= _MAX_FINE_STEP * float((high - low).max()) / math.sqrt(len(points))
 
@@ -120,12 +114,7 @@ def _middle_half(points: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def describe_placeholders(points: NDArray[np.floating]) -> str:
-    """Return a note if many points lie at 0 0 0, where cameras put pixels without depth.
-
-    Example:
-        >>> describe_placeholders(np.arange(120).reshape(40, 3) // 60 * 1.0)
-        '20 of 40 points lie at 0 0 0, as pixels without depth do; remove them, or set them to NaN'
-    """
+    """Return a note if many points lie at 0 0 0, where cameras put pixels without depth."""
     count = len(points) - int(np.count_nonzero(points.any(axis=1)))
     if not _MIN_PLACEHOLDERS <= count < len(points):
         return ""

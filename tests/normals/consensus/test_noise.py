@@ -128,3 +128,10 @@ def test_a_board_a_few_times_the_noise_off_its_wall_is_a_face(offset, ramp, nois
     assert float((labels[height == 0] == wall).float().mean()) > 0.97
     assert float((board == wall).float().mean()) < 0.25
     assert float((board == board.mode().values).float().mean()) > 0.7
+
+
+def test_regional_noise_by_example():
+    line = torch.arange(8)
+    neighbors = Neighbors(torch.stack([line, line - 1, line + 1], dim=1).clamp(0, 7).int())
+    noise = torch.tensor([1.0, 1, 1, 9, 9, 1, 1, 1])
+    assert repr(regional_noise(noise, neighbors)) == "tensor([1., 1., 1., 1., 1., 1., 1., 1.])"

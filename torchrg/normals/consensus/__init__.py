@@ -101,11 +101,6 @@ def adapted_count(fractions: Tensor, count: int, config: NormalsConfig) -> int:
 
     ``fractions`` are the ratios of noise to radius of all points with ``count`` neighbors, NaN if
     unknown; ``config.adaptive_k`` is the maximum.
-
-    Example:
-        >>> fractions = torch.full((500,), 0.3)
-        >>> adapted_count(fractions, 50, NormalsConfig(adaptive_k=300))
-        200
     """
     finite = fractions[~fractions.isnan()]
     if config.adaptive_k is None or len(finite) == 0:

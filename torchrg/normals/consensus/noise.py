@@ -115,13 +115,6 @@ def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
 
     For scanner noise, which is independent per point, estimates scatter, and this is about three
     quarters of the noise.
-
-    Example:
-        >>> line = torch.arange(8)
-        >>> neighbors = Neighbors(torch.stack([line, line - 1, line + 1], dim=1).clamp(0, 7).int())
-        >>> noise = torch.tensor([1.0, 1, 1, 9, 9, 1, 1, 1])
-        >>> regional_noise(noise, neighbors)
-        tensor([1., 1., 1., 1., 1., 1., 1., 1.])
     """
     for _ in range(constants.REGIONAL_STEPS):
         noise = _neighbor_quantiles(noise[:, None], neighbors, constants.REGIONAL_QUANTILE)[:, 0]
