@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from torchrg.datasets import FolderOfClouds, RGBDFrames
-from torchrg.datasets.folder import natural_key
+from torchrg.datasets.folder import add_note, natural_key
 from torchrg.errors import FormatError
 from torchrg.io import write_cloud
 from torchrg.structures import Cloud
@@ -212,3 +212,9 @@ def test_arrays_of_a_scene_need_its_coordinates(root):
         FolderOfClouds(root)
     np.save(root / "room" / "coord.npy", COORDINATES)
     assert "room" in names_of(FolderOfClouds(root))
+
+
+def test_add_note_by_example():
+    error = ValueError("expected a floor")
+    add_note(error, "This was room 3.")
+    assert "room 3" in "".join(traceback.format_exception(error))

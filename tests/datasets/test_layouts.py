@@ -22,7 +22,7 @@ from torchrg.batch.sources import CloudSource
 from torchrg.cli.flags import Layout
 from torchrg.config import SuperpointsConfig
 from torchrg.datasets import ScanNet
-from torchrg.datasets.layouts import LAYOUTS
+from torchrg.datasets.layouts import LAYOUTS, _split, split_name
 from torchrg.datasets.scannet import NYU_IDS
 from torchrg.errors import ConfigError
 from torchrg.io import read_cloud, write_cloud
@@ -355,3 +355,20 @@ def test_points_that_are_not_finite_are_refused(room, tmp_path, run):
     assert wrong.code == 2
     assert "expected finite points for layout npy, got 1 non-finite of 4,000" in wrong.err
     assert not [*(tmp_path / "out").rglob("*.npy")]
+
+
+def test_split_name_by_example():
+    assert (split_name("val/scene0011_00"), split_name("Area_1/office_1")) == (
+        ("val", "scene0011_00"),
+        ("", "Area_1_office_1"),
+    )
+
+
+def test_split_by_example():
+    assert _split(np.array([0, 0, 0, 1, 1]), [np.array([0, 1]), np.array([1, 3])]).tolist() == [
+        2,
+        4,
+        0,
+        3,
+        1,
+    ]

@@ -112,3 +112,17 @@ def test_a_directory_is_of_one_kind_and_layout(tmp_path, earlier, source, messag
         return
     with pytest.raises(FormatError, match=f"expected results {message} another directory"):
         check_source(tmp_path, record, source)
+
+
+def test_owned_files_by_example():
+    assert (owned_files({"claims": {"coord.npy": None}}), owned_files(None)) == (
+        {"coord.npy": None},
+        {},
+    )
+
+
+def test_claim_files_by_example():
+    assert claim_files({"versions": {}, "outputs": {"a.npy": {"bytes": 8}}}, ["b.npy"]) == {
+        "versions": {},
+        "claims": {"a.npy": {"bytes": 8}, "b.npy": None},
+    }

@@ -15,7 +15,7 @@ from tests.io.conftest import needs
 from torchrg.datasets import FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, read_cloud, write_cloud
-from torchrg.io.files import atomic_path, check_end
+from torchrg.io.files import atomic_path, check_end, list_some, normalize_file_name, split_words
 from torchrg.io.result import read_result
 from torchrg.structures import Cloud
 
@@ -170,3 +170,16 @@ def test_bytes_after_the_last_record_are_refused_from_a_record_on(
             return
         with pytest.raises(FormatError, match=f"got {rest} more bytes"):
             check_end(path, stream, record_bytes)
+
+
+def test_list_some_by_example():
+    assert list_some(["a", "b", "c"], 2) == "a, b and 1 more"
+
+
+def test_normalize_file_name_by_example():
+    assert normalize_file_name("B\u00fcro") == normalize_file_name("bu\u0308RO")
+
+
+def test_split_words_by_example():
+    assert split_words("property float höhe".encode()) == ["property", "float", "höhe"]
+    assert split_words(b"property float h\xf6he") == ["property", "float", "höhe"]

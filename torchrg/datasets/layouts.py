@@ -113,12 +113,7 @@ class LayoutScan:
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Return the split in the name of a scan, if any, and the stem of its files.
-
-    Example:
-        >>> split_name("val/scene0011_00"), split_name("Area_1/office_1")
-        (('val', 'scene0011_00'), ('', 'Area_1_office_1'))
-    """
+    """Return the split in the name of a scan, if any, and the stem of its files."""
     head, _, tail = name.rpartition("/")
     return (head, tail) if head in SPLIT_NAMES else ("", name.replace("/", "_"))
 
@@ -250,10 +245,6 @@ def _split(
     """Split superpoints so that each lies entirely inside or outside every object.
 
     Objects may overlap, because some segments of the release belong to two objects.
-
-    Example:
-        >>> _split(np.array([0, 0, 0, 1, 1]), [np.array([0, 1]), np.array([1, 3])]).tolist()
-        [2, 4, 0, 3, 1]
     """
     parts = superpoint.astype(np.int64)
     for rows in objects:

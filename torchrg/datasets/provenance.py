@@ -75,23 +75,13 @@ def write_record(folder: Path, record: Record) -> None:
 
 
 def owned_files(record: Record | None) -> dict[str, Record | None]:
-    """Return the fingerprints of the files of a record or claim; None for any content.
-
-    Example:
-        >>> owned_files({"claims": {"coord.npy": None}}), owned_files(None)
-        ({'coord.npy': None}, {})
-    """
+    """Return the fingerprints of the files of a record or claim; None for any content."""
     record = record or {}
     return {**(record.get("claims") or record.get("outputs") or {})}
 
 
 def claim_files(record: Record, names: Iterable[str]) -> Record:
-    """Return a record as a claim on its files, and on files with these names of any content.
-
-    Example:
-        >>> claim_files({"versions": {}, "outputs": {"a.npy": {"bytes": 8}}}, ["b.npy"])
-        {'versions': {}, 'claims': {'a.npy': {'bytes': 8}, 'b.npy': None}}
-    """
+    """Return a record as a claim on its files, and on files with these names of any content."""
     described = {key: value for key, value in record.items() if key != "outputs"}
     return described | {"claims": owned_files(record) | dict.fromkeys(names)}
 

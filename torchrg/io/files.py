@@ -379,12 +379,7 @@ def first_line(error: BaseException) -> str:
 
 
 def list_some(names: Sequence[str], max_names: int) -> str:
-    """List names for a message of one line, at most ``max_names``.
-
-    Example:
-        >>> list_some(["a", "b", "c"], 2)
-        'a, b and 1 more'
-    """
+    """List names for a message of one line, at most ``max_names``."""
     more = f" and {len(names) - max_names:,} more" if len(names) > max_names else ""
     return f"{', '.join(names[:max_names])}{more}"
 
@@ -393,10 +388,6 @@ def normalize_file_name(name: str) -> str:
     """Normalize a name so that names which collide on some file systems become equal.
 
     macOS and Windows ignore case and the composition of accented letters.
-
-    Example:
-        >>> normalize_file_name("B\u00fcro") == normalize_file_name("bu\u0308RO")
-        True
     """
     return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())
 
@@ -426,14 +417,7 @@ def parse_count(word: str) -> int | None:
 
 
 def split_words(raw: bytes) -> list[str]:
-    r"""Split a header line into words, decoded as UTF-8, or as Latin-1 from some programs.
-
-    Example:
-        >>> split_words("property float höhe".encode())
-        ['property', 'float', 'höhe']
-        >>> split_words(b"property float h\xf6he")
-        ['property', 'float', 'höhe']
-    """
+    r"""Split a header line into words, decoded as UTF-8, or as Latin-1 from some programs."""
     try:
         return [word.decode() for word in raw.split()]
     except UnicodeDecodeError:
