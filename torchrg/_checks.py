@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
+from numbers import Real
 from typing import Any, NoReturn, ParamSpec, TypeGuard, TypeVar, get_args
 
 import numpy as np
@@ -65,6 +66,10 @@ def _repair(caller: str, name: str, values: object) -> str:
         return "; pass numpy.asarray(cloud.points)"
     if has := [key for key in (name, "points", "labels") if hasattr(values, key)]:
         return f"; pass its {has[0]}"
+    if name == "intrinsics":
+        return "; use torchrg.depth.make_intrinsics(fx, fy, cx, cy)"
+    if isinstance(values, str):
+        return "; pass its values, not a name or path"
     if isinstance(values, list | tuple) and values and getattr(values[0], "ndim", 0) > 1:
         return f"; pass one at a time, as [{caller}(p) for p in {name}]"
     if isinstance(values, list | tuple):
@@ -90,13 +95,29 @@ def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
             raise ConfigError(f"{caller}: expected {name} to be one of {choices}, got {value!r}.")
 
 
+def check_kinds(caller: str, repair: str, **arguments: tuple[object, Any]) -> None:
+    """Check that arguments other than tensors are of a class; None is skipped."""
+    for name, (value, kind) in arguments.items():
+        if value is not None and not isinstance(value, kind):
+            raise ConfigError(
+                f"{caller}: expected {name} to be {getattr(kind, '__name__', 'a path')}, got "
+                f"{type(value).__name__}; "
+                f"{repair}."
+            )
+
+
+def is_positive(value: object) -> bool:
+    """Return whether a setting is a positive, finite number."""
+    return isinstance(value, Real) and 0 < float(value) < float("inf")
+
+
 def check_floating(caller: str, **arguments: Tensor | None) -> None:
     """Check that tensors are float32 or float64, and of one dtype; None is skipped."""
     tensors = {name: tensor for name, tensor in arguments.items() if tensor is not None}
     for name, tensor in tensors.items():
         if tensor.dtype not in (torch.float32, torch.float64):
             dtype = str(tensor.dtype).removeprefix("torch.")
-            fix = f"; pass {name}.float()" if tensor.is_floating_point() else ""
+            fix = "" if tensor.is_complex() else f"; pass {name}.float()"
             raise ShapeError(f"{caller}: expected {name} of float32 or float64, got {dtype}{fix}.")
         if tensor.is_nested:
             raise ShapeError(

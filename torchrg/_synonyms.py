@@ -14,6 +14,7 @@ _VOXEL = "downsample grid_size leaf_size voxel_down_sample voxel_size"
 _SYNONYMS = {
     "angle_deg": "angle theta",
     "curvature_quantile": "curvature_threshold",
+    "exclude": "ignore omit skip",
     "force": "overwrite rerun",
     "intrinsics": "camera camera_matrix",
     "k": "k_neighbors k_search knn max_nn n_neighbors num_neighbors",
@@ -25,6 +26,7 @@ _SYNONYMS = {
     "merge": "concat concatenate fuse",
     "method": "estimator normal_method",
     "min_size": "min_cluster_size min_num_points min_points min_pts min_region_size min_samples",
+    "only_failed": "failed failed_only retry",
     "orient": "orientation",
     "out": _OUTPUT,
     "picture": "image plot render visualize",
@@ -49,6 +51,7 @@ _ADVICE = {
     "other functions, or --normals.method pca": "detmcd fastmcd irls jet mve pca",
     "regions grow without random samples; leave it out": "max_iterations num_iterations "
     "probability ransac_n",
+    "finished scans are skipped; leave it out": "continue resume skip_existing",
     "results are deterministic; leave it out": f"seed {_SEED}",
     "the numbers of superpoints are counts": "n",
     "batches with an offset are supported by torchrg.transforms": "offset",
@@ -81,6 +84,7 @@ _ATTRIBUTES = {
     "superpoints supervoxel_clustering supervoxels",
     "torchrg.render.color_planes(seg.labels, points)": "color_by_label colorize paint "
     "paint_uniform_color",
+    "torchrg.io.result.Result.from_segmentation(cloud, seg)": "cloud provenance",
     "seg.show()": "draw draw_geometries plot render show view visualize",
     "torchrg.scenes.make_room(num_points)": "demo_data example make_room sample_data",
     "seg.inliers(i), or seg.labels == i": "indices inlier inlier_indices inlier_mask mask masks "

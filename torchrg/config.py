@@ -644,7 +644,7 @@ def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
     """Read the settings of a preset or a file."""
     path = Path(name_or_file)
     if path.suffix not in (".yaml", ".yml"):
-        expected = f"{caller}: expected a .yaml file, or a preset, one of"
+        expected = f"{caller}{': ' * bool(caller)}expected a .yaml file, or a preset, one of"
         path = _preset_file(str(name_or_file), expected=expected)
     import yaml
 

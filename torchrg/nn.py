@@ -20,12 +20,12 @@ describes the majority, even on a line; normals need planes: pass ``min_dimensio
 from collections.abc import Callable
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from torchrg._checks import check_choices
+from torchrg._checks import check_choices, check_kinds
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg import covariance, eigh3
 from torchrg.normals import fit_normals_irls, fit_normals_jet, fit_normals_pca, fit_normals_robust
@@ -62,9 +62,16 @@ class _Function(nn.Module, Generic[Result]):
         def __call__(self, *tensors: object, **options: object) -> Result: ...
 
     def __post_init__(self) -> None:
-        super().__init__()
+        self._initialize()
         # A call without patches validates the settings.
         self(torch.empty(0, 4, 3))
+
+    def _initialize(self) -> None:
+        """Initialize the module; raise if tensors are passed in place of settings."""
+        super().__init__()
+        if any(isinstance(value, Tensor) for value in asdict(self).values()):
+            name = type(self).__name__
+            raise ConfigError(f"{name}: expected settings, got a tensor; use {name}()(tensor).")
 
     def extra_repr(self) -> str:
         """Return the settings as text."""
@@ -131,6 +138,7 @@ class Normal(_Function[Tensor]):
 
     def forward(self, eigen: Eigen) -> Tensor:
         """Return normals ``(*, P)``, of arbitrary sign."""
+        check_kinds("Normal", "use Normal()(Eigh()(covariances or fits))", eigen=(eigen, Eigen))
         return eigen.vectors[..., 0]
 
 
@@ -151,17 +159,29 @@ class Qn(_Function[Tensor]):
     finite_sample: bool = False
 
     def __post_init__(self) -> None:
+        self._initialize()
         if type(self.dim) is not int:
             raise ConfigError(f"Qn: expected dim to be an integer, got {self.dim!r}.")
-        nn.Module.__init__(self)
 
     def forward(self, values: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the scale."""
         return qn(values, mask=mask, **asdict(self))
 
 
+class _Fit(_Function[RobustFit]):
+    """A robust fit."""
+
+    function: ClassVar[Callable[..., RobustFit]]
+
+    def forward(
+        self, patches: Tensor, mask: Tensor | None = None, **options: torch.Generator | None
+    ) -> RobustFit:
+        """Return the fits of patches; ``generator`` draws the starts of FastMCD and MVE."""
+        return self.function(patches, mask, **options, **asdict(self))
+
+
 @dataclass(eq=False, repr=False)
-class DetMCD(_Function[RobustFit]):
+class DetMCD(_Fit):
     """Deterministic MCD of patches; the fields are settings of :func:`torchrg.robust.fit_detmcd`.
 
     Example:
@@ -179,13 +199,11 @@ class DetMCD(_Function[RobustFit]):
     min_dimension: int = 0
     chunk_size: int = 4096
 
-    def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
-        """Return the fits."""
-        return fit_detmcd(patches, mask, **asdict(self))
+    function = staticmethod(fit_detmcd)
 
 
 @dataclass(eq=False, repr=False)
-class FastMCD(_Function[RobustFit]):
+class FastMCD(_Fit):
     """MCD of patches with random starts, with the settings of :func:`torchrg.robust.fit_fastmcd`.
 
     Example:
@@ -201,15 +219,11 @@ class FastMCD(_Function[RobustFit]):
     min_dimension: int = 0
     chunk_size: int = 16
 
-    def forward(
-        self, patches: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
-    ) -> RobustFit:
-        """Return the fits; the generator draws the starts."""
-        return fit_fastmcd(patches, mask, generator=generator, **asdict(self))
+    function = staticmethod(fit_fastmcd)
 
 
 @dataclass(eq=False, repr=False)
-class MVE(_Function[RobustFit]):
+class MVE(_Fit):
     """Minimum volume ellipsoid of patches, with the settings of :func:`torchrg.robust.fit_mve`.
 
     It is for points of 3 coordinates; use :class:`DetMCD` for more.
@@ -227,15 +241,11 @@ class MVE(_Function[RobustFit]):
     min_dimension: int = 0
     chunk_size: int = 64
 
-    def forward(
-        self, patches: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
-    ) -> RobustFit:
-        """Return the fits; the generator draws the subsets."""
-        return fit_mve(patches, mask, generator=generator, **asdict(self))
+    function = staticmethod(fit_mve)
 
 
 @dataclass(eq=False, repr=False)
-class DetS(_Function[RobustFit]):
+class DetS(_Fit):
     """Deterministic S-estimator of patches, with settings of :func:`torchrg.robust.fit_dets`.
 
     Gradients are those of the last step, with fixed weights of the points.
@@ -251,13 +261,11 @@ class DetS(_Function[RobustFit]):
     min_dimension: int = 0
     chunk_size: int = 2048
 
-    def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
-        """Return the fits."""
-        return fit_dets(patches, mask, **asdict(self))
+    function = staticmethod(fit_dets)
 
 
 @dataclass(eq=False, repr=False)
-class DetMM(_Function[RobustFit]):
+class DetMM(_Fit):
     """Deterministic MM-estimator of patches, with settings of :func:`torchrg.robust.fit_detmm`.
 
     Gradients are those of the last step, with fixed weights of the points.
@@ -274,9 +282,7 @@ class DetMM(_Function[RobustFit]):
     min_dimension: int = 0
     chunk_size: int = 2048
 
-    def forward(self, patches: Tensor, mask: Tensor | None = None) -> RobustFit:
-        """Return the fits."""
-        return fit_detmm(patches, mask, **asdict(self))
+    function = staticmethod(fit_detmm)
 
 
 Method = Literal["pca", "jet", "irls", "detmcd", "fastmcd", "mve", "dets", "detmm"]

@@ -72,11 +72,11 @@ def _exit_code(arguments: list[str]) -> int:
 
 def _run(arguments: list[str]) -> int:
     """Run the command named by the first argument."""
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(_OVERVIEW)
         return 0 if arguments else ending.USAGE_ERROR
     name, *remaining = arguments
-    if name == "--version":
+    if name in ("--version", "-V", "version"):
         from torchrg.version import __version__
 
         print(f"torchrg {__version__}")

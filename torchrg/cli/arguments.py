@@ -38,7 +38,11 @@ RESOURCES = (*("--workers", "--threads", "--limit-memory", "--chunk-size", "--en
 """Flags that set where and how fast a command runs, and do not change its result."""
 _STARTS = ("--preset", "--config", "--angle-deg")
 """Flags that set several settings."""
-ALIASES = {"--superpoints": ("--superpoint",), "--out": ("--output", "-o")}
+ALIASES = {
+    "--superpoints": ("--superpoint",),
+    "--out": ("--output", "-o"),
+    "--verbose": ("-v",),
+}
 """Alternative spellings of flags, accepted but not listed."""
 REQUIRED = "required"
 """Title of the required arguments."""

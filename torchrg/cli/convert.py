@@ -275,7 +275,10 @@ def run(argv: list[str]) -> int:
         raise SystemExit(0 if argv else ending.USAGE_ERROR)
     kind, *remaining = argv
     if kind not in KINDS:
-        raise ConfigError(f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}.")
+        raise ConfigError(
+            f"expected a kind of data set ({', '.join(KINDS)}), got {kind!r}; "
+            "folder takes any clouds."
+        )
     arguments = parse(KINDS[kind], remaining, prog=f"torchrg convert {kind}")
     _check(arguments)
     root, out = arguments.root.resolve(), arguments.out.resolve()

@@ -45,6 +45,9 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
     if suffix and len(inputs) == 1 and not out.is_dir():
         check_writable(out) if ending == suffix else check_output(out)
         return [out]
+    for path in inputs:  # A word after a switch is taken for an input.
+        if not path.exists():
+            raise FormatError(f"{path}: file not found; check the path.")
     if ending and ending in (suffix, *FORMATS) and not out.is_dir():
         raise FormatError(
             f"{out}: expected a directory for {len(inputs)} inputs, got a file; pass a directory."

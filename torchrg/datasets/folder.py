@@ -329,9 +329,10 @@ def check_outside(root: Path, out: Path, why: str = "so that no result is read a
 
 
 def check_folder(folder: Path) -> None:
-    """Raise FormatError if a folder does not exist."""
-    if not local_path(folder).is_dir():
-        raise FormatError(f"{folder}: no such folder; check the spelling.")
+    """Raise FormatError if a folder does not exist, or is a file."""
+    if not (path := local_path(folder)).is_dir():
+        problem = "expected a folder, got a file" if path.exists() else "no such folder"
+        raise FormatError(f"{folder}: {problem}; check the spelling.")
 
 
 def find_files(

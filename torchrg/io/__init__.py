@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchrg._checks import to_cloud
+from torchrg._checks import check_kinds, to_cloud
 from torchrg.errors import FormatError
 from torchrg.io.columns import check_field
 from torchrg.io.e57 import count_e57, read_e57
@@ -196,6 +197,11 @@ def write_cloud(
         ...     read_cloud(Path(folder) / "corner.ply").fields["labels"].tolist()
         [0, 0, -1]
     """
+    repair, paths = "pass path, cloud, then a result", (str, os.PathLike)
+    check_kinds(
+        "write_cloud", repair, path=(path, paths), segmentation=(segmentation, Segmentation)
+    )
+    check_kinds("write_cloud", repair, superpoints=(superpoints, Superpoints))
     target = Path(path)
     cloud = to_cloud("write_cloud", cloud)
     check_output(target, cloud)

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_floating, check_shapes
+from torchrg._checks import as_tensor, check_floating, check_shapes, is_positive
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import (
     check_labels,
@@ -102,7 +102,7 @@ def score_partition(
     superpoints, ground_truth = check_labels(
         "score_partition", superpoints=superpoints, ground_truth=ground_truth
     )
-    if boundary_distance is not None and not 0 < boundary_distance < float("inf"):
+    if boundary_distance is not None and not is_positive(boundary_distance):
         raise ConfigError(
             f"score_partition: expected boundary_distance > 0, got {boundary_distance!r}."
         )

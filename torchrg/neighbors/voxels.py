@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_points
+from torchrg._checks import as_tensor, check_points, is_positive
 from torchrg.errors import ConfigError
 from torchrg.structures import UNLABELED, AnyCloud
 from torchrg.structures.points import short_repr
@@ -48,7 +48,7 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     """
     tensor = as_tensor("sample_voxels", "points", points)
     check_points("sample_voxels", tensor)
-    if not 0 < size < float("inf"):
+    if not is_positive(size):
         raise ConfigError(f"sample_voxels: expected size > 0, got {size!r}.")
     inverse = torch.full((len(tensor),), UNLABELED, device=tensor.device)
     finite = tensor.isfinite().all(dim=-1).nonzero().squeeze(-1)

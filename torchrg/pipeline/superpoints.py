@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._checks import as_tensor, check_points, check_shapes, eager_only
+from torchrg._checks import as_tensor, check_kinds, check_points, check_shapes, eager_only
 from torchrg.config import AnyConfig, SuperpointsConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError, warn
 from torchrg.neighbors import expand_to_points, sample_voxels
@@ -81,6 +81,7 @@ def make_superpoints(
         >>> found.labels.unique(return_counts=True)[1].tolist(), found.plane.tolist()
         ([200, 200], [0, 1])
     """
+    check_kinds("make_superpoints", "pass seg, then settings", seg=(seg, Segmentation))
     tensor = as_tensor("make_superpoints", "points", points).detach()
     check_points("make_superpoints", tensor)
     shades = _unit_colors("make_superpoints", tensor, colors)

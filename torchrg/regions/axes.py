@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchrg._checks import default_device_cpu
+from torchrg._checks import check_kinds, default_device_cpu
 from torchrg.errors import ConfigError, warn
 from torchrg.linalg.angles import unit_direction
 from torchrg.linalg.moments import eigh3_lapack
@@ -73,6 +73,7 @@ def align_axes(seg: Segmentation | Planes, *, up: Sequence[float] | str = "z") -
         True
     """
     planes = seg.planes if isinstance(seg, Segmentation) else seg
+    check_kinds("align_axes", "pass a result of segment_planes", planes=(planes, Planes))
     upwards = unit_direction("align_axes", up)
     normals = planes.normal.cpu().double()
     areas = torch.where(planes.curved.cpu(), 0.0, planes.area.cpu().double())

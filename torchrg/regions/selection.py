@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchrg._checks import check_kinds
 from torchrg.config import SelectionConfig, settings_of
 from torchrg.errors import CloudWarning, ConfigError, warn
 from torchrg.linalg.angles import unit_direction
@@ -64,6 +65,7 @@ def select_planes(
         >>> seg.planes.area.round().tolist(), len(select_planes(seg, min_area=150).planes)
         ([209.0, 133.0], 1)
     """
+    check_kinds("select_planes", "pass a result of segment_planes", seg=(seg, Segmentation))
     values = {"min_area": min_area, "kinds": kinds, "sort": sort}
     settings = settings_of("select_planes", SelectionConfig, None, values)
     if up is not None or (settings.kinds is not None and seg.planes.kind is None):

@@ -66,14 +66,20 @@ class Cloud(Explained):
     repairs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        fields = {name: _as_array(field) for name, field in self.fields.items()}
         vars(self)["coordinates"] = coordinates = _as_array(self.coordinates)
-        vars(self).update(fields=fields, front=_as_array(self.front))
         if not isinstance(coordinates, np.ndarray):
             raise ShapeError(
                 "Cloud: expected coordinates to be a tensor or a NumPy array, got "
                 f"{type(self.coordinates).__name__}; use numpy.array, or torchrg.read_cloud(path)."
             )
+        if coordinates.shape[1:] != (3,) or not isinstance(self.fields, Mapping):
+            raise ShapeError(
+                f"Cloud: expected coordinates of shape (N, 3) and a dictionary of fields, got "
+                f"{coordinates.shape} and {type(self.fields).__name__}; pass Cloud(points[:, :3], "
+                "{'color': colors})."
+            )
+        fields = {name: _as_array(field) for name, field in self.fields.items()}
+        vars(self).update(fields=fields, front=_as_array(self.front))
         if self.front is not None and self.front.shape != (len(self), 3):
             raise ShapeError(
                 f"Cloud: expected front of shape {(len(self), 3)}, got {self.front.shape}."

@@ -273,7 +273,7 @@ def _find_row(caller: str, row: SupportsIndex, num_planes: int) -> int:
 
 def _plural(count: int, noun: str) -> str:
     """Return a count with a noun, or with an adjective, which has no plural."""
-    has_plural = noun in ("plane", "floor", "ceiling", "wall")
+    has_plural = noun in ("point", "plane", "floor", "ceiling", "wall")
     return f"{count:,} {noun}{'s' * (count != 1 and has_plural)}"
 
 
@@ -281,7 +281,7 @@ def _count_points(labels: Tensor) -> str:
     """Return the number of points, or the size of an image, as text."""
     if labels.ndim == 2:
         return f"{labels.shape[0]:,} x {labels.shape[1]:,} pixels"
-    return f"{len(labels):,} points"
+    return _plural(len(labels), "point")
 
 
 PLANE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
