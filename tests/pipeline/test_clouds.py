@@ -9,7 +9,7 @@ from torchrg import load_config
 from torchrg.config import SuperpointsConfig
 from torchrg.errors import ConfigError
 from torchrg.pipeline import clouds
-from torchrg.pipeline.clouds import find_objects
+from torchrg.pipeline.clouds import check_finite, describe_multipliers, find_objects, note_on_copies
 from torchrg.structures import Cloud
 
 
@@ -76,3 +76,24 @@ def test_other_errors_stay(monkeypatch):
     monkeypatch.setattr(clouds, "segment_planes", lambda *_, **__: torch.zeros(2) + torch.zeros(3))
     with pytest.raises(RuntimeError, match="size of tensor"):
         clouds.segment_cloud(Cloud(np.eye(9, 3)), load_config(**{"normals.k": 600}))
+
+
+def test_describe_multipliers_by_example():
+    assert describe_multipliers(load_config({"normals.k": 600})) == " with --normals.k 600"
+
+
+def test_check_finite_by_example():
+    assert check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]]))) == (
+        "2 of 3 points are not finite or beyond 1e+12; they have no normal and no plane",
+    )
+
+
+def test_note_on_copies_by_example():
+    assert note_on_copies(2, 3) == (
+        "2 of 3 points are duplicates; duplicates count once and share one result",
+    )
+
+
+def test_find_objects_by_example():
+    cloud = Cloud(np.zeros((2, 3)), {"instance": np.array([[3, 5], [4, -1]])})
+    assert find_objects(cloud, "instance").tolist() == [3, 4]

@@ -7,7 +7,7 @@ import torch
 from tests.render.test_page import described, places, room, unpacked
 from torchrg.io.result import Result
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.channels import decode_directions, encode_directions
+from torchrg.render.channels import decode_directions, encode_directions, point_outcomes
 from torchrg.render.page import make_page
 
 
@@ -47,3 +47,17 @@ def test_directions_survive_two_bytes():
     found = decode_directions(encode_directions(directions))
     cosines = (found * directions.numpy()).sum(axis=1)
     assert np.degrees(np.arccos(cosines.clip(-1, 1))).max() < 1.0
+
+
+def test_point_outcomes_by_example():
+    assert (
+        repr(point_outcomes(torch.tensor([0, 0, 0, 1, 2, -1]), torch.tensor([5, 5, 5, 5, 6, 6])))
+        == "tensor([0, 0, 0, 1, 0, 3])"
+    )
+
+
+def test_encode_directions_by_example():
+    assert encode_directions(torch.tensor([[0.0, 0, 1], [1, 0, 0]])).tolist() == [
+        [127, 127],
+        [254, 127],
+    ]

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchrg.render.page import _json_for_html
+
 pytest.importorskip("pydeck", reason="needs the extra view")
 
 from torchrg.errors import ConfigError, MissingDependencyError
@@ -233,3 +235,7 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, run, arguments, message
     assert done.code == 2
     assert message in done.error
     assert not list(tmp_path.glob("page.*"))
+
+
+def test_json_for_html_by_example():
+    assert _json_for_html({"name": "</script>&"}) == '{"name":"\\u003c/script\\u003e\\u0026"}'

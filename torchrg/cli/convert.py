@@ -30,7 +30,7 @@ from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.batch.stale import StaleResult, check_stale, find_stale, remove_empty, remove_stale
 from torchrg.batch.task import Reports
 from torchrg.cli import ending, flags
-from torchrg.cli.arguments import Argument, parse
+from torchrg.cli.arguments import Argument, describe, parse
 from torchrg.cli.loop import Progress, print_failure
 from torchrg.cli.report import format_costs, format_plan, format_report
 from torchrg.config import DepthConfig, SelectionConfig, SuperpointsConfig, load_config
@@ -254,24 +254,14 @@ KINDS: dict[str, type[Arguments]] = {
 }
 """Arguments by kind of data set."""
 
-OVERVIEW = f"""usage: torchrg convert {{{",".join(KINDS)}}} ROOT OUT ...
-
-Normals, curvature and plane labels of every scan of a data set.
-
-  s3dis    rooms of the S3DIS release, to Pointcept's layout
-  folder   every cloud below a folder
-  scannet  scans of the ScanNet or ScanNet++ release, to Pointcept's layout
-  rgbd     depth frames: phone captures, public data sets, or any images
-
-For superpoint files of other projects, pass --layout.
-
-torchrg convert s3dis --help lists the options."""
-
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, check the plan, convert, and print a report."""
     if not argv or argv[0] in ("-h", "--help"):
-        print(OVERVIEW)
+        kinds = [f"  {name:<9}{describe(kind).partition('.')[0]}." for name, kind in KINDS.items()]
+        usage = f"usage: torchrg convert {{{','.join(KINDS)}}} ROOT OUT ..."
+        more = "torchrg convert s3dis --help lists the options."
+        print("\n".join([usage, "", *kinds, "", more]))
         raise SystemExit(0 if argv else ending.USAGE_ERROR)
     kind, *remaining = argv
     if kind not in KINDS:

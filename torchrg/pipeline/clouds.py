@@ -131,13 +131,7 @@ def segment_cloud(
 
 
 def describe_multipliers(settings: PipelineConfig, partition: object = None) -> str:
-    """Return the settings that need more memory than their defaults, as flags after "with".
-
-    Example:
-        >>> from torchrg.config import load_config
-        >>> describe_multipliers(load_config({"normals.k": 600}))
-        ' with --normals.k 600'
-    """
+    """Return the settings that need more memory than their defaults, as flags after "with"."""
     normals, default, flags = settings.normals, NormalsConfig.k, []
     for name, value in (("k", normals.k), ("adaptive-k", normals.adaptive_k or 0)):
         flags += [f"--normals.{name} {value}"] if value > default else []
@@ -154,10 +148,6 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
 
     Raises:
         FormatError: If no point is finite.
-
-    Example:
-        >>> check_finite(Cloud(np.array([[0.0, 0, 0], [np.nan, 0, 0], [1e30, 0, 0]])))
-        ('2 of 3 points are not finite or beyond 1e+12; they have no normal and no plane',)
     """
     num_bad = len(cloud) - int(np.count_nonzero(cloud.finite))
     if num_bad == len(cloud):
@@ -189,12 +179,7 @@ def check_finite(cloud: Cloud) -> tuple[str, ...]:
 
 
 def note_on_copies(num_copies: int, num_points: int) -> tuple[str, ...]:
-    """Return a note if a cloud has points with equal coordinates.
-
-    Example:
-        >>> note_on_copies(2, 3)
-        ('2 of 3 points are duplicates; duplicates count once and share one result',)
-    """
+    """Return a note if a cloud has points with equal coordinates."""
     if not num_copies:
         return ()
     return (
@@ -211,11 +196,6 @@ def find_objects(cloud: Cloud, name: str | None) -> NDArray[np.int64] | None:
 
     Raises:
         FormatError: If the field is missing or does not have one integer per point.
-
-    Example:
-        >>> cloud = Cloud(np.zeros((2, 3)), {"instance": np.array([[3, 5], [4, -1]])})
-        >>> find_objects(cloud, "instance").tolist()
-        [3, 4]
     """
     if name is None:
         return None

@@ -160,10 +160,6 @@ def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
 
     Raises:
         ShapeError: If a shape or dtype is invalid.
-
-    Example:
-        >>> point_outcomes(torch.tensor([0, 0, 0, 1, 2, -1]), torch.tensor([5, 5, 5, 5, 6, 6]))
-        tensor([0, 0, 0, 1, 0, 3])
     """
     regions, faces = check_labels("point_outcomes", labels=labels, ground_truth=ground_truth)
     table = contingency_table(regions, faces)
@@ -189,10 +185,6 @@ def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
     References:
         [1] Z. Cigolle et al. A survey of efficient representations for independent unit vectors.
             Journal of Computer Graphics Techniques 3(2), 2014.
-
-    Example:
-        >>> encode_directions(torch.tensor([[0.0, 0, 1], [1, 0, 0]])).tolist()
-        [[127, 127], [254, 127]]
     """
     size = directions.abs().sum(dim=1, keepdim=True)
     size = torch.where(size > 0, size, 1.0)

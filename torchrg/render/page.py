@@ -367,12 +367,7 @@ def load_template(name: str) -> "Template":
 
 
 def _json_for_html(value: object) -> str:
-    r"""Encode as JSON without characters special to HTML.
-
-    Example:
-        >>> _json_for_html({"name": "</script>&"})
-        '{"name":"\\u003c/script\\u003e\\u0026"}'
-    """
+    r"""Encode as JSON without characters special to HTML."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")

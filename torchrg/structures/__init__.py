@@ -2,7 +2,7 @@
 
 import torch
 
-from torchrg.structures.cloud import AnyCloud, Cloud
+from torchrg.structures.cloud import Cloud
 from torchrg.structures.planes import (
     PLANE_KINDS,
     Plane,
@@ -16,8 +16,10 @@ from torchrg.structures.points import (
     FARTHEST,
     MAX_POINTS,
     UNLABELED,
+    FilePath,
     Neighbors,
     NormalFit,
+    Points,
     Sampling,
 )
 
@@ -39,6 +41,9 @@ __all__ = [
     "Superpoints",
 ]
 __dir__ = __all__.copy
+
+AnyCloud = Points | Cloud | FilePath
+"""Points ``(N, 3)`` as a tensor or an array, a cloud, or the path of a file."""
 
 # Lets torch.load(weights_only=True) read results and samples.
 torch.serialization.add_safe_globals(

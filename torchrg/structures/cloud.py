@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning, warn
-from torchrg.structures.points import (
-    FARTHEST,
-    Explained,
-    FilePath,
-    Points,
-    bounding_box,
-    local_origin,
-)
+from torchrg.structures.points import FARTHEST, Explained, bounding_box, local_origin
 from torchrg.structures.precision import describe_steps, describe_units
 
 
@@ -171,7 +164,3 @@ class Cloud(Explained):
 def _as_array(values: Any) -> Any:  # noqa: ANN401
     """Convert a tensor to an array; return anything else unchanged."""
     return values.numpy(force=True) if isinstance(values, Tensor) else values
-
-
-AnyCloud = Points | Cloud | FilePath
-"""Points ``(N, 3)`` as a tensor or an array, a cloud, or the path of a file."""
