@@ -203,3 +203,81 @@ def test_a_mask_of_numbers_is_refused_with_the_repair(module, name):
 
 def test_every_function_with_a_mask_was_called():
     assert len(MASKED) == 16
+
+
+def taking_points():
+    """Return calls of all functions that take the points of a cloud, by name."""
+    points = argument("planes")
+    seg = torchrg.segment_planes(points, "classic")
+    fit, near = torchrg.estimate_normals(points, method="pca", k=9), torchrg.search_knn(points, 9)
+    parts = torchrg.make_superpoints(points, seg, counts=2)
+    render, white = torchrg.render, torch.full((60, 3), 255, dtype=torch.uint8)
+    return {
+        "segment_planes": lambda x: torchrg.segment_planes(x, "classic").labels,
+        "estimate_normals": lambda x: torchrg.estimate_normals(x, method="pca", k=9).normals,
+        "orient_normals": lambda x: orient_normals(x, fit.normals),
+        "search_knn": lambda x: torchrg.search_knn(x, 5).indices,
+        "grow_regions": lambda x: torchrg.grow_regions(x, *fit[:2], near, "classic"),
+        "make_superpoints": lambda x: torchrg.make_superpoints(x, seg).labels,
+        "segment_mesh": lambda x: torchrg.segment_mesh(x),
+        "canonical_order": lambda x: torchrg.neighbors.canonical_order(x),
+        "distinct_points": lambda x: torchrg.neighbors.distinct_points(x).rows,
+        "sample_voxels": lambda x: torchrg.neighbors.sample_voxels(x, 0.2).rows,
+        "measure_sampling": lambda x: torch.tensor(torchrg.neighbors.measure_sampling(x, near)),
+        "summarize_planes": lambda x: (
+            torchrg.regions.summarize_planes(x, fit.normals, seg.labels).area
+        ),
+        "score_partition": lambda x: torch.tensor(
+            torchrg.metrics.score_partition(parts.labels, seg.labels, x)
+        ),
+        "color_planes": lambda x: render.color_planes(seg.labels, x),
+        "render_cloud": lambda x: render.render_cloud(x, white, width=64),
+        "make_nag": lambda x: torchrg.datasets.make_nag(x, parts, data=dict)[0]["pos"],
+        "match_points": lambda x: torch.tensor(torchrg.metrics.match_points(x, x, 0.1)),
+    }
+
+
+@pytest.mark.filterwarnings("ignore::torchrg.errors.CloudWarning")
+def test_functions_take_points_clouds_and_paths_alike(tmp_path):
+    points = argument("planes")
+    torchrg.write_cloud(tmp_path / "cloud.ply", points)
+    forms = (points.numpy(), torchrg.Cloud(points), str(tmp_path / "cloud.ply"))
+    for name, call in taking_points().items():
+        expected = call(points)
+        for form in forms:
+            found = call(form)
+            assert torch.equal(found.nan_to_num(), expected.nan_to_num()), (name, type(form))
+        for wrong, repair in [
+            (points.tolist(), "use torch.tensor"),
+            ([points, points], r"pass one at a time, as \["),
+            (3.5, "a Cloud or a path, got float"),
+        ]:
+            with pytest.raises(ShapeError, match=repair):
+                call(wrong)
+
+
+def test_results_in_other_places_are_refused_with_the_repair(tmp_path):
+    points = argument("planes")
+    seg = torchrg.segment_planes(points, "classic")
+    for call, message in [
+        (lambda: torchrg.select_planes(points), "seg to be Segmentation, got Tensor; pass a res"),
+        (lambda: torchrg.align_axes(points), "planes to be Planes, got Tensor; pass a result"),
+        (lambda: torchrg.make_superpoints(points, "classic"), "seg to be Segmentation, got str"),
+        (lambda: torchrg.write_cloud("a.ply", points, seg.planes), "to be Segmentation, got Pla"),
+        (lambda: torchrg.write_cloud(points, "a.ply"), "path to be a path, got Tensor; pass path"),
+        (lambda: torchrg.nn.Normal()(points), r"eigen to be Eigen, got Tensor; use Normal"),
+        (lambda: torchrg.nn.Qn(points), r"expected settings, got a tensor; use Qn\(\)\(tensor\)"),
+        (lambda: torchrg.nn.DetMCD(points), r"use DetMCD\(\)\(tensor\)"),
+        (lambda: torchrg.segment_planes(points, voxel="2cm"), "expected size > 0, got '2cm'"),
+        (lambda: torchrg.estimate_normals(points, "pca"), "an estimator is a method, as method='p"),
+    ]:
+        with pytest.raises(ConfigError, match=message):
+            call()
+    with pytest.raises(ShapeError, match=r"got int32; pass points.float"):
+        torchrg.segment_planes(points.int())
+    with pytest.raises(ShapeError, match=r"got tuple; use torchrg.depth.make_intrinsics\(fx"):
+        torchrg.depth.segment_depth(torch.ones(4, 5), (5, 5, 2, 2))
+    with pytest.raises(ShapeError, match="got Segmentation; pass its labels"):
+        torchrg.metrics.score_labels(seg, seg.labels)
+    with pytest.raises(ShapeError, match="got str; pass its values, not a name or path"):
+        torchrg.segment_planes(points, within="instance")

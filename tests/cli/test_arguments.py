@@ -244,3 +244,13 @@ def test_plain_by_example():
         plain("With ``absorb``; see :func:`torchrg.segment_planes`.")
         == "With absorb; see torchrg.segment_planes."
     )
+
+
+def test_a_named_argument_may_follow_its_name_and_lists_may_be_repeated():
+    kind = KINDS["torchrg convert folder"]
+    words = ["scans", "--out", "results", "--exclude", "a.txt", "b*", "--exclude=c"]
+    arguments = parse(kind, words, prog="torchrg convert folder")
+    assert (arguments.root, arguments.out) == (Path("scans"), Path("results"))
+    assert arguments.exclude == ("a.txt", "b*", "c")
+    with pytest.raises(ConfigError, match="unrecognized argument results"):
+        parse(kind, ["scans", "results", "--out", "other"], prog="torchrg convert folder")

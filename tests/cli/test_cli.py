@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -244,3 +245,17 @@ def test_a_limit_of_the_system_is_one_line(error, message, run, monkeypatch):
     done = run("info", "room.ply")
     assert done.code == 2
     assert f"torchrg: info: {message}" in done.error
+
+
+def test_a_result_is_described_by_its_planes_and_settings_if_verbose(room_file, tmp_path, run):
+    command = ("segment", room_file, "--out", tmp_path / "a.npz")
+    (line,) = run(*command).out.splitlines()
+    assert re.search(
+        r": \d+ planes, [\d.]+ % labeled: 1 floor, 1 ceiling, 4 walls.*; [\d,]+ points in", line
+    )
+    first, last = run(*command, "-v").out.splitlines()
+    assert re.search(r"\(whiteness [\d.]+\): noise_scope \w+, facet_tolerance", first)
+    assert last.partition(" points in ")[0] == line.partition(" points in ")[0]
+    assert run("segment", room_file, "on", "--out", tmp_path / "a.npz").err.endswith(
+        "torchrg: on: file not found; check the path.\n"
+    )
