@@ -17,9 +17,9 @@ def differing_rows(ours: AnyCloud, theirs: AnyCloud) -> NDArray[np.int64]:
 
     Example:
         >>> exact = np.array([[0.1, 2.0, 3.0], [0.5, 0.25, 0.125]])
-        >>> differing_rows(Cloud(exact.astype(np.float32)), Cloud(exact)).tolist()
+        >>> differing_rows(exact.astype(np.float32), exact).tolist()
         []
-        >>> differing_rows(Cloud(exact[::-1]), Cloud(exact)).tolist()
+        >>> differing_rows(exact[::-1], exact).tolist()
         [0, 1]
     """
     ours, theirs = clouds = [to_cloud("differing_rows", cloud) for cloud in (ours, theirs)]
@@ -37,7 +37,7 @@ def match_points(ours: AnyCloud, theirs: AnyCloud, max_distance: float) -> NDArr
 
     Example:
         >>> room = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-        >>> match_points(Cloud(room[[2, 0]]), Cloud(room), 0.001).tolist()
+        >>> match_points(room[[2, 0]], room, 0.001).tolist()
         [1, -1, 0]
     """
     ours, theirs = (to_cloud("match_points", cloud) for cloud in (ours, theirs))

@@ -43,8 +43,8 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [0.04, 0, 0], [0.11, 0, 0]])
-        >>> sample_voxels(points, 0.1)
-        Voxels(rows=tensor([1, 2]), inverse=tensor([0, 0, 1]))
+        >>> [column.tolist() for column in sample_voxels(points, 0.1)]
+        [[1, 2], [0, 0, 1]]
     """
     tensor = as_tensor("sample_voxels", "points", points)
     check_points("sample_voxels", tensor)
