@@ -1,11 +1,20 @@
 """Argument checks say what was expected and what came."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
 
-from torchrg._checks import as_tensor, check_floating, check_shapes, is_concrete
-from torchrg.errors import ShapeError
+from torchrg._checks import (
+    as_tensor,
+    check_choices,
+    check_floating,
+    check_shapes,
+    default_device_cpu,
+    is_concrete,
+)
+from torchrg.errors import ConfigError, ShapeError
 
 
 def test_letters_are_shared_between_arguments():
@@ -81,3 +90,14 @@ def test_is_concrete_by_example():
         False,
         False,
     ]
+
+
+def test_choices_are_listed_if_another_is_passed():
+    message = "f: expected rule to be one of all, none, got 'half'."
+    with pytest.raises(ConfigError, match=message):
+        check_choices("f", rule=("half", Literal["all", "none"]))
+
+
+def test_the_default_device_is_the_cpu_in_a_block():
+    with torch.device("meta"), default_device_cpu():
+        assert torch.zeros(2).device.type == "cpu"

@@ -41,6 +41,7 @@ def test_modules_load_when_they_are_asked_for():
         _ = torchrg.nothing
 
 
+@pytest.mark.slow
 def test_torch_load_knows_saved_results(tmp_path):
     torch.save(torchrg.segment_planes(torch.rand(200, 3), "classic"), tmp_path / "seg.pt")
     script = f"import torch, torchrg; print(torch.load({str(tmp_path / 'seg.pt')!r}))"

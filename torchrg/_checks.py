@@ -80,15 +80,7 @@ def _repair(caller: str, name: str, values: object) -> str:
 
 
 def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
-    """Check that settings are among the choices of their types, as in ``x=(x, Literal["a", "b"])``.
-
-    Example:
-        >>> from typing import Literal
-        >>> check_choices("f", rule=("half", Literal["all", "none"]))
-        Traceback (most recent call last):
-            ...
-        torchrg.errors.ConfigError: f: expected rule to be one of all, none, got 'half'.
-    """
+    """Check that settings are among the choices of their types, as in ``x=(x, Literal["a", "b"])``."""
     for name, (value, kind) in arguments.items():
         if value not in get_args(kind):
             choices = ", ".join(get_args(kind))
@@ -237,13 +229,7 @@ def _plain(value: object) -> object:
 
 @contextmanager
 def default_device_cpu() -> Iterator[None]:
-    """Create tensors on the CPU, ignoring ``torch.set_default_device``.
-
-    Example:
-        >>> with torch.device("meta"), default_device_cpu():
-        ...     torch.zeros(2).device
-        device(type='cpu')
-    """
+    """Create tensors on the CPU, ignoring ``torch.set_default_device``."""
     if torch.empty(0).device.type == "cpu":
         yield
         return

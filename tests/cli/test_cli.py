@@ -259,3 +259,18 @@ def test_a_result_is_described_by_its_planes_and_settings_if_verbose(room_file, 
     assert run("segment", room_file, "on", "--out", tmp_path / "a.npz").err.endswith(
         "torchrg: on: file not found; check the path.\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("word", "shown"), [("help", "usage: torchrg COMMAND"), ("-V", "torchrg 0.")]
+)
+def test_usual_words_for_help_and_version_are_taken(word, shown, run):
+    done = run(word)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.startswith(shown)
+
+
+def test_an_estimator_as_preset_leads_to_its_setting(room_file, run):
+    err = run("segment", room_file, "--out", "a.npz", "--preset", "pca").err
+    assert err.startswith("torchrg: expected a .yaml file, or a preset, one of algorithm2")
+    assert "--normals.method pca" in err
