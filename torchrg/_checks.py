@@ -80,7 +80,7 @@ def _repair(caller: str, name: str, values: object) -> str:
 
 
 def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
-    """Check that settings are among the choices of their types, as in ``x=(x, Literal["a", "b"])``."""
+    """Check that settings are among the choices of types, as in ``x=(x, Literal["a", "b"])``."""
     for name, (value, kind) in arguments.items():
         if value not in get_args(kind):
             choices = ", ".join(get_args(kind))
