@@ -10,7 +10,7 @@ def test_info_says_what_a_file_holds_and_where_it_is(room_file, tmp_path, run):
     assert "6,000 of float32" in shown
     assert "labels" in shown
     surfaces = next(line[12:] for line in shown.splitlines() if line.startswith("surfaces"))
-    assert surfaces in run("segment", room_file, "--out", tmp_path / "a.npz").out
+    assert surfaces in run("segment", room_file, "--out", tmp_path / "a.npz", "--verbose").out
     far = np.array([[500000.125, 4000000.25, 1], [500001.375, 4000000.5, 2]])
     np.save(tmp_path / "far.npy", far)
     shown = run("info", tmp_path / "far.npy").out
