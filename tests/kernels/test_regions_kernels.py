@@ -10,6 +10,7 @@ from tests.kernels.clouds import both, clouds, definitions, growing_cloud, lists
 from torchrg.config import load_config
 from torchrg.neighbors import canonical_order, search_knn
 from torchrg.regions.adjacency import KnnAdjacency, find_adjacency, find_region_pairs
+from torchrg.regions.edges import are_coplanar
 from torchrg.regions.growth import grow
 from torchrg.scenes import make_room
 from torchrg.structures import Sampling
@@ -77,6 +78,19 @@ def test_regions_are_those_of_the_definition(name, k):
         large = (expected >= 0) & (counts[expected] >= settings.min_size)
         assert torch.equal(found[large], expected[large])
         assert torch.equal(found.cpu() >= 0, expected >= 0)
+
+
+@pytest.mark.parametrize("k", [1, 9, 50])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_coplanar_neighbors_are_those_of_the_definition(name, k):
+    cloud, rows = growing_cloud(CLOUDS[name], k, False), slice(3, 250)
+    mask = torch.rand(247, k, generator=torch.Generator().manual_seed(2)) < 0.1
+    cloud.points[90] *= 1e30  # Its differences are not finite.
+    for floor in (0.0, 0.05):
+        found, expected = both(are_coplanar, cloud, rows, mask, None, floor)
+        tested = mask.any(dim=1)
+        assert torch.equal(found[tested], expected[tested])
+        assert not found[~tested].any()
 
 
 @pytest.mark.parametrize("masked", [False, True])

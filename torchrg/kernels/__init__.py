@@ -32,6 +32,7 @@ SIGNATURES = {
     "scatter_matrices": "f[KM] f[KM] f[KM] f[KM] f[KM] f[KM] f[KM] f[T] x -> f[6M33]",
     "sphered_sets": "f[KM] f[KM] f[KM] f[SM33] x n -> f[KSM] b[SM]",
     "concentrate": "f[KM] f[KM] f[KM] f[KSM] f[M] n n n -> f[KSM] d[SM]",
+    "are_coplanar": "f[3N] f[3N] i[nk] b[nk] x x -> b[nk] b[n]",
     "fit_normals_pca": "f[N3] i[nk] b[nk]? f[n] x x -> f[n3] f[n] f[n] b[n] b[n]",
     "survey": "f[N3] i[nk] b[nk]? f[n3] b[n] n n x x x n n -> f[n] f[n] f[n] f[n] b[n] f[n] f[n]",
     "broken_planes": "f[N3] i[nk] b[nk]? f[n] f[n3] l[p2] f[c] -> f[n3] f[n] f[n3] f[n] f[n]",

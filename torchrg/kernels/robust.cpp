@@ -62,6 +62,13 @@ INLINE Lanes median_of_sorted(const Column& rows, int n) {
   return n % 2 ? low : low + (high - low) / all(2);
 }
 
+INLINE Lanes roots_of(Lanes squares) {
+  float lanes[LANES];
+  store(lanes, squares);
+  for (float& lane : lanes) lane = square_root(lane);
+  return load(lanes);
+}
+
 INLINE Lanes one_where(Flags flags) { return where(flags, all(1), all(0)); }
 INLINE bool is_any(Flags flags) { return total(flags) != 0; }
 
@@ -269,10 +276,8 @@ KERNEL may_have_flats(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Float
               across[0] * axes[a][0] + across[1] * axes[a][1] + across[2] * axes[a][2];
           for (int i = 0; i < 3; i++) across[i] = across[i] - along * axes[a][i];
         }
-        float heights[LANES];
-        store(heights, across[0] * across[0] + across[1] * across[1] + across[2] * across[2]);
-        for (float& height : heights) height = square_root(height);
-        const Lanes height = load(heights);
+        const Lanes height =
+            roots_of(across[0] * across[0] + across[1] * across[1] + across[2] * across[2]);
         near += steep & (height <= reach);
         steep = steep & (height > extent * all(MIN_EDGE));
         reach = larger(reach, limit * (all(1) + extent * all(2) / height));
@@ -452,6 +457,50 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
       best[job.start * M + job.patch] = value;
       active--, enter(l);
     }
+  }
+  return DONE;
+}
+
+// edges.are_coplanar of rows with an edge to test; open rows have a difference that is not finite.
+KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
+                    Ints indices, Flagged tested, double factor, double floor_fraction,
+                    bool* passed, bool* open) {
+  if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
+  static thread_local Column residuals, sorted;
+  int64_t rows[LANES];
+  int used = 0;
+  for (int64_t q = 0; q < num_rows; q++) {
+    bool is_tested = open[q] = false;
+    for (int64_t e = q * k; e < (q + 1) * k; e++) is_tested |= tested[e], passed[e] = false;
+    if (is_tested) rows[used++] = q;
+    if (used == 0 || (used < LANES && q + 1 < num_rows)) continue;
+    float squares[LANES];
+    for (int l = 0; l < LANES; l++) {
+      const int32_t* list = indices + k * rows[l < used ? l : 0];
+      if (!are_rows(list, k, num_points)) return NO_SUCH_ROW;
+      float center[3], normal[3], square = 0;
+      for (int i = 0; i < 3; i++)
+        center[i] = points[i * num_points + *list], normal[i] = normals[i * num_points + *list];
+      for (int j = 0; j < k; j++) {
+        const float x = points[list[j]] - center[0], y = points[num_points + list[j]] - center[1],
+                    z = points[2 * num_points + list[j]] - center[2];
+        residuals.at(j, l) = size_of(x * normal[0] + y * normal[1] + z * normal[2]);
+        square = larger(square, x * x + y * y + z * z);
+      }
+      squares[l] = square;
+    }
+    const Lanes sq_radius = load(squares);
+    Flags is_finite = sq_radius < all(INFINITE);
+    for (int j = 0; j < k; j++) is_finite = is_finite & (residuals[j] < all(INFINITE));
+    sorted = residuals;
+    const Lanes floor = all(float(floor_fraction)) * roots_of(sq_radius);
+    const Lanes scale = sort_and_scale(sorted, int(k), factor);
+    const Lanes limit = median_of_sorted(sorted, int(k)) + all(2) * larger(scale, floor);
+    for (int l = 0; l < used; l++) {
+      open[rows[l]] = !is_finite[l];
+      for (int j = 0; j < k; j++) passed[k * rows[l] + j] = residuals.at(j, l) <= limit[l];
+    }
+    used = 0;
   }
   return DONE;
 }

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import map_chunks
+from torchrg._parallel import map_chunks, nonzero_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Columns, project, sq_lengths, to_column_major
+from torchrg.linalg.precision import rounded_sqrt
 from torchrg.neighbors.knn import gather_columns
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
 from torchrg.robust import median, qn
+from torchrg.robust.scale import QN_FACTOR
 from torchrg.structures import Neighbors
 from torchrg.structures.points import Rows
 
@@ -230,14 +232,22 @@ def are_coplanar(
     The limit is computed over the neighbors ``compared``, shape ``(n, K)``, default all. Its floor
     is a fraction of the distance to the farthest neighbor.
     """
-    tested = (mask.sum(dim=1) > 0).nonzero().squeeze(-1)
-    indices, counted = cloud.neighbors.select(rows).select(tested)
-    columns = gather_columns(cloud.points, indices)
+    near, result = cloud.neighbors.select(rows), torch.zeros_like(mask)
+    open_rows = mask.any(dim=1)
+    columns = cloud.points.T, cloud.normals.T
+    is_complete = compared is None and near.valid is None
+    if is_complete and kernels.serve(near.indices, *columns, k=mask.shape[1]):
+        factors = QN_FACTOR, floor_fraction
+        result, open_rows = kernels.call("are_coplanar", *columns, near.indices, mask, *factors)
+    tested = nonzero_rows(open_rows)
+    if len(tested) == 0:
+        return result
+    indices, counted = near.select(tested)
+    offsets = gather_columns(cloud.points, indices)
     # |(p_j - p_i) . n_i|, below eq. (10).
-    residuals = project(columns, cloud.normals[rows][tested]).abs_()
-    floor = floor_fraction * patch_radii(columns, counted)
+    residuals = project(offsets, cloud.normals[rows][tested]).abs_()
+    floor = floor_fraction * patch_radii(offsets, counted)
     limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[tested])
-    result = torch.zeros_like(mask)
     result[tested] = residuals <= limits[:, None]
     return result
 
@@ -268,4 +278,4 @@ def patch_radii(columns: Columns, mask: Tensor | None = None) -> Tensor:
     sq_distances = sq_lengths(columns)
     if mask is not None:
         sq_distances = torch.where(mask, sq_distances, 0.0)
-    return sq_distances.amax(dim=-1).sqrt()
+    return rounded_sqrt(sq_distances.amax(dim=-1))
