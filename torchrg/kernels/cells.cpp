@@ -10,22 +10,32 @@ constexpr double SURELY = 1e-6;       // rounding of the cell of a point at a bo
 struct Candidates {
   alignas(32) double x[MAX_CANDIDATES], y[MAX_CANDIDATES], z[MAX_CANDIDATES],
       square[MAX_CANDIDATES];
-  int32_t row[MAX_CANDIDATES], chosen[MAX_CHOSEN + 1];
+  int32_t row[MAX_CANDIDATES], chosen[MAX_CANDIDATES];
   alignas(32) float key[MAX_CHOSEN];  // their squared distances, rounded
   alignas(32) int32_t rank[MAX_CHOSEN];
   int32_t sorted[MAX_CHOSEN];
 };
 
+// Counts the keys below each of some keys.
+template <int num_vectors>
+INLINE void rank_keys(Candidates& all, int first, int count) {
+  Lanes keys[num_vectors];
+  Flags ranks[num_vectors] = {};
+  for (int v = 0; v < num_vectors; v++) keys[v] = load(all.key + first + v * LANES);
+  for (int j = 0; j < count; j++) {
+    const Lanes other = Lanes{} + all.key[j];
+    for (int v = 0; v < num_vectors; v++) ranks[v] -= other < keys[v];
+  }
+  __builtin_memcpy(all.rank + first, ranks, sizeof ranks);
+}
+
 // Sorts selected candidates by distance, then row; returns the k-th distance.
 INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
   const int width = padded(count);
   for (int i = 0; i < width; i++) all.key[i] = float(all.square[all.chosen[i < count ? i : 0]]);
-  for (int i = 0; i < width; i += LANES) {
-    const Lanes keys = load(all.key + i);
-    Flags rank{};
-    for (int j = 0; j < count; j++) rank -= Lanes{} + all.key[j] < keys;
-    __builtin_memcpy(all.rank + i, &rank, sizeof rank);
-  }
+  int ranked = 0;
+  for (; ranked + 3 * LANES <= width; ranked += 3 * LANES) rank_keys<3>(all, ranked, count);
+  for (; ranked < width; ranked += LANES) rank_keys<1>(all, ranked, count);
   int64_t sum = 0;
   for (int i = 0; i < count; i++) sum += all.rank[i], all.sorted[all.rank[i]] = all.chosen[i];
   if (sum != int64_t(count) * (count - 1) / 2) {
@@ -160,7 +170,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
       for (int turn = 0; turn < 8; turn++) {
         count = 0;
         for (int t = 0; t < n; t++) {
-          all.chosen[count < MAX_CHOSEN ? count : MAX_CHOSEN] = t;
+          all.chosen[count] = t;
           count += all.square[t] < within;
         }
         if (count > MAX_CHOSEN)
