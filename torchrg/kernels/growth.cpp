@@ -1,33 +1,60 @@
 // Region growing and its edges: torchrg/regions/growth.py and edges.py.
 #include "plain.h"
 
+namespace {
+
+// 1 with the sign of each lane.
+INLINE Lanes sign_of(Lanes values) {
+  constexpr int32_t ONE = 0x3F800000;  // the bits of 1
+  Flags bits;
+  __builtin_memcpy((void*)&bits, &values, sizeof bits);
+  bits = (bits & (Flags{} + INT32_MIN)) | (Flags{} + ONE);
+  __builtin_memcpy((void*)&values, &bits, sizeof bits);
+  return values;
+}
+
+// Whether values are within a limit, or the limit is disabled.
+INLINE Flags within(Lanes values, double limit) {
+  return limit >= 0 ? values <= all(float(limit)) : ~Flags{};
+}
+
+}  // namespace
+
 // edges.accept_edges: position and normal tests of edges to neighbors; points and normals (3, N);
 // limits below 0 are disabled.
 KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
                   Flagged valid, Floats reach, Ints indices, Flagged mask, Longs rows,
                   double max_sq_chord, double max_sq_distance, int64_t is_signed, bool* joins) {
+  if (k > MAX_WIDTH) return TOO_WIDE;
   const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
   const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
-  const float max_square = float(max_sq_distance);
+  alignas(32) float near[7][MAX_WIDTH] = {};
+  alignas(32) int32_t passes[MAX_WIDTH] = {};
   for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
     const int64_t i = rows[q];
     if (i < 0 || i >= num_points || !are_rows(indices, k, num_points)) return NO_SUCH_ROW;
     for (int64_t j = 0; j < k; j++) {
       const int32_t t = indices[j];
-      const float dot = a[i] * a[t] + b[i] * b[t] + c[i] * c[t];
-      const float sign = is_signed ? 1 : __builtin_copysignf(1, dot);
-      const float da = a[t] - a[i] * sign, db = b[t] - b[i] * sign, dc = c[t] - c[i] * sign;
-      bool passes = valid[i] & valid[t] & (t != i);
-      passes &= !(max_sq_chord >= 0) | (da * da + db * db + dc * dc <= float(max_sq_chord));
-      const float u = x[t] - x[i], v = y[t] - y[i], w = z[t] - z[i];
-      passes &= !(max_sq_distance >= 0) | (u * u + v * v + w * w <= max_square);
-      if (reach) {
-        passes &= size_of(u * a[i] + v * b[i] + w * c[i]) <= reach[i];
-        passes &= size_of(u * a[t] + v * b[t] + w * c[t]) <= reach[t];
-      }
-      joins[j] = passes;
+      near[0][j] = x[t], near[1][j] = y[t], near[2][j] = z[t];
+      near[3][j] = a[t], near[4][j] = b[t], near[5][j] = c[t];
+      passes[j] = -int32_t(valid[i] & valid[t] & (t != i) & (!mask || mask[q * k + j]));
     }
-    for (int64_t j = 0; mask && j < k; j++) joins[j] &= mask[q * k + j];
+    for (int64_t j = 0; reach && j < k; j++) near[6][j] = reach[indices[j]];
+    for (int64_t j = 0; j < k; j += LANES) {
+      const Lanes d = load(near[3] + j), e = load(near[4] + j), f = load(near[5] + j);
+      const Lanes sign = is_signed ? all(1) : sign_of(d * a[i] + e * b[i] + f * c[i]);
+      const Lanes da = d - sign * a[i], db = e - sign * b[i], dc = f - sign * c[i];
+      Flags passed = load(passes + j) & within(da * da + db * db + dc * dc, max_sq_chord);
+      const Lanes u = load(near[0] + j) - x[i], v = load(near[1] + j) - y[i],
+                  w = load(near[2] + j) - z[i];
+      passed = passed & within(u * u + v * v + w * w, max_sq_distance);
+      if (reach) {
+        passed = passed & (magnitude(u * a[i] + v * b[i] + w * c[i]) <= all(reach[i]));
+        passed = passed & (magnitude(u * d + v * e + w * f) <= load(near[6] + j));
+      }
+      __builtin_memcpy(passes + j, &passed, sizeof passed);
+    }
+    for (int64_t j = 0; j < k; j++) joins[j] = passes[j] != 0;
   }
   return DONE;
 }
