@@ -162,6 +162,21 @@ INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
   return low;
 }
 
+// Gathers some adjacent columns of the neighbors of a row as keys, from a lane on; returns the
+// number of counted neighbors.
+template <int num_lanes>
+INLINE int gather_keys(const float* column, int64_t num_columns, const int32_t* row,
+                       const bool* counted, int64_t k, int lane, int32_t* keys) {
+  int count = 0;
+  for (int64_t j = 0; j < k; j++) {
+    const bool counts = !counted || counted[j];
+    count += counts;
+    for (int l = 0; l < num_lanes; l++)
+      keys[LANES * j + lane + l] = as_key(counts ? column[num_columns * row[j] + l] : INFINITE);
+  }
+  return count;
+}
+
 }  // namespace
 
 // torchrg.normals.consensus.noise._neighbor_quantiles of columns; one lane per result.
@@ -172,20 +187,20 @@ KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_r
   alignas(32) int32_t keys[MAX_WIDTH * LANES], ranks[LANES];
   const int64_t num_found = num_rows * num_columns;
   for (int64_t start = 0; start < num_found; start += LANES) {
-    for (int lane = 0; lane < LANES; lane++) {
+    for (int lane = 0, width = 1; lane < LANES; lane += width) {
       const int64_t entry = smaller(start + lane, num_found - 1), i = entry / num_columns;
       const int32_t* row = indices + i * k;
       const bool* counted = mask ? mask + i * k : nullptr;
       const float* column = values + entry % num_columns;
       if (!are_rows(row, k, num_points)) return NO_SUCH_ROW;
-      int count = 0;
-      for (int j = 0; j < k; j++) {
-        const bool counts = !counted || counted[j];
-        count += counts;
-        keys[LANES * j + lane] = as_key(counts ? column[num_columns * row[j]] : INFINITE);
+      width = num_columns % 4 == 0 && start + lane + 4 <= num_found ? 4 : 1;
+      const int count = width == 4
+                            ? gather_keys<4>(column, num_columns, row, counted, k, lane, keys)
+                            : gather_keys<1>(column, num_columns, row, counted, k, lane, keys);
+      for (int l = lane; l < lane + width; l++) {
+        ranks[l] = int(rank_of_all);
+        if (mask) ranks[l] = larger(int(__builtin_ceilf(float(quantile) * float(count))), 1);
       }
-      ranks[lane] = int(rank_of_all);
-      if (mask) ranks[lane] = larger(int(__builtin_ceilf(float(quantile) * float(count))), 1);
     }
     const Flags selected = select(keys, int(k), load(ranks));
     for (int lane = 0; lane < LANES && start + lane < num_found; lane++)
