@@ -9,6 +9,7 @@ import torch
 from tests.kernels.clouds import both, clouds, definitions, growing_cloud, lists, needs_library
 from torchrg.config import load_config
 from torchrg.neighbors import canonical_order, search_knn
+from torchrg.neighbors.order import sort_integers
 from torchrg.regions.adjacency import KnnAdjacency, find_adjacency, find_region_pairs
 from torchrg.regions.edges import are_coplanar
 from torchrg.regions.growth import grow
@@ -47,6 +48,16 @@ def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition
         expected = search_knn(batch, 20, offset=ends), search_knn(ordered, 20, canonical=True)
     for one, other in zip(found, expected, strict=True):
         assert torch.equal(one.indices, other.indices)
+
+
+@pytest.mark.parametrize("size", [1, 2**20, 2**62])
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_sorted_integers_are_those_of_the_definition(size, count):
+    keys = torch.randint(-size, size, (count,), generator=torch.Generator().manual_seed(3))
+    for keys in (keys, torch.cat([keys, torch.tensor([2**63 - 1, -(2**63), 0, -1])])):
+        found, expected = both(sort_integers, keys)
+        assert torch.equal(found[0], expected[0])
+        assert torch.equal(found[1], expected[1])
 
 
 PRESETS = ("classic", "paper", "consensus")

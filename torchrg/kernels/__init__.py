@@ -42,6 +42,7 @@ SIGNATURES = {
     "fit_paraboloids": "f[N3] i[Nk] b[Nk]? f[N3] l[n] x -> f[n3] f[n] f[n]",
     "morton_codes": "f[N3] x x x x -> l[N]",
     "morton_codes_double": "d[N3] x x x x -> l[N]",
+    "sort_integers": "l[N] -> l[N] l[N] l[N] l[N]",
     "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N] d[N3]",
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",

@@ -93,6 +93,38 @@ KERNEL morton_codes_double(int64_t num_points, const double* points, double x, d
   return fill_codes(num_points, points, {x, y, z}, extent, codes);
 }
 
+// order.sort_integers: rows that sort keys, ties by row, and the keys in this order; a radix sort by
+// bytes, lowest first, without bytes that are the same in all keys.
+KERNEL sort_integers(int64_t n, Longs keys, int64_t* rows, int64_t* sorted, int64_t* other_rows,
+                     int64_t* others) {
+  constexpr int BYTES = 8, VALUES = 256;
+  int64_t counts[BYTES][VALUES] = {};
+  const auto digit = [](int64_t key, int byte) {
+    return (uint64_t(key) ^ uint64_t(1) << 63) >> 8 * byte & 255;
+  };
+  for (int64_t i = 0; i < n; i++) {
+    rows[i] = i, sorted[i] = keys[i];
+    for (int byte = 0; byte < BYTES; byte++) counts[byte][digit(keys[i], byte)]++;
+  }
+  int64_t *from = sorted, *from_rows = rows, *to = others, *to_rows = other_rows;
+  for (int byte = 0; byte < BYTES && n > 0; byte++) {
+    int64_t(&next)[VALUES] = counts[byte], before = 0;
+    if (next[digit(keys[0], byte)] == n) continue;
+    for (int64_t& count : next) {
+      const int64_t start = before;
+      before += count, count = start;
+    }
+    for (int64_t i = 0; i < n; i++) {
+      const int64_t position = next[digit(from[i], byte)]++;
+      to[position] = from[i], to_rows[position] = from_rows[i];
+    }
+    int64_t *const used = from, *const used_rows = from_rows;
+    from = to, from_rows = to_rows, to = used, to_rows = used_rows;
+  }
+  for (int64_t i = 0; from != sorted && i < n; i++) sorted[i] = from[i], rows[i] = from_rows[i];
+  return DONE;
+}
+
 // Sorts points by cell: `starts` receives the first index of each cell, then the end.
 KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, int32_t* starts,
                   int64_t width, int64_t height, double x, double y, double z, double size,

@@ -52,10 +52,8 @@ def canonical_order(points: AnyCloud, ties: Sequence[Tensor] = ()) -> Tensor:
     coordinates = tensor.detach().cpu().numpy()
     if len(coordinates) == 0:
         return torch.zeros(0, dtype=torch.int64, device=tensor.device)
-    codes = morton_codes(coordinates)
-    # Six times faster than a stable sort; ties are sorted below.
-    order = np.argsort(codes)
-    codes = codes[order]
+    codes = torch.from_numpy(morton_codes(coordinates))
+    order, codes = (part.numpy() for part in sort_integers(codes))
     is_equal = codes[1:] == codes[:-1]
     if is_equal.any():
         is_tied = np.zeros(len(order), dtype=bool)
@@ -154,13 +152,18 @@ def ascending_rows(values: Tensor) -> Tensor:
     """
     if values.dtype != torch.float32 or values.device.type != "cpu":
         return values.argsort(stable=True)
-    # Ten times faster: sort integers of the value bits (reversed for negative values) and the row.
-    bits = (values + 0.0).numpy().view(np.int32)
-    keys = (bits ^ ((bits >> 31) & np.int32(2**31 - 1))).astype(np.int64) << 32
-    keys |= np.arange(len(keys))
-    keys.sort()
-    keys &= 2**32 - 1
-    return torch.from_numpy(keys)
+    # Ten times faster: integers of the value bits, reversed for negative values.
+    bits = (values + 0.0).view(torch.int32)
+    return sort_integers((bits ^ ((bits >> 31) & 0x7FFFFFFF)).long())[0]
+
+
+def sort_integers(keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rows that sort int64 keys ``(N,)``, ties by row, and the keys in this order."""
+    if kernels.serve():
+        rows, ascending, *_ = kernels.call("sort_integers", keys)
+        return rows, ascending
+    ascending, rows = keys.sort(stable=True)
+    return rows, ascending
 
 
 def scatter_rows(values: Tensor, rows: Tensor, num_points: int, *, fill: int = 0) -> Tensor:
