@@ -54,8 +54,9 @@ def test_neighbors_of_a_batch_and_of_points_in_order_are_those_of_the_definition
 @pytest.mark.parametrize("count", [0, 1, 5000])
 def test_sorted_integers_are_those_of_the_definition(size, count):
     keys = torch.randint(-size, size, (count,), generator=torch.Generator().manual_seed(3))
-    for keys in (keys, torch.cat([keys, torch.tensor([2**63 - 1, -(2**63), 0, -1])])):
-        found, expected = both(sort_integers, keys)
+    ends = torch.tensor([2**63 - 1, -(2**63), 0, -1])
+    for integers in (keys, torch.cat([keys, ends])):
+        found, expected = both(sort_integers, integers)
         assert torch.equal(found[0], expected[0])
         assert torch.equal(found[1], expected[1])
 

@@ -291,14 +291,14 @@ def _search_cloud(
     k = indices.shape[1]
     columns = as_tensor("search_knn", "points", points).unbind(dim=1)
     starts = np.flatnonzero(mark_distinct(*columns).numpy())
-    counts = np.diff(starts, append=len(points))
-    positions = points[starts].astype(np.float64)
+    positions = (points if len(starts) == len(points) else points[starts]).astype(np.float64)
 
     def store(
         queried: NDArray[np.integer], distances: NDArray[np.float64], nearest: NDArray[np.integer]
     ) -> None:
         rows = queried
         if len(positions) < len(points):
+            counts = np.diff(starts, append=len(points))
             rows, distances, nearest = _restore_duplicates(
                 queried, distances, nearest, starts, counts, k
             )

@@ -61,12 +61,13 @@ def find_faces(
     """
     faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
     rows = nonzero_rows(labels >= 0)
-    label, axes = labels[rows].long(), axes.to(points)
-    cosine = dot(normals[rows], axes[label])
+    label, axes = labels.index_select(0, rows).long(), axes.to(points)
+    cosine = dot(normals.index_select(0, rows), axes.index_select(0, label))
     side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
-    is_on_plane = is_thin[label] & (cosine.abs() > _MIN_COSINE)
-    rows = rows[is_on_plane]
-    faces[rows], signs[rows] = (2 * label + side)[is_on_plane], cosine[is_on_plane].sign()
+    kept = nonzero_rows(is_thin.index_select(0, label) & (cosine.abs() > _MIN_COSINE))
+    rows = rows.index_select(0, kept)
+    faces.index_copy_(0, rows, (2 * label + side).index_select(0, kept))
+    signs.index_copy_(0, rows, cosine.index_select(0, kept).sign())
     joined, signs = _join_patches(points, normals, near, faces, signs, _MIN_AGREEMENT)
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
     has_plane[joined[rows]] = True

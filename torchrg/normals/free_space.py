@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks
 from torchrg.linalg.moments import dot, kth_smallest
+from torchrg.neighbors.order import sort_integers
 from torchrg.normals.faces import gather_lists
 
 _SPACINGS_PER_CELL = 1.5
@@ -82,7 +83,7 @@ def _mark_cells(
     for axis in range(3):
         codes *= _MAX_CELLS
         codes += ((points[:, axis] - low[axis]) / width).long()
-    cells = np.sort(torch.unique_consecutive(codes).numpy())
+    cells = sort_integers(torch.unique_consecutive(codes))[1].numpy()
     cells = cells[np.append(True, cells[1:] != cells[:-1])]
     x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
     at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell]).astype(np.int32)

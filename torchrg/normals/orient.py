@@ -303,10 +303,10 @@ def _turn_inside(
     faces, signs = find_faces(points, normals, near, labels, axes, _THICKNESS * width)
     sizes = torch.bincount(faces)
     hashes = torch.arange(len(points)) * _HASH % _HASHES
-    rows = nonzero_rows(hashes * sizes[faces] < _NUM_VOTES * _HASHES)
+    rows = nonzero_rows(hashes * sizes.index_select(0, faces) < _NUM_VOTES * _HASHES)
     votes = vote_free_side(points, normals, near, rows, width) * signs[rows]
     total = torch.bincount(faces[rows], votes.double(), minlength=len(sizes))
-    return torch.where(total[faces] < 0, -signs, signs)
+    return torch.where(total.index_select(0, faces) < 0, -signs, signs)
 
 
 def _turn_outwards(points: Tensor, normals: Tensor, near: Tensor) -> Tensor:

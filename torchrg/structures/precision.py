@@ -115,7 +115,8 @@ def _middle_half(points: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def describe_placeholders(points: NDArray[np.floating]) -> str:
     """Return a note if many points lie at 0 0 0, where cameras put pixels without depth."""
-    count = len(points) - int(np.count_nonzero(points.any(axis=1)))
+    at_zero = points[points[:, 0] == 0]
+    count = len(at_zero) - int(np.count_nonzero(at_zero.any(axis=1)))
     if not _MIN_PLACEHOLDERS <= count < len(points):
         return ""
     return (
