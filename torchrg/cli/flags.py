@@ -21,7 +21,6 @@ from torchrg.config import (
     SuperpointsConfig,
     settings_of,
 )
-from torchrg.datasets.camera_files import SUFFIXES, read_camera
 from torchrg.depth.camera import Pinhole
 from torchrg.depth.values import DepthKind
 from torchrg.errors import ConfigError
@@ -225,6 +224,8 @@ def check_superpoints(config: SuperpointsConfig, level: int, *, is_on: bool) -> 
 
 def parse_intrinsics(text: str | None) -> Pinhole | None:
     """Parse a camera from ``fx,fy,cx,cy`` or a file; None stays None."""
+    from torchrg.datasets.camera_files import SUFFIXES, read_camera
+
     if text is None:
         return None
     numbers: list[float] = []

@@ -17,7 +17,7 @@ from torchrg.neighbors import distinct_points, measure_sampling
 from torchrg.neighbors.knn import prepare_search
 from torchrg.regions.directions import likely_up
 from torchrg.structures import Cloud
-from torchrg.structures.points import Array
+from torchrg.structures.points import Array, bounding_box
 
 _DIGITS = {4: 6, 8: 10}
 """Significant digits printed for a coordinate, by its size in bytes. float32 has at most six; ten
@@ -76,10 +76,12 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
     facts = {"points": f"{len(cloud):,} of {cloud.coordinates.dtype}"}
     if cloud.grid_shape:
         facts["grid"] = f"{cloud.grid_shape[0]} rows x {cloud.grid_shape[1]} columns"
-    finite = cloud.coordinates[cloud.finite]
+    finite = cloud.coordinates
+    if not cloud.finite.all():
+        finite = finite[cloud.finite]
     facts["not finite"] = f"{len(cloud) - len(finite):,}"
     if len(finite):
-        low, high = finite.min(axis=0), finite.max(axis=0)
+        low, high = (end.astype(finite.dtype) for end in bounding_box(finite))
         digits = _DIGITS[cloud.coordinates.dtype.itemsize]
         for name, values in (("lowest", low), ("highest", high), ("extent", high - low)):
             facts[name] = " ".join(f"{value:.{digits}g}" for value in values)
@@ -91,12 +93,13 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
         if len(positions) > 1:
             search = prepare_search(positions, min(_NUM_NEIGHBORS, len(positions)))
             rows = np.arange(0, len(positions), -(-len(positions) // _NUM_FOR_SPACING))
-            steps = positions[rows] - positions[search(rows)[:, 1]]
+            near = search(rows)
+            steps = positions[rows] - positions[near[:, 1]]
             spacing = np.median(np.linalg.norm(steps, axis=1))
             facts["spacing"] = f"{spacing:.4g} (median to the nearest point)"
             sampling = measure_sampling(torch.from_numpy(positions), search)
             chosen = load_config().measured(sampling)["settings"]
-            facts["up axis"] = _describe_up(positions, rows, search(rows))
+            facts["up axis"] = _describe_up(positions, rows, near)
             facts["height"] = f"{sampling.height:g} (smallest extent along the principal axes)"
             facts["density"] = f"{sampling.density:g} points on a square of side 1"
             facts["surfaces"] = describe_sampling(sampling, chosen)

@@ -96,7 +96,8 @@ class Cloud(Explained):
         Larger coordinates are codes for missing points.
         """
         with np.errstate(invalid="ignore"):
-            finite: NDArray[np.bool_] = (np.abs(self.coordinates) <= FARTHEST).all(axis=1)
+            x, y, z = (np.abs(column) <= FARTHEST for column in self.coordinates.T)
+        finite: NDArray[np.bool_] = x & y & z
         return finite
 
     @property

@@ -108,9 +108,9 @@ def is_fine_step(step: float, points: NDArray[np.floating]) -> bool:
 def _middle_half(points: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the lowest and highest coordinates of the middle half of points, shape ``(2, 3)``."""
     ranks = [int(fraction * (len(points) - 1)) for fraction in _QUARTILES]
-    # One rank and one column at a time take a third of the time of np.quantile.
-    ends = [[np.partition(column, rank)[rank] for column in points.T] for rank in ranks]
-    return np.array(ends, dtype=np.float64)
+    # One column at a time takes a third of the time of np.quantile.
+    ends = [np.partition(column, ranks)[ranks] for column in points.T]
+    return np.array(ends, dtype=np.float64).T
 
 
 def describe_placeholders(points: NDArray[np.floating]) -> str:
