@@ -83,24 +83,6 @@ def map_chunks(
     return map_tasks(work, split_rows(num_rows, size) or [slice(0, 0)], device)
 
 
-def map_rows(
-    work: Callable[..., Sequence[Tensor]], columns: Sequence[Tensor], *others: Tensor
-) -> list[Tensor]:
-    """Call ``work`` on one equal block of rows per thread, and concatenate the results.
-
-    It receives the rows of each of the ``columns``, which have the same length, then the ``others``
-    unchanged, and returns tensors of rows.
-    """
-    first, *more = map_chunks(
-        lambda rows: work(*(column[rows] for column in columns), *others),
-        len(columns[0]),
-        max(len(columns[0]), 1),
-        columns[0].device,
-    )
-    parts = zip(first, *more, strict=True)
-    return [torch.cat(same) for same in parts] if more else list(first)
-
-
 def map_selected(
     work: Callable[[Tensor], Returned], chosen: Tensor, chunk_size: int
 ) -> list[Returned]:

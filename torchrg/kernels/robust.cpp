@@ -461,7 +461,7 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
   return DONE;
 }
 
-// edges.are_coplanar of rows with an edge to test; open rows have a difference that is not finite.
+// edges.are_coplanar; rows with a difference that is not finite remain open.
 KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
                     Ints indices, Flagged tested, double factor, double floor_fraction,
                     bool* passed, bool* open) {
@@ -471,7 +471,7 @@ KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, Floats poin
   int used = 0;
   for (int64_t q = 0; q < num_rows; q++) {
     bool is_tested = open[q] = false;
-    for (int64_t e = q * k; e < (q + 1) * k; e++) is_tested |= tested[e], passed[e] = false;
+    for (int64_t e = q * k; e < (q + 1) * k; e++) is_tested |= tested[e], passed[e] = !tested[e];
     if (is_tested) rows[used++] = q;
     if (used == 0 || (used < LANES && q + 1 < num_rows)) continue;
     float squares[LANES];
@@ -498,7 +498,7 @@ KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, Floats poin
     const Lanes limit = median_of_sorted(sorted, int(k)) + all(2) * larger(scale, floor);
     for (int l = 0; l < used; l++) {
       open[rows[l]] = !is_finite[l];
-      for (int j = 0; j < k; j++) passed[k * rows[l] + j] = residuals.at(j, l) <= limit[l];
+      for (int j = 0; j < k; j++) passed[k * rows[l] + j] |= residuals.at(j, l) <= limit[l];
     }
     used = 0;
   }

@@ -175,7 +175,7 @@ def accept_edges(
         if connect is not None and config.coplanarity_scope == "connected":
             connected = connect(cloud.neighbors.mask(rows))
         mask = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
-        joins &= ~mask | are_coplanar(cloud, rows, mask, connected, config.coplanarity_floor)
+        joins &= are_coplanar(cloud, rows, mask, connected, config.coplanarity_floor)
     if connect is not None:
         if connected is None:
             connected = connect(joins)
@@ -227,28 +227,25 @@ def within_reach(
 def are_coplanar(
     cloud: GrowingInput, rows: Rows, mask: Tensor, compared: Tensor | None, floor_fraction: float
 ) -> Tensor:
-    """Return a mask of the candidate neighbors on the point's plane, eq. (11).
+    """Return a mask of neighbors on the point's plane, eq. (11), and of those not in ``mask``.
 
     The limit is computed over the neighbors ``compared``, shape ``(n, K)``, default all. Its floor
     is a fraction of the distance to the farthest neighbor.
     """
-    near, result = cloud.neighbors.select(rows), torch.zeros_like(mask)
-    open_rows = mask.any(dim=1)
+    near, result, open_rows = cloud.neighbors.select(rows), ~mask, mask.any(dim=1)
     columns = cloud.points.T, cloud.normals.T
     is_complete = compared is None and near.valid is None
     if is_complete and kernels.serve(near.indices, *columns, k=mask.shape[1]):
         factors = QN_FACTOR, floor_fraction
         result, open_rows = kernels.call("are_coplanar", *columns, near.indices, mask, *factors)
     tested = nonzero_rows(open_rows)
-    if len(tested) == 0:
-        return result
     indices, counted = near.select(tested)
     offsets = gather_columns(cloud.points, indices)
     # |(p_j - p_i) . n_i|, below eq. (10).
     residuals = project(offsets, cloud.normals[rows][tested]).abs_()
     floor = floor_fraction * patch_radii(offsets, counted)
     limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[tested])
-    result[tested] = residuals <= limits[:, None]
+    result[tested] = (residuals <= limits[:, None]) | ~mask[tested]
     return result
 
 

@@ -216,7 +216,7 @@ def _fit_groups(
             chunk: slice, rows: Tensor = rows, whole: bool = count == num_points, count: int = count
         ) -> None:
             chosen = rows[chunk]
-            block = patches[chosen]
+            block = patches.index_select(0, chosen)
             if whole:
                 _store(out, chosen, fit(block))
                 return
@@ -245,7 +245,7 @@ def _spread(fit: RobustFit, order: Tensor, num_points: int) -> RobustFit:
 
 def _store(out: RobustFit, rows: Tensor, fit: RobustFit) -> None:
     for target, source in zip(out, fit, strict=True):
-        target[rows] = source
+        target.index_copy_(0, rows, source)
 
 
 def _fit_chunk(

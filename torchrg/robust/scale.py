@@ -4,7 +4,6 @@ The factors make the scales consistent with the standard deviation of normal dat
 """
 
 from collections.abc import Callable
-from functools import partial
 from math import comb
 from statistics import NormalDist
 from typing import Literal
@@ -16,7 +15,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_floating, check_shapes
 from torchrg._opaque import opaque
-from torchrg._parallel import CACHE_BYTES, map_chunks, map_rows
+from torchrg._parallel import CACHE_BYTES, ROWS_AT_ONCE, map_chunks
 from torchrg.errors import ShapeError
 
 MAD_FACTOR = 1.4826
@@ -307,7 +306,12 @@ def _majority_difference(sorted_rows: Tensor) -> Tensor:
     if sorted_rows.requires_grad:
         return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
-        (differences,) = map_rows(partial(kernels.call, "majority_differences"), [sorted_rows])
+
+        def find(rows: slice) -> Tensor:
+            return kernels.call("majority_differences", sorted_rows[rows])[0]
+
+        parts = map_chunks(find, len(sorted_rows), ROWS_AT_ONCE, sorted_rows.device)
+        differences = torch.cat(parts)
         infinite = differences.isnan().nonzero().squeeze(1)
         if len(infinite):
             differences[infinite] = _difference_by_lags(sorted_rows[infinite])
