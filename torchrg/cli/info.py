@@ -76,9 +76,7 @@ def describe_cloud(cloud: Cloud) -> dict[str, str]:
     facts = {"points": f"{len(cloud):,} of {cloud.coordinates.dtype}"}
     if cloud.grid_shape:
         facts["grid"] = f"{cloud.grid_shape[0]} rows x {cloud.grid_shape[1]} columns"
-    finite = cloud.coordinates
-    if not cloud.finite.all():
-        finite = finite[cloud.finite]
+    finite = cloud.coordinates if cloud.finite.all() else cloud.coordinates[cloud.finite]
     facts["not finite"] = f"{len(cloud) - len(finite):,}"
     if len(finite):
         low, high = (end.astype(finite.dtype) for end in bounding_box(finite))

@@ -298,10 +298,8 @@ def _search_cloud(
     ) -> None:
         rows = queried
         if len(positions) < len(points):
-            counts = np.diff(starts, append=len(points))
-            rows, distances, nearest = _restore_duplicates(
-                queried, distances, nearest, starts, counts, k
-            )
+            bounds = np.append(starts, len(points))
+            rows, distances, nearest = _restore_duplicates(queried, distances, nearest, bounds, k)
         if is_far is not None:
             too_far = distances > max_distance
             nearest = np.where(too_far, rows[:, None], nearest)
@@ -430,10 +428,13 @@ def _restore_duplicates(
     distances: NDArray[np.float64],
     nearest: NDArray[np.integer],
     starts: NDArray[np.int64],
-    counts: NDArray[np.int64],
     k: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-    """Expand positions to their points: query rows, and the k nearest, the point itself first."""
+    """Expand positions to their points: query rows, and the k nearest, the point itself first.
+
+    ``starts`` ``(P + 1,)`` are the first points of the positions, and the number of points.
+    """
+    counts = np.diff(starts)
     before = np.minimum(np.cumsum(counts[nearest], axis=1), k)
     taken = np.diff(before, axis=1, prepend=0).ravel()
     position = np.arange(len(nearest) * k) - np.repeat(np.cumsum(taken) - taken, taken)

@@ -52,8 +52,7 @@ def canonical_order(points: AnyCloud, ties: Sequence[Tensor] = ()) -> Tensor:
     coordinates = tensor.detach().cpu().numpy()
     if len(coordinates) == 0:
         return torch.zeros(0, dtype=torch.int64, device=tensor.device)
-    sorted_codes = sort_integers(torch.from_numpy(morton_codes(coordinates)))
-    order, codes = (part.numpy() for part in sorted_codes)
+    order, codes = map(Tensor.numpy, sort_integers(torch.from_numpy(morton_codes(coordinates))))
     is_equal = codes[1:] == codes[:-1]
     if is_equal.any():
         is_tied = np.zeros(len(order), dtype=bool)

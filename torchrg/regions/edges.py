@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import map_chunks, nonzero_rows
+from torchrg._parallel import ROWS_IN_CACHE, map_chunks, map_tasks, nonzero_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Columns, project, sq_lengths, to_column_major
 from torchrg.linalg.precision import rounded_sqrt
 from torchrg.neighbors.knn import gather_columns
 from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
-from torchrg.robust import median, qn
-from torchrg.robust.scale import QN_FACTOR
+from torchrg.robust.scale import QN_FACTOR, median, qn
 from torchrg.structures import Neighbors
 from torchrg.structures.points import Rows
 
@@ -260,14 +259,17 @@ def coplanarity_limits(residuals: Tensor, floor: Tensor, mask: Tensor | None = N
     return median(residuals, mask=mask) + 2 * scale
 
 
-def neighborhood_radii(points: Tensor, neighbors: Neighbors) -> Tensor:
-    """Return the distance of each point to its last neighbor, shape ``(N,)``."""
+def neighborhood_radii(points: Tensor, neighbors: Neighbors, rows: Tensor | None = None) -> Tensor:
+    """Return the distance of points ``rows`` ``(n,)``, default all, to their last neighbor."""
     indices, counted = neighbors
-    last = torch.full_like(indices[:, :1], indices.shape[1] - 1)
-    if counted is not None:
-        last = counted.sum(dim=1, keepdim=True, dtype=last.dtype).sub_(1).clamp_(min=0)
-    ends = torch.cat([indices[:, :1], indices.gather(1, last.long())], dim=1)
-    return patch_radii(gather_columns(points, ends))
+    rows = torch.arange(len(points), device=points.device) if rows is None else rows
+
+    def measure(rows: Tensor) -> Tensor:
+        last = -1 if counted is None else counted[rows].sum(dim=1).sub_(1).clamp_(min=0)
+        ends = torch.stack([rows, indices[rows, last].long()], dim=1)
+        return patch_radii(gather_columns(points, ends))
+
+    return torch.cat(map_tasks(measure, torch.split(rows, ROWS_IN_CACHE), points.device))
 
 
 def patch_radii(columns: Columns, mask: Tensor | None = None) -> Tensor:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks
+from torchrg._parallel import ROWS_AT_ONCE, map_tasks
 from torchrg.config import Auto, GrowingConfig
 from torchrg.linalg.moments import Segments, eigh3_lapack
 from torchrg.linalg.precision import coordinate_resolution
@@ -198,12 +198,8 @@ def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> R
     """
     segments = Segments(labels, max_points=MAX_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
-    radii = map_tasks(
-        lambda rows: neighborhood_radii(cloud.points, cloud.neighbors.select(rows)),
-        torch.split(segments.rows, ROWS_IN_CACHE),
-        labels.device,
-    )
-    radius = segments.median(torch.cat(radii)).double()
+    radii = neighborhood_radii(cloud.points, cloud.neighbors, segments.rows)
+    radius = segments.median(radii).double()
     floor = config.coplanarity_floor * radius
     facets = _FACET_THICKNESS * float(config.facet_tolerance or 0.0)
     planes = planes._replace(

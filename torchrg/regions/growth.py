@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
-from torchrg._parallel import CHUNK_SIZE, ROWS_AT_ONCE, limit_rows, map_chunks
+from torchrg._parallel import CHUNK_SIZE, limit_rows
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.linalg.moments import to_column_major
@@ -210,14 +210,8 @@ def checked_cloud(
         check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
         check_floating(caller, points=points, residual_rms=residual_rms)
         # The noise is unknown if the fit is exact.
-        radii = map_chunks(
-            lambda rows: neighborhood_radii(positions, neighbors.select(rows)),
-            len(positions),
-            ROWS_AT_ONCE,
-            positions.device,
-        )
         residual_rms = residual_rms.to(positions)
-        floor = config.coplanarity_floor * torch.cat(radii)
+        floor = config.coplanarity_floor * neighborhood_radii(positions, neighbors)
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     finite = normals.isfinite().all(dim=1) & curvature.isfinite()
     valid = finite if valid is None else finite & valid

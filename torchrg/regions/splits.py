@@ -394,7 +394,7 @@ def _measure_residuals(
 
     def work(block: slice) -> None:
         rows = segments.rows[block]
-        near = Neighbors(cloud.neighbors.select(rows).indices[:, :_NUM_AVERAGED])
+        near = Neighbors(cloud.neighbors.indices[:, :_NUM_AVERAGED]).select(rows)
         same = near.gather(narrow) == narrow[rows, None]
         average[rows] = sum_neighbors(near.gather(residual) * same) / same.sum(dim=1)
 
