@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.kernels.clouds import both, clouds, lists, needs_library
 from tests.made import make_shape
 from torchrg.errors import ConfigError
 from torchrg.neighbors import search_knn
 from torchrg.normals import estimate_normals, find_sharp_points
+from torchrg.normals.pca import fit_points_pca
 from torchrg.structures import Neighbors
 
 
@@ -113,3 +115,15 @@ def test_half_of_the_neighbors_are_no_majority_for_qn(equal, sharp):
     normals = torch.stack([angles.sin(), torch.zeros(10), angles.cos()], dim=1)
     neighbors = Neighbors(torch.arange(10)[None])
     assert find_sharp_points(normals, neighbors, rule="qn", angle_deg=5).tolist() == [sharp]
+
+
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("rule", ["qn", "percentile"])
+@pytest.mark.parametrize("k", [1, 9, 50])
+def test_sharp_points_by_kernels_are_those_of_the_definition(k, rule):
+    for points in clouds().values():
+        near = lists(points, k, masked=False)
+        normals = fit_points_pca(points, near).normals
+        normals[::7] *= -1
+        found, expected = both(find_sharp_points, normals, near, rule=rule, angle_deg=8.0)
+        assert torch.equal(found, expected)

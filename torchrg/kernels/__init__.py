@@ -46,6 +46,7 @@ SIGNATURES = {
     "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N] d[N3]",
     "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Nk] B[N] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
+    "neighbor_chords": "f[3N] i[nk] -> f[nk]",
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
     "mark_boundary": "i[N] i[Nk] b[Nk]? n n n n L[RR] B[N] -> ",
     "crossing_edges": "i[N] i[Nk] b[Nk]? i[n] n n n -> i[nk] i[nk] i[nk] l[nk] l[1]",

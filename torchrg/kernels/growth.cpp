@@ -13,6 +13,13 @@ INLINE Lanes sign_of(Lanes values) {
   return values;
 }
 
+// angles.sq_chords of one normal and eight others.
+INLINE Lanes sq_chords(float a, float b, float c, Lanes d, Lanes e, Lanes f, bool is_signed) {
+  const Lanes sign = is_signed ? all(1) : sign_of(d * a + e * b + f * c);
+  const Lanes u = d - sign * a, v = e - sign * b, w = f - sign * c;
+  return u * u + v * v + w * w;
+}
+
 // Whether values are within a limit, or the limit is disabled.
 INLINE Flags within(Lanes values, double limit) {
   return limit >= 0 ? values <= all(float(limit)) : ~Flags{};
@@ -42,9 +49,8 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
     for (int64_t j = 0; reach && j < k; j++) near[6][j] = reach[indices[j]];
     for (int64_t j = 0; j < k; j += LANES) {
       const Lanes d = load(near[3] + j), e = load(near[4] + j), f = load(near[5] + j);
-      const Lanes sign = is_signed ? all(1) : sign_of(d * a[i] + e * b[i] + f * c[i]);
-      const Lanes da = d - sign * a[i], db = e - sign * b[i], dc = f - sign * c[i];
-      Flags passed = load(passes + j) & within(da * da + db * db + dc * dc, max_sq_chord);
+      const Lanes chords = sq_chords(a[i], b[i], c[i], d, e, f, is_signed != 0);
+      Flags passed = load(passes + j) & within(chords, max_sq_chord);
       const Lanes u = load(near[0] + j) - x[i], v = load(near[1] + j) - y[i],
                   w = load(near[2] + j) - z[i];
       passed = passed & within(u * u + v * v + w * w, max_sq_distance);
@@ -55,6 +61,26 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
       __builtin_memcpy(passes + j, &passed, sizeof passed);
     }
     for (int64_t j = 0; j < k; j++) joins[j] = passes[j] != 0;
+  }
+  return DONE;
+}
+
+// paper.find_sharp_points: squared chords between the normals (3, N) of the first and all neighbors.
+KERNEL neighbor_chords(int64_t num_points, int64_t num_rows, int64_t k, Floats normals,
+                       Ints indices, float* chords) {
+  if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
+  const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
+  alignas(32) float near[3][MAX_WIDTH] = {}, found[MAX_WIDTH];
+  for (int64_t q = 0; q < num_rows; q++, indices += k, chords += k) {
+    if (!are_rows(indices, k, num_points)) return NO_SUCH_ROW;
+    for (int64_t j = 0; j < k; j++) {
+      const int32_t t = indices[j];
+      near[0][j] = a[t], near[1][j] = b[t], near[2][j] = c[t];
+    }
+    for (int64_t j = 0; j < k; j += LANES)
+      store(found + j, sq_chords(near[0][0], near[1][0], near[2][0], load(near[0] + j),
+                                 load(near[1] + j), load(near[2] + j), false));
+    for (int64_t j = 0; j < k; j++) chords[j] = found[j];
   }
   return DONE;
 }

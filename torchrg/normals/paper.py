@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchrg import kernels
 from torchrg._checks import check_shapes
 from torchrg._parallel import CHUNK_SIZE, map_chunks
 from torchrg.config import NormalsConfig
@@ -118,8 +119,11 @@ def find_sharp_points(
     def classify(block: slice) -> None:
         near = neighbors.select(block)
         counted = near.valid if valid is None else near.mask() & near.gather(valid)
-        near_columns = [near.gather(column) for column in columns]
-        chords = sq_chords([component[:, :1] for component in near_columns], near_columns)
+        if kernels.serve(near.indices, columns, k=near.indices.shape[1]):
+            (chords,) = kernels.call("neighbor_chords", columns, near.indices)
+        else:
+            near_columns = [near.gather(column) for column in columns]
+            chords = sq_chords([component[:, :1] for component in near_columns], near_columns)
         exceeds = _qn_exceeds if rule == "qn" else _percentile_exceeds
         sharp[block] = exceeds(chords, counted, angle_deg)
 
