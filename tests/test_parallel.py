@@ -16,7 +16,6 @@ import torchrg
 from torchrg._parallel import (
     limit_rows,
     map_chunks,
-    map_rows,
     map_tasks,
     nonzero_rows,
     sequential_operations,
@@ -241,13 +240,6 @@ def test_limit_rows_by_example():
 def test_map_chunks_by_example():
     assert map_chunks(lambda rows: rows.stop, 5, 3, torch.device("cpu")) == [3, 5]
     assert repr(map_chunks(lambda rows: rows, 0, 3, torch.device("cpu"))) == "[slice(0, 0, None)]"
-
-
-def test_map_rows_by_example():
-    assert (
-        repr(map_rows(lambda x, y, factor: (factor * x + y,), [torch.ones(2)] * 2, torch.tensor(3)))
-        == "[tensor([4., 4.])]"
-    )
 
 
 def test_nonzero_rows_by_example():
