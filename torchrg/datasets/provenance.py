@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Iterable
 from dataclasses import asdict
-from importlib import metadata
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ def describe_versions() -> dict[str, str]:
         "torchrg": version.__version__,
         "torch": str(torch.__version__),
         "numpy": np.__version__,
-        "scipy": metadata.version("scipy"),
+        "scipy": import_module("scipy").__version__,
         "kernels": "none" if kernels.name_of_library() is None else "C++",
     }
 

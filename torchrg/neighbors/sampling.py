@@ -98,13 +98,16 @@ def _nearest(
     ascending distances, and the positions relative to the point.
     """
     lists = np.sort(lists, axis=1)
+    is_first = np.diff(lists, axis=1, prepend=-1) > 0
+    # Lists of neighbors of neighbors repeat most points: move these to the end, and drop them.
+    order = (~is_first).argsort(axis=1, kind="stable")[:, : is_first.sum(axis=1).max(initial=0)]
+    lists = np.take_along_axis(lists, order, axis=1)
+    is_first = np.take_along_axis(is_first, order, axis=1)
     cpu = points.detach().cpu()
     centers = cpu[rows].double().numpy()
     positions = cpu[lists.ravel()].double().numpy().reshape(*lists.shape, 3) - centers[:, None]
     distances = np.sqrt((positions * positions).sum(axis=2))
-    is_duplicate = (distances == 0) & (lists != rows[:, None])
-    is_duplicate[:, 1:] |= lists[:, 1:] == lists[:, :-1]
-    distances[is_duplicate] = np.inf
+    distances[~is_first | ((distances == 0) & (lists != rows[:, None]))] = np.inf
     counts = np.isfinite(distances).sum(axis=1)
     count = min(max_count, int(np.median(counts))) if len(rows) else 0
     order = distances.argsort(axis=1, kind="stable")[counts >= count, :count]

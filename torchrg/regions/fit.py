@@ -165,7 +165,7 @@ def _fit_chunk(
     for _ in range(_NUM_FITS):
         mean, covariance = segments.moments(local, weights)
         variances, axes = eigh3_lapack(covariance)
-        normal = canonicalize_sign(_plane_normals(variances, axes, mean_normal))
+        normal = _plane_normals(variances, axes, mean_normal)
         factors = (MAD_FACTOR, BISQUARE_CUT)
         weights, median, squares = segments.reweigh(local, mean, normal, resolution, factors)
     thickness = MAD_FACTOR * median
@@ -174,7 +174,7 @@ def _fit_chunk(
     # An arc without width lies in its own plane, which does not show its thickness.
     crosses = (mean_normal * normal).sum(dim=1).abs() > math.sqrt(0.5)
     return RegionPlanes(
-        normal,
+        canonicalize_sign(normal),
         origin + mean,
         covariance,
         thickness,
