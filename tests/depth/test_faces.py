@@ -8,6 +8,7 @@ import torch
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
 from torchrg.depth.faces import join_strips
+from torchrg.depth.pixels import InverseCloud
 from torchrg.depth.windows import (
     NARROW,
     Image,
@@ -146,12 +147,13 @@ def roof(turn_deg, step=0.0):
 def join(labels, planes, normals, axes=(0, 1)):
     """Return what ``join_strips`` makes of an image, or of one turned over with its axes."""
     places = [rays()[0, :, 0], rays()[:, 0, 1]]
-    noise = torch.full((labels.numel(),), 1e-6).double()
+    noise = torch.full(labels.shape, 1e-6).double()
     count = torch.bincount(labels[labels >= 0], minlength=len(planes))
     axes = [*axes, 2]
     x, y = (places[axis] for axis in axes[:2])
     planes, normals = planes[:, axes], normals[:, axes]
-    return join_strips(labels.flatten(), (x, y), noise, planes, normals, count).view(labels.shape)
+    cloud = InverseCloud(noise, x, y, noise, labels >= 0)
+    return join_strips(cloud, labels.flatten(), planes, normals, count).view(labels.shape)
 
 
 @pytest.mark.parametrize(("turn", "step", "joins"), [(20, 0, 1), (50, 0, 0), (20, 0.05, 0)])

@@ -8,7 +8,10 @@ from tests.made import cameras_around, render_depth
 from torchrg.config import DepthConfig
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
-from torchrg.linalg.moments import Segments
+from torchrg.depth.faces import _strip_contacts
+from torchrg.depth.growth import PixelGrid, fit_inverse_planes
+from torchrg.depth.pixels import InverseCloud
+from torchrg.linalg.moments import Segments, kth_smallest
 from torchrg.regions.extents import hull_candidates
 from torchrg.scenes import build_room
 from torchrg.structures.planes import PLANE_COLUMNS
@@ -129,3 +132,62 @@ def test_rows_and_outer_points_of_regions_are_those_of_the_definition(most, rng)
     found = stages()
     with definitions():
         assert_same(found, stages())
+
+
+def image_of_regions(rng):
+    """Return a cloud of steps and slopes, and labels with strips, lines and single pixels."""
+    height, width = 45, 70
+    x, y = (torch.arange(n).double() / 100 - 0.3 for n in (width, height))
+    labels = (torch.arange(width) // 9)[None] + 8 * (torch.arange(height) // 20)[:, None]
+    labels[::7] = 3
+    labels[:, 33:36] = 24
+    labels[torch.rand(height, width, generator=rng) < 0.1] = -1
+    labels[5, 5], labels[44, 60:] = 25, 26
+    values = 1 + 0.1 * torch.rand(27, generator=rng).double()[labels] * x + 0.2 * y[:, None]
+    values += 1e-4 * torch.randn(height, width, generator=rng)
+    noise = 1e-4 * (1 + torch.rand(height, width, generator=rng).double())
+    return InverseCloud(values, x, y, noise, labels >= 0), labels
+
+
+def test_regions_of_an_image_meet_as_by_definition(rng):
+    cloud, labels = image_of_regions(rng)
+
+    def stages():
+        fit = fit_inverse_planes(cloud, labels.flatten())
+        planes = torch.randn(27, 3, generator=torch.Generator().manual_seed(1)).double() / 100
+        strips = _strip_contacts(cloud, labels.flatten(), planes, fit.num_points)
+        return [*fit, *PixelGrid(labels.shape).contacts(labels.flatten()), *strips]
+
+    found = stages()
+    assert len(found[-1]) > 20
+    assert found[1].isfinite().all()
+    with definitions():
+        assert_same(found, stages())
+
+
+def test_a_line_of_pixels_has_the_plane_of_least_slope(rng):
+    # Slopes across the line are unknown, and 0.
+    x, y = torch.arange(40).double(), torch.arange(30).double()
+    along, labels = (x + y[:, None]) / 2, torch.full((30, 40), -1)
+    labels[torch.arange(30), torch.arange(30)] = 0
+    labels[2, 10:], labels[20, 3] = 1, 2
+    seen = labels >= 0
+    fit = fit_inverse_planes(InverseCloud(along, x, y, 0 * along + 1e-3, seen), labels.flatten())
+    slopes = -fit.normal[:, :2] / fit.normal[:, 2:]
+    torch.testing.assert_close(slopes, torch.tensor([[0.5, 0.5], [0.5, 0], [0, 0]]).double())
+
+
+@pytest.mark.parametrize("kind", ["random", "periodic", "equal", "with NaN"])
+def test_a_value_of_a_rank_is_that_of_sorted_values(kind, rng):
+    values = torch.randn(5000, generator=rng)
+    if kind == "periodic":
+        values = (torch.arange(5000) % 64) * 0.1
+    elif kind == "equal":
+        values[:4990] = 0.5
+    elif kind == "with NaN":
+        values[::3] = torch.nan
+    for numbers in (values, values.double(), values[:7]):
+        expected = numbers.sort().values
+        for rank in {0, 1, len(numbers) // 2, len(numbers) - 1}:
+            found = kth_smallest(numbers, rank)
+            torch.testing.assert_close(found, expected[rank], rtol=0, atol=0, equal_nan=True)

@@ -3,14 +3,15 @@
 Strips along rounded edges join the adjacent surface; coplanar regions may meet behind an object.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
 from torchrg import kernels
 from torchrg._parallel import nonzero_rows
-from torchrg.depth.passes import has_kernels
+from torchrg.depth.passes import has_kernels, has_pair_kernels
+from torchrg.depth.pixels import InverseCloud
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
 from torchrg.regions.repair import remap_labels
@@ -39,28 +40,24 @@ _MIN_NEARER = 0.5
 may lie on it or have no depth, as in the shadow of a nearer object."""
 
 
-def boundaries(labels: Tensor, steps: Iterable[tuple[int, int]]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield, for each step in rows and columns, pairs of adjacent pixels with different labels.
+def boundaries(labels: Tensor, steps: Iterable[tuple[int, int]]) -> tuple[Tensor, Tensor]:
+    """Return the pairs of adjacent pixels with different labels, along steps in rows and columns.
 
     Both are row-major indices, ``(n,)`` each.
     """
-    # int32 is compared faster.
-    width, flat = labels.shape[1], labels.flatten().to(torch.int32)
+    width, flat, pairs = labels.shape[1], labels.flatten(), []
     for down, right in steps:
         step = down * width + right
         here = nonzero_rows(flat[: max(len(flat) - step, 0)] != flat[step:])
         column = here % width + right
         here = here[(column >= 0) & (column < width)]
-        yield here, here + step
+        pairs.append(torch.stack([here, here + step]))
+    first, second = torch.cat(pairs, dim=1)
+    return first, second
 
 
 def join_strips(
-    labels: Tensor,
-    rays: tuple[Tensor, Tensor],
-    noise: Tensor,
-    planes: Tensor,
-    normals: Tensor,
-    count: Tensor,
+    cloud: InverseCloud, labels: Tensor, planes: Tensor, normals: Tensor, count: Tensor
 ) -> Tensor:
     """Merge narrow regions into the surface that they bend away from, and return the labels.
 
@@ -71,35 +68,11 @@ def join_strips(
     region is twice its pixel count over its perimeter in pixel sides.
 
     ``labels`` ``(H * W,)`` are 0 to M-1 by descending size or :data:`torchrg.UNLABELED`, and are
-    returned unchanged if nothing is merged. The ``rays`` are x of the columns ``(W,)`` and y of the
-    rows ``(H,)``. Inverse depths are ``(x, y, 1)`` times ``planes`` ``(M, 3)``, with standard
-    deviation ``noise`` ``(H * W,)``; ``normals`` ``(M, 3)`` are in space, ``count`` ``(M,)`` are
-    pixel counts.
+    returned unchanged if nothing is merged. The last coordinates of the cloud are ``(x, y, 1)``
+    times ``planes`` ``(M, 3)``; ``normals`` ``(M, 3)`` are in space, ``count`` ``(M,)`` are pixel
+    counts.
     """
-    (x, y), num_regions, meetings = rays, len(normals), []
-    image = labels.view(len(y), len(x))
-    sides = [image[0], image[-1], image[:, 0], image[:, -1]]
-    for here, there in boundaries(image, [(1, 0), (0, 1)]):
-        pair = torch.stack([labels[here], labels[there]], dim=1)
-        sides.append(pair.flatten())
-        meets = (pair >= 0).all(dim=1)
-        here, pair = here[meets], pair[meets]
-        difference = planes[pair[:, 0]] - planes[pair[:, 1]]
-        a, b, c = difference.unbind(dim=1)
-        gap = (a * x[here % len(x)] + b * y[here // len(x)] + c).abs()
-        meetings.append((pair, difference, gap - _MAX_NOISE * noise[here]))
-    pairs, difference, gap = (torch.cat(columns) for columns in zip(*meetings, strict=True))
-    edges = torch.bincount(torch.cat(sides) + 1, minlength=num_regions + 1)[1:]
-    width = 2 * count / edges
-    pitch = torch.stack([(index[-1] - index[0]) / max(len(index) - 1, 1) for index in rays])
-    slope = (difference[:, :2] * pitch).norm(dim=1)
-    smooth = [
-        pairs[gap <= slope * (width[pairs[:, 0]] / 2).clamp(min=_MIN_REACH)],
-        pairs.flip(1)[gap <= slope * (width[pairs[:, 1]] / 2).clamp(min=_MIN_REACH)],
-    ]
-    strip, face = torch.cat(smooth).unbind(dim=1)
-    keys, contacts = torch.unique(strip * num_regions + face, return_counts=True)
-    strip, face = keys // num_regions, keys % num_regions
+    width, strip, face, contacts = _strip_contacts(cloud, labels, planes, count)
     ours, theirs = (normals[columns][:, :, None].unbind(dim=1) for columns in (strip, face))
     joins = (width[strip] < _MAX_WIDTH) & (width[strip] <= _MAX_WIDTH_RATIO * width[face])
     joins &= sq_chords(ours, theirs).squeeze(1) <= deg_to_sq_chord(_MAX_TURN_DEG)
@@ -107,16 +80,49 @@ def join_strips(
     joins &= ~torch.isin(face, strip[joins])
     if not bool(joins.any()):
         return labels
-    highest = contacts.new_zeros(num_regions)
-    highest = highest.scatter_reduce(0, strip[joins], contacts[joins], "amax")
+    highest = torch.zeros_like(count).scatter_reduce(0, strip[joins], contacts[joins], "amax")
     joins &= contacts == highest[strip]
-    unchanged = torch.arange(num_regions, device=labels.device)
-    target = torch.where(highest > 0, num_regions, unchanged)
+    unchanged = torch.arange(len(count), device=labels.device)
+    target = torch.where(highest > 0, len(count), unchanged)
     return remap_labels(labels, target.scatter_reduce(0, strip[joins], face[joins], "amin"))
 
 
+def _strip_contacts(
+    cloud: InverseCloud, labels: Tensor, planes: Tensor, count: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the widths ``(M,)`` of regions, and how often a strip meets a surface without a step.
+
+    Strips, surfaces, and the number of their sides of pixels are ``(n,)`` each.
+    """
+    _, x, y, noise, _ = cloud
+    num_regions, image = len(count), labels.view(noise.shape)
+    pitch = [float((index[-1] - index[0]) / max(len(index) - 1, 1)) for index in (x, y)]
+    if has_pair_kernels(labels, num_regions):
+        regions, limits = (planes, count), (*pitch, _MAX_NOISE, _MIN_REACH)
+        width, table = kernels.call("strip_contacts", image, x, y, noise, *regions, *limits)
+        strip, face = table.nonzero().unbind(dim=1)
+        return width, strip, face, table[strip, face]
+    here, there = boundaries(image, [(1, 0), (0, 1)])
+    pairs = torch.stack([labels[here], labels[there]], dim=1)
+    sides = torch.cat([pairs.flatten(), image[0], image[-1], image[:, 0], image[:, -1]])
+    width = 2 * count.double() / torch.bincount(sides + 1, minlength=num_regions + 1)[1:]
+    meets = (pairs >= 0).all(dim=1)
+    here, (one, two) = here[meets], pairs[meets].T
+    a, b, c = (planes[one] - planes[two]).unbind(dim=1)
+    gap = (a * x[here % len(x)] + b * y[here // len(x)] + c).abs()
+    gap -= _MAX_NOISE * noise.flatten()[here]
+    slope = ((a * pitch[0]).square() + (b * pitch[1]).square()).sqrt()
+    reach = (width / 2).clamp(min=_MIN_REACH)
+    keys = [
+        (strip * num_regions + face)[gap <= slope * reach[strip]]
+        for strip, face in ((one, two), (two, one))
+    ]
+    pair, contacts = torch.unique(torch.cat(keys), return_counts=True)
+    return width, pair // num_regions, pair % num_regions, contacts
+
+
 def hidden_contacts(
-    points: Tensor, seen: Tensor, labels: Tensor, planes: RegionPlanes, reach: Tensor
+    cloud: InverseCloud, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return pairs of coplanar regions separated only by nearer objects, and contact counts.
 
@@ -124,17 +130,16 @@ def hidden_contacts(
     no pixel between the two is behind that plane, and at least half are in front. A pixel behind a
     plane shows that the plane ends there, such as the floor between two tables of equal height.
 
-    ``points`` ``(H * W, 3)`` and ``seen`` ``(H, W)`` are from
-    :class:`torchrg.depth.growth.InverseCloud`; ``reach`` ``(M,)`` is the maximum distance of a
-    point on a plane, NaN for a curved region. The pairs are in the format of
-    :func:`torchrg.regions.repair.merge_coplanar`.
+    ``reach`` ``(M,)`` is the maximum distance of a point on a plane, NaN for a curved region. The
+    pairs are in the format of :func:`torchrg.regions.repair.merge_coplanar`.
     """
     pairs, tables = _aligned_pairs(planes), (planes.normal, planes.center, reach)
-    if has_kernels(points):
-        image = points.T, seen, labels.view(seen.shape)
+    seen = cloud.seen
+    if has_kernels(cloud.values):
+        image = *cloud[:3], seen, labels.view(seen.shape)
         (lines, *_) = kernels.call("count_lines", *image, *tables, pairs, _STRIDE, _MIN_NEARER)
     else:
-        pixels = points.view(*seen.shape, 3), seen, labels.view(seen.shape)
+        pixels = cloud.points.view(*seen.shape, 3), seen, labels.view(seen.shape)
         rows = [values[::_STRIDE] for values in pixels]
         columns = [values[:, ::_STRIDE].transpose(0, 1) for values in pixels]
         lines = pairs.new_tensor(

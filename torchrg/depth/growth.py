@@ -1,7 +1,5 @@
 """Region growing in depth images, with boundary assignment, merging and creases."""
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -10,7 +8,8 @@ from torchrg import kernels
 from torchrg._parallel import map_tasks
 from torchrg.config import DepthConfig
 from torchrg.depth.faces import boundaries, hidden_contacts, join_strips
-from torchrg.depth.passes import has_kernels
+from torchrg.depth.passes import has_kernels, has_pair_kernels
+from torchrg.depth.pixels import InverseCloud
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MAX_FITTED, RegionPlanes
 from torchrg.regions.growth import rank_by_size
@@ -35,23 +34,13 @@ _MAX_BEND = 0.03
 slightly bent surface is one plane; a column is 0.4 of its extent thick."""
 _NUM_FITS = 2
 """Fits of a region's plane, a plain and a reweighted one: its pixels are already near the plane."""
+_MIN_SPREAD = 1e-12
+"""Minimum determinant of the covariance of a region's pixels, as a fraction of its squared trace.
+Below it they are on a line up to rounding, and have 1e-7 if one of a thousand is off it."""
 _MAX_MOVES = 16
 """Maximum displacement of a boundary, in pixels: windows hardly reach farther from their center."""
 _MIN_COSINE = 0.85
 """Minimum cosine of the angle between a step perpendicular to a crease and one that counts."""
-
-
-class InverseCloud(NamedTuple):
-    """A depth image as a cloud in which planes stay planes and noise does not depend on depth.
-
-    Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
-    the median depth ``c``: a projective map of space. ``points`` ``(H * W, 3)`` are float64, in
-    columns; ``noise`` ``(H * W,)`` is that of the last coordinate; ``seen`` ``(H, W)`` masks depth.
-    """
-
-    points: Tensor
-    noise: Tensor
-    seen: Tensor
 
 
 def grow_pixels(
@@ -69,7 +58,7 @@ def grow_pixels(
     """
     labels = rank_by_size(connect_pixels(flat, *joins), config.min_size)
     if not bool((labels >= 0).any()):
-        return labels, cloud.points.new_empty(0, 3), flat.new_empty(0)
+        return labels, cloud.values.new_empty(0, 3), flat.new_empty(0)
     labels, fit = _refine(cloud, labels, config)
     return labels, _normals_in_space(fit), fit.curved
 
@@ -119,19 +108,18 @@ class PixelGrid:
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of adjacent regions, and the number of contacts of each pair."""
-        first, second = (labels[pixels] for pixels in self.boundaries(labels))
-        num_regions = int(labels.max()) + 1
-        keys = torch.minimum(first, second) * num_regions + torch.maximum(first, second)
+        num_regions, image = int(labels.max()) + 1, labels.view(self.height, self.width)
+        if has_pair_kernels(labels, num_regions):
+            table = labels.new_empty(num_regions, num_regions)
+            kernels.call("count_contacts", image, table)
+            pairs = table.nonzero()
+            return pairs, 2 * table[pairs[:, 0], pairs[:, 1]]
+        ends = torch.stack([labels[pixels] for pixels in boundaries(image, _FORWARD_STEPS)])
+        first, second = ends.sort(dim=0).values
+        keys = (first * num_regions + second)[first >= 0]
         keys, counts = torch.unique(keys, return_counts=True)
         # Contacts are symmetric.
         return torch.stack([keys // num_regions, keys % num_regions], dim=1), 2 * counts
-
-    def boundaries(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pairs of adjacent pixels of two regions, each once."""
-        pairs = boundaries(labels.view(self.height, self.width), _FORWARD_STEPS)
-        first, second = (torch.cat(ends) for ends in zip(*pairs, strict=True))
-        adjacent = (labels[first] >= 0) & (labels[second] >= 0)
-        return first[adjacent], second[adjacent]
 
 
 def _refine(
@@ -148,15 +136,14 @@ def _refine(
         planes = fit_inverse_planes(cloud, labels)
         reach = planes.scale_thickness(_ASSIGN_REACH)
         labels = assign_unlabeled_pixels(cloud, labels, planes, reach)
-        hidden = hidden_contacts(cloud.points, cloud.seen, labels, planes, reach)
+        hidden = hidden_contacts(cloud, labels, planes, reach)
         pairs = zip(grid.contacts(labels), hidden, strict=True)
         contacts, counts = (torch.cat(ends) for ends in pairs)
         merged = merge_coplanar(labels, (contacts, counts), planes, tolerance=_MERGE_TOLERANCE)
         labels = rank_by_size(merged, config.min_size)
     planes = fit_inverse_planes(cloud, labels)
-    width, (x, y, _) = cloud.seen.shape[1], cloud.points.unbind(dim=1)
     tables = _ray_planes(planes), _normals_in_space(planes), planes.num_points
-    joined = join_strips(labels, (x[:width], y[::width]), cloud.noise, *tables)
+    joined = join_strips(cloud, labels, *tables)
     if joined is not labels:
         labels = rank_by_size(joined, config.min_size)
         planes = fit_inverse_planes(cloud, labels)
@@ -171,13 +158,12 @@ def assign_unlabeled_pixels(
 ) -> Tensor:
     """Apply :func:`torchrg.regions.repair.assign_unlabeled` to the pixels of an image."""
     seen = cloud.seen
-    if not has_kernels(cloud.points):
+    if not has_kernels(cloud.values):
         grid = PixelGrid(seen.shape)
         return assign_unlabeled(cloud.points, labels, grid, planes, reach, valid=seen.flatten())
     image = labels.view(seen.shape).clone()
-    buffers = [torch.empty_like(image) for _ in range(3)]
     tables = planes.normal, planes.center, reach
-    kernels.call("assign_unlabeled_pixels", cloud.points.T, seen, image, *tables, *buffers)
+    kernels.call("assign_unlabeled_pixels", *cloud[:3], seen, image, *tables)
     return image.flatten()
 
 
@@ -187,38 +173,39 @@ def _ray_planes(fit: RegionPlanes) -> Tensor:
     return torch.cat([-fit.normal[:, :2], offset], dim=1) / fit.normal[:, 2:]
 
 
-def fit_inverse_planes(
-    cloud: InverseCloud, labels: Tensor, *, max_pixels: int = MAX_FITTED
-) -> RegionPlanes:
+def fit_inverse_planes(cloud: InverseCloud, labels: Tensor) -> RegionPlanes:
     """Fit planes to regions by least squares along the last coordinate, the only noisy one.
 
     A second fit uses Tukey's bisquare weights, as in :func:`torchrg.regions.fit.fit_planes`. The
     thickness, along the normals, is at least the mean noise of the region. Regions thicker than
-    noise and a slight bend explain are curved. Each fit uses up to ``max_pixels`` evenly spaced
-    pixels per region.
+    noise and a slight bend explain are curved. Each fit uses up to 4096 evenly spaced pixels
+    per region.
     """
-    chunks = Segments(labels, max_points=max_pixels).chunks(len(labels) + 1)
+    chunks = Segments(labels, max_points=MAX_FITTED).chunks(len(labels) + 1)
     parts = map_tasks(lambda chunk: _fit_chunk(cloud, chunk), chunks, labels.device)
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _fit_chunk(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
     """Fit planes to one chunk of regions; see :func:`fit_inverse_planes`."""
-    noise = segments.mean(segments.gather(cloud.noise))
-    columns = segments.gather_columns(cloud.points)
-    weights = torch.ones_like(columns[0])
-    for _ in range(_NUM_FITS):
-        center, covariance = segments.moments(columns, weights)
-        inverse = torch.linalg.pinv(covariance[:, :2, :2], hermitian=True)
-        slopes = (inverse @ covariance[:, :2, 2:]).squeeze(2)
-        normal = torch.cat([-slopes, torch.ones_like(slopes[:, :1])], dim=1)
-        factors = (MAD_FACTOR, BISQUARE_CUT)
-        weights, median, squares = segments.reweigh(columns, center, normal, noise, factors)
+    fits = _NUM_FITS, MAD_FACTOR, BISQUARE_CUT
+    if segments.are_served(cloud.values):
+        rows = segments.rows, segments.counts
+        _, *measured = kernels.call("fit_pixel_regions", *cloud[:4], *rows, *fits, _MIN_SPREAD)
+        center, covariance, normal, noise, median, squares = measured
+    else:
+        noise = segments.mean(segments.gather(cloud.noise.flatten()))
+        columns = segments.gather_columns(cloud.points)
+        weights = torch.ones_like(columns[0])
+        for _ in range(_NUM_FITS):
+            center, covariance = segments.moments(columns, weights)
+            normal = _fit_slopes(covariance)
+            weights, median, squares = segments.reweigh(columns, center, normal, noise, fits[1:])
     thickness = MAD_FACTOR * median
     length = normal.norm(dim=1, keepdim=True)
     # For a plane at distance d from the camera, w is the cosine along a ray over d.
     offset = (normal * center).sum(dim=1, keepdim=True)
-    nearness = torch.cat([slopes, offset], dim=1).norm(dim=1)
+    nearness = torch.cat([normal[:, :2], offset], dim=1).norm(dim=1)
     extent = torch.linalg.eigvalsh(covariance[:, :2, :2])[:, 0].clamp(min=0).sqrt()
     return RegionPlanes(
         normal / length,
@@ -233,6 +220,18 @@ def _fit_chunk(cloud: InverseCloud, segments: Segments) -> RegionPlanes:
         bent=torch.zeros_like(noise, dtype=torch.bool),
         radius=torch.zeros_like(noise),
     )
+
+
+def _fit_slopes(covariance: Tensor) -> Tensor:
+    """Return normals ``(-u, -v, 1)`` of least squares ``(M, 3)``; the flattest along a line."""
+    a, b, c, p, q = covariance[:, [0, 0, 1, 0, 1], [0, 1, 1, 2, 2]].unbind(dim=1)
+    determinant, square = a * c - b * b, (a + c) * (a + c)
+    is_full = determinant > _MIN_SPREAD * square
+    # The pseudoinverse of a matrix of rank one is the matrix over its squared trace.
+    a, b, c = torch.where(is_full, torch.stack([c, -b, a]), torch.stack([a, b, c]))
+    divisor = torch.where(is_full, determinant, torch.where(square > 0, square, 1.0))
+    slopes = [-((a * p + b * q) / divisor), -((b * p + c * q) / divisor), torch.ones_like(p)]
+    return torch.stack(slopes, dim=1)
 
 
 def move_to_creases(
@@ -250,17 +249,15 @@ def move_to_creases(
     """
     planes, middles = _ray_planes(fit), fit.center[:, :2]
     labels = labels.clone()
-    if has_kernels(cloud.points):
+    if has_kernels(cloud.values):
         image = labels.view(cloud.seen.shape)
-        buffers = [torch.empty_like(image) for _ in range(3)]
-        limits = _MAX_MOVES, _MIN_COSINE
-        kernels.call(
-            "move_to_creases", cloud.points.T, image, planes, middles, reach, *limits, *buffers
-        )
+        tables, limits = (planes, middles, reach), (_MAX_MOVES, _MIN_COSINE)
+        kernels.call("move_to_creases", *cloud[:3], image, *tables, *limits)
         return labels
     grid = PixelGrid(cloud.seen.shape)
-    rows = torch.unique(torch.cat(grid.boundaries(labels)))
+    rows = torch.unique(torch.cat(boundaries(labels.view(cloud.seen.shape), _FORWARD_STEPS)))
     for _ in range(_MAX_MOVES):
+        rows = rows[labels[rows] >= 0]
         near_rows = grid.neighbor_rows(rows)
         regions = _crease_regions(cloud, labels, planes, middles, reach, rows, near_rows)
         moved = regions != labels[rows]
@@ -268,7 +265,6 @@ def move_to_creases(
             break
         labels[rows[moved]] = regions[moved]
         rows = torch.unique(torch.cat([rows[moved], near_rows[moved].flatten()]))
-        rows = rows[labels[rows] >= 0]
     return labels
 
 

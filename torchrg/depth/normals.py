@@ -1,13 +1,13 @@
 """Plane of each depth pixel, from the largest flat window around it."""
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg._parallel import map_tasks, nonzero_rows
+from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels, pass_over_rows
 from torchrg.depth.windows import (
     CELL_SIZES,
@@ -132,15 +132,16 @@ def fit_pixels(
         Biomedical Images, 1976.
     """
     squares = fit_windows(image)
-    noises, jitter = _measure_noise(squares, noise, dtype)
+    noises = noise_by_size(squares, noise, dtype)
+    jitter = find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)
     window = torch.arange(image.seen.numel(), device=image.seen.device).view(image.seen.shape)
     choice = Choice(window, torch.zeros_like(image.seen), torch.zeros_like(image.seen))
     first = sum(math.prod(table.shape[1:]) for table in squares.values())
     num_squares = first
     for size in CELL_SIZES:
         quarters = size // 2 if size // 2 in squares else None
-        rate_windows(squares, size, noises, focal, quarters=quarters)
-    for size in CELL_SIZES:
+        masks = (image.seen, choice.flat) if size == 1 else (None, None)
+        rate_windows(squares, size, noises, focal, masks, quarters=quarters)
         first -= math.prod(squares[size].shape[1:])
         offer_windows(choice, image, squares[size], size, first)
     pixels = nonzero_rows(image.seen & ~choice.flat)
@@ -157,24 +158,12 @@ def fit_pixels(
     return PixelPlanes(choice, squares, narrow, pixels, noises[CELL_SIZES[0]])
 
 
-def _measure_noise(
-    squares: Mapping[int, Tensor], noise: tuple[float, float] | None, dtype: torch.dtype
-) -> tuple[dict[int, WindowNoise], float]:
-    """Return the noise of windows of each size and the jitter of rays, measured in threads."""
-    steep = squares[_STEEP_SIZE]
-    tasks: list[Callable[[], Any]] = [
-        lambda: noise_by_size(squares, noise, dtype),
-        lambda: find_jitter(steep, _STEEP_SIZE),
-    ]
-    noises, jitter = map_tasks(lambda task: task(), tasks, steep.device)
-    return noises, jitter
-
-
 def rate_windows(
     tables: Mapping[int, Tensor],
     size: int,
     noises: Mapping[int, WindowNoise],
     focal: tuple[float, float],
+    masks: tuple[Tensor | None, Tensor | None] = (None, None),
     *,
     quarters: int | None = None,
     jitter: float = 0.0,
@@ -184,13 +173,14 @@ def rate_windows(
     A bend is a fraction of half a window's side on the surface. On a plane at distance d from the
     camera, a pixel at depth z is up to ``z^2 / (f d)`` long. A deviation e of inverse depth equals
     a distance of ``d z e`` to the plane. Windows that deviate by more than their ``quarters``, the
-    windows of half the size, are not flat.
+    windows of half the size, are not flat. With ``masks`` of seen pixels and of pixels in flat
+    windows, kernels skip windows that contain no other seen pixel; their limits are undefined.
     """
     table, noise, half = tables[size], noises[size], SIDE * size / 2 / max(map(abs, focal))
     if has_kernels(table):
         finer = tables[size][0, :0] if quarters is None else tables[quarters][3]
         parameters = *noise, noises[quarters or size].factor, *focal, half, jitter
-        pass_over_rows("rate_windows", table.shape[1], table, finer, *parameters, size)
+        pass_over_rows("rate_windows", table.shape[1], table, finer, *masks, *parameters, size)
         return
     u_slope, v_slope, origin, deviation, mean = table[:NUM_PLANE]
     sq_blur = jitter * jitter * (u_slope.square() + v_slope.square())

@@ -36,6 +36,28 @@ class Pixels(NamedTuple):
     down: Tensor
 
 
+class InverseCloud(NamedTuple):
+    """A depth image as a cloud in which planes stay planes and noise does not depend on depth.
+
+    Its coordinates are the slopes of the ray and the inverse depth, ``(x / z, y / z, c / z)`` with
+    the median depth ``c``: a projective map of space. ``values`` ``(H, W)`` are the last coordinate
+    and ``noise`` is its noise, ``x`` ``(W,)`` and ``y`` ``(H,)`` are slopes, in float64; ``seen``
+    masks depth.
+    """
+
+    values: Tensor
+    x: Tensor
+    y: Tensor
+    noise: Tensor
+    seen: Tensor
+
+    @property
+    def points(self) -> Tensor:
+        """All points ``(H * W, 3)``."""
+        rays = self.x.expand_as(self.values), self.y[:, None].expand_as(self.values)
+        return torch.stack([column.flatten() for column in (*rays, self.values)]).T
+
+
 def describe_pixels(
     image: Image, planes: PixelPlanes, focal: tuple[float, float], config: DepthConfig
 ) -> Pixels:

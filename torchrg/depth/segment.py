@@ -11,9 +11,9 @@ from torchrg._checks import as_tensor, check_choices, check_shapes, eager_only
 from torchrg._parallel import nonzero_rows
 from torchrg.config import DepthConfig, SelectionConfig, settings_of
 from torchrg.depth.camera import check_view, read_intrinsics
-from torchrg.depth.growth import InverseCloud, grow_pixels
+from torchrg.depth.growth import grow_pixels
 from torchrg.depth.normals import fit_pixels
-from torchrg.depth.pixels import Pixels, describe_pixels
+from torchrg.depth.pixels import InverseCloud, describe_pixels
 from torchrg.depth.values import DepthKind, convert_depth, drop_channel
 from torchrg.depth.windows import Image
 from torchrg.linalg.angles import unit_direction
@@ -105,14 +105,6 @@ def _segment(
     depth: Tensor, intrinsics: Tensor, config: DepthConfig, pose: Tensor | None, orient: Orientation
 ) -> Segmentation:
     """Implement :func:`segment_depth`."""
-    if depth.numel() == 0:
-        pixel = _segment(depth.new_zeros(1, 1), intrinsics, config, pose, orient)
-        images: dict[str, Any] = {
-            name: image.new_zeros(*depth.shape, *image.shape[2:])
-            for name, image in vars(pixel).items()
-            if isinstance(image, Tensor)
-        }
-        return replace(pixel, **images)
     if config.max_depth is not None:
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = depth > 0
@@ -125,19 +117,23 @@ def _segment(
     pixels = describe_pixels(image, planes, (fx, fy), config)
     joins, flat, edge = (pixels.right, pixels.down), *planes.choice[1:]
     del planes
-    cloud = _inverse_cloud(image, pixels, x, y)
+    num_seen = int(seen.count_nonzero())
+    # Pixels without depth have inverse depth 0, which is less than that of others.
+    middle = seen.numel() - num_seen + (num_seen - 1) // 2
+    unit = kth_smallest(inverse.flatten(), middle) if num_seen else 1.0
+    cloud = InverseCloud(inverse / unit, x, y, pixels.noise / unit, seen)
     labels, plane_normals, curved = grow_pixels(cloud, flat, joins, config)
     normals, valid = pixels.normals.view(-1, 3), pixels.valid
     # A boundary pixel without a flat window has no normal; use the region's.
-    boundary = (~flat.flatten() & (labels >= 0)).nonzero().squeeze(1)
+    boundary = nonzero_rows((labels >= 0) & ~flat.flatten())
     boundary = boundary[~curved[labels[boundary]]]
     normals[boundary] = plane_normals[labels[boundary]]
     valid.view(-1)[boundary] = True
     if pose is not None:
         pose = pose.to(normals)
         normals, plane_normals = normals @ pose[:3, :3].T, plane_normals @ pose[:3, :3].T
-    # The table is measured later, even if images change by then.
-    depth, numbers = depth.clone(), labels.clone()
+    # The table is measured later, even if labels change by then.
+    numbers = labels.clone()
 
     def locate() -> Tensor:
         z = torch.where(seen, depth.double(), 1.0)
@@ -165,13 +161,3 @@ def _segment(
         valid,
         cast(Planes, Deferred(measure)),
     )
-
-
-def _inverse_cloud(image: Image, pixels: Pixels, x: Tensor, y: Tensor) -> InverseCloud:
-    """Return the image as the cloud for region growing, from the rays ``(x, y, 1)``."""
-    inverse, seen = image.values, image.seen
-    values = inverse.flatten()[nonzero_rows(seen)]
-    unit = kth_smallest(values, (len(values) - 1) // 2) if len(values) else inverse.new_ones(())
-    columns = [x.expand_as(inverse), y[:, None].expand_as(inverse), inverse / unit]
-    points = torch.stack([column.flatten() for column in columns]).T
-    return InverseCloud(points, (pixels.noise / unit).flatten(), seen)

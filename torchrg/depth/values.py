@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import check_choices, check_floating
+from torchrg._parallel import nonzero_rows
 from torchrg.errors import ConfigError, DepthWarning, warn
 from torchrg.structures.points import Array
 
@@ -28,10 +29,10 @@ def has_depth(depth: Tensor) -> Tensor:
 
     Depth is finite and positive; the largest integer of its type and of 16 bits mean none.
     """
-    largest, values = _MAX_16_BIT, depth
-    if not depth.is_floating_point():
-        largest, values = float(torch.iinfo(depth.dtype).max), depth.double()
-    return values.isfinite() & (values > 0) & (values != _MAX_16_BIT) & (values != largest)
+    if depth.is_floating_point():
+        return (depth > 0) & (depth < torch.inf) & (depth != _MAX_16_BIT)
+    values, largest = depth.double(), float(torch.iinfo(depth.dtype).max)
+    return (values > 0) & (values != _MAX_16_BIT) & (values != largest)
 
 
 def drop_channel(image: Image) -> Image:
@@ -66,16 +67,19 @@ def convert_depth(
     check_conversion(caller, depth_scale, depth_kind)
     if stored.dtype == torch.bool or stored.is_floating_point() or stored.is_complex():
         check_floating(caller, depth=stored)
-    meters = torch.where(has_depth(stored), stored.double(), 0.0) / depth_scale
+    exact = depth_scale == 1 and stored.is_floating_point()
+    values = stored if exact else stored.double() / depth_scale
+    meters = torch.where(has_depth(stored), values, 0.0)
     if depth_kind == "ray" and intrinsics is not None:
         from kornia.geometry.depth import depth_to_3d_v2
 
-        images = meters.reshape(-1, *meters.shape[-2:])
-        cameras = intrinsics.to(meters).reshape(-1, 3, 3)
+        images = meters.reshape(-1, *meters.shape[-2:]).double()
+        cameras = intrinsics.to(images).reshape(-1, 3, 3)
         points = depth_to_3d_v2(images, cameras, normalize_points=True)
         meters = points[..., 2].reshape(meters.shape)
-    valid = meters[meters > 0]
-    median = float(valid[:: len(valid) // _SAMPLED + 1].median()) if len(valid) else 1.0
+    valid = nonzero_rows(meters > 0)
+    sample = meters.flatten()[valid[:: len(valid) // _SAMPLED + 1]]
+    median = float(sample.median()) if len(sample) else 1.0
     if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:
         warn(
             f"{caller}: expected a median depth of {_MIN_MEDIAN_DEPTH} to {_MAX_MEDIAN_DEPTH:g} m, "

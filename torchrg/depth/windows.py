@@ -4,7 +4,7 @@ Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Win
 apart, so that all large ones together cost less than the smallest.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -90,14 +90,14 @@ def fit_windows(image: Image) -> dict[int, Tensor]:
     the plane fields filled in; they are contiguous in memory.
     """
     values, seen, u, v = image
-    shapes = [seen.shape]
+    shapes, columns = [seen.shape], len(Windows._fields)
     for _ in CELL_SIZES[1:]:
         shapes.append(torch.Size(-(-length // 2) for length in shapes[-1]))
-    sizes = sorted(CELL_SIZES)
-    flat = values.new_empty(len(Windows._fields) * sum(shape.numel() for shape in shapes))
-    parts = torch.split(flat, [len(Windows._fields) * shape.numel() for shape in shapes])
+    parts = [columns * shape.numel() for shape in shapes]
+    flat = torch.split(values.new_empty(sum(parts)), parts)
     tables = {
-        size: part.view(-1, *shape) for size, part, shape in zip(sizes, parts, shapes, strict=True)
+        size: part.view(columns, *shape)
+        for size, part, shape in zip(sorted(CELL_SIZES), flat, shapes, strict=True)
     }
     if not has_kernels(values):
         ones = seen.to(values.dtype)
@@ -238,11 +238,12 @@ def noise_by_size(
     if noise is not None:
         constant, growth = noise
         return dict.fromkeys(tables, WindowNoise(1.0, constant, growth, rounding))
-    windows = {size: _sample_windows(tables[size], size) for size in sorted(tables)}
+    names = "deviation", "mean"
+    windows = {size: _sample_windows(tables[size], size, *names) for size in sorted(tables)}
     middle = windows[sorted(windows)[len(windows) // 2 - 1]]
     shape = WindowNoise(1.0, *_fit_noise(middle, rounding), rounding)
     noises, factor = {}, 0.0
-    for size, (*_, deviation, mean) in windows.items():
+    for size, (deviation, mean) in windows.items():
         ratios = torch.maximum(deviation, rounding * mean) / shape.evaluate(mean)
         typical = float(_low_quantile(ratios)) if len(ratios) else factor
         factor = typical if factor == 0 else min(max(typical, factor), _MAX_GROWTH * factor)
@@ -250,14 +251,15 @@ def noise_by_size(
     return noises
 
 
-def _sample_windows(table: Tensor, size: int) -> Tensor:
-    """Return the planes ``(5, n)`` of valid windows four pixels or a cell apart.
+def _sample_windows(table: Tensor, size: int, *names: str) -> list[Tensor]:
+    """Return columns ``(n,)`` of valid windows four pixels or a cell apart, by name.
 
     The input is a table ``(9, h, w)`` of windows of one size.
     """
     step = max(_SAMPLE_STRIDE // size, 1)
-    planes = table[:NUM_PLANE, ::step, ::step].flatten(1)
-    return planes.index_select(1, nonzero_rows(planes[3].isfinite()))
+    windows = Windows(*table[:, ::step, ::step])
+    valid = nonzero_rows(windows.deviation < torch.inf)
+    return [getattr(windows, name).flatten()[valid] for name in names]
 
 
 def find_jitter(table: Tensor, size: int) -> float:
@@ -268,7 +270,7 @@ def find_jitter(table: Tensor, size: int) -> float:
     bins, the one with the smallest deviation of flat windows counts. ``table`` ``(9, h, w)``
     contains windows of one size.
     """
-    u_slope, v_slope, _, deviation, _ = _sample_windows(table, size)
+    u_slope, v_slope, deviation = _sample_windows(table, size, "u_slope", "v_slope", "deviation")
     slope, order = torch.hypot(u_slope, v_slope).sort()
     is_steep = slope > 0
     ratio = deviation[order][is_steep] / slope[is_steep]
@@ -281,15 +283,15 @@ def _low_quantile(values: Tensor) -> Tensor:
     return kth_smallest(values, int(_FLAT_QUANTILE * (len(values) - 1)))
 
 
-def _fit_noise(planes: Tensor, rounding: float) -> tuple[float, float]:
-    """Fit nonnegative ``b + a w^2`` to the deviations of flat windows; return a and b."""
-    mean, order = planes[4].sort()
-    deviation = torch.maximum(planes[3][order], rounding * mean)
-    bins = [rows for rows in torch.arange(len(order)).tensor_split(_NUM_BINS) if len(rows)]
-    if not bins:
+def _fit_noise(columns: Sequence[Tensor], rounding: float) -> tuple[float, float]:
+    """Fit nonnegative ``b + a w^2`` to deviations at means ``(n,)`` of windows; return a and b."""
+    if len(columns[0]) == 0:
         return 0.0, 0.0
-    x = torch.stack([mean[rows].square().mean() for rows in bins])
-    q = torch.stack([_low_quantile(deviation[rows]) for rows in bins])
+    mean, order = columns[1].sort()
+    deviation = torch.maximum(columns[0][order], rounding * mean)
+    num_bins = min(_NUM_BINS, len(mean))
+    x = torch.stack([part.square().mean() for part in mean.tensor_split(num_bins)])
+    q = torch.stack([_low_quantile(part) for part in deviation.tensor_split(num_bins)])
     # Relative errors: a bin with only cluttered windows has little weight.
     p, e = x / q, 1 / q
     spread = (p * p).sum() * (e * e).sum() - (p * e).sum() ** 2

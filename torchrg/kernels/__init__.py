@@ -13,7 +13,7 @@ import math
 import os
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -64,7 +64,7 @@ SIGNATURES = {
     "neighbor_quantiles": "f[Nc] i[nk] b[nk]? x n -> f[nc]",
     "fit_pixel_windows": "d[hw] b[hw] d[w] d[h] D[5hw] D[mpq] x x n n -> ",
     "fit_cell_windows": "d[mhw] D[5hw] D[mpq] x x n n -> ",
-    "rate_windows": "D[9hw] d[pq] x x x x x x x x x n n n -> ",
+    "rate_windows": "D[9hw] d[pq] b[hw]? b[hw]? x x x x x x x x x n n n -> ",
     "offer_windows": "d[hw] b[hw] d[w] d[h] d[9pq] L[hw] B[hw] B[hw] n n n n -> ",
     "fit_narrow_windows": "d[hw] d[w] d[h] l[hw] l[n] x x D[52n] n n -> ",
     "choose_narrow": "d[hw] d[w] d[h] l[hw] l[n] d[92n] L[n] B[n] n n -> ",
@@ -76,10 +76,15 @@ SIGNATURES = {
     "segment_coordinates_double": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
+    "kth_value": "d[n] n -> d[1] d[n]",
+    "fit_pixel_regions": "d[hw] d[w] d[h] d[hw] l[n] l[M] n x x x -> d[4n] d[M3] d[M33] d[M3] d[M] "
+    "d[M] d[M]",
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",
-    "assign_unlabeled_pixels": "d[3P] b[hw] L[hw] d[M3] d[M3] d[M] L[hw] L[hw] L[hw] -> ",
-    "move_to_creases": "d[3P] L[hw] d[M3] d[M2] d[M] n x L[hw] L[hw] L[hw] -> ",
-    "count_lines": "d[3P] b[hw] l[hw] d[M3] d[M3] d[M] l[p2] n x -> l[p] l[M] l[M]",
+    "assign_unlabeled_pixels": "d[hw] d[w] d[h] b[hw] L[hw] d[M3] d[M3] d[M] -> l[hw] l[hw] l[hw]",
+    "move_to_creases": "d[hw] d[w] d[h] L[hw] d[M3] d[M2] d[M] n x -> l[hw] l[hw] l[hw]",
+    "count_contacts": "l[hw] L[MM] -> ",
+    "strip_contacts": "l[hw] d[w] d[h] d[hw] d[M3] l[M] x x x x -> d[M] l[MM]",
+    "count_lines": "d[hw] d[w] d[h] b[hw] l[hw] d[M3] d[M3] d[M] l[p2] n x -> l[p] l[M] l[M]",
 }
 """Arguments and results of each kernel.
 
@@ -96,6 +101,8 @@ _DTYPES = {
     "b": torch.bool,
 }
 """Dtypes by their letters in a signature."""
+_FIXED = {str(length): length for length in range(10)}
+"""Lengths of axes that a signature fixes."""
 
 
 def name_of_library() -> str | None:
@@ -133,80 +140,73 @@ def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
         ValueError: If the arguments do not match :data:`SIGNATURES`.
         IndexError: If a neighbor index is out of range.
     """
-    signature, library = _signature(name), _library()
-    if library is None or len(arguments) != len(signature.inputs):
-        raise ValueError(f"{name}: expected {len(signature.inputs)} arguments and a library.")
-    lengths: dict[str, int] = {}
+    (inputs, outputs), library = _signature(name), _library()
+    if library is None or len(arguments) != len(inputs):
+        raise ValueError(f"{name}: expected {len(inputs)} arguments and a library.")
+    lengths = _FIXED.copy()
     taken: list[Tensor | float | None] = []
-    for argument, kind in zip(arguments, signature.inputs, strict=True):
+    for argument, kind in zip(arguments, inputs, strict=True):
         taken.append(kind.check(name, argument, lengths))
-    outputs = tuple(kind.allocate(lengths) for kind in signature.outputs)
-    passed: list[object] = [ctypes.c_int64(length) for length in lengths.values()]
-    passed += [_pass(value) for value in (*taken, *outputs)]
-    status = getattr(library, name)(*passed)
+    # Separate lengths are parsed faster than a list.
+    found = tuple(
+        torch.empty(*[lengths[axis] for axis in kind.axes], dtype=kind.dtype, device="cpu")
+        for kind in outputs
+    )
+    passed = [v.data_ptr() if isinstance(v, Tensor) else v for v in (*taken, *found)]
+    status = getattr(library, name)(*list(lengths.values())[len(_FIXED) :], *passed)
     if status == 1:
         raise IndexError(f"{name}: expected neighbor indices of existing rows, got others.")
     if status:
         raise ValueError(f"{name}: expected rows of 1 to {MAX_NEIGHBORS} values, got {lengths}.")
-    return outputs
+    return found
 
 
 class _Argument(NamedTuple):
-    """Argument in a signature: dtype, axes, and whether it is optional."""
+    """Argument in a signature: its letter, axes, dtype, and whether it is optional."""
 
-    dtype: str
+    letter: str
     axes: str
+    dtype: torch.dtype | None
     optional: bool
 
     def check(
         self, name: str, value: Tensor | float | None, lengths: dict[str, int]
     ) -> Tensor | float | None:
         """Return the argument as contiguous; record and check the lengths of its axes."""
-        if not self.axes and not self.optional and self.dtype in "nx":
-            if isinstance(value, int | float):  # bool is one
-                return int(value) if self.dtype == "n" else float(value)
-        elif isinstance(value, Tensor) and value.dtype == _DTYPES[self.dtype.lower()]:
-            if value.dim() == len(self.axes) and value.device.type == "cpu":
-                agrees = [
-                    length == (int(axis) if axis.isdigit() else lengths.setdefault(axis, length))
-                    for axis, length in zip(self.axes, value.shape, strict=True)
-                ]
-                if all(agrees) and (self.dtype.islower() or value.is_contiguous()):
+        if isinstance(value, Tensor):
+            if value.dtype is self.dtype and value.dim() == len(self.axes) and value.is_cpu:
+                agrees = True
+                for axis, length in zip(self.axes, value.shape, strict=True):
+                    agrees &= lengths.setdefault(axis, length) == length
+                if agrees and (self.letter.islower() or value.is_contiguous()):
                     return value.contiguous()
         elif value is None and self.optional:
             return None
+        elif value is not None and self.dtype is None:
+            return int(value) if self.letter == "n" else float(value)
         shape = tuple(value.shape) if isinstance(value, Tensor) else value
-        raise ValueError(f"{name}: expected {self.dtype}[{self.axes}], got {shape}, {lengths}.")
-
-    def allocate(self, lengths: dict[str, int]) -> Tensor:
-        """Allocate an output tensor."""
-        shape = [int(axis) if axis.isdigit() else lengths[axis] for axis in self.axes]
-        return torch.empty(shape, dtype=_DTYPES[self.dtype], device="cpu")
-
-
-class _Signature(NamedTuple):
-    inputs: list[_Argument]
-    outputs: list[_Argument]
+        raise ValueError(f"{name}: expected {self.letter}[{self.axes}], got {shape}, {lengths}.")
 
 
 @cache
-def _signature(name: str) -> _Signature:
-    inputs, outputs = SIGNATURES[name].split("->")
-
-    def read(text: str) -> list[_Argument]:
-        return [
-            _Argument(word[0], word[1:].strip("[]?"), word.endswith("?")) for word in text.split()
-        ]
-
-    return _Signature(read(inputs), read(outputs))
+def _signature(name: str) -> tuple[list[_Argument], list[_Argument]]:
+    """Return the inputs and outputs of a kernel."""
+    inputs, outputs = (side.split() for side in SIGNATURES[name].split("->"))
+    return [_argument(word) for word in inputs], [_argument(word) for word in outputs]
 
 
-def _pass(value: object) -> object:
-    if isinstance(value, Tensor):
-        return ctypes.c_void_p(value.data_ptr())
-    if isinstance(value, int):
-        return ctypes.c_int64(value)
-    return ctypes.c_double(value) if isinstance(value, float) else None
+def _argument(word: str) -> _Argument:
+    dtype = _DTYPES.get(word[0].lower())
+    return _Argument(word[0], word[1:].strip("[]?"), dtype, word.endswith("?"))
+
+
+def _types(name: str) -> list[Any]:
+    """Return the types of the arguments of a kernel in C: the lengths of axes come first."""
+    inputs, outputs = _signature(name)
+    lengths = {axis for kind in inputs for axis in kind.axes if axis not in _FIXED}
+    numbers: dict[str, Any] = {"n": ctypes.c_int64, "x": ctypes.c_double}
+    kinds = [numbers.get(kind.letter, ctypes.c_void_p) for kind in inputs + outputs]
+    return [ctypes.c_int64] * len(lengths) + kinds
 
 
 def _kind() -> str:
@@ -243,6 +243,7 @@ def _library() -> ctypes.CDLL | None:
         if all(hasattr(library, name) for name in SIGNATURES):
             for name in SIGNATURES:
                 getattr(library, name).restype = ctypes.c_int64
+                getattr(library, name).argtypes = _types(name)
             return library
         warn("torchrg runs without its kernels, which are of another version; install it again.")
         return None

@@ -178,43 +178,58 @@ KERNEL fit_cell_windows(int64_t m, int64_t h, int64_t w, int64_t p, int64_t q, D
 }
 
 // normals.rate_windows: maximum deviations of windows, and whether windows or quarters exceed
-// them.
+// them; with masks of pixels, only of windows that may contain a seen pixel without a flat window.
 KERNEL rate_windows(int64_t h, int64_t w, int64_t p, int64_t q, double* table, Doubles quarters,
-                    double factor, double constant, double growth, double rounding,
-                    double quarter_factor, double fx, double fy, double half, double jitter,
-                    int64_t size, int64_t from, int64_t to) {
+                    Flagged seen, Flagged flat, double factor, double constant, double growth,
+                    double rounding, double quarter_factor, double fx, double fy, double half,
+                    double jitter, int64_t size, int64_t from, int64_t to) {
+  constexpr int64_t BATCH = 28;  // and two on both sides
   if (!are_rows_of(from, to, h)) return TOO_WIDE;
   const Noise noise = {factor, constant, growth, rounding};
   const Noise finer = {quarter_factor, constant, growth, rounding};
+  const double factor_of_quarters = 1 + SAME_NOISE / double(SIDE * size);
   double* columns[COLUMNS];
   for (int column = 0; column < COLUMNS; column++) columns[column] = table + column * h * w;
-  for (int64_t k = from * w; k < to * w; k++) {
-    const double a = columns[U_SLOPE][k], b = columns[V_SLOPE][k], c = columns[ORIGIN][k],
-                 mean = columns[MEAN][k], expected = noise.at(mean);
-    const double by_noise = square_root(square(expected) + square(jitter) * (a * a + b * b));
-    const double nearness = square(a * fx) + square(b * fy) + c * c;
-    const double straight = nearness > square(STEEPEST * mean) ? 0 : nearness;
-    const double bend = mean > 0 ? half * straight / mean : 0;
-    columns[NOISE][k] = by_noise, columns[TOLERANCE][k] = larger(by_noise, BEND * bend);
-    columns[STRONGEST][k] = MAX_BEND * bend;
-  }
-  const double factor_of_quarters = 1 + SAME_NOISE / double(SIDE * size);
+  const auto* counted = reinterpret_cast<const uint8_t*>(seen);
+  const auto* taken = reinterpret_cast<const uint8_t*>(flat);
+  const auto is_open = [&](int64_t i, int64_t left) {
+    if (!seen || !flat) return true;
+    const int64_t first = larger(left - REACH, int64_t(0)), end = smaller(left + BATCH + REACH, w);
+    uint8_t open = 0;
+    for (int64_t r = larger(i - REACH, int64_t(0)); r <= smaller(i + REACH, h - 1); r++)
+      for (int64_t k = r * w + first; k < r * w + end; k++) open |= counted[k] & ~taken[k];
+    return open > 0;
+  };
   for (int64_t i = from; i < to; i++)
-    for (int64_t j = 0; j < w; j++) {
-      const int64_t here = i * w + j;
-      const double tolerance = columns[TOLERANCE][here], deviation = columns[DEVIATION][here];
-      bool is_flat = deviation / tolerance <= FLAT;
-      if (p * q > 0 && is_flat) {
-        double squares = 0, count = 0;
-        for (int64_t k = 2 * i - 2; k <= 2 * i + 3; k += SIDE)
-          for (int64_t l = 2 * j - 2; l <= 2 * j + 3; l += SIDE)
-            if (k >= 0 && k < p && l >= 0 && l < q && quarters[k * q + l] < NONE)
-              squares += square(quarters[k * q + l]), count += 1;
-        double expected = square_root(count > 0 ? squares / count : NONE);
-        expected = expected * (columns[NOISE][here] / finer.at(columns[MEAN][here]));
-        is_flat = deviation <= factor_of_quarters * larger(expected, MIN_QUARTERS * tolerance);
+    for (int64_t left = 0; left < w; left += BATCH) {
+      if (!is_open(i, left)) continue;
+      const int64_t right = smaller(left + BATCH, w);
+      for (int64_t k = i * w + left; k < i * w + right; k++) {
+        const double a = columns[U_SLOPE][k], b = columns[V_SLOPE][k], c = columns[ORIGIN][k],
+                     mean = columns[MEAN][k], expected = noise.at(mean);
+        const double by_noise = square_root(square(expected) + square(jitter) * (a * a + b * b));
+        const double nearness = square(a * fx) + square(b * fy) + c * c;
+        const double straight = nearness > square(STEEPEST * mean) ? 0 : nearness;
+        const double bend = mean > 0 ? half * straight / mean : 0;
+        columns[NOISE][k] = by_noise, columns[TOLERANCE][k] = larger(by_noise, BEND * bend);
+        columns[STRONGEST][k] = MAX_BEND * bend;
       }
-      columns[RELATIVE][here] = is_flat ? deviation / tolerance : NONE;
+      for (int64_t j = left; j < right; j++) {
+        const int64_t here = i * w + j;
+        const double tolerance = columns[TOLERANCE][here], deviation = columns[DEVIATION][here];
+        bool is_flat = deviation / tolerance <= FLAT;
+        if (p * q > 0 && is_flat) {
+          double squares = 0, count = 0;
+          for (int64_t k = 2 * i - 2; k <= 2 * i + 3; k += SIDE)
+            for (int64_t l = 2 * j - 2; l <= 2 * j + 3; l += SIDE)
+              if (k >= 0 && k < p && l >= 0 && l < q && quarters[k * q + l] < NONE)
+                squares += square(quarters[k * q + l]), count += 1;
+          double expected = square_root(count > 0 ? squares / count : NONE);
+          expected = expected * (columns[NOISE][here] / finer.at(columns[MEAN][here]));
+          is_flat = deviation <= factor_of_quarters * larger(expected, MIN_QUARTERS * tolerance);
+        }
+        columns[RELATIVE][here] = is_flat ? deviation / tolerance : NONE;
+      }
     }
   return DONE;
 }
@@ -230,6 +245,7 @@ KERNEL offer_windows(int64_t h, int64_t w, int64_t p, int64_t q, Doubles values,
   for (int64_t i = from; i < to; i++)
     for (int64_t j = 0; j < q; j++) {
       const int64_t here = i * q + j;
+      if (size == 1 && flat[here]) continue;
       int64_t flattest = -1;  // unknown; `here` if no window is flat
       for (int64_t r = i * size; r < smaller((i + 1) * size, h); r++)
         for (int64_t c = j * size; c < smaller((j + 1) * size, w); c++) {
@@ -346,12 +362,15 @@ struct Described {
   int64_t number = -1;
   Window window = {};
   double slopes[2] = {}, origin = 0, deviation = 0, limit = 0, length = 1, normal[3] = {};
+  double variances[2] = {};  // of the columns and rows of its pixels
 
   INLINE_MEMBER void look_at(const Windows& all, int64_t window_number, const double* focal) {
     if (number == window_number) return;
     number = window_number, window = all[number], origin = window[ORIGIN];
     deviation = window[DEVIATION], limit = window[TOLERANCE];
     slopes[0] = window[U_SLOPE], slopes[1] = window[V_SLOPE];
+    variances[0] = (window.columns * window.columns - 1) / 12;
+    variances[1] = (window.rows * window.rows - 1) / 12;
     const double a = slopes[0] * focal[0], b = slopes[1] * focal[1];
     length = square_root(a * a + b * b + origin * origin), length = length > 0 ? length : 1;
     normal[0] = -a / length, normal[1] = -b / length, normal[2] = -origin / length;
@@ -402,31 +421,37 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
     return (similar || turned <= wider_sq_chord) && here.window.holds(r + is_down, c + !is_down) &&
            other.window.holds(r, c);
   };
+  alignas(32) double parts[6][TILE];  // of the windows of pixels, for one pass without branches
   for (int64_t r = from; r < to; r++)
-    for (int64_t c = 0; c < w; c++) {
-      const int64_t pixel = r * w + c;
-      if (windows[pixel] == next.number) here = next;
-      here.look_at(all, windows[pixel], focal);
-      noise[pixel] = expected.at(values[pixel]);
-      right[pixel] = flat[pixel] && c + 1 < w && flat[pixel + 1] && are_joined(r, c, next, false);
-      down[pixel] = flat[pixel] && r + 1 < h && flat[pixel + w] && are_joined(r, c, below, true);
-      valid[pixel] = flat[pixel] || (seen[pixel] && here.deviation < NONE);
-      for (int axis = 0; axis < 3; axis++)
-        normals[3 * pixel + axis] = valid[pixel] ? here.normal[axis] : 0;
-      curvature[pixel] = 0;
-      if (!valid[pixel]) continue;
-      const double z = 1 / (values[pixel] > 0 ? values[pixel] : 1);
-      const double ray = x[c] * x[c] + y[r] * y[r] + 1;
-      const double across = square(z * here.deviation / here.length);
-      const double sides[2] = {here.window.columns, here.window.rows}, positions[2] = {x[c], y[r]};
-      double along = 0;
-      for (int axis = 0; axis < 2; axis++) {
-        const double step = here.slopes[axis] * z, f = focal[axis];
-        along += (sides[axis] * sides[axis] - 1) / 12 *
-                 (step * step * ray - 2 / f * step * positions[axis] + 1 / (f * f));
+    for (int64_t left = 0; left < w; left += TILE) {
+      const int width = int(smaller(int64_t(TILE), w - left));
+      for (int64_t pixel = r * w + left; pixel < r * w + left + width; pixel++)
+        noise[pixel] = expected.at(values[pixel]);
+      for (int j = 0; j < width; j++) {
+        const int64_t c = left + j, pixel = r * w + c;
+        if (windows[pixel] == next.number) here = next;
+        here.look_at(all, windows[pixel], focal);
+        right[pixel] = flat[pixel] && c + 1 < w && flat[pixel + 1] && are_joined(r, c, next, false);
+        down[pixel] = flat[pixel] && r + 1 < h && flat[pixel + w] && are_joined(r, c, below, true);
+        valid[pixel] = flat[pixel] || (seen[pixel] && here.deviation < NONE);
+        for (int axis = 0; axis < 3; axis++)
+          normals[3 * pixel + axis] = valid[pixel] ? here.normal[axis] : 0;
+        for (int axis = 0; axis < 2; axis++)
+          parts[axis][j] = here.slopes[axis], parts[2 + axis][j] = here.variances[axis];
+        parts[4][j] = valid[pixel] ? here.deviation : 0, parts[5][j] = here.length;
       }
-      const double total = across + along * z * z;
-      curvature[pixel] = smaller(across / (total > 0 ? total : 1), 1.0 / 3);
+      for (int j = 0; j < width; j++) {
+        const int64_t c = left + j, pixel = r * w + c;
+        const double z = 1 / (values[pixel] > 0 ? values[pixel] : 1);
+        const double ray = x[c] * x[c] + y[r] * y[r] + 1;
+        const double across = square(z * parts[4][j] / parts[5][j]);
+        const double u = parts[0][j] * z, v = parts[1][j] * z;
+        const double along =
+            parts[2][j] * (u * u * ray - 2 / fx * u * x[c] + 1 / (fx * fx)) +
+            parts[3][j] * (v * v * ray - 2 / fy * v * y[r] + 1 / (fy * fy));
+        const double total = across + along * z * z;
+        curvature[pixel] = smaller(across / (total > 0 ? total : 1), 1.0 / 3);
+      }
     }
   return DONE;
 }
@@ -506,20 +531,48 @@ struct Front {
   }
 };
 
+// Calls `visit` with the pairs of adjacent pixels that have different labels, along rows, columns
+// and, if asked, diagonals.
+template <class Visit>
+INLINE void visit_borders(int64_t h, int64_t w, Longs labels, bool diagonal, const Visit& visit) {
+  constexpr int64_t BLOCK = 32;
+  const auto compare = [&](int64_t i, int64_t other) {
+    if (labels[i] != labels[other]) visit(i, other);
+  };
+  for (int64_t r = 0; r < h; r++)
+    for (int64_t left = 0; left < w; left += BLOCK) {
+      const int64_t right = smaller(left + BLOCK, w);
+      if (r + 1 < h && right < w) {
+        const int64_t *here = labels + r * w, *below = here + w;
+        int64_t changes = 0;
+        for (int64_t c = left; c < left + BLOCK; c++)
+          changes |= (here[c] ^ here[c + 1]) | (here[c] ^ below[c]) | (here[c] ^ below[c + 1]);
+        if (!changes) continue;
+      }
+      for (int64_t c = left, i = r * w + left; c < right; c++, i++) {
+        if (c + 1 < w) compare(i, i + 1);
+        if (r + 1 < h) compare(i, i + w);
+        if (diagonal && r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
+      }
+    }
+}
+
 INLINE bool are_labels(Longs labels, int64_t n, int64_t num) {
-  bool inside = true;
-  for (int64_t i = 0; i < n; i++) inside &= (labels[i] >= -1) & (labels[i] < num);
-  return inside;
+  uint64_t wrong = 0;  // in its sign, without a branch
+  for (int64_t i = 0; i < n; i++)
+    wrong |= (uint64_t(labels[i]) + 1) | (uint64_t(num) - 1 - uint64_t(labels[i]));
+  return int64_t(wrong) >= 0;
 }
 
 }  // namespace
 
-// repair.assign_unlabeled for pixels; points are (3, h w).
-KERNEL assign_unlabeled_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points,
-                               Flagged seen, int64_t* labels, Doubles normals, Doubles centers,
-                               Doubles reach, int64_t* rows, int64_t* marks, int64_t* chosen) {
+// repair.assign_unlabeled for the pixels of a growth.InverseCloud.
+KERNEL assign_unlabeled_pixels(int64_t h, int64_t w, int64_t M, Doubles values, Doubles x,
+                               Doubles y, Flagged seen, int64_t* labels, Doubles normals,
+                               Doubles centers, Doubles reach, int64_t* rows, int64_t* marks,
+                               int64_t* chosen) {
   const int64_t n = h * w;
-  if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
+  if (!are_labels(labels, n, M)) return NO_SUCH_ROW;
   Front front(h, w, rows, marks, chosen);
   const auto may_join = [&](int64_t pixel) { return labels[pixel] < 0 && seen[pixel]; };
   for (int64_t i = 0; i < n; i++)
@@ -529,48 +582,43 @@ KERNEL assign_unlabeled_pixels(int64_t P, int64_t h, int64_t w, int64_t M, Doubl
       [&](int64_t pixel, int64_t other) {
         const int64_t m = labels[other];
         if (m < 0) return NONE;
+        const double point[3] = {x[pixel % w], y[pixel / w], values[pixel]};
         double away = 0;
         for (int axis = 0; axis < 3; axis++)
-          away += (points[axis * n + pixel] - centers[3 * m + axis]) * normals[3 * m + axis];
+          away += (point[axis] - centers[3 * m + axis]) * normals[3 * m + axis];
         return size_of(away) <= reach[m] ? size_of(away) : NONE;
       },
       may_join);
   return DONE;
 }
 
-// growth.move_to_creases; planes (M, 3) are per ray, points (3, h w).
-KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles points, int64_t* labels,
-                       Doubles planes, Doubles middles, Doubles reach, int64_t num_turns,
-                       double straight, int64_t* rows, int64_t* marks, int64_t* chosen) {
-  const int64_t n = h * w;
-  if (P != n || !are_labels(labels, n, M)) return NO_SUCH_ROW;
-  const double *x = points, *y = points + n, *z = points + 2 * n;
+// growth.move_to_creases; planes (M, 3) are per ray.
+KERNEL move_to_creases(int64_t h, int64_t w, int64_t M, Doubles values, Doubles x, Doubles y,
+                       int64_t* labels, Doubles planes, Doubles middles, Doubles reach,
+                       int64_t num_turns, double straight, int64_t* rows, int64_t* marks,
+                       int64_t* chosen) {
+  if (!are_labels(labels, h * w, M)) return NO_SUCH_ROW;
   Front front(h, w, rows, marks, chosen);
-  const auto compare = [&](int64_t i, int64_t other) {
-    if (labels[i] != labels[other] && labels[i] >= 0 && labels[other] >= 0)
-      front.add(i), front.add(other);
-  };
-  for (int64_t r = 0; r < h; r++)
-    for (int64_t c = 0, i = r * w; c < w; c++, i++) {
-      if (c + 1 < w) compare(i, i + 1);
-      if (r + 1 < h) compare(i, i + w);
-      if (r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
-    }
+  visit_borders(h, w, labels, true, [&](int64_t i, int64_t other) {
+    if (labels[i] >= 0 && labels[other] >= 0) front.add(i), front.add(other);
+  });
   front.spread(
       labels, num_turns,
       [&](int64_t pixel, int64_t q) {
         const int64_t label = labels[pixel], other = labels[q];
         if (other < 0 || other == label) return NONE;
         const double *one = planes + 3 * label, *two = planes + 3 * other;
-        const double away = size_of(z[pixel] - (two[0] * x[pixel] + two[1] * y[pixel] + two[2]));
+        const double u = x[pixel % w], v = y[pixel / w];
+        const double away = size_of(values[pixel] - (two[0] * u + two[1] * v + two[2]));
         if (!(away <= reach[other])) return NONE;
         const double a = one[0] - two[0], b = one[1] - two[1], c = one[2] - two[2];
         const auto over = [&](double u, double v) { return a * u + b * v + c; };
-        const double here = over(x[pixel], y[pixel]), there = over(x[q], y[q]);
+        const double next_u = x[q % w], next_v = y[q / w];
+        const double here = over(u, v), there = over(next_u, next_v);
         const double mine = over(middles[2 * label], middles[2 * label + 1]),
                      theirs = over(middles[2 * other], middles[2 * other + 1]);
         const double slope = square_root(a * a + b * b);
-        const double step = square_root(square(x[q] - x[pixel]) + square(y[q] - y[pixel]));
+        const double step = square_root(square(next_u - u) + square(next_v - v));
         const bool goes = size_of(there) - size_of(here) >= straight * slope * step &&
                           here * mine < 0 && mine * theirs < 0 && size_of(mine) > reach[other] &&
                           size_of(theirs) > reach[label];
@@ -580,14 +628,56 @@ KERNEL move_to_creases(int64_t P, int64_t h, int64_t w, int64_t M, Doubles point
   return DONE;
 }
 
+// growth.PixelGrid.contacts: number of contacts (M, M) between pixels of two regions, the smaller
+// label first.
+KERNEL count_contacts(int64_t h, int64_t w, int64_t M, Longs labels, int64_t* counts) {
+  if (!are_labels(labels, h * w, M)) return NO_SUCH_ROW;
+  for (int64_t pair = 0; pair < M * M; pair++) counts[pair] = 0;
+  visit_borders(h, w, labels, true, [&](int64_t i, int64_t other) {
+    const int64_t one = smaller(labels[i], labels[other]), two = larger(labels[i], labels[other]);
+    if (one >= 0) counts[one * M + two]++;
+  });
+  return DONE;
+}
+
+// faces.strip_contacts: perimeters and widths of regions, and at how many sides of pixels a region
+// (row) meets another (column) without a step.
+KERNEL strip_contacts(int64_t h, int64_t w, int64_t M, Longs labels, Doubles x, Doubles y,
+                      Doubles noise, Doubles planes, Longs sizes, double x_pitch, double y_pitch,
+                      double max_noise, double min_reach, double* widths, int64_t* counts) {
+  if (!are_labels(labels, h * w, M)) return NO_SUCH_ROW;
+  for (int64_t m = 0; m < M; m++) widths[m] = 0;
+  for (int64_t pair = 0; pair < M * M; pair++) counts[pair] = 0;
+  if (h * w == 0) return DONE;
+  const auto add_side = [&](int64_t pixel) {
+    if (labels[pixel] >= 0) widths[labels[pixel]] += 1;
+  };
+  for (int64_t c = 0; c < w; c++) add_side(c), add_side((h - 1) * w + c);
+  for (int64_t r = 0; r < h; r++) add_side(r * w), add_side(r * w + w - 1);
+  visit_borders(h, w, labels, false,
+                [&](int64_t i, int64_t other) { add_side(i), add_side(other); });
+  for (int64_t m = 0; m < M; m++) widths[m] = double(2 * sizes[m]) / widths[m];
+  visit_borders(h, w, labels, false, [&](int64_t i, int64_t other) {
+    const int64_t one = labels[i], two = labels[other];
+    if (one < 0 || two < 0) return;
+    const double *p = planes + 3 * one, *q = planes + 3 * two;
+    const double a = p[0] - q[0], b = p[1] - q[1], c = p[2] - q[2];
+    const double gap = size_of(a * x[i % w] + b * y[i / w] + c) - max_noise * noise[i];
+    const double slope = square_root(square(a * x_pitch) + square(b * y_pitch));
+    counts[one * M + two] += gap <= slope * larger(widths[one] / 2, min_reach);
+    counts[two * M + one] += gap <= slope * larger(widths[two] / 2, min_reach);
+  });
+  return DONE;
+}
+
 // faces.count_lines: number of sampled rows and columns along which one region of a pair continues
-// as the other behind a nearer object; points are (3, h w).
-KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Doubles points,
+// as the other behind a nearer object.
+KERNEL count_lines(int64_t h, int64_t w, int64_t M, int64_t p, Doubles values, Doubles x, Doubles y,
                    Flagged seen, Longs labels, Doubles normals, Doubles centers, Doubles reach,
                    Longs pairs, int64_t every, double min_nearer, int64_t* counts, int64_t* firsts,
                    int64_t* lasts) {
   if (every < 1) return TOO_WIDE;
-  if (P != h * w || !are_labels(labels, P, M)) return NO_SUCH_ROW;
+  if (!are_labels(labels, h * w, M)) return NO_SUCH_ROW;
   for (int64_t q = 0; q < 2 * p; q++)
     if (pairs[q] < 0 || pairs[q] >= M) return NO_SUCH_ROW;
   for (int64_t q = 0; q < p; q++) counts[q] = 0;
@@ -612,9 +702,10 @@ KERNEL count_lines(int64_t P, int64_t h, int64_t w, int64_t M, int64_t p, Double
           const bool is_end = label == first || label == second;
           // Pixels before the first of either region are ignored.
           if (!is_end && (previous < 0 || !seen[pixel])) continue;
+          const double point[3] = {x[direction ? line : i], y[direction ? i : line], values[pixel]};
           double height = 0;
           for (int axis = 0; axis < 3 && !is_end; axis++)
-            height += (points[axis * P + pixel] - center[axis]) * normal[axis];
+            height += (point[axis] - center[axis]) * normal[axis];
           if (is_end || height < -reach[first]) {
             const int64_t gap = i - previous - 1;
             leads = is_end && end >= 0 && end != label && gap > 0 &&

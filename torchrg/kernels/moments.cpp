@@ -144,6 +144,59 @@ int64_t project(int64_t P, int64_t n, int64_t num, int64_t num_axes, const T* x,
   });
 }
 
+// Mean (3) and covariance (9) of weighted points, about zero if not centered.
+void measure(Doubles x, Doubles y, Doubles z, Doubles weights, int64_t start, int64_t end,
+             bool is_centered, double* mean, double* covariance) {
+  double sums[4], squares[6];
+  add_up(
+      start, end - start,
+      [&](int64_t i, double* terms) {
+        const double weight = weights[i];
+        terms[0] = x[i] * weight, terms[1] = y[i] * weight, terms[2] = z[i] * weight;
+        terms[3] = weight;
+      },
+      sums);
+  const double total = sums[3];
+  for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total : 0;
+  const double a = mean[0], b = mean[1], c = mean[2];
+  add_up(
+      start, end - start,
+      [&](int64_t i, double* terms) {
+        const double u = x[i] - a, v = y[i] - b, w = z[i] - c;
+        const double wu = weights[i] * u, wv = weights[i] * v, ww = weights[i] * w;
+        terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
+        terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
+      },
+      squares);
+  const int index[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
+  for (int entry = 0; entry < 9; entry++) covariance[entry] = squares[index[entry]] / total;
+}
+
+// Median and mean square of the distances of points from a plane, and their weights.
+void reweigh(Doubles x, Doubles y, Doubles z, int64_t start, int64_t end, Doubles mean,
+             Doubles axis, double min_scale, double mad, double cut, double* weights,
+             double& median, double& square) {
+  const double a = mean[0], b = mean[1], c = mean[2], p = axis[0], q = axis[1], r = axis[2];
+  const auto residual = [&](int64_t i) {
+    return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r;
+  };
+  for (int64_t i = start; i < end; i++) {
+    const double away = size_of(residual(i));
+    weights[i] = away < double(INFINITE) ? away : double(INFINITE);
+  }
+  const int64_t count = end - start;
+  double sum[1];
+  add_up(start, count, [&](int64_t i, double* term) { *term = weights[i] * weights[i]; }, sum);
+  square = sum[0] / double(count);
+  median = select(weights + start, count, (count - 1) / 2);
+  const double min_unit = cut * larger(mad * median, min_scale);
+  const double unit = min_unit > 0 ? min_unit : 1;
+  for (int64_t i = start; i < end; i++) {
+    const double ratio = residual(i) / unit, weight = larger(1 - ratio * ratio, 0.0);
+    weights[i] = weight * weight;
+  }
+}
+
 }  // namespace
 
 KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Floats x, Floats y,
@@ -163,9 +216,9 @@ KERNEL segment_coordinates_double(int64_t P, int64_t n, int64_t num, int64_t num
 KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t max_points, int64_t* counts,
                     int64_t* sizes, int64_t* ends, int64_t* rows) {
   if (max_points < 1) return TOO_WIDE;
-  bool inside = true;
-  for (int64_t i = 0; i < n; i++) inside &= labels[i] < num;
-  if (!inside) return NO_SUCH_ROW;
+  int64_t highest = -1;
+  for (int64_t i = 0; i < n; i++) highest = larger(labels[i], highest);
+  if (highest >= num) return NO_SUCH_ROW;
   for (int64_t m = 0; m < num; m++) sizes[m] = counts[m] = 0;
   visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
     if (m >= 0) sizes[m] += to - from;
@@ -191,30 +244,7 @@ KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t max_points, in
 KERNEL segment_moments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z, Doubles weights,
                        Longs counts, int64_t is_centered, double* means, double* covariances) {
   return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
-    double sums[4], squares[6], *mean = means + 3 * m;
-    add_up(
-        start, end - start,
-        [&](int64_t i, double* terms) {
-          const double weight = weights[i];
-          terms[0] = x[i] * weight, terms[1] = y[i] * weight, terms[2] = z[i] * weight;
-          terms[3] = weight;
-        },
-        sums);
-    const double total = sums[3];
-    for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total : 0;
-    const double a = mean[0], b = mean[1], c = mean[2];
-    add_up(
-        start, end - start,
-        [&](int64_t i, double* terms) {
-          const double u = x[i] - a, v = y[i] - b, w = z[i] - c;
-          const double wu = weights[i] * u, wv = weights[i] * v, ww = weights[i] * w;
-          terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
-          terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
-        },
-        squares);
-    const int index[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
-    for (int entry = 0; entry < 9; entry++)
-      covariances[9 * m + entry] = squares[index[entry]] / total;
+    measure(x, y, z, weights, start, end, is_centered, means + 3 * m, covariances + 9 * m);
   });
 }
 
@@ -224,27 +254,53 @@ KERNEL reweigh_segments(int64_t n, int64_t num, Doubles x, Doubles y, Doubles z,
                         Doubles means, Doubles axes, Doubles min_scale, double mad, double cut,
                         double* weights, double* medians, double* squares) {
   return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
-    const double *mean = means + 3 * m, *axis = axes + 3 * m, a = mean[0], b = mean[1], c = mean[2];
-    const double p = axis[0], q = axis[1], r = axis[2];
-    const auto residual = [&](int64_t i) {
-      return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r;
-    };
-    for (int64_t i = start; i < end; i++) {
-      const double away = size_of(residual(i));
-      weights[i] = away < double(INFINITE) ? away : double(INFINITE);
+    reweigh(x, y, z, start, end, means + 3 * m, axes + 3 * m, min_scale[m], mad, cut, weights,
+            medians[m], squares[m]);
+  });
+}
+
+// growth._fit_chunk: centers, covariances, normals of length sqrt(1 + slopes^2), mean noise, median
+// and mean square residuals of the pixels in `rows`; buffers are (4, n).
+KERNEL fit_pixel_regions(int64_t h, int64_t w, int64_t n, int64_t num, Doubles values, Doubles x,
+                         Doubles y, Doubles noise, Longs rows, Longs counts, int64_t num_fits,
+                         double mad, double cut, double min_spread, double* buffers,
+                         double* centers, double* covariances, double* normals, double* mean_noise,
+                         double* medians, double* squares) {
+  if (num_fits < 1 || num_fits > MAX_WIDTH) return TOO_WIDE;
+  for (int64_t i = 0; i < n; i++)
+    if (rows[i] < 0 || rows[i] >= h * w) return NO_SUCH_ROW;
+  double *u = buffers, *v = u + n, *z = v + n, *weights = z + n;
+  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
+    for (int64_t i = start, first = 0, row = 0; i < end; i++) {
+      const int64_t pixel = rows[i];
+      if (pixel < first || pixel >= first + w) row = pixel / w, first = row * w;
+      u[i] = x[pixel - first], v[i] = y[row], z[i] = values[pixel], weights[i] = 1;
     }
-    const int64_t count = end - start;
-    double sum[1];
-    add_up(start, count, [&](int64_t i, double* term) { *term = weights[i] * weights[i]; }, sum);
-    squares[m] = sum[0] / double(count);
-    medians[m] = select(weights + start, count, (count - 1) / 2);
-    const double min_unit = cut * larger(mad * medians[m], min_scale[m]);
-    const double unit = min_unit > 0 ? min_unit : 1;
-    for (int64_t i = start; i < end; i++) {
-      const double ratio = residual(i) / unit, weight = larger(1 - ratio * ratio, 0.0);
-      weights[i] = weight * weight;
+    double sum[1], *center = centers + 3 * m, *s = covariances + 9 * m, *normal = normals + 3 * m;
+    add_up(start, end - start, [&](int64_t i, double* term) { *term = noise[rows[i]]; }, sum);
+    mean_noise[m] = sum[0] / double(end - start);
+    for (int64_t fit = 0; fit < num_fits; fit++) {
+      measure(u, v, z, weights, start, end, true, center, s);
+      // growth._fit_slopes
+      const double determinant = s[0] * s[4] - s[1] * s[1], square = (s[0] + s[4]) * (s[0] + s[4]);
+      const bool is_full = determinant > min_spread * square;
+      const double divisor = is_full ? determinant : square > 0 ? square : 1;
+      const double xx = is_full ? s[4] : s[0], xy = is_full ? -s[1] : s[1],
+                   yy = is_full ? s[0] : s[4];
+      normal[0] = -((xx * s[2] + xy * s[5]) / divisor), normal[2] = 1;
+      normal[1] = -((xy * s[2] + yy * s[5]) / divisor);
+      reweigh(u, v, z, start, end, center, normal, mean_noise[m], mad, cut, weights, medians[m],
+              squares[m]);
     }
   });
+}
+
+// moments.kth_smallest: the value of rank k (from 0), NaN last.
+KERNEL kth_value(int64_t n, Doubles values, int64_t k, double* found, double* scratch) {
+  int64_t count = 0;
+  for (int64_t i = 0; i < n; i++) scratch[count] = values[i], count += values[i] == values[i];
+  *found = k >= 0 && k < count ? select(scratch, count, k) : __builtin_nan("");
+  return DONE;
 }
 
 // extents.hull_candidates: whether the points (x, y) of each region are outside the octagon of its

@@ -8,6 +8,7 @@ summation order, so that a sum does not depend on its position in a tensor. All 
 
 import bisect
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -126,31 +127,28 @@ class Segments:
 
     def __init__(self, labels: Tensor, *, max_points: int | None = None) -> None:
         if labels.device.type == "cpu" and kernels.serve():
-            self._take_rows(labels, max_points)
+            num_regions = max(int(labels.max()) + 1, 0) if len(labels) else 0
+            labels = labels.long()
+            self.counts, self.sizes, _ = tables = labels.new_zeros(3, num_regions).unbind()
+            rows = kernels.call("segment_rows", labels, max_points or len(labels) + 1, *tables)[0]
+            self.rows = rows[: int(self.counts.sum())]
             return
         labels = labels.clamp(min=-1)
         num_unlabeled, *_ = counts = torch.bincount(labels + 1, minlength=1)
-        self.rows = _ascending(labels)[num_unlabeled:]
+        self.rows = labels.argsort(stable=True)[num_unlabeled:]
         self.counts = self.sizes = counts[1:]
         if max_points is not None:
-            steps = (self.counts + (max_points - 1)) // max_points
-            steps, first = steps.clamp(min=1), self.counts.cumsum(0) - self.counts
-            self.labels = torch.repeat_interleave(self.counts, output_size=len(self.rows))
-            index = torch.arange(len(self.rows), device=labels.device) - self.broadcast(first)
-            self.rows = self.rows[index % self.broadcast(steps) == 0]
+            steps = ((self.counts + (max_points - 1)) // max_points).clamp(min=1)
+            region = torch.repeat_interleave(self.counts, output_size=len(self.rows))
+            index = torch.arange(len(region), device=labels.device)
+            index -= (self.counts.cumsum(0) - self.counts)[region]
+            self.rows = self.rows[index % steps[region] == 0]
             self.counts = (self.counts + steps - 1) // steps
-        self.labels = torch.repeat_interleave(self.counts, output_size=len(self.rows))
 
-    def _take_rows(self, labels: Tensor, max_points: int | None) -> None:
-        num_regions = int(labels.max()) + 1 if len(labels) else 0
-        self.counts = labels.new_zeros(max(num_regions, 0), dtype=torch.int64)
-        self.sizes, indices = self.counts.new_empty(2, len(self.counts))
-        written = self.counts, self.sizes, indices
-        (rows,) = kernels.call(
-            "segment_rows", labels.long(), max_points or len(labels) + 1, *written
-        )
-        self.rows = rows[: int(self.counts.sum())]
-        self.labels = torch.repeat_interleave(self.counts)
+    @cached_property
+    def labels(self) -> Tensor:
+        """The region of each point, in the order of :meth:`gather`."""
+        return torch.repeat_interleave(self.counts, output_size=len(self.rows))
 
     def split(self, max_points: int) -> "list[Segments]":
         """Split into parts of complete regions, renumbered from 0, of at most ``max_points``."""
@@ -161,7 +159,7 @@ class Segments:
             last = max(bisect.bisect_right(ends, row + max_points), min(region + 1, len(ends)))
             segments = Segments.__new__(Segments)
             end = ends[last - 1] if last else 0
-            segments.rows, segments.labels = self.rows[row:end], self.labels[row:end] - region
+            segments.rows = self.rows[row:end]
             segments.counts, segments.sizes = self.counts[region:last], self.sizes[region:last]
             parts.append(segments)
             region, row = last, end
@@ -284,20 +282,16 @@ class Segments:
     def quantile(self, values: Tensor, fraction: float) -> Tensor:
         """Return the lower quantile of the values of each region, without interpolation."""
         on_cpu = values.device.type == "cpu"
-        first = self.counts.cumsum(0) - self.counts
+        if len(values) == 0 or (on_cpu and len(values) >= _SORTED_SIZE * len(self.counts)):
+            parts = torch.split(values, self.counts.tolist())
+            each = [kth_smallest(region, int(fraction * (len(region) - 1))) for region in parts]
+            return torch.stack(each) if parts else values
+        order = values.argsort()
+        order = order[self.labels[order].argsort(stable=True)]
         rank = (fraction * (self.counts - 1).double()).long()
-        are_small = len(values) < _SORTED_SIZE * len(self.counts) and bool(self.counts.all())
-        if on_cpu and are_small:
-            order = torch.from_numpy(np.lexsort((values.numpy(), self.labels.numpy())))
-            return values[order[first + rank]]
-        if not on_cpu and len(values):
-            order = values.argsort()
-            order = order[self.labels[order].argsort(stable=True)]
-            found = values[order[(first + rank).clamp(0, len(values) - 1)]]
-            return torch.where(self.counts > 0, found, torch.nan)
-        parts = torch.split(values, self.counts.tolist())
-        each = [kth_smallest(region, int(fraction * (len(region) - 1))) for region in parts]
-        return torch.stack(each) if parts else values
+        index = self.counts.cumsum(0) - self.counts + rank
+        found = values[order[index.clamp(0, len(values) - 1)]]
+        return torch.where(self.counts > 0, found, torch.nan)
 
 
 def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
@@ -319,21 +313,13 @@ def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
     return torch.from_numpy(reduction.reduceat(values.numpy(), starts.numpy()))
 
 
-def _ascending(labels: Tensor) -> Tensor:
-    """Return the rows by ascending label, with a stable sort."""
-    if labels.device.type == "cpu" and bool((labels < 2**15).all()):
-        # Radix sort: five times faster than by comparisons.
-        return torch.from_numpy(labels.to(torch.int16).numpy().argsort(kind="stable"))
-    return labels.argsort(stable=True)
-
-
 def kth_smallest(values: Tensor, k: int) -> Tensor:
     """Return the value with index k in sorted order of ``(n,)``, NaN last; NaN if empty."""
     if len(values) == 0:
         return values.new_tensor(torch.nan)
-    if values.device.type == "cpu":
-        # Up to eight times faster than in torch.
-        return torch.from_numpy(np.partition(values.numpy(), k))[k]
+    if values.device.type == "cpu" and kernels.serve():
+        # Up to thirty times faster than in torch.
+        return kernels.call("kth_value", values.double(), k)[0].to(values.dtype).squeeze(0)
     return values.kthvalue(k + 1).values
 
 
