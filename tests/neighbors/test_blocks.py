@@ -59,11 +59,10 @@ def test_neighbors_of_blocks_are_the_nearest_of_all(make, size, most):
     points = in_order(make)
     boxes = find_boxes(points, 8)
     for k in (1, 12):
-        found = [
-            search_block(points, boxes, block, k, search_rows, most)
-            for block in blocks_of(boxes, size)
-        ]
-        np.testing.assert_array_equal(np.concatenate(found), nearest(points, k))
+        found = np.empty((len(points), k), dtype=np.int32)
+        for block in blocks_of(boxes, size):
+            search_block(points, boxes, block, search_rows, found, most)
+        np.testing.assert_array_equal(found, nearest(points, k))
 
 
 @pytest.mark.parametrize("make", CLOUDS)

@@ -154,8 +154,8 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
 
 // Writes the k nearest neighbors of the selected points in cells `from` to `to` to their rows of
 // `found`, renumbered by `order` if given; `certain` marks exact results.
-KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const double* sorted,
-                    Ints rows, Ints starts, Flagged selected, Longs order, int32_t* found,
+KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, int64_t k,
+                    const double* sorted, Ints rows, Ints starts, Flagged selected, Longs order, int32_t* found,
                     bool* certain, int64_t from, int64_t to, int64_t width, int64_t height,
                     int64_t first_row, double x, double y, double z, double size) {
   if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
@@ -214,7 +214,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t k, const doub
       }
       if (count < k || count > MAX_CHOSEN) continue;
       const int64_t to_row = order ? order[row] : row;
-      if (to_row < 0 || to_row >= num_points) return NO_SUCH_ROW;
+      if (to_row < 0 || to_row >= num_lists) return NO_SUCH_ROW;
       int32_t* list = found + k * to_row;
       const double farthest = sort(all, count, int(k), list);
       // Whether a point outside could tie with the last neighbor by rounding.

@@ -6,7 +6,7 @@ order, so ties are resolved as in a search of the complete cloud.
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,8 +22,8 @@ _MIN_CANDIDATES = 65536
 _NUM_BLOCKS = 2
 """Maximum number of rows searched at a time: those of two blocks, but at least ``_MIN_CANDIDATES``,
 so that a small block is not fragmented."""
-SearchRows = Callable[[NDArray[np.floating], slice, int], NDArray[np.int32]]
-"""Points in canonical order, query rows, and k -> their neighbors, ``(n, k)``."""
+SearchRows = Callable[[NDArray[np.floating], slice, NDArray[np.int64], NDArray[np.int32]], None]
+"""Writes the neighbors of query rows of points, numbered as in a larger cloud, to its lists."""
 POINTS_PER_BOX = 256
 """Points per box, a surface patch about two neighborhoods of 50 wide. Few rows are read in vain,
 and boxes take a hundredth of the memory of the points."""
@@ -117,38 +117,37 @@ def _gaps(
 
 
 def search_blocks(
-    points: NDArray[np.floating], k: int, search: SearchRows
-) -> Iterator[tuple[slice, NDArray[np.int32]]]:
-    """Yield blocks of rows, and their neighbors ``(n, k)`` as in :func:`torchrg.search_knn`.
+    points: NDArray[np.floating], search: SearchRows, nearest: NDArray[np.int32]
+) -> None:
+    """Write the neighbors of points ``(N, 3)`` to ``nearest`` ``(N, k)``, block by block.
 
-    The points ``(N, 3)`` are in canonical order, k is at most N; ``search`` processes the given
-    rows of a smaller cloud.
+    As in :func:`torchrg.search_knn`, for points in canonical order and k of at most N. ``search``
+    writes them for some rows of a smaller cloud.
     """
     boxes = find_boxes(points)
-    firsts = np.arange(0, len(points), limit_rows(BLOCK_SIZE, k))
+    firsts = np.arange(0, len(points), limit_rows(BLOCK_SIZE, nearest.shape[1]))
     ends = boxes.starts[np.searchsorted(boxes.starts, firsts)]
     for start, stop in itertools.pairwise(np.unique(np.append(ends, len(points))).tolist()):
-        block = slice(start, stop)
-        yield block, search_block(points, boxes, block, k, search)
+        search_block(points, boxes, slice(start, stop), search, nearest)
 
 
 def search_block(
     points: NDArray[np.floating],
     boxes: Boxes,
     block: slice,
-    k: int,
     search: SearchRows,
+    nearest: NDArray[np.int32],
     max_rows: int | None = None,
-) -> NDArray[np.int32]:
-    """Return the rows of the ``k`` nearest points of each point of a block, shape ``(n, k)``.
+) -> None:
+    """Write the rows of the nearest points of each point of a block to ``nearest`` ``(N, k)``.
 
     The block begins and ends at the boundaries of ``boxes``; at most ``max_rows`` rows are searched
     at a time.
     """
+    k, num_queries = nearest.shape[1], block.stop - block.start
     first, last = np.searchsorted(boxes.starts, (block.start, block.stop))
     reach = _reach_of_boxes(points[block], boxes, slice(first, last), k)
-    nearest = np.empty((block.stop - block.start, k), dtype=np.int32)
-    max_rows = max(_NUM_BLOCKS * len(nearest), _MIN_CANDIDATES) if max_rows is None else max_rows
+    max_rows = max(_NUM_BLOCKS * num_queries, _MIN_CANDIDATES) if max_rows is None else max_rows
     pending = [slice(first, last)]
     while pending:
         run = pending.pop()
@@ -162,14 +161,11 @@ def search_block(
             bound = np.minimum(reach[indices - first], farthest_neighbor(boxes, run.start, k))
             rows = _rows_near(boxes, indices, bound)
         queries = slice(boxes.starts[run.start], boxes.starts[run.stop])
-        out = nearest[queries.start - block.start : queries.stop - block.start]
         if len(rows) > max_rows:
-            out[:] = _search_each(points, rows, np.arange(queries.start, queries.stop), k)
+            nearest[queries] = _search_each(points, rows, np.arange(queries.start, queries.stop), k)
             continue
         start = int(np.searchsorted(rows, queries.start))
-        local = slice(start, start + queries.stop - queries.start)
-        np.take(rows.astype(np.int32), search(points[rows], local, k), out=out, mode="clip")
-    return nearest
+        search(points[rows], slice(start, start + queries.stop - queries.start), rows, nearest)
 
 
 def _reach_of_boxes(

@@ -111,9 +111,14 @@ def search_knn(
         order = None if canonical else canonical_order(cloud).numpy()
         cloud = cloud if order is None else cloud[order]
         if scratch.is_active() and max_distance is None:
-            for rows, near in search_blocks(cloud, k, search_rows):
-                target = rows if order is None else order[rows]
-                indices[start:stop][target] = (near if order is None else order[near]) + start
+            lists = indices[start:stop]
+            found = lists if order is None else scratch.empty(lists.shape, np.int32)
+            search_blocks(cloud, search_rows, found)
+            if order is not None:
+                for rows in split_rows(len(cloud), ROWS_AT_ONCE):
+                    lists[order[rows]] = order[found[rows]]
+            if start:
+                lists += start
             continue
         _search_cloud(
             cloud,
@@ -265,11 +270,17 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
 
 
 @sequential_operations()
-def search_rows(points: NDArray[np.floating], rows: slice, k: int) -> NDArray[np.int32]:
-    """Apply :func:`search_knn` to some rows of at least ``k`` points in canonical order."""
-    indices = np.empty((len(points), k), dtype=np.int32)
-    _search_cloud(points, rows, None, 0, math.inf, indices, None)
-    return indices[rows]
+def search_rows(
+    points: NDArray[np.floating],
+    rows: slice,
+    numbers: NDArray[np.int64],
+    indices: NDArray[np.int32],
+) -> None:
+    """Write the neighbors of some rows of points in canonical order to lists ``(N, k)``.
+
+    ``numbers`` ``(n,)`` are the rows of the points in the lists.
+    """
+    _search_cloud(points, rows, numbers, 0, math.inf, indices, None)
 
 
 def _search_cloud(
@@ -350,7 +361,7 @@ def search_cells(
         points: Distinct points.
         rows: Query rows, ascending.
         reach: Distances of the k-th neighbor for a sample of the points.
-        found: Output neighbors of each point, ``(N, k)``, sorted by distance, then by row.
+        found: Output neighbors of each point, ``(M, k)``, sorted by distance, then by row.
         order: Row of ``found`` for each point, and its index there. Default: the point's row.
         first_row: Offset added to each index.
 
