@@ -1,8 +1,8 @@
 """Large arrays in unnamed scratch files, for clouds larger than memory.
 
-Most of the memory of a segmentation goes to the neighbor lists. Within :func:`on_disk` they are
-memory maps of temporary files that are unlinked once opened. The files are removed when the process
-exits, even on a crash. Memory mapping is transparent to callers.
+Within :func:`on_disk`, neighbor lists and the large arrays that hold a value per point are memory
+maps of temporary files, unlinked once opened. The files are removed when the process exits, even on
+a crash. Memory mapping is transparent to callers.
 """
 
 import math
@@ -15,26 +15,31 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchrg.errors import FormatError
 
 __all__ = ["on_disk"]
 __dir__ = __all__.copy
 
-_MIN_BYTES = 2**24
+_MIN_BYTES = 2**22
 """Minimum size of an array on disk, in bytes; all smaller arrays together take little memory."""
 BYTES_PER_NEIGHBOR = 9
 """Maximum bytes per neighbor of a point: four in the neighbor list, and five in the list of
 neighbors of the same object (index and mask)."""
+BYTES_PER_POINT = 200
+"""Maximum bytes of the other arrays per point: coordinates, normals, labels and their copies."""
 _RELEASE_SECONDS = 0.01
 """Interval for releasing pages, in seconds. Meanwhile about 20 MB of an array are read."""
 _ZEROS = bytes(2**20)
 """Bytes that reserve disk space on systems without posix_fallocate, such as macOS."""
 Scalar = TypeVar("Scalar", bound=np.generic)
+Stored = TypeVar("Stored", Tensor, NDArray[Any])
 
 _folder: ContextVar[Path | None] = ContextVar("scratch", default=None)
 _maps: "weakref.WeakSet[mmap.mmap]" = weakref.WeakSet()
@@ -55,9 +60,9 @@ if hasattr(os, "register_at_fork"):
 def on_disk(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Move large arrays to the disk of a folder, with identical results and bounded memory.
 
-    Segmenting a cloud then takes about 400 bytes of memory per point, including file pages not yet
-    released by the system. It takes up to nine bytes of disk per neighbor of a point. Results
-    contain no such array and can be used afterwards. The folder should be on a disk.
+    Clouds read and segmented in this context have such arrays, and can be used afterwards. See
+    :func:`torchrg.batch.memory.scan_memory` for the memory that remains. The folder should be on a
+    disk: in a RAM disk, the arrays still take memory.
 
     Raises:
         FormatError: If the disk is too full, or the folder is not writable.
@@ -86,10 +91,10 @@ def is_active() -> bool:
     return _folder.get() is not None
 
 
-def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
+def empty(shape: Sequence[int], dtype: type[Scalar] | np.dtype[Scalar]) -> NDArray[Scalar]:
     """Return an uninitialized array: ``numpy.empty``, or a map on disk if large and active."""
     folder, size = _folder.get(), math.prod(shape) * np.dtype(dtype).itemsize
-    if folder is None or size < _MIN_BYTES:
+    if folder is None or size < max(_MIN_BYTES, 1):
         return np.empty(shape, dtype)
     try:
         with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
@@ -107,6 +112,27 @@ def empty(shape: Sequence[int], dtype: type[Scalar]) -> NDArray[Scalar]:
     with _lock:
         _maps.add(memory)
     return np.frombuffer(memory, dtype).reshape(shape)
+
+
+def new_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return an uninitialized tensor of a shape with the dtype and device of another."""
+    if not is_active() or like.device.type != "cpu":
+        return like.new_empty(shape)
+    # NumPy's dtype, without converting values.
+    return torch.from_numpy(empty(shape, like[:0].numpy().dtype))
+
+
+def store(values: Stored) -> Stored:
+    """Return a copy on disk of an array or tensor, in its layout; itself if small or not active."""
+    if not is_active() or values.nbytes < _MIN_BYTES:
+        return values
+    if isinstance(values, Tensor):
+        return torch.from_numpy(store(values.numpy())) if values.device.type == "cpu" else values
+    if values.T.flags.c_contiguous and not values.flags.c_contiguous:
+        return store(values.T).T
+    stored = empty(values.shape, values.dtype)
+    stored[...] = values
+    return stored
 
 
 def _release_until(is_done: threading.Event) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._checks import check_floating, check_shapes
 from torchrg._parallel import allowed_threads
 from torchrg.linalg.eigen import smallest_eigenvector3
@@ -113,7 +113,7 @@ def _symmetric(triangle: Sequence[Tensor], size: int) -> Tensor:
 
 def to_column_major(vectors: Tensor) -> Tensor:
     """Return vectors ``(N, C)`` in column-major layout, which regions read without a copy."""
-    return vectors.T.contiguous().T
+    return scratch.store(vectors.T.contiguous().T)
 
 
 class Segments:

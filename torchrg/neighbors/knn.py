@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrg import kernels, scratch
 from torchrg._checks import as_tensor, check_points, check_shapes, eager_only, is_tensor
 from torchrg._parallel import (
+    CHUNK_SIZE,
     ROWS_AT_ONCE,
     ROWS_IN_CACHE,
     allowed_threads,
@@ -339,7 +340,7 @@ def _search_cloud(
                 if is_far is not None:
                     distances = np.linalg.norm(positions[near] - positions[rows, None], axis=2)
                 store(rows, distances, near)
-    for chunk in split_rows(len(pending), limit_rows(ROWS_AT_ONCE, width)):
+    for chunk in split_rows(len(pending), limit_rows(CHUNK_SIZE, width)):
         store(pending[chunk], *_query(tree, positions[pending[chunk]], width))
 
 

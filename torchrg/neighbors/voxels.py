@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._checks import as_tensor, check_points, is_positive
 from torchrg.errors import ConfigError
 from torchrg.structures import UNLABELED, AnyCloud
@@ -54,29 +55,33 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     finite = tensor.isfinite().all(dim=-1).nonzero().squeeze(-1)
     if len(finite) == 0:
         return Voxels(finite, inverse)
-    columns = [column[finite].double() for column in tensor.detach().unbind(dim=-1)]
-    scaled = [(column - column.min()) / size for column in columns]
-    if max(float(column.max()) for column in scaled) >= _MAX_VOXELS:
+    columns, cells = tensor.detach().unbind(dim=-1), list[Tensor]()
+    sq_distance = tensor.new_zeros((), dtype=torch.float64)
+    for column in columns:
+        scaled = column[finite].double()
+        scaled = scaled.sub_(scaled.min()).div_(size)
+        cell = scaled.floor()
+        sq_distance = scratch.store(scaled.sub_(cell).sub_(0.5).square_().add_(sq_distance))
+        cells.append(scratch.store(cell))
+    if max(float(cell.max()) for cell in cells) >= _MAX_VOXELS:
         raise ConfigError(
             f"sample_voxels: expected size to divide the extent of the cloud into fewer than 2^53 "
             f"cells, got {size!r}. Choose a larger size."
         )
-    cells = [column.floor() for column in scaled]
-    x, y, z = ((s - cell - 0.5).square() for s, cell in zip(scaled, cells, strict=True))
-    keys, order = cell_keys(cells).sort(stable=True)
+    keys, order = map(scratch.store, cell_keys(cells).sort(stable=True))
     voxel, counts = torch.unique_consecutive(keys, return_inverse=True, return_counts=True)[1:]
-    sq_distance = (x + y + z)[order]
+    order, voxel, sq_distance = finite[order], scratch.store(voxel), sq_distance[order]
     minimum = torch.segment_reduce(sq_distance, "min", lengths=counts)
     nearest = (sq_distance == minimum[voxel]).nonzero().squeeze(1)
     if len(nearest) > len(counts):
         nearest = _first_by_coordinates(nearest, voxel, [c[order] for c in columns])
-    rows = finite[order[nearest]]
+    rows = order[nearest]
     ranks = rows.argsort().argsort()
-    inverse[finite[order]] = ranks[voxel]
-    return Voxels(rows.sort().values, inverse)
+    inverse[order] = ranks[voxel]
+    return Voxels(rows.sort().values, scratch.store(inverse))
 
 
-def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: list[Tensor]) -> Tensor:
+def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: Sequence[Tensor]) -> Tensor:
     """Return the chosen point of lowest x, then y, then z in each voxel, in voxel order."""
     x, y, z = (column[chosen].cpu().numpy() for column in columns)
     order = torch.from_numpy(np.lexsort((z, y, x, voxel[chosen].cpu().numpy()))).to(voxel.device)

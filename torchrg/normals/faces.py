@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, nonzero_rows
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, nonzero_rows, split_rows
 from torchrg.linalg.moments import dot
 
 _RANKS = (2, 4, 6, 9, 12, 15)
@@ -55,26 +55,31 @@ def find_faces(
 
     Points ``(N, 3)`` are in canonical order, ``near`` ``(N, K)`` are rows of their neighbors,
     ``labels`` ``(N,)`` are plane IDs or negative, with unit normals ``axes`` ``(M, 3)``.
-    ``max_thickness`` is the maximum RMS height of a thin face. Returns the face of each point, and
-    the sign that makes its normal consistent within the face, ``(N,)`` each. Some face IDs are
-    unused.
+    ``max_thickness`` is the maximum RMS height of a thin face. Returns the face of each point,
+    int32, and the sign that makes its normal consistent within the face, ``(N,)`` each. Some face
+    IDs are unused.
     """
-    faces, signs = torch.full((len(points),), -1), normals.new_ones(len(points))
-    rows = nonzero_rows(labels >= 0)
-    label, axes = labels.index_select(0, rows).long(), axes.to(points)
-    cosine = dot(normals.index_select(0, rows), axes.index_select(0, label))
+    faces = torch.full((len(points),), -1, dtype=torch.int32)
+    signs, rows = normals.new_ones(len(points)), scratch.store(nonzero_rows(labels >= 0))
+    label, axes = scratch.store(labels.index_select(0, rows).long()), axes.to(points)
     side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
-    kept = nonzero_rows(is_thin.index_select(0, label) & (cosine.abs() > _MIN_COSINE))
-    rows = rows.index_select(0, kept)
-    faces.index_copy_(0, rows, (2 * label + side).index_select(0, kept))
-    signs.index_copy_(0, rows, cosine.index_select(0, kept).sign())
+    for part in split_rows(len(rows), ROWS_AT_ONCE):
+        near_plane, plane = rows[part], label[part]
+        cosine = dot(normals.index_select(0, near_plane), axes.index_select(0, plane))
+        kept = nonzero_rows(is_thin.index_select(0, plane) & (cosine.abs() > _MIN_COSINE))
+        chosen, face = near_plane.index_select(0, kept), 2 * plane + side[part]
+        faces.index_copy_(0, chosen, face.index_select(0, kept).int())
+        signs.index_copy_(0, chosen, cosine.index_select(0, kept).sign())
+    del label, side, rows
+    rows = nonzero_rows(faces >= 0)
     joined, signs = _join_patches(points, normals, near, faces, signs, _MIN_AGREEMENT)
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
     has_plane[joined[rows]] = True
     rows = nonzero_rows(~has_plane[joined])
     indices, patch = torch.unique(joined[rows], return_inverse=True)
     sums = normals.new_zeros(len(indices), 3)
-    sums.index_add_(0, patch, normals[rows] * signs[rows, None])
+    for part in split_rows(len(rows), ROWS_AT_ONCE):
+        sums.index_add_(0, patch[part], normals[rows[part]] * signs[rows[part], None])
     axes = torch.nn.functional.normalize(sums, dim=1)
     side, _ = _split_plates(points, rows, patch, axes, max_thickness)
     joined[rows] += len(has_plane) * side
@@ -95,21 +100,21 @@ def find_surfaces(points: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor
 
     Smooth patches join the patch with the highest agreement until none has a neighbor.
     """
-    none = torch.full((len(points),), -1)
+    none = torch.full((len(points),), -1, dtype=torch.int32)
     return _join_patches(points, normals, near, none, normals.new_ones(len(points)), 0.0)
 
 
 def _split_plates(
     points: Tensor, rows: Tensor, faces: Tensor, axes: Tensor, max_thickness: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the side of each point ``(n,)``, 0 or 1 on a plate, and a mask of thin faces ``(M,)``.
+    """Return which points ``(n,)`` are on the upper side of a plate, and which faces ``(M,)`` thin.
 
     The points ``rows`` ``(n,)`` are on ``faces`` ``(n,)``, rows of the ``axes`` ``(M, 3)``.
     """
     if kernels.serve(points, axes):
         limits = max_thickness * max_thickness, _MAX_HEIGHT_FACTOR, _MIN_TWO_SIDED
         side, is_thin, *_ = kernels.call("split_plates", points, rows, faces, axes, *limits)
-        return side.long(), is_thin
+        return side, is_thin
     counts = torch.bincount(faces, minlength=len(axes)).clamp(min=1)
 
     def mean(values: Tensor) -> Tensor:
@@ -124,13 +129,15 @@ def _split_plates(
     squares = mean(middle * middle)
     is_thin = squares <= max_thickness * max_thickness
     is_plate = is_thin & (mean(middle.abs()) ** 2 > _MIN_TWO_SIDED * squares)
-    return ((middle > 0) & is_plate[faces]).long(), is_thin
+    return (middle > 0) & is_plate[faces], is_thin
 
 
 def _join_patches(
     points: Tensor, normals: Tensor, near: Tensor, faces: Tensor, signs: Tensor, strong: float
 ) -> tuple[Tensor, Tensor]:
     """Grow smooth patches of points without a face (negative), and join patches and faces.
+
+    Writes to ``faces``, int32, and ``signs``, ``(N,)`` each.
 
     Two normals agree if one and the mirror image of the other form less than a right angle,
     mirrored in the bisecting plane of the two points [1]. This holds on a sphere, on both sides of
@@ -146,18 +153,18 @@ def _join_patches(
     rows, num_faces = nonzero_rows(faces < 0), int(faces.max()) + 1
     ranks = [rank for rank in _RANKS if rank < near.shape[1]]
     patch, sign = _grow_patches(points, normals, near, rows, ranks)
-    faces, signs = faces.clone(), signs.clone()
-    faces[rows], signs[rows] = num_faces + patch, sign.to(signs)
-    narrow = faces.to(torch.int32)
+    faces[rows], signs[rows] = patch.add_(num_faces), sign.to(signs)
+    del patch, sign
 
     def compare(chunk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        starts, ends, cosine, bend = _find_links(points, normals, near, chunk, ranks, narrow)
+        starts, ends, cosine, bend = _find_links(points, normals, near, chunk, ranks, faces)
         trust = (1 - bend / 2).clamp(min=0) ** _TRUST_POWER
         agreement = trust * cosine.sign() * signs[starts] * signs[ends]
         return faces[starts], faces[ends], agreement
 
     links = map_tasks(compare, torch.split(rows, ROWS_AT_ONCE), rows.device)
     low, high, agreement = (torch.cat(parts) for parts in zip(*links, strict=True))
+    del links, rows
     sizes = torch.bincount(faces)
     joined, flips = _join_faces(low, high, agreement, sizes, strong)
     return joined[faces], signs * flips[faces].to(signs)
@@ -230,11 +237,11 @@ def _join_faces(
 
     The agreement of two faces is the sum over the links ``(L,)`` between them; if it is negative,
     one is flipped. Faces of many points join if it is ``strong`` for their ``sizes`` ``(M,)``.
-    Returns the new index of each face and its sign, ``(M,)``.
+    Returns the new index of each face, int32, and its sign, ``(M,)``.
     """
     from scipy.sparse import coo_array
 
-    indices, signs = torch.arange(len(sizes)), torch.ones(len(sizes))
+    indices, signs = torch.arange(len(sizes), dtype=torch.int32), torch.ones(len(sizes))
     while True:
         is_between = low != high
         ends = torch.stack([torch.minimum(low, high), torch.maximum(low, high)])[:, is_between]
@@ -257,7 +264,7 @@ def _join_faces(
         indices, signs = joined[indices], signs * flips[indices]
         sizes = torch.bincount(joined, sizes).long()
         half = half.tocoo()
-        low, high = (torch.from_numpy(end).long() for end in half.coords)
+        low, high = (torch.from_numpy(end) for end in half.coords)
         agreement = torch.from_numpy(half.data) * flips[low] * flips[high]
         low, high = joined[low], joined[high]
 
@@ -289,12 +296,12 @@ class _Components:
             kernels.call("flatten_nodes", self.parents, self.is_flipped, self.is_contradictory)
         elif self.links:
             self._search()
-        nodes = torch.arange(len(self.parents))
         # Single nodes of contradictory components come last.
-        roots = torch.where(self.is_contradictory, len(nodes) + nodes, self.parents)
-        is_used = torch.zeros(2 * len(nodes), dtype=torch.bool).index_fill_(0, roots, True)
+        roots, single = self.parents.long(), nonzero_rows(self.is_contradictory)
+        roots[single] = len(roots) + single
+        is_used = torch.zeros(2 * len(roots), dtype=torch.bool).index_fill_(0, roots, True)
         signs = torch.where(self.is_flipped & ~self.is_contradictory, -1.0, 1.0)
-        return is_used.cumsum(0)[roots] - 1, signs
+        return is_used.cumsum(0, dtype=torch.int32)[roots].sub_(1), signs
 
     def _search(self) -> None:
         """Find components of the double cover, which contains each node with both signs."""

@@ -79,15 +79,17 @@ def _mark_cells(
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the occupied cells ``(3, C)`` of a grid, and the index of the cell of some points."""
     low = points.amin(dim=0)
-    codes = torch.zeros(len(points), dtype=torch.int64)
-    for axis in range(3):
-        codes *= _MAX_CELLS
-        codes += ((points[:, axis] - low[axis]) / width).long()
-    cells = sort_integers(torch.unique_consecutive(codes))[1].numpy()
+
+    def encode(positions: Tensor) -> Tensor:
+        x, y, z = ((positions - low) / width).long().unbind(dim=1)
+        return (x * _MAX_CELLS + y) * _MAX_CELLS + z
+
+    parts = [torch.unique_consecutive(encode(part)) for part in torch.split(points, ROWS_AT_ONCE)]
+    cells = sort_integers(torch.cat(parts))[1].numpy()
     cells = cells[np.append(True, cells[1:] != cells[:-1])]
     x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
     at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell]).astype(np.int32)
-    return at, np.searchsorted(cells, codes[rows].numpy())
+    return at, np.searchsorted(cells, encode(points[rows]).numpy())
 
 
 def cell_width(points: Tensor, near: Tensor) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._checks import (
     as_cloud,
     as_tensor,
@@ -18,7 +19,7 @@ from torchrg._checks import (
     check_shapes,
     eager_only,
 )
-from torchrg._parallel import nonzero_rows
+from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
 from torchrg.errors import ConfigError
 from torchrg.neighbors import distinct_points, search_knn
 from torchrg.neighbors.knn import check_neighbors
@@ -277,7 +278,7 @@ def turn_faces(
     Points ``(N, 3)`` are distinct and in canonical order. Neighbors are searched if there are too
     few. Planes with ``labels`` ``(N,)`` and unit normals ``axes`` ``(M, 3)`` are interior faces.
     """
-    upright = _upright(normals)
+    upright = scratch.store(_upright(normals))
     if len(points) == 0:
         return upright
     k = min(NUM_NEIGHBORS, len(points))
@@ -302,8 +303,11 @@ def _turn_inside(
     width = cell_width(points, near[:, :NUM_NEIGHBORS])
     faces, signs = find_faces(points, normals, near, labels, axes, _THICKNESS * width)
     sizes = torch.bincount(faces)
-    hashes = torch.arange(len(points)) * _HASH % _HASHES
-    rows = nonzero_rows(hashes * sizes.index_select(0, faces) < _NUM_VOTES * _HASHES)
+    votes_at = torch.zeros(len(points), dtype=torch.bool)
+    for part in split_rows(len(points), ROWS_AT_ONCE):
+        hashes = torch.arange(part.start, part.stop) * _HASH % _HASHES
+        votes_at[part] = hashes * sizes.index_select(0, faces[part]) < _NUM_VOTES * _HASHES
+    rows = nonzero_rows(votes_at)
     votes = vote_free_side(points, normals, near, rows, width) * signs[rows]
     total = torch.bincount(faces[rows], votes.double(), minlength=len(sizes))
     return torch.where(total.index_select(0, faces) < 0, -signs, signs)
@@ -313,8 +317,9 @@ def _turn_outwards(points: Tensor, normals: Tensor, near: Tensor) -> Tensor:
     """Return consistent signs for which each surface encloses a positive volume."""
     surfaces, signs = find_surfaces(points, normals, near)
     count = torch.bincount(surfaces)[:, None]
-    agreed, local = (normals * signs[:, None]).double(), (points - points[:1]).double()
-    arms = local - (_sum_by(surfaces, local) / count)[surfaces]
+    agreed = scratch.store((normals * signs[:, None]).double())
+    local = scratch.store((points - points[:1]).double())
+    arms = scratch.store(local - (_sum_by(surfaces, local) / count)[surfaces])
     volume = _sum_by(surfaces, (arms * agreed).sum(dim=-1))
     size = _sum_by(surfaces, (arms * arms).sum(dim=-1).sqrt())
     # An open surface encloses no volume; ignore its rounding error.

@@ -172,7 +172,7 @@ def _segment(
     ``side`` is the orientation of the normals, with the front directions ``(N, 3)`` if known.
     """
     begin("neighbors")
-    distinct = distinct_points(points)
+    distinct = DistinctPoints(*map(scratch.store, distinct_points(points)))
     sites = _find_sites(distinct, voxel)
     if voxel is not None or min(len(sites.points), config.normals.k) > 2:
         _warn_about_size(len(sites.points), config.normals.k)
@@ -182,6 +182,7 @@ def _segment(
 
     begin("normals")
     fit = run_estimator(sites.points, neighbors, config.normals, config.chunk_size)
+    fit = fit.map(scratch.store)
 
     begin("regions")
     parts = _split_by_object(sites, neighbors, objects, config.chunk_size)
@@ -199,7 +200,7 @@ def _segment(
     )
     point_labels = expand_to_points(labels, parts.inverse, fill=UNLABELED)
     numbers = rank_by_count(point_labels)
-    labels, point_labels = numbers[labels], numbers[point_labels]
+    labels, point_labels = (scratch.store(numbers[each]) for each in (labels, point_labels))
 
     begin("planes")
     growing = config.growing
@@ -213,11 +214,12 @@ def _segment(
         sites.points[parts.rows], normals, labels, neighbors=parts.surrounding, canonical=True
     )
     fit = fit._replace(sharp=torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp)
-    found = fit.map(partial(expand_to_points, inverse=sites.inverse))
+    found = fit.map(lambda values: scratch.store(expand_to_points(values, sites.inverse)))
     planes = site_planes
     if voxel is not None:
         rows: Rows = distinct.rows if objects is None else slice(None)
-        cloud = points[rows], found.normals[rows], point_labels[rows]
+        columns = points, found.normals, point_labels
+        cloud = (scratch.store(values[rows]) for values in columns)
         table = describe(*cloud, canonical=objects is None)
         planes = replace(table, adjacency=planes.adjacency)
     planes = _complete(planes, points, point_labels, objects, config)
@@ -228,7 +230,7 @@ def _segment(
     def turn(orient: Orientation) -> Tensor:
         axes = site_planes.normal
         turned = turn_faces(sites.points, fit.normals, orient, neighbors, site_labels, axes)
-        return expand_to_points(turned, sites.inverse)
+        return scratch.store(expand_to_points(turned, sites.inverse))
 
     normals = choose_side(points, found.normals, *side, turn)
     begin("done")
@@ -264,7 +266,8 @@ def _find_sites(distinct: DistinctPoints, voxel: float | None) -> _Sites:
         return _Sites(distinct.points, distinct.inverse)
     voxels = sample_voxels(distinct.points, voxel)
     order = canonical_order(distinct.points[voxels.rows])
-    site = distinct.restore(order.argsort()[voxels.inverse], fill=UNLABELED)
+    site = scratch.store(order.argsort()[voxels.inverse])
+    site = scratch.store(distinct.restore(site, fill=UNLABELED))
     num_voxels, num_points, result = len(order), len(distinct.points), ""
     if num_voxels < _MIN_SITES <= num_points:
         result = f"leaves {num_voxels:,} of {num_points:,} points"
@@ -275,7 +278,7 @@ def _find_sites(distinct: DistinctPoints, voxel: float | None) -> _Sites:
             f"segment_planes: voxel {voxel:g} {result}; check that it is in units of the cloud.",
             CloudWarning,
         )
-    return _Sites(distinct.points[voxels.rows[order]], site)
+    return _Sites(scratch.store(distinct.points[voxels.rows[order]]), site)
 
 
 class _Parts(NamedTuple):

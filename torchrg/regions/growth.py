@@ -260,7 +260,8 @@ def rank_by_size(regions: Tensor, min_size: int) -> Tensor:
     # The last entry is selected by -1.
     numbers = np.full(num + 1, UNLABELED)
     numbers[large] = np.arange(len(large))
-    return torch.from_numpy(np.repeat(numbers[run_labels], lengths)).to(regions.device)
+    ranked = torch.from_numpy(np.repeat(numbers[run_labels], lengths))
+    return scratch.store(ranked).to(regions.device)
 
 
 def rank_by_count(labels: Tensor) -> Tensor:

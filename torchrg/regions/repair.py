@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_IN_CACHE, map_chunks, nonzero_rows
+from torchrg import scratch
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
@@ -141,7 +142,7 @@ def remap_labels(labels: Tensor, mapping: Tensor) -> Tensor:
     table = torch.cat([mapping, mapping.new_tensor([UNLABELED])])
     if table.device.type == "cpu":
         # Three times faster than indexing in torch.
-        return torch.from_numpy(np.take(table.numpy(), labels.numpy()))
+        return scratch.store(torch.from_numpy(np.take(table.numpy(), labels.numpy())))
     return table[labels]
 
 
@@ -171,19 +172,21 @@ def assign_unlabeled(
     limit = deg_to_sq_chord(max_angle_deg)
     rows = candidates = ((labels == UNLABELED) & valid).nonzero().squeeze(1)
     while len(rows):
-        near = labels[adjacency.neighbor_rows(rows)]
-        is_adjacent = (near >= 0).any(dim=1)
-        rows, near = rows[is_adjacent], near[is_adjacent]
-        region = near.clamp(min=0)
-        distance = planes.signed_distances(points[rows], region).abs()
-        fits = (near >= 0) & (distance <= reach[region])
-        if normals is not None:
-            ours = normals[rows].double()[:, :, None].unbind(dim=1)
-            fits &= sq_chords(ours, planes.normal[region].unbind(dim=2)) <= limit
-        choice, min_cost = _lowest(torch.where(fits, distance, torch.inf), near)
-        joined = min_cost.isfinite()
-        rows = rows[joined]
-        labels[rows] = choice[joined]
+        joining = []
+        for part in torch.split(rows, ROWS_AT_ONCE):
+            near = labels[adjacency.neighbor_rows(part)]
+            is_adjacent = (near >= 0).any(dim=1)
+            part, near = part[is_adjacent], near[is_adjacent]
+            region = near.clamp(min=0)
+            distance = planes.signed_distances(points[part], region).abs()
+            fits = (near >= 0) & (distance <= reach[region])
+            if normals is not None:
+                ours = normals[part].double()[:, :, None].unbind(dim=1)
+                fits &= sq_chords(ours, planes.normal[region].unbind(dim=2)) <= limit
+            choice, min_cost = _lowest(torch.where(fits, distance, torch.inf), near)
+            joining.append(torch.stack([part, choice])[:, min_cost.isfinite()])
+        rows, choice = torch.cat(joining, dim=1)
+        labels[rows] = choice.to(labels)
         candidates = candidates[labels[candidates] == UNLABELED]
         # A rejected point is reconsidered only if one of its neighbors was labeled.
         rows = adjacency.frontier(candidates, rows)
@@ -435,7 +438,8 @@ def _reassign(
     for _ in range(_MAX_PASSES):
         rows = rows[movable[labels[rows]]]
         near = adjacency.neighbor_rows(rows)
-        chosen = choose(labels, rows, near)
+        parts = zip(torch.split(rows, ROWS_AT_ONCE), torch.split(near, ROWS_AT_ONCE), strict=True)
+        chosen = torch.cat([choose(labels, *part) for part in parts])
         moved = chosen != labels[rows]
         if not bool(moved.any()):
             break

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
@@ -249,8 +250,9 @@ def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor, chunk_size: int) 
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
     narrow, local = labels.to(torch.int32), row_of[rows]
-    indices = cloud.neighbors.indices.new_empty(len(rows), cloud.neighbors.indices.shape[1])
-    counted = torch.empty_like(indices, dtype=torch.bool)
+    shape = len(rows), cloud.neighbors.indices.shape[1]
+    indices = scratch.new_empty(cloud.neighbors.indices, shape)
+    counted = scratch.new_empty(cloud.valid, shape)
     for chunk in split_rows(len(rows), chunk_size):
         near, itself = cloud.neighbors.select(rows[chunk]), local[chunk, None]
         local_rows = near.gather(row_of)
@@ -264,14 +266,15 @@ def _find_edges(
     cloud: GrowingInput, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
 ) -> _InnerEdges:
     """Return the edges of the given points."""
-    near, narrow = cloud.neighbors.select(rows), labels.to(torch.int32)
-    inside = torch.empty_like(near.indices, dtype=torch.bool)
-    passed = torch.empty_like(inside)
+    shape, narrow = (len(rows), cloud.neighbors.indices.shape[1]), labels.to(torch.int32)
+    targets = scratch.new_empty(cloud.neighbors.indices, shape)
+    inside, passed = (scratch.new_empty(cloud.valid, shape) for _ in range(2))
     for chunk in split_rows(len(rows), chunk_size):
-        same = near.gather(narrow, chunk) == narrow[rows[chunk], None]
-        inside[chunk] = same & near.mask(chunk)
+        near = cloud.neighbors.select(rows[chunk])
+        targets[chunk] = near.indices
+        inside[chunk] = (near.gather(narrow) == narrow[rows[chunk], None]) & near.mask()
         passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0] & inside[chunk]
-    return _InnerEdges(rows, near.indices, inside, passed)
+    return _InnerEdges(rows, targets, inside, passed)
 
 
 def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tensor:
@@ -389,7 +392,8 @@ def _measure_residuals(
     """
     segments, narrow = Segments(region), region.to(torch.int32)
     (along,) = segments.coordinates(cloud.points, planes.center, planes.normal[:, None])
-    residual, average = torch.zeros(2, len(region), dtype=torch.float32, device=region.device)
+    zeros = torch.zeros(2, len(region), dtype=torch.float32, device=region.device)
+    residual, average = scratch.store(zeros)
     residual[segments.rows] = along.float()
 
     def work(block: slice) -> None:

@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg import scratch
+from torchrg._parallel import ROWS_AT_ONCE, split_rows
 from torchrg.errors import PrecisionWarning, ShapeError, UnitWarning, warn
 from torchrg.structures.points import FARTHEST, Explained, bounding_box, local_origin
 from torchrg.structures.precision import describe_steps, describe_units
@@ -95,9 +97,11 @@ class Cloud(Explained):
 
         Larger coordinates are codes for missing points.
         """
+        finite = np.empty(len(self), dtype=bool)
         with np.errstate(invalid="ignore"):
-            x, y, z = (np.abs(column) <= FARTHEST for column in self.coordinates.T)
-        finite: NDArray[np.bool_] = x & y & z
+            for rows in split_rows(len(self), ROWS_AT_ONCE):
+                x, y, z = (np.abs(column) <= FARTHEST for column in self.coordinates[rows].T)
+                finite[rows] = x & y & z
         return finite
 
     @property
@@ -154,12 +158,15 @@ class Cloud(Explained):
 
     def relative_to(self, origin: NDArray[np.float64]) -> Tensor:
         """Return the coordinates relative to ``origin`` ``(3,)``, float32, shape ``(N, 3)``."""
-        coordinates = self.coordinates
-        if not self.finite.all() and (is_code := np.abs(coordinates) > FARTHEST).any():
-            coordinates = np.where(is_code, coordinates.dtype.type(np.nan), coordinates)
-        if coordinates.dtype == np.float32 and not origin.any():
+        coordinates, is_near = self.coordinates, not origin.any()
+        if coordinates.dtype == np.float32 and is_near and self.finite.all():
             return torch.from_numpy(np.ascontiguousarray(coordinates))
-        return torch.from_numpy((coordinates - origin).astype(np.float32))
+        local = scratch.empty(coordinates.shape, np.float32)
+        with np.errstate(invalid="ignore"):
+            for rows in split_rows(len(local), ROWS_AT_ONCE):
+                is_code = np.abs(coordinates[rows]) > FARTHEST
+                local[rows] = np.where(is_code, np.nan, coordinates[rows] - origin)
+        return torch.from_numpy(local)
 
 
 def _as_array(values: Any) -> Any:  # noqa: ANN401

@@ -7,6 +7,7 @@ selection), ``smoothing``; ``constants`` documents every number.
 import torch
 from torch import Tensor
 
+from torchrg import scratch
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows
 from torchrg.config import NormalsConfig
 from torchrg.neighbors import measure_sampling, search_knn
@@ -58,7 +59,7 @@ def estimate_consensus(
     """
     width = max(neighbors.indices.shape[1], config.adaptive_k or 0)
     size = min(chunk_size, limit_rows(ROWS_IN_CACHE, width))
-    fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
+    fit = fit_points_pca(points, neighbors, chunk_size=chunk_size).map(scratch.store)
     if neighbors.indices.shape[1] < constants.MIN_NEIGHBORS:
         return fit._replace(sharp=torch.zeros_like(fit.valid))
     survey = estimate_noise(points, neighbors, fit, chunk_size=size)
@@ -66,7 +67,7 @@ def estimate_consensus(
         count = adapted_count(_noise_fraction(survey), neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
-            fit = fit_points_pca(points, neighbors, chunk_size=chunk_size)
+            fit = fit_points_pca(points, neighbors, chunk_size=chunk_size).map(scratch.store)
             survey = estimate_noise(points, neighbors, fit, chunk_size=size)
     noise = survey.noise
     if config.noise_scope == "auto":

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, limit_rows, map_chunks, nonzero_rows
 from torchrg.linalg.angles import above
 from torchrg.linalg.moments import (
@@ -63,7 +63,7 @@ def estimate_noise(
     """
     points = points.contiguous()
     offsets, radius = torch.empty_like(points[:, 0]), torch.empty_like(points[:, 0])
-    deviations = points.new_empty(len(points), 2 + len(constants.NOISE_COUNTS))
+    deviations = scratch.new_empty(points, (len(points), 2 + len(constants.NOISE_COUNTS)))
 
     def work(block: slice) -> None:
         near = neighbors.select(block)
@@ -100,9 +100,8 @@ def estimate_noise(
         noise = torch.minimum(noise, torch.where(below > 0, scaled, torch.inf))
     common = _neighbor_quantiles(noise[:, None], neighbors, constants.COMMON_QUANTILE)[:, 0]
     noise = torch.minimum(noise, constants.MAX_ABOVE_COMMON * common)
-    return NoiseEstimate(
-        offsets, deviations[:, 0].contiguous(), torch.maximum(noise, floor), radius
-    )
+    survey = offsets, deviations[:, 0].contiguous(), torch.maximum(noise, floor), radius
+    return NoiseEstimate(*map(scratch.store, survey))
 
 
 def regional_noise(noise: Tensor, neighbors: Neighbors) -> Tensor:
@@ -224,7 +223,7 @@ def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:
 
 def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -> Tensor:
     """Return quantiles over the neighbors of each point, for each column of values ``(N, C)``."""
-    k, quantiles = neighbors.indices.shape[1], torch.empty_like(values)
+    k, quantiles = neighbors.indices.shape[1], scratch.new_empty(values, values.shape)
     rank = max(math.ceil(quantile * k), 1)
 
     def work(block: slice) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows, map_chunks, map_selected
 from torchrg.linalg.angles import signs
 from torchrg.linalg.moments import (
@@ -69,7 +69,7 @@ def _replace_planes(
     planes: TangentPlanes, rows: Tensor, chunk_size: int, find: Callable[[Tensor], Sequence[Tensor]]
 ) -> TangentPlanes:
     """Return all planes, with the normals and offsets of some ``rows`` replaced by ``find``."""
-    replaced = TangentPlanes(planes.normals.clone(), planes.offsets.clone())
+    replaced = TangentPlanes(*(scratch.store(values.clone()) for values in planes))
 
     def work(block: slice) -> None:
         replaced.normals[rows[block]], replaced.offsets[rows[block]] = find(rows[block])
@@ -80,7 +80,8 @@ def _replace_planes(
 
 def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
     """Return rows of point, normal, offset and value ``(N, 8)``, contiguous per point."""
-    return torch.cat([points, planes.normals, planes.offsets[:, None], values[:, None]], dim=1)
+    columns = points, planes.normals, planes.offsets[:, None], values[:, None]
+    return torch.cat(columns, dim=1, out=scratch.new_empty(points, (len(points), 8)))
 
 
 def _smooth_rows(

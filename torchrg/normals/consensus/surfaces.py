@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg import kernels
-from torchrg._parallel import map_chunks, map_selected
+from torchrg import kernels, scratch
+from torchrg._parallel import ROWS_AT_ONCE, map_chunks, map_selected, nonzero_rows
 from torchrg.linalg.moments import Columns, unbind_columns
 from torchrg.neighbors.knn import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
@@ -60,7 +60,10 @@ def fit_surfaces(
     broken &= deviations > constants.CURVED_FRACTION * survey.deviations
     far_off = deviations > constants.FAR_OFF * noise
     gain, explained = torch.zeros_like(noise), torch.zeros_like(broken)
-    by_votes, meeting = (TangentPlanes(normals.clone(), offsets.clone()) for _ in range(2))
+    by_votes, meeting = (
+        TangentPlanes(*(scratch.store(values.clone()) for values in (normals, offsets)))
+        for _ in range(2)
+    )
 
     def split(rows: Tensor) -> None:
         scale = noise[rows]
@@ -164,8 +167,11 @@ def _may_meet(broken: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
     """Return points whose gain can make an average large enough; spares most of the fits."""
     upper = _mean_of_nearest(broken.float() * constants.MAX_GAIN, neighbors, chunk_size)
     candidates = broken & (upper > constants.MIN_POOLED_GAIN)
-    pooled = neighbors.indices[candidates, : constants.NUM_POOLED].reshape(-1)
-    return torch.zeros_like(broken).index_fill_(0, pooled.long(), True)
+    may_meet = torch.zeros_like(broken)
+    for rows in torch.split(nonzero_rows(candidates), ROWS_AT_ONCE):
+        pooled = neighbors.indices[rows, : constants.NUM_POOLED].reshape(-1)
+        may_meet.index_fill_(0, pooled.long(), True)
+    return may_meet
 
 
 def _mean_of_nearest(values: Tensor, neighbors: Neighbors, chunk_size: int) -> Tensor:
