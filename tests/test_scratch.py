@@ -15,6 +15,7 @@ import torch
 from torchrg import scratch
 from torchrg.config import load_config
 from torchrg.errors import FormatError
+from torchrg.io import read_cloud, write_cloud
 from torchrg.neighbors import blocks
 from torchrg.pipeline import make_superpoints, segment_planes
 from torchrg.scenes import make_room
@@ -126,6 +127,32 @@ def test_released_pages_hold_what_was_written(tmp_path, small):
         np.testing.assert_array_equal(kept, values)
         assert not list(tmp_path.iterdir())
     np.testing.assert_array_equal(kept, values)
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.int64, torch.bool])
+def test_stored_tensors_keep_values_and_layout(tmp_path, small, kind):
+    values = (torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) * 9).to(kind)
+    for tensor in (values, values.T.contiguous().T, values[::2]):
+        assert scratch.store(tensor) is tensor
+        with scratch.on_disk(tmp_path):
+            stored, maps = scratch.store(tensor), [np.frombuffer(m, "u1") for m in scratch._maps]
+        assert stored.untyped_storage().data_ptr() in {each.ctypes.data for each in maps}
+        assert stored.dtype == kind
+        assert torch.equal(stored, tensor)
+        assert stored.is_contiguous() or tensor.T.is_contiguous()
+
+
+def test_a_cloud_read_within_is_on_the_disk(tmp_path, small):
+    points = difficult_room(100).astype(np.float64) + 1e5
+    color = np.full(points.shape, 7, "u1")
+    write_cloud(tmp_path / "room.ply", Cloud(points, {"color": color}))
+    with scratch.on_disk(tmp_path):
+        cloud = read_cloud(tmp_path / "room.ply")
+        arrays = cloud.coordinates, cloud.fields["color"], cloud.points.numpy()
+        starts = {np.frombuffer(m, "u1").ctypes.data for m in scratch._maps}
+        assert all(array.ctypes.data in starts for array in arrays)
+    np.testing.assert_array_equal(cloud.coordinates, points)
+    torch.testing.assert_close(cloud.points, Cloud(points).points, rtol=0, atol=0, equal_nan=True)
 
 
 def test_a_full_disk_is_one_line(tmp_path, small, monkeypatch):

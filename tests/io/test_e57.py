@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchrg.errors import FormatError
-from torchrg.io import read_cloud
+from torchrg.io import estimate_points, read_cloud
 from torchrg.io.e57 import ScanPose, to_cartesian
 
 pye57 = pytest.importorskip("pye57")
@@ -45,6 +45,10 @@ def test_scans_are_moved_by_their_poses(scans):
     assert cloud.fields["scan"].tolist() == [0] * 20 + [1] * 20
     assert cloud.fields["color"][:, 0].tolist() == [*range(20), *[0] * 20]
     assert [scan.name for scan in cloud.header["scans"]] == ["scan 0", "scan 1"]
+
+
+def test_points_are_counted_in_all_scans(scans):
+    assert estimate_points(scans[0]) == len(scans[1])
 
 
 def test_fields_that_a_scan_lacks_are_zero_there(scans):

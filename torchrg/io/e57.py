@@ -10,7 +10,7 @@ import contextlib
 import math
 import struct
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -20,9 +20,11 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg import scratch
 from torchrg._optional import require
+from torchrg._parallel import ROWS_AT_ONCE, split_rows
 from torchrg.errors import FormatError
-from torchrg.io.fields import assemble_cloud
+from torchrg.io.fields import assemble_cloud, stack_columns
 from torchrg.io.files import PARSE_ERRORS, check_available, wrap_errors
 from torchrg.io.headers import check_grid, distance_outside
 from torchrg.io.mesh import Fronts
@@ -52,8 +54,6 @@ _MAX_RATIO = 1_000
 """Maximum bytes of memory per byte of a file. Constant values take no bits in the file."""
 _VALUE_BYTES = 8
 """Maximum bytes of a value in memory."""
-_BYTES_PER_POINT = 12
-"""Assumed bytes per point when estimating the count from the file size: three float32."""
 _Block = dict[str, Array]
 """Columns of a scan, by name."""
 
@@ -81,7 +81,7 @@ class ScanPose(NamedTuple):
         from scipy.spatial.transform import Rotation
 
         w, x, y, z = self.rotation if any(self.rotation) else ScanPose().rotation
-        turned, (i, j, k) = np.empty(vectors.shape), vectors.T
+        turned, (i, j, k) = scratch.empty(vectors.shape, np.float64), vectors.T
         for axis, (a, b, c) in enumerate(Rotation.from_quat([x, y, z, w]).as_matrix()):
             turned[:, axis] = i * a + j * b + k * c
         return turned
@@ -167,8 +167,15 @@ def read_e57(path: Path, size: int) -> Cloud:
 
 
 def count_e57(path: Path, size: int) -> int:
-    """Estimate the number of points from the file size; opening a file would check all pages."""
-    return size // _BYTES_PER_POINT
+    """Return the number of points of all scans from the XML, without checking all pages."""
+    counts: list[int] = []
+
+    def begin(name: str, attributes: dict[str, str]) -> None:
+        if name == "points":
+            counts.append(int(attributes.get("recordCount", 0)))
+
+    _parse_tree(path, size, begin)
+    return min(sum(counts), 8 * size)  # A point takes at least a bit.
 
 
 def _color_limits(pye57: ModuleType, header: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
@@ -224,7 +231,8 @@ def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud:
         )
     if not inside.any():
         return None, notes
-    front = np.zeros((len(cloud), 3), np.float32)
+    front = scratch.empty((len(cloud), 3), np.float32)
+    front[:] = 0
     parts = (np.split(values, np.cumsum(counts)[:-1]) for values in (front, cloud.coordinates))
     for position, is_inside, part, points in zip(positions, inside, *parts, strict=True):
         if is_inside:
@@ -252,14 +260,6 @@ def _check_pages(path: Path, size: int) -> None:
 
 def _check_tree(path: Path, size: int) -> None:
     """Check that libe57 parses the XML in time; libe57 reports any other errors in it."""
-    with path.open("rb") as stream:
-        head = stream.read(_XML_ENTRY.size)
-        if len(head) < _XML_ENTRY.size or not max(_XML_ENTRY.unpack(head)) <= size:
-            return
-        start, length = _XML_ENTRY.unpack(head)
-        stream.seek(start - start % _PAGE_BYTES)
-        num_pages = -(-(start % _PAGE_BYTES + length) // _CONTENT_BYTES)
-        pages = [stream.read(_PAGE_BYTES)[:_CONTENT_BYTES] for _ in range(num_pages)]
     open_nodes: list[tuple[str | None, int]] = []
 
     def begin(name: str, attributes: dict[str, str]) -> None:
@@ -271,9 +271,26 @@ def _check_tree(path: Path, size: int) -> None:
                 f"per structure, got more at {name}; write the file again."
             )
 
+    _parse_tree(path, size, begin, lambda name: open_nodes.pop())
+
+
+def _parse_tree(
+    path: Path,
+    size: int,
+    begin: Callable[[str, dict[str, str]], object],
+    end: Callable[[str], object] | None = None,
+) -> None:
+    """Pass the name and attributes of each XML element to functions; ignore an incomplete XML."""
+    with path.open("rb") as stream:
+        head = stream.read(_XML_ENTRY.size)
+        if len(head) < _XML_ENTRY.size or not max(_XML_ENTRY.unpack(head)) <= size:
+            return
+        start, length = _XML_ENTRY.unpack(head)
+        stream.seek(start - start % _PAGE_BYTES)
+        num_pages = -(-(start % _PAGE_BYTES + length) // _CONTENT_BYTES)
+        pages = [stream.read(_PAGE_BYTES)[:_CONTENT_BYTES] for _ in range(num_pages)]
     parser = expat.ParserCreate()
-    parser.StartElementHandler = begin
-    parser.EndElementHandler = lambda name: open_nodes.pop()
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
     with contextlib.suppress(expat.ExpatError):
         parser.Parse(b"".join(pages)[start % _PAGE_BYTES :][:length], True)
 
@@ -316,7 +333,7 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
         if name in (*_AXES, *_SPHERICAL) and isinstance(node, libe57.ScaledIntegerNode):
             check_grid(path, name, [node.scale()], [node.offset()])
     block = {
-        name: np.empty(count, _type_code(libe57, node))
+        name: scratch.empty((count,), np.dtype(_type_code(libe57, node)))
         for name, node in nodes.items()
         if not isinstance(node, libe57.StringNode)
     }
@@ -331,10 +348,12 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
             raise EOFError(f"{num_read:,} of {count:,} points")
         reader.close()
     if all(axis in block for axis in _AXES):
-        points = np.stack([block.pop(axis) for axis in _AXES], axis=1)
+        points = stack_columns(path, [block.pop(axis) for axis in _AXES])
     elif all(axis in block for axis in _SPHERICAL):
-        spherical = [block.pop(axis).astype("d") for axis in _SPHERICAL]
-        points = to_cartesian(np.stack(spherical, axis=1))
+        spherical = stack_columns(path, [block.pop(axis) for axis in _SPHERICAL])
+        points = scratch.empty(spherical.shape, np.float64)
+        for rows in split_rows(count, ROWS_AT_ONCE):
+            points[rows] = to_cartesian(spherical[rows].astype(np.float64))
     else:
         raise FormatError(f"{path}: expected {', '.join(_AXES)}, got {', '.join(block) or 'none'}.")
     for name in _STATES:

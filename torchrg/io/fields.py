@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg import scratch
 from torchrg.errors import FormatError
 from torchrg.io.tables import check_table, guess_column_names, warn_about_counters
 from torchrg.structures import UNLABELED, Cloud
@@ -81,13 +82,13 @@ def assemble_cloud(
             raise FormatError(
                 f"{path}: expected x, y, z of one number per point, got {shapes}; flatten them."
             )
-        values = _stack(path, axes)
+        values = stack_columns(path, axes)
     else:
-        values = remaining.pop(coordinates)
+        values = stack_columns(path, [remaining.pop(coordinates)])
     points = convert_coordinates(path, values)
     sources = _field_columns(remaining)
     fields = {
-        name: _stack(path, [remaining[column] for column in parts])
+        name: stack_columns(path, [remaining[column] for column in parts])
         for name, parts in sources.items()
     }
     if "labels" in fields:
@@ -100,6 +101,7 @@ def assemble_cloud(
             color = color.astype(np.int64)
         fields["color"], more = read_colors(path, color)
         notes += more
+    fields = {name: scratch.store(values) for name, values in fields.items()}
     return Cloud(points, fields, grid_shape, str(path), header or {}, notes)
 
 
@@ -252,10 +254,11 @@ def _find_numbered(columns: NamedColumns) -> dict[str, list[str]]:
     }
 
 
-def _stack(path: Path, columns: list[Array]) -> Array:
+def stack_columns(path: Path, columns: list[Array]) -> Array:
     """Stack single columns, or return one column as it is, in native byte order."""
     if len(columns) == 1:
-        return np.ascontiguousarray(columns[0], dtype=columns[0].dtype.newbyteorder("="))
+        native = columns[0].dtype.newbyteorder("=")
+        return scratch.store(np.ascontiguousarray(columns[0], dtype=native))
     try:
         dtype = np.result_type(*columns)
     except TypeError as error:
@@ -263,7 +266,7 @@ def _stack(path: Path, columns: list[Array]) -> Array:
         raise FormatError(
             f"{path}: expected columns of one type to combine, got {kinds}; convert to numbers."
         ) from error
-    stacked = np.empty((len(columns[0]), len(columns)), dtype)
+    stacked = scratch.empty((len(columns[0]), len(columns)), dtype)
     for i, column in enumerate(columns):
         stacked[:, i] = column
     return stacked

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from torchrg import scratch
 from torchrg._optional import require
 from torchrg._parallel import split_rows
 from torchrg.errors import FormatError
@@ -99,8 +100,8 @@ def read_las(path: Path, size: int) -> Cloud:
     wide = {dim.name for dim in extra if dim.description == _WIDE_DESCRIPTION}
     columns = {
         # Popped from the parts, so that a column is not stored twice for long.
-        name.removesuffix(_WIDE_SUFFIX) if name in wide else name: np.concatenate(
-            [chunk.pop(name) for chunk in parts]
+        name.removesuffix(_WIDE_SUFFIX) if name in wide else name: scratch.store(
+            np.concatenate([chunk.pop(name) for chunk in parts])
         )
         for name in names
         if name not in unused
@@ -474,8 +475,13 @@ def _chunk_columns(block: Any) -> dict[str, Array]:  # noqa: ANN401
         if dimension.name in ("X", "Y", "Z"):
             continue
         parts = [values] if values.ndim == 1 else values.T
-        columns |= dict(zip(_column_names(dimension), parts, strict=True))
+        columns |= dict(zip(_column_names(dimension), map(_compact, parts), strict=True))
     return columns
+
+
+def _compact(values: Array) -> Array:
+    """Return a copy that does not keep the packed points, and takes no memory if all are zero."""
+    return values.copy() if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
 
 
 def _dimension_holds(dimension: Any, column: Array) -> bool:  # noqa: ANN401

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from torchrg import scratch
 from torchrg.errors import FormatError
 from torchrg.io.e57 import SYSTEM
 from torchrg.io.headers import MAX_INTEGER
 from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.structures import Cloud
+from torchrg.structures.points import Array
 
 _SUSPICIOUS_RATIO = 100
 """Ratio of the extents of two clouds from which a warning is issued: tiles of one survey differ
@@ -58,15 +60,19 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
     times = Counter(cloud.source for cloud in clouds if cloud.source)
     notes += [f"{name} is used {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(clouds)
+
+    def join(parts: Sequence[Array]) -> Array:
+        return scratch.store(np.concatenate(parts))
+
     fronts = [np.zeros((len(c), 3), np.float32) if c.front is None else c.front for c in clouds]
     has_front = any(cloud.front is not None for cloud in clouds)
     return Cloud(
-        np.concatenate([cloud.coordinates for cloud in clouds]),
-        {name: np.concatenate([cloud.fields[name] for cloud in clouds]) for name in shared},
+        join([cloud.coordinates for cloud in clouds]),
+        {name: join([cloud.fields[name] for cloud in clouds]) for name in shared},
         source=f"{clouds[0].source} and {len(clouds) - 1} more",
         header=header,
         notes=tuple(notes),
-        front=np.concatenate(fronts) if has_front else None,
+        front=join(fronts) if has_front else None,
     )
 
 

@@ -20,6 +20,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy_format
 
+from torchrg import scratch
 from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, to_records
 from torchrg.io.fields import (
@@ -305,7 +306,7 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
     with _open_member(path, archive, archive.getinfo(f"{name}.npy")) as stream:
         values: Array = npy_format.read_array(stream, allow_pickle=False)
         _drain(stream)
-        return values
+        return scratch.store(values)
 
 
 def _drain(stream: IO[bytes]) -> None:
