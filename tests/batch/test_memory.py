@@ -76,7 +76,8 @@ def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, what, p
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     options = {"num_levels": 4 * ("superpoints" in what), "on_disk": "disk" in what}
     promised = scan_memory(num_points, **options)
-    assert 0.5 * promised < int(done.stdout) < promised
+    pages = 1.5e8 * ("disk" in what)  # Of files, which the system can reclaim.
+    assert 0.5 * promised < int(done.stdout) < promised + pages
 
 
 @pytest.mark.slow

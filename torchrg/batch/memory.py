@@ -8,9 +8,10 @@ from pathlib import Path
 
 PROCESS_BYTES = 400_000_000
 """Memory of a process without points: Python, torch, scipy."""
-_BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 400, (True, True): 600}
+_BYTES_PER_POINT = {(False, False): 500, (True, False): 1000, (False, True): 100, (True, True): 600}
 """Peak memory per point or pixel with any preset, by whether there are superpoints and whether the
-large arrays are on disk, for at most ``_K`` neighbors and ``_NUM_LEVELS`` levels."""
+large arrays are on disk, for at most ``_K`` neighbors and ``_NUM_LEVELS`` levels. On disk, pages of
+files do not count: the system can reclaim them."""
 _K, _NUM_LEVELS = 50, 4
 _BYTES_PER_NEIGHBOR, _BYTES_PER_LEVEL, _BYTES_PER_PAIR = {False: 14, True: 8}, 24, 40
 """Memory per point of each further neighbor (False: not on disk) and level, and of ``k * k``."""

@@ -9,12 +9,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from torchrg import scratch
 from torchrg.batch.memory import available_memory, scan_memory
 from torchrg.batch.run import lock_folder
+from torchrg.batch.sites import count_sites, propose_voxel
 from torchrg.batch.stale import find_records
 from torchrg.cli import flags, loop
 from torchrg.cli.arguments import parse
@@ -100,7 +102,7 @@ class Arguments(flags.PlaneSettings):
     verbose: bool = False
     """Also print the measured kind of noise and the settings chosen from it."""
     limit_memory: float | None = None
-    """Memory limit per cloud, in GB. Beyond it, the largest arrays go to disk (about 450 bytes per
+    """Memory limit per cloud, in GB. Beyond it, the largest arrays go to disk (about 650 bytes per
     point, next to OUT or in TMPDIR); the result is identical. Default: half of the free memory."""
 
 
@@ -179,27 +181,30 @@ def _reject_images(argv: list[str]) -> None:
             )
 
 
-def _segment(
+def _segment(arguments: Arguments, *paths: Any) -> None:  # noqa: ANN401
+    """Apply :func:`_segment_cloud` to one input."""
+    with contextlib.ExitStack() as storage:
+        _segment_cloud(storage, arguments, *paths)
+
+
+def _segment_cloud(
+    storage: contextlib.ExitStack,
     arguments: Arguments,
     sources: tuple[Path, ...],
     target: Path,
     table: Path | None,
     picture: Path | None,
 ) -> None:
-    """Segment a cloud with a progress bar, and print one line about the result."""
+    """Segment a cloud with a progress bar, and print one line about the result.
+
+    Its large arrays are in the ``storage``, a context that ends with the cloud.
+    """
     begin, source = time.perf_counter(), loop.display_name(sources)
-    limit = flags.limit_in_bytes(arguments.limit_memory, available_memory() // 2)
-    num_points = sum(map(estimate_points, sources))
-    _check_limit(arguments, source, num_points, limit)  # Before reading.
-    clouds = [
-        read_cloud(path, columns=flags.file_columns(path, arguments.columns)) for path in sources
-    ]
-    cloud = merge_clouds(clouds)
-    where = _array_storage(arguments, source, target, len(cloud), limit)
+    cloud = _read(arguments, sources, target, storage)
     find_objects(cloud, arguments.within)  # An unknown field fails before any warning.
     _check_points(arguments, source, cloud, target)
     stages = (*loop.STAGES, *["superpoints"] * arguments.superpoints)
-    with loop.stage_bar(sources[0].name, stages) as advance, where:
+    with loop.stage_bar(sources[0].name, stages) as advance:
         seg, superpoints = segment_cloud(
             cloud,
             arguments.settings,
@@ -237,6 +242,31 @@ def _segment(
     loop.report_planes(source, seg, len(cloud), reason, f"{seconds} -> {target}{dropped}")
 
 
+def _read(
+    arguments: Arguments, sources: tuple[Path, ...], target: Path, storage: contextlib.ExitStack
+) -> Cloud:
+    """Read the inputs as one cloud, whose large arrays go to the storage that the limit allows.
+
+    Raises ConfigError if the limit does not suffice, before reading if its points do not fit.
+    """
+    source = loop.display_name(sources)
+    limit = flags.limit_in_bytes(arguments.limit_memory, available_memory() // 2)
+    num_points = sum(map(estimate_points, sources))
+    storage.enter_context(_array_storage(arguments, source, target, num_points, limit))
+    columns = {path: flags.file_columns(path, arguments.columns) for path in sources}
+    cloud = merge_clouds([read_cloud(path, columns=columns[path]) for path in sources])
+    if not scratch.is_active():
+        storage.enter_context(_array_storage(arguments, source, target, len(cloud), limit))
+    _check_limit(arguments, source, len(cloud), limit)  # The number was an estimate for text.
+    if arguments.voxel is not None:
+        num_sites = count_sites(cloud.points, arguments.voxel)
+        print_lines(f"{source}: {num_sites:,} sites, one of the {len(cloud):,} points per voxel")
+    elif scratch.is_active():
+        voxel = propose_voxel(cloud.points)
+        print_lines(f"{source}: --voxel {voxel:g} would segment about half of the points")
+    return cloud
+
+
 def _check_limit(arguments: Arguments, source: str, num_points: int, limit: int) -> None:
     """Raise if a cloud exceeds the memory limit even with its large arrays on disk."""
     minimum = _needed_memory(arguments, num_points, on_disk=True)
@@ -270,7 +300,8 @@ def _array_storage(
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
     k = min(arguments.settings.max_neighbors, num_points)
-    check_space(folder, num_points * k * scratch.BYTES_PER_NEIGHBOR, "the work")
+    size = k * scratch.BYTES_PER_NEIGHBOR + scratch.BYTES_PER_POINT
+    check_space(folder, num_points * size, "the work")
     print_lines(
         f"{source}: about {num_points:,} points need {needed / 1e9:.2f} GB of memory, the limit "
         f"is {limit / 1e9:.2f} GB: moving the largest arrays to disk in {folder}"
