@@ -77,8 +77,8 @@ class Arguments:
     limit_memory: float | None = None
     """Memory limit for all concurrent scans, in GB. Default: 80 % of the free memory."""
     table: str | None = None
-    """Name of a plane table in the folder of each scan, besides planes.json, such as planes.csv; see
-    torchrg segment --table."""
+    """Name of a plane table in the folder of each scan, besides planes.json, such as planes.csv;
+    see torchrg segment --table."""
     only: str | None = None
     """Shell pattern of scans to convert, such as "Area_5/*". Results of missing scans are kept."""
     only_failed: bool = False
