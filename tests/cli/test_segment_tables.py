@@ -57,10 +57,10 @@ def test_a_table_goes_beside_any_result_and_keeps_coordinates(scans, tmp_path, r
     for row in rows if labels is not None else ():
         own = coordinates[labels == int(row["id"])]
         assert len(own) == int(row["count"])
-        centroid = [float(row[f"centroid_{x}"]) for x in "xyz"]
-        np.testing.assert_allclose(centroid, own.mean(axis=0), atol=1e-6)
-        away = own @ [float(row[f"normal_{x}"]) for x in "xyz"] - float(row["offset"])
-        assert np.sqrt((away**2).mean()) == pytest.approx(float(row["rms"]), abs=1e-6)
+        centroid = [float(row[f"centroid_{x}_m"]) for x in "xyz"]
+        np.testing.assert_allclose(centroid, own.mean(axis=0), atol=1e-4)
+        away = own @ [float(row[f"normal_{x}"]) for x in "xyz"] - float(row["offset_m"])
+        assert np.sqrt((away**2).mean()) == pytest.approx(float(row["rms_m"]), abs=1e-4)
 
 
 def test_outlines_and_roles_need_no_flag_and_a_flag_wins(scans, tmp_path, run, monkeypatch):
@@ -92,7 +92,8 @@ def test_json_is_the_planes_json_of_convert(scans, tmp_path, run):
     written = json.loads((out / "room" / "planes.json").read_text())
     assert json.loads(table.read_text()) == written
     rows = rows_of(out / "room" / "planes.csv")
-    assert [float(row["offset"]) for row in rows] == [row["offset"] for row in written["planes"]]
+    offsets = [row["offset"] for row in written["planes"]]
+    np.testing.assert_allclose([float(row["offset_m"]) for row in rows], offsets, atol=1e-4)
 
 
 @pytest.mark.parametrize("flags", [(), ("--preset", "classic")])
@@ -124,10 +125,10 @@ def test_convert_keeps_its_tables_and_never_replaces_those_of_others(scans, tmp_
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ("planes.txt", "planes.txt: expected a file ending in .csv or .json, got '.txt'"),
+        ("planes.txt", "planes.txt: expected a file ending in .csv or .json or .dxf, got '.txt'"),
         ("no/planes.csv", "not found; create it first"),
-        ("out.npz", "expected a file ending in .csv or .json, got '."),
-        ("room.xyz", "expected a file ending in .csv or .json, got '."),
+        ("out.npz", "expected a file ending in .csv or .json or .dxf, got '."),
+        ("room.xyz", "expected a file ending in .csv or .json or .dxf, got '."),
     ],
 )
 def test_a_table_without_a_place_is_refused_before_the_work(scans, tmp_path, run, table, message):
@@ -142,7 +143,7 @@ def test_a_table_without_a_place_is_refused_before_the_work(scans, tmp_path, run
 )
 def test_convert_refuses_a_table_outside_the_folder_of_a_scan(scans, tmp_path, run, table):
     reported = run("convert", "folder", scans[0], tmp_path / "out", "--table", table)
-    assert "expected --table to be a name ending in .csv or .json" in reported.error
+    assert "expected --table to be a name ending in .csv or .json or .dxf" in reported.error
     assert not (tmp_path / "out").exists()
 
 

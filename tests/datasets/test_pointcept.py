@@ -119,7 +119,7 @@ def test_optional_columns_are_described(sample):
     config = load_config("classic")
     seg = segment_planes(sample["coord"], config)
     bare = replace(seg.planes, kind=None, outline=None, adjacency=None)
-    assert set(describe_planes(bare)) == {"planes"}
+    assert set(describe_planes(bare)) == {"unit", "planes"}
     assert not {"kind", "outline"} & set(describe_planes(bare)["planes"][0])
     ring = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     full = replace(

@@ -41,6 +41,7 @@ from torchrg.datasets.rgbd import FusedRecordings
 from torchrg.datasets.s3dis import ClassOrder, find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
+from torchrg.io.dxf import check_dxf
 from torchrg.io.files import (
     OUTPUT_MARK,
     check_writable,
@@ -319,8 +320,11 @@ def _check(arguments: Arguments) -> None:
     table = arguments.table or PLANES_FILE
     if Path(table).name != table or Path(table).suffix not in TABLE_SUFFIXES or table == RECORD:
         raise ConfigError(
-            f"expected --table to be a name ending in .csv or .json, got {table}; use planes.csv."
+            f"expected --table to be a name ending in {' or '.join(TABLE_SUFFIXES)}, got {table}; "
+            "use planes.csv."
         )
+    if Path(table).suffix == ".dxf":
+        check_dxf()
     if arguments.engine not in ("local", "ray", "auto") and ":" not in arguments.engine:
         raise ConfigError(
             f"expected --engine local, ray, auto or HOST:PORT of a cluster, got {arguments.engine}."

@@ -113,10 +113,11 @@ TableFlag = Annotated[
     Path | None,
     Argument(
         metavar="PLANES.csv",
-        text="Also write the plane table, as .csv or .json; with several inputs, a directory. CSV "
-        "has one row per plane in input coordinates: class, normal, offset, centroid, area, dip, "
-        "RMS distance and the polygon as WKT POLYGON Z. The up axis is z. For point clouds, also "
-        "traces polygons if shapely is installed (pip install 'torchrg[outline]').",
+        text="Also write the plane table, as .csv, .json or .dxf; with several inputs, a "
+        "directory. CSV has one row per plane in input coordinates: class, normal, offset, "
+        "centroid, area, dip, RMS distance and the polygon as WKT POLYGON Z. DXF has closed 3D "
+        "polylines on layers by class (pip install 'torchrg[dxf]'). The up axis is z. For point "
+        "clouds, also traces polygons if shapely is installed (pip install 'torchrg[outline]').",
     ),
 ]
 WithinFlag = Annotated[

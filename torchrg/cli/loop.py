@@ -12,6 +12,7 @@ from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.cli.ending import SOME_FAILED, fail, print_lines, printable, warn
 from torchrg.errors import FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output
+from torchrg.io.dxf import check_dxf
 from torchrg.io.fields import describe_renamed_fields
 from torchrg.io.files import check_writable, create_folder, list_some, normalize_file_name
 from torchrg.io.npy import DISPLAYED_FIELDS
@@ -119,6 +120,8 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
     check_writable(path)
     if is_viewer(path):
         read_library()
+    if path.suffix.lower() == ".dxf":
+        check_dxf()
 
 
 def is_viewer(path: Path) -> bool:

@@ -1,10 +1,11 @@
 """Plane tables in files: ``.npz`` arrays, JSON and CSV.
 
-:func:`describe_planes` creates the JSON form, from which the CSV form is derived.
+:func:`describe_planes` creates the JSON form, from which the CSV and DXF forms are derived.
 """
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg.io.outlines import straighten_rings
 from torchrg.structures import PLANE_KINDS, PlaneAdjacency, Planes
 from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.structures.points import Array
@@ -39,8 +41,16 @@ CSV_COLUMNS = (
 )  # fmt: skip
 """Columns of CSV files and data frames, empty if unknown. Directions and positions have three
 columns, such as ``normal_x``; a polygon is a WKT ``POLYGON Z``."""
-TABLE_SUFFIXES = (".csv", ".json")
+TABLE_SUFFIXES = (".csv", ".json", ".dxf")
 """File extensions of plane tables."""
+_STOREY_HEIGHTS = 2.0, 6.0
+"""Range of the height of the tallest plane, in meters: the walls of rooms and halls."""
+_DECIMALS = {"normal": 12, "axes": 12, "dip_deg": 5, "dip_direction_deg": 5}
+"""Decimals of numbers that are no lengths. Offsets at UTM coordinates need exact normals."""
+_MIN_ERROR = 1e-5
+"""Minimum error of positions, as a fraction of the longest plane, for points without noise."""
+_NUM_ERRORS = 3.0
+"""Number of standard errors of its dip below which a plane has no dip direction."""
 
 
 def planes_to_arrays(planes: Planes, origin: NDArray[np.float64]) -> Arrays:
@@ -154,8 +164,10 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
         ``planes``: for each plane its ``id`` (the value in ``plane.npy``) and the columns of
         :class:`torchrg.structures.Planes`; ``kind`` as text, and ``outline`` as rings of points.
         With z up and y north, ``dip_deg`` is the angle to the horizontal, in [0, 90], and
-        ``dip_direction_deg`` the direction of steepest descent, clockwise from north, 0 if level.
-        ``adjacency``, if known: ``pair`` of IDs, ``boundary_length``, ``dihedral_deg``.
+        ``dip_direction_deg`` the direction of steepest descent, clockwise from north; None for a
+        dip below its error.
+        ``adjacency``, if known: ``pair`` of IDs, ``boundary_length``, ``dihedral_deg``. ``unit``:
+        "m" if the tallest plane is as high as a room, else "".
 
     Example:
         >>> from torchrg.pipeline import segment_planes
@@ -169,18 +181,34 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     )
     columns = {"id": [*range(len(planes))]} | _lists(arrays, "plane_")
     x, y, z = arrays["plane_normal"].T.astype(np.float64)
-    columns["dip_deg"] = np.degrees(np.arctan2(np.hypot(x, y), np.abs(z))).tolist()
-    falls = np.arctan2(x * np.copysign(1, z), y * np.copysign(1, z))
-    columns["dip_direction_deg"] = (np.degrees(falls) % 360).tolist()
+    dip = np.arctan2(np.hypot(x, y), np.abs(z))
+    columns["dip_deg"] = np.degrees(dip).tolist()
+    falls = np.degrees(np.arctan2(x * np.copysign(1, z), y * np.copysign(1, z))) % 360
+    # The error of the slope of a fit to points that are spread evenly over the shorter side.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = arrays["plane_rms"] / arrays["plane_extent"][:, 1]
+        error = _NUM_ERRORS * error * np.sqrt(12 / arrays["plane_count"])
+    error = np.nan_to_num(error, nan=np.inf) + np.finfo(arrays["plane_normal"].dtype).eps
+    columns["dip_direction_deg"] = [
+        None if is_level else fall
+        for is_level, fall in zip(dip <= error, falls.tolist(), strict=True)
+    ]
     if planes.outline is not None:
         ends = arrays["outline_ring_sizes"].cumsum()[:-1]
         rings = iter([ring.tolist() for ring in np.split(arrays["outline_points"], ends)])
         columns["outline"] = [[next(rings) for _ in outline] for outline in planes.outline]
-    table: Json = {"planes": _rows(columns)}
+    table: Json = {"unit": guess_unit(planes), "planes": _rows(columns)}
     if planes.adjacency is not None:
         pairs = _lists(arrays, "adjacency_")
         table["adjacency"] = _rows({"pair": pairs.pop("pairs"), **pairs})
     return table
+
+
+def guess_unit(planes: Planes) -> str:
+    """Return "m" if the tallest plane is as high as a room in meters, else an empty string."""
+    heights = (planes.axes[..., 2].abs() * planes.extent).sum(dim=1).tolist()
+    low, high = _STOREY_HEIGHTS
+    return "m" if low <= max(heights, default=0.0) <= high else ""
 
 
 def tabulate_planes(described: Json) -> Json:
@@ -208,10 +236,51 @@ def tabulate_planes(described: Json) -> Json:
 
 
 def encode_csv(described: Json) -> bytes:
-    """Convert the result of :func:`describe_planes` to CSV with a header line."""
-    columns, text = tabulate_planes(described), io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
+    """Convert the result of :func:`describe_planes` to CSV with a header line.
+
+    Numbers and polygons are those of :func:`simplify_table`. Names of lengths and areas end in the
+    unit if it is known, as in ``area_m2``.
+    """
+    columns, text = tabulate_planes(simplify_table(described)), io.StringIO()
+    unit, powers = described.get("unit"), {"area": "2", "rms": "", "offset": ""}
+    powers |= {f"centroid_{axis}": "" for axis in "xyz"}
+    header = [
+        f"{name}_{unit}{powers[name]}" if unit and name in powers else name for name in columns
+    ]
+    csv.writer(text, lineterminator="\n").writerows([header, *zip(*columns.values(), strict=True)])
     return text.getvalue().encode()
+
+
+def simplify_table(described: Json) -> Json:
+    """Return the result of :func:`describe_planes` with few corners and rounded numbers.
+
+    Polygons are those of :func:`torchrg.io.outlines.straighten_rings`. Lengths and areas are
+    rounded to a hundredth of the median RMS distance, which adds nothing to their error.
+    """
+    planes = described["planes"]
+    error = float(np.median([plane.get("rms", 0.0) for plane in planes])) if planes else 0.0
+    size = max((side for plane in planes for side in plane.get("extent", ())), default=1.0)
+    decimals = math.ceil(2 - math.log10(max(error, _MIN_ERROR * size, np.finfo(float).tiny)))
+    rows = []
+    for plane in planes:
+        row = plane | ({"outline": _straighten(plane)} if plane.get("outline") else {})
+        rows.append({n: _rounded(value, _DECIMALS.get(n, decimals)) for n, value in row.items()})
+    return described | {"planes": rows}
+
+
+def _straighten(plane: Json) -> list[list[list[float]]]:
+    """Return the straightened rings of a plane."""
+    center, axes = np.array(plane["center"]), np.array(plane["axes"])
+    flat = [(np.array(ring) - center) @ axes.T for ring in plane["outline"]]
+    spacing = math.sqrt(plane["area"] / max(plane["count"], 1))
+    return [(center + r @ axes).tolist() for r in straighten_rings(flat, spacing, plane["rms"])]
+
+
+def _rounded(value: Any, decimals: int) -> Any:  # noqa: ANN401
+    """Round all numbers of a JSON value; minus zero becomes zero."""
+    if isinstance(value, list):
+        return [_rounded(part, decimals) for part in value]
+    return round(value, decimals) + 0.0 if isinstance(value, float) else value
 
 
 def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float]) -> str:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
+from torchrg.io.dxf import encode_dxf
 from torchrg.io.fields import add_result_fields
 from torchrg.io.files import PARSE_ERRORS, atomic_path, local_path
 from torchrg.io.npy import POINT_RESULTS, map_folder, read_result_arrays
@@ -269,9 +270,12 @@ class Result:
 
 
 def write_table(path: Path, described: Json) -> None:
-    """Write the result of :func:`describe_planes` as JSON or CSV, by file extension."""
-    is_json = path.suffix.lower() == ".json"
-    content = json.dumps(described, indent=1).encode() if is_json else encode_csv(described)
+    """Write the result of :func:`describe_planes` as JSON, CSV or DXF, by file extension."""
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        content = json.dumps(described, indent=1).encode()
+    else:
+        content = encode_dxf(described) if suffix == ".dxf" else encode_csv(described)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
