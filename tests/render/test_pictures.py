@@ -72,8 +72,8 @@ def face_of_box(eye, pose, size, focal):
 
 @pytest.mark.parametrize("eye", [(2.5, 2.0, 1.8), (2.5, 0.9, 1.5)])
 def test_discs_do_not_color_the_face_beyond_an_edge(rng, eye):
-    """Colors of the nearest discs, which reach past edges, are wrong in three times as many."""
-    count, most = 600, 0.03
+    """Discs that do not end at edges color eight in a hundred pixels wrongly, for the first eye."""
+    count, most = 600, 0.01
     points = torch.rand(6 * count, 3, generator=rng)
     faces = torch.arange(6 * count) % 6
     points[torch.arange(6 * count), faces // 2] = (faces % 2).float()

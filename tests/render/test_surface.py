@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchrg.render.surface import sample_surface
+from torchrg.render.surface import sample_rows, sample_surface
 
 
 def plane_grid(step, count=60):
@@ -92,3 +92,22 @@ def test_voxels_of_a_tilted_plane_have_its_normal(rng, offset):
     cosine = (surface.normals.double() @ basis[:, 2]).abs()
     assert float(cosine.median()) > 0.999
     assert float((cosine > 0.99).double().mean()) > 0.95
+
+
+def test_a_sample_is_even_whatever_the_density_and_the_order(monkeypatch):
+    monkeypatch.setattr("torchrg.render.surface.MAX_DISCS", 2**10)
+    rng = torch.Generator().manual_seed(3)
+    dense = torch.rand(20_000, 3, generator=rng) * torch.tensor([1.0, 1, 0])
+    sparse = torch.rand(2000, 3, generator=rng) * torch.tensor([1.0, 1, 0]) + torch.tensor(
+        [1.0, 0, 0]
+    )
+    far = torch.tensor([[50.0, 50, 50], [torch.nan, 0, 0]])
+    points = torch.cat([dense, sparse, far])
+    rows = sample_rows(points)
+    assert 2**9 <= len(rows) <= 2**10
+    assert bool(points[rows].isfinite().all())
+    left = float((points[rows][:, 0] < 1).float().mean())
+    assert 0.4 < left < 0.65
+    order = torch.randperm(len(points), generator=rng)
+    again = points[order][sample_rows(points[order])]
+    assert {tuple(p) for p in again.tolist()} == {tuple(p) for p in points[rows].tolist()}

@@ -5,19 +5,17 @@ labels. The shader and the picking of ``page.js`` use the same bits per point.
 """
 
 import math
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrg.config import load_config
 from torchrg.errors import ConfigError
 from torchrg.metrics.contingency import number_labels
-from torchrg.pipeline import segment_planes
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.directions import find_heading, horizontal_toward, unit_axis
 from torchrg.regions.table import summarize_planes
+from torchrg.render.creases import segment_surface
 from torchrg.render.surface import VisibleSurface
 from torchrg.structures import PLANE_KINDS, UNLABELED, Planes
 
@@ -30,8 +28,6 @@ MAX_SIDES = 7
 """Maximum number of outer sides: bits of a byte but the last, which hides planes in a viewer."""
 _MAX_WALLS = 60
 """Maximum number of candidate walls and ceilings, the largest ones; bounds the memory."""
-_ANGLE_DEG = 4.0
-"""Maximum angle for region growing on voxels, in degrees. With more, ceilings grow into walls."""
 _MIN_SIDE_COSINE = 0.9
 """Minimum cosine between the directions of walls that are hidden together."""
 _MAX_BEYOND_FRACTION = 0.03
@@ -87,10 +83,7 @@ def find_sides(surface: VisibleSurface, labels: Tensor | None, up: Tensor) -> Si
         nothing = torch.zeros(0, dtype=torch.uint8, device=centers.device)
         return Sides(centers, nothing, nothing, horizontal_toward(unit_axis(up), up))
     if labels is None:
-        config = load_config("classic").with_angle(_ANGLE_DEG)
-        # Otherwise a few voxels at a corner join two walls to a region that is no wall.
-        config = replace(config, growing=replace(config.growing, cut_bridges=True))
-        labels = segment_planes(centers, config).labels[surface.voxel_of]
+        labels = segment_surface(surface)
     present, of_points = number_labels(labels.clamp(min=UNLABELED))
     of_voxels = of_points[surface.first]
     numbers = number_labels(of_voxels)[1]

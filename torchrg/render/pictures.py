@@ -2,7 +2,7 @@
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,18 +17,20 @@ from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
 from torchrg.render import raster
 from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
+from torchrg.render.creases import find_creases, segment_surface
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides
-from torchrg.render.surface import VisibleSurface, sample_surface
+from torchrg.render.legend import Legend, add_legend
+from torchrg.render.surface import VisibleSurface, sample_rows, sample_surface
 from torchrg.structures import AnyCloud
 from torchrg.structures.points import Labels, Points
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_CHUNK_POINTS = 131_072
-"""Number of points drawn at a time; bounds the memory."""
 _RADIUS = 1.3
 """Radius of a disc, in local spacings; leaves only a few gaps in a surface."""
+_CREASE_REACH = 1.7
+"""Factor for the radius of discs that end at a crease, up to which no gaps remain."""
 _MAX_RADIUS_RATIO = 4
 """Maximum radius of a disc in a plane, in median radii; outside planes it is 1."""
 _RADIUS_FRACTION = 0.02
@@ -54,7 +56,7 @@ def draw_picture(
     colors: Tensor,
     normals: Tensor | None,
     *,
-    labels: Tensor | None = None,
+    labels: Tensor,
     supersampling: int,
 ) -> Tensor:
     """Draw points as discs, close gaps, shade, and average subpixels.
@@ -69,50 +71,56 @@ def draw_picture(
             f"{height:,} pixels with supersampling {supersampling}; lower one of them."
         )
     project = projection_of(camera, surface.origin, finer=supersampling)
-    lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)
     indices = is_shown.nonzero().squeeze(-1)
-    radius, length = _median_radius(project, surface.points, lengths, indices)
+    lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)[indices]
+    rows, position = surface.rows[indices], surface.points[indices]
+    voxel, floor, creases = (
+        surface.voxel_of[indices],
+        supersampling / 2,
+        find_creases(surface, labels),
+    )
+    slant = creases.normals_at(position, voxel) if normals is None else normals[rows].float()
+    ends = creases.bounds_of(position, slant, voxel)
+    # Larger discs fill the surface up to its end.
+    ends = ends * (ends[:, :, 3:].abs() < _CREASE_REACH * lengths[:, None, None])
+    lengths = torch.where((ends != 0).flatten(1).any(dim=1), _CREASE_REACH * lengths, lengths)
+    discs = _discs(project, position, colors[rows], slant, lengths, floor=floor, ends=ends)
+    discs = discs.by_color()
     widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
-    buffer = raster.DepthBuffer(
-        width * supersampling, height * supersampling, max_radius=widest, device=indices.device
+    keys = raster.draw_discs(
+        discs, width=width * supersampling, height=height * supersampling, max_radius=widest
     )
-
-    def discs_of(chunk: Tensor) -> raster.Discs:
-        rows = surface.rows[chunk]
-        slant = surface.normals_at(chunk) if normals is None else normals[rows]
-        position, floor = surface.points[chunk], supersampling / 2
-        return _discs(project, position, colors[rows], slant.float(), lengths[chunk], floor=floor)
-
-    parts = torch.split(indices, _CHUNK_POINTS)
-    for chunk in parts:
-        buffer.draw(discs_of(chunk))
-    buffer.end_drawing()
-    for chunk in parts:
-        buffer.paint(discs_of(chunk))
-    reach = max(1, round(_GAP_RADIUS * min(radius, widest)))
-    depth, paint = raster.depth_and_colors(
-        raster.close_gaps(buffer.keys(), reach=reach, thickness=length)
-    )
+    radius = float(discs.radii.median()) / supersampling if len(discs.radii) else 1.0
+    reach = max(1, round(_GAP_RADIUS * min(radius, widest / supersampling)))
+    steps = range(supersampling)
+    parts = [keys[row::supersampling, column::supersampling] for row in steps for column in steps]
+    # Edges of surfaces are partly covered pixels, which no closing of covered pixels extends.
+    closed = raster.close_gaps(functools.reduce(torch.minimum, parts), reach=reach)
+    thickness = float(lengths.median()) if len(lengths) else 0.0
+    paint = torch.cat([colors.new_full((1, 3), 255), discs.colors])
+    front, total = torch.zeros_like(closed), closed.new_zeros(height, width, 3, dtype=torch.int32)
+    nearest = raster.split_keys(closed)[0]
+    for part in parts:
+        depth = raster.split_keys(part)[0]
+        shown = torch.where(nearest > depth + thickness * depth * nearest, closed, part)
+        front = torch.maximum(front, shown)
+        total += paint[raster.split_keys(shown)[1]]
     brightness = raster.shade_hollows(
-        _reduce(depth, supersampling, torch.maximum),
+        _plane_depths(discs, front, supersampling),
         focal=project.focal / supersampling,
-        radius=max(1.0, radius / supersampling),
+        radius=max(1.0, radius),
     )
-    total = _reduce(paint.to(torch.int32), supersampling, torch.add)
     return (total * (brightness / supersampling**2)[..., None]).round_().to(torch.uint8)
 
 
-def _median_radius(
-    project: Projection, points: Tensor, lengths: Tensor, indices: Tensor
-) -> tuple[float, float]:
-    """Return the median radius of the discs, in pixels and in units of the cloud."""
-    sample = indices[:: max(1, len(indices) // _CHUNK_POINTS)]
-    depth = project(points[sample])[0][:, 2]
-    sample, depth = sample[depth > 0], depth[depth > 0]
-    if len(sample) == 0:
-        return 1.0, 0.0
-    lengths = lengths[sample]
-    return float((lengths / depth).median()) * project.focal, float(lengths.median())
+def _plane_depths(discs: raster.Discs, keys: Tensor, supersampling: int) -> Tensor:
+    """Return the inverse depth of the disc of each pixel, without its dome; 0 without a disc."""
+    row, column = (keys > 0).nonzero().unbind(dim=1)
+    centers = supersampling * torch.stack([column, row], dim=1) + (supersampling - 1) / 2
+    chosen = discs.select(raster.split_keys(keys)[1][row, column] - 1)
+    depth = torch.zeros(keys.shape, device=keys.device)
+    depth[row, column] = chosen.depth_at(centers)
+    return depth
 
 
 def _discs(
@@ -123,6 +131,7 @@ def _discs(
     lengths: Tensor,
     *,
     floor: float,
+    ends: Tensor,
 ) -> raster.Discs:
     """Return shaded discs of radii ``lengths``, in units of the cloud, at least ``floor`` pixels.
 
@@ -132,27 +141,27 @@ def _discs(
     ahead = positions[:, 2] > 0
     if not bool(ahead.all()):
         positions, pixels, colors = positions[ahead], pixels[ahead], colors[ahead]
-        normals, lengths = normals[ahead], lengths[ahead]
-    normals = normals @ project.local_to_camera[0, :3, :3].T
+        normals, lengths, ends = normals[ahead], lengths[ahead], ends[ahead]
+    rotation = project.local_to_camera[0, :3, :3]
+    normals, across = normals @ rotation.T, ends[:, :, :3] @ rotation.T
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
     min_cosine = torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE)
     along = torch.where(along.abs() < _MIN_COSINE, min_cosine, along)
+    # n . X = const gives 1 / z = n . ray / const, with the gradient n_xy / focal in pixels.
+    slopes = normals[:, :2] * (inverse / (along * project.focal))[:, None]
+    # On the disc, m . X - e = z (m . ray - e / z), of which the factor of z is linear, too.
+    offset = (across * positions[:, None]).sum(dim=2) - ends[:, :, 3]
+    bounds = across[:, :, :2] / project.focal - offset[:, :, None] * slopes[:, None]
     return raster.Discs(
         pixels,
         inverse,
         raster.light_colors(colors, normals, positions),
         (lengths * inverse * project.focal).clamp(min=floor),
-        # n . X = const gives 1 / z = n . ray / const, with the gradient n_xy / focal in pixels.
-        slopes=normals[:, :2] * (inverse / (along * project.focal))[:, None],
+        slopes=slopes,
         max_change=lengths * inverse * inverse,
+        bounds=torch.cat([ends[:, :, 3:] * inverse[:, None, None], bounds], dim=2),
     )
-
-
-def _reduce(image: Tensor, size: int, combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Combine the pixels of each square with sides ``size``."""
-    parts = [image[row::size, column::size] for row in range(size) for column in range(size)]
-    return functools.reduce(combine, parts)
 
 
 def render_cloud(
@@ -168,6 +177,7 @@ def render_cloud(
     width: int = 1400,
     height: int | None = None,
     supersampling: int = 2,
+    legend: Legend | None = None,
 ) -> Tensor:
     """Render a cloud from a camera, chosen automatically or given.
 
@@ -178,6 +188,7 @@ def render_cloud(
     Convention:
         Points are drawn as discs with the radius of the local spacing, tilted by their normals. The
         image depends neither on the order of the points nor, but for rounding, on unit and origin.
+        Of more than half a million points, a sample is drawn that is even on the surfaces.
 
     Args:
         points: Points, shape ``(N, 3)``; points with NaN or Inf are omitted.
@@ -196,9 +207,11 @@ def render_cloud(
         width: Width in pixels, at most 8,192; about 4,800 at the default supersampling.
         height: Height in pixels, at most 8,192. Default: fitted, from a quarter of the width on.
         supersampling: Subpixels per pixel and axis, which are averaged.
+        legend: Title, colors and unit to add below the image, with a scale bar. Default: none.
 
     Returns:
-        The image, shape ``(height, width, 3)``, uint8. White if no point is finite.
+        The image, shape ``(height, width, 3)``, uint8; higher with a legend. White if no point is
+        finite.
 
     Raises:
         ShapeError: If a shape or dtype is invalid.
@@ -224,11 +237,17 @@ def render_cloud(
     for (name, limit), value in zip(limits.items(), (width, height, supersampling), strict=True):
         if value is not None and not 1 <= value <= limit:
             raise ConfigError(f"render_cloud: expected {name} from 1 to {limit:,}, got {value!r}.")
+    sampled = sample_rows(cloud)
+    cloud, paint = cloud[sampled], paint[sampled]
+    slant = None if slant is None else slant[sampled]
+    planes = None if planes is None else planes[sampled]
     surface = sample_surface(cloud)
     if len(surface.rows) == 0:
         shape = (height or round(0.75 * width), width, 3)
         return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
     planes = None if planes is None else planes[surface.rows]
+    if planes is None:
+        planes = segment_surface(surface)
     near = surface.spacing <= _OUTLIER_SPACING * surface.spacing.median()
     is_shown = torch.ones_like(near)
     if not isinstance(view, str):
@@ -245,9 +264,14 @@ def render_cloud(
         shown = surface.points[is_shown & near].double() + surface.origin
         axes = view_axes(viewpoint.toward, viewpoint.up)
         camera = fit_camera(shown, axes, width=width, height=height)
-    return draw_picture(
+    image = draw_picture(
         camera, surface, is_shown, paint, slant, labels=planes, supersampling=supersampling
     )
+    if legend is None:
+        return image
+    project = projection_of(camera, surface.origin, finer=1)
+    depth = float(project(surface.points[near].mean(dim=0, keepdim=True))[0][0, 2])
+    return add_legend(image, legend, project.focal / abs(depth or 1.0))
 
 
 def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:

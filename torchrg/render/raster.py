@@ -1,10 +1,8 @@
-"""Two-pass rasterization of points as small tilted discs.
+"""Rasterization of points as small tilted discs, and the shading of the image.
 
-The first pass finds the nearest disc of each pixel. Discs extend beyond the edge of their surface
-and hide the surface behind it. The second pass therefore chooses, for each pixel, the disc with the
-nearest center in the image, among the discs that the nearest disc may wrongly hide. Such a disc is
-at most a disc diameter behind. Unlike for a real occluder, the center of the nearest disc is not in
-front of its plane. Ties are broken by color, not by the order of the points.
+Discs extend beyond the edge of their surface and would hide the surface behind it. Their depth is
+therefore domed: of discs at about one depth, the one with the nearest center in the image wins.
+Ties are broken by color, not by the order of the points.
 """
 
 import math
@@ -15,17 +13,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_WHITE = 0xFFFFFF
-"""Color of pixels without a disc, as three bytes."""
 _DEPTH_BITS = 32
 """Number of bits of a key below the depth."""
-_OVERHANG = 2.0
-"""Maximum depth difference, in disc radii, at which a disc may wrongly hide another at an edge."""
+_CHUNK_DISCS = 131_072
+"""Number of discs drawn at a time, which fit the cache."""
 _DOME = 0.1
-"""Curvature of discs, as depth of the rim in radii: of coplanar discs, the nearest center wins."""
-_FLAT = 0.1
-"""Tolerance in depth, in radii of a disc, since noise moves the centers of one surface off the
-planes of its discs. With 0 more pixels of noisy boxes get the color of another surface."""
+"""Curvature of discs, as depth of the rim in radii. With less, discs hide the surface beyond an
+edge; with more, thin plates are transparent."""
 _LIGHT = (-0.45, -0.7, -0.55)
 """Direction toward the light in camera axes: from the left, above and behind the camera."""
 _MIN_BRIGHTNESS = 0.62
@@ -37,9 +31,6 @@ _REACHES = ((1, 0.5), (2, 0.3), (3, 0.2))
 and decrease, so that creases are thin lines."""
 _NOISE = 0.7
 """Tangent of a bend over one disc radius, below which it is noise and not shaded."""
-_MAX_SEARCH = 20
-"""Maximum reach for an exhaustive search, in pixels; its time grows with the square. Clouds of
-20,000 points and more need less in an image of 1,600 pixels."""
 _MAX_SHADE_RADIUS = 4.0
 """Maximum radius for detecting hollows, in pixels; larger ones create halos."""
 
@@ -57,7 +48,10 @@ class Discs(NamedTuple):
         radii: In pixels, shape ``(N,)``; every disc covers at least one pixel.
         slopes: Change of the inverse depth per pixel to the right and down, shape ``(N, 2)``.
         max_change: Maximum difference of the inverse depth from the center, shape ``(N,)``: it ends
-            the disc, and is the tolerance for equally near discs.
+            the disc, and scales its dome.
+        bounds: Signed distance of each center from the lines where its surface ends, of any scale,
+            and its change per pixel to the right and down, shape ``(N, L, 3)``. The distance on the
+            surface is not negative; zero for no line.
     """
 
     pixels: Tensor
@@ -66,130 +60,83 @@ class Discs(NamedTuple):
     radii: Tensor
     slopes: Tensor
     max_change: Tensor
-
-    def pixel_offsets(self) -> Tensor:
-        """Return the offsets of the centers from their pixel centers, shape ``(N, 2)``."""
-        return self.pixels - self.pixels.round()
-
-    def pixel_depths(self) -> Tensor:
-        """Return the inverse depth of the planes at the pixels of the centers."""
-        return self.inverse_depth - (self.slopes * self.pixel_offsets()).sum(dim=1)
+    bounds: Tensor
 
     def select(self, rows: Tensor) -> "Discs":
         """Return the selected discs."""
-        discs = Discs(*(values.index_select(0, rows) for values in self))
-        # Contiguous columns are faster to read.
-        return discs._replace(slopes=discs.slopes.T.contiguous().T)
+        return Discs(*(values.index_select(0, rows) for values in self))
+
+    def by_color(self) -> "Discs":
+        """Return the discs in the order of their colors, which breaks ties."""
+        red, green, blue = self.colors.int().unbind(dim=1)
+        return self.select((red << 16 | green << 8 | blue).sort(stable=True).indices)
+
+    def depth_at(self, pixels: Tensor) -> Tensor:
+        """Return the inverse depth of each disc's plane at a pixel of it, shape ``(N,)``."""
+        change = ((pixels - self.pixels) * self.slopes).sum(dim=1)
+        return self.inverse_depth + change.clamp(-self.max_change, self.max_change)
 
 
-class DepthBuffer:
-    """Buffer of the nearest disc in each pixel of an image.
+def draw_discs(discs: Discs, *, width: int, height: int, max_radius: float) -> Tensor:
+    """Return the key of the nearest disc of each pixel, shape ``(height, width)``, int64.
 
-    Args:
-        width: Width of the image, in pixels.
-        height: Height of the image, in pixels.
-        max_radius: Maximum radius of a disc, in pixels; larger radii are clamped.
-        device: Device of the buffer.
+    A key has the bits of the inverse depth, which sort like the float, above the row of the disc
+    plus 1; see :func:`split_keys`. Radii are clamped to ``max_radius``, in pixels. The time grows
+    with the covered pixels, the memory with the number of discs.
 
     Example:
-        >>> buffer = DepthBuffer(3, 1, max_radius=1)
-        >>> colors = torch.tensor([[9, 9, 9], [7, 7, 7]], dtype=torch.uint8)
-        >>> ends, flat = torch.tensor([[0.0, 0.0], [2.0, 0.0]]), torch.zeros(2, 2)
-        >>> discs = Discs(ends, torch.ones(2), colors, torch.ones(2), flat, torch.zeros(2))
-        >>> buffer.draw(discs)
-        >>> buffer.end_drawing()
-        >>> buffer.paint(discs)
-        >>> depth_and_colors(buffer.keys())[1].tolist()
-        [[[9, 9, 9], [9, 9, 9], [7, 7, 7]]]
+        >>> ends, colors = torch.tensor([[0.0, 0.0], [2.0, 0.0]]), torch.zeros(2, 3).byte()
+        >>> flat = torch.zeros(2, 2)
+        >>> ones, endless = torch.ones(2), torch.zeros(2, 0, 3)
+        >>> discs = Discs(ends, ones, colors, ones, flat, torch.zeros(2), endless)
+        >>> split_keys(draw_discs(discs, width=3, height=1, max_radius=1))[1].tolist()
+        [[1, 2, 2]]
     """
+    device = discs.pixels.device
+    # Discs may extend beyond the image, into a margin that is never shown.
+    margin = math.ceil(max_radius)
+    stride = width + 2 * margin
+    front = torch.zeros(stride * (height + 2 * margin), dtype=torch.int64, device=device)
+    ends = (discs.bounds != 0).flatten(1).any(dim=1)
+    for is_kind, num_lines in ((~ends, 0), (ends, discs.bounds.shape[1])):
+        kind = discs._replace(bounds=discs.bounds[:, :num_lines])
+        for rows in torch.split(is_kind.nonzero().squeeze(1), _CHUNK_DISCS):
+            _draw_chunk(front, kind, rows, (width, height), max_radius)
+    return front.view(-1, stride)[margin : margin + height, margin : margin + width]
 
-    def __init__(
-        self, width: int, height: int, *, max_radius: float, device: torch.device | None = None
-    ) -> None:
-        self.width, self.height, self.max_radius = width, height, max_radius
-        # Discs may extend beyond the image, into a margin that is never shown.
-        self._margin = math.ceil(max_radius)
-        self._stride = width + 2 * self._margin
-        size = self._stride * (height + 2 * self._margin)
-        # Bits of the inverse depth, which sort like the float, above the index of a disc.
-        self._front = torch.zeros(size, dtype=torch.int64, device=device)
-        # Bits of the nearness of the center, above three bytes of color.
-        self._colors = torch.full((size,), _WHITE, dtype=torch.int64, device=device)
-        # Column, row and inverse depth of the centers of all discs, after an empty entry; the same
-        # for the nearest disc of each pixel, and its inverse depth there.
-        self._centers, self._nearest = (torch.zeros(1, n, device=device) for n in (3, 4))
 
-    def keys(self) -> Tensor:
-        """Return the key of each pixel ``(height, width)``, int64; see :func:`depth_and_colors`."""
-        shown = slice(self._margin, self._margin + self.height)
-        columns = slice(self._margin, self._margin + self.width)
-        front, colors = (
-            values.view(-1, self._stride)[shown, columns] for values in (self._front, self._colors)
-        )
-        return (front >> _DEPTH_BITS << _DEPTH_BITS) | (colors & _WHITE)
-
-    def draw(self, discs: Discs) -> None:
-        """First pass: find the nearest disc of each pixel."""
-        number = torch.arange(len(discs.pixels), device=self._front.device) + len(self._centers)
-        centers = torch.cat([discs.pixels, discs.inverse_depth[:, None]], dim=1)
-        self._centers = torch.cat([self._centers, centers])
-        order, sizes, indices = self._by_size(discs)
-        shown, number = discs.select(order), number.index_select(0, order)
-        start = shown.pixel_depths()
-        dome = _DOME * shown.max_change / sizes.clamp(min=1).square_()
-        for dx, dy, count in _pixels_of(sizes):
-            depth = _depth_at_offset(shown, start, dx, dy, count)
-            depth.sub_(dome[:count], alpha=dx * dx + dy * dy)
-            keys = depth.view(torch.int32).long() << _DEPTH_BITS
-            index = indices[:count] + self._step(dx, dy)
-            self._front.scatter_reduce_(0, index, keys.bitwise_or_(number[:count]), "amax")
-
-    def end_drawing(self) -> None:
-        """Look up the nearest discs between the passes."""
-        number = self._front & (2**_DEPTH_BITS - 1)
-        depth = (self._front >> _DEPTH_BITS).int().view(torch.float32)[:, None]
-        self._nearest = torch.cat([self._centers.index_select(0, number), depth], dim=1)
-
-    def paint(self, discs: Discs) -> None:
-        """Second pass: color the covered pixels."""
-        order, sizes, indices = self._by_size(discs)
-        shown = discs.select(order)
-        away_x, away_y = shown.pixel_offsets().T.contiguous()
-        start = shown.pixel_depths()
-        slope_x, slope_y = shown.slopes.T
-        # The inverse depth of a disc's plane in the corner of the image, plus the noise tolerance.
-        corner = shown.inverse_depth - (shown.slopes * shown.pixels).sum(dim=1)
-        corner += _FLAT * shown.max_change
-        keys = torch.zeros(len(sizes), 8, dtype=torch.uint8, device=discs.colors.device)
-        keys[:, :3] = shown.colors
-        nearness, keys = keys.view(torch.float32)[:, 1], keys.view(torch.int64).squeeze(-1)
-        for dx, dy, count in _pixels_of(sizes):
-            index = indices[:count] + self._step(dx, dy)
-            x, y, at_middle, front = self._nearest.index_select(0, index).unbind(dim=1)
-            depth = _depth_at_offset(shown, start, dx, dy, count)
-            seen = depth.add_(shown.max_change[:count], alpha=_OVERHANG) >= front
-            seen &= x.mul_(slope_x[:count]) + y.mul_(slope_y[:count]) + corner[:count] >= at_middle
-            sq_distance = (away_x[:count] - dx).square_()
-            sq_distance += (away_y[:count] - dy).square_()
-            nearness[:count] = sq_distance.add_(1).reciprocal_().mul_(seen)
-            self._colors.scatter_reduce_(0, index, keys[:count], "amax")
-
-    def _step(self, dx: int, dy: int) -> int:
-        """Return the offset of a pixel in the flat buffer."""
-        return dy * self._stride + dx
-
-    def _by_size(self, discs: Discs) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the visible discs by descending size, their radii, and flat center indices."""
-        center = discs.pixels.round()
-        inside = (center >= 0) & (center < center.new_tensor([self.width, self.height]))
-        # Few distinct sizes and a stable sort keep neighboring discs close in memory.
-        sizes = (2 * discs.radii.clamp(max=self.max_radius)).round() / 2
-        sizes, order = torch.where(inside.all(dim=-1), sizes, -1.0).sort(
-            descending=True, stable=True
-        )
-        order = order[: int((sizes >= 0).sum())]
-        column, row = (center[order] + self._margin).long().unbind(dim=-1)
-        return order, sizes[: len(order)], row * self._stride + column
+def _draw_chunk(
+    front: Tensor, discs: Discs, rows: Tensor, size: tuple[int, int], max_radius: float
+) -> None:
+    """Draw some discs, given as rows, into the flat keys of an image with a margin."""
+    centers = discs.pixels[rows].round()
+    inside = ((centers >= 0) & (centers < centers.new_tensor(size))).all(dim=1)
+    # Few distinct sizes and a stable sort keep neighboring discs close in memory.
+    sizes = (2 * discs.radii[rows].clamp(max=max_radius)).round() / 2
+    sizes, order = sizes[inside].sort(descending=True, stable=True)
+    rows, centers = rows[inside][order], centers[inside][order]
+    shown, margin = discs.select(rows), math.ceil(max_radius)
+    stride = size[0] + 2 * margin
+    column, row = (centers + margin).long().unbind(dim=1)
+    targets, (slope_x, slope_y) = row * stride + column, shown.slopes.T.contiguous()
+    start = ((centers - shown.pixels) * shown.slopes).sum(dim=1)
+    away = centers - shown.pixels
+    bounds = shown.bounds.permute(1, 2, 0).contiguous()
+    bounds[:, 0] += (bounds[:, 1:] * away.T).sum(dim=1)
+    dome = _DOME * shown.max_change / sizes.clamp(min=1).square_()
+    keys = torch.stack([rows + 1, torch.zeros_like(rows)], dim=1).int()
+    depth, keys = keys.view(torch.float32)[:, 1], keys.view(torch.int64).squeeze(1)
+    for dx, dy, count in _pixels_of(sizes):
+        limit = shown.max_change[:count]
+        change = torch.add(start[:count], slope_x[:count], alpha=dx)
+        change.add_(slope_y[:count], alpha=dy)
+        beyond = change.abs() > limit if dx or dy else torch.zeros_like(change, dtype=torch.bool)
+        for bound, bound_x, bound_y in bounds[:, :, :count]:
+            beyond |= torch.add(bound, bound_x, alpha=dx).add_(bound_y, alpha=dy) < 0
+        change.clamp_(-limit, limit).add_(shown.inverse_depth[:count])
+        change.sub_(dome[:count], alpha=dx * dx + dy * dy)
+        depth[:count] = change.masked_fill_(beyond, -torch.inf)
+        front.scatter_reduce_(0, targets[:count] + (dy * stride + dx), keys[:count], "amax")
 
 
 def _pixels_of(sizes: Tensor) -> Iterator[tuple[int, int, int]]:
@@ -208,68 +155,15 @@ def _pixels_of(sizes: Tensor) -> Iterator[tuple[int, int, int]]:
             yield dx, dy, count
 
 
-def _depth_at_offset(discs: Discs, start: Tensor, dx: int, dy: int, count: int) -> Tensor:
-    """Return the inverse depth of the first discs at an offset, negative beyond their rims.
-
-    ``start`` is the inverse depth of their planes at the center pixel, which all discs cover.
-    """
-    slope_x, slope_y = discs.slopes[:count].unbind(dim=-1)
-    center, limit = discs.inverse_depth[:count], discs.max_change[:count]
-    change = (slope_y * dy).add_(slope_x, alpha=dx).add_(start[:count]).sub_(center)
-    if dx == dy == 0:
-        return change.clamp_(-limit, limit).add_(center)
-    ends = change.abs() > limit
-    return change.add_(center).masked_fill_(ends, -torch.inf)
+def split_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Return views of the inverse depth ``(*)`` and of the rows of discs plus 1, 0 for none."""
+    halves = keys.contiguous().view(torch.int32).view(*keys.shape, 2)
+    return halves.view(torch.float32)[..., 1], halves[..., 0]
 
 
-def depth_and_colors(keys: Tensor) -> tuple[Tensor, Tensor]:
-    """Return views of the inverse depth ``(*)``, 0 for empty pixels, and of the colors ``(*, 3)``.
-
-    A key has the bits of the inverse depth above three bytes of color. Positive floats sort like
-    integers, so the nearest disc has the largest key.
-    """
-    halves = keys.view(torch.float32).view(*keys.shape, 2)
-    return halves[..., 1], keys.view(torch.uint8).view(*keys.shape, 8)[..., :3]
-
-
-def close_gaps(keys: Tensor, *, reach: int, thickness: float) -> Tensor:
-    """Fill gaps in a surface of up to ``2 * reach`` pixels.
-
-    A pixel is a gap if it is farther than the morphological closing of the inverse depth by more
-    than ``thickness``, in units of the cloud. It takes the nearest key within ``reach`` that is not
-    in front of the closing. With a reach beyond 20 pixels, as for a few large discs, it takes the
-    key of the closing, at constant cost.
-    """
-    around = _window_maximum(keys, reach)
-    closing = -_window_maximum(-around, reach)
-    depth, closed = depth_and_colors(keys)[0], depth_and_colors(closing)[0]
-    rows, columns = (closed > depth + thickness * depth * closed).nonzero().unbind(dim=-1)
-    best, closed = closing[rows, columns], closed[rows, columns]
-    if reach <= _MAX_SEARCH:
-        limit = closed / (1 - thickness * closed).clamp(min=0.5)
-        # The largest key of this depth.
-        max_keys = (limit.view(torch.int32).long() << _DEPTH_BITS) + 2**_DEPTH_BITS - 1
-        best = around[rows, columns]
-        is_left = best > max_keys
-        best[is_left] = _nearest_behind(
-            keys, (rows[is_left], columns[is_left]), max_keys[is_left], reach=reach
-        )
-    return keys.index_put((rows, columns), best)
-
-
-def _nearest_behind(
-    keys: Tensor, pixels: tuple[Tensor, Tensor], max_keys: Tensor, *, reach: int
-) -> Tensor:
-    """Return the largest key within reach of each pixel, at most ``max_keys``, ``(n,)`` each."""
-    padded = functional.pad(keys, [reach] * 4)
-    stride, values = padded.shape[1], padded.flatten()
-    first = pixels[0] * stride + pixels[1]
-    best = torch.zeros_like(max_keys)
-    for dy in range(2 * reach + 1):
-        for dx in range(2 * reach + 1):
-            near = values.index_select(0, first + (dy * stride + dx))
-            torch.maximum(best, near.masked_fill_(near > max_keys, 0), out=best)
-    return best
+def close_gaps(keys: Tensor, *, reach: int) -> Tensor:
+    """Return the morphological closing of keys, which fills gaps of up to ``2 * reach`` pixels."""
+    return -_window_maximum(-_window_maximum(keys, reach), reach)
 
 
 def _window_maximum(image: Tensor, reach: int) -> Tensor:

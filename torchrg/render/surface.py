@@ -22,6 +22,14 @@ _FLAT = 0.15
 """Maximum ratio of the two smallest eigenvalues of coplanar voxels."""
 
 
+MAX_DISCS = 2**19
+"""Maximum number of points that an image shows; more would not be visible in two million pixels."""
+_CHUNK_POINTS = 2**17
+"""Number of points sampled at a time."""
+_PRIMES = (73_856_093, 19_349_663, 83_492_791)
+"""Factors of a spatial hash."""
+
+
 class VisibleSurface(NamedTuple):
     """The n finite points of a cloud along a Morton curve, in V voxels.
 
@@ -49,22 +57,6 @@ class VisibleSurface(NamedTuple):
     near: Tensor
     size: float
 
-    def normals_at(self, rows: Tensor) -> Tensor:
-        """Return unit normals of the selected points, ``(*, 3)``; zero without a plane.
-
-        In a voxel at an edge, a point gets the normal of the nearest plane of a neighboring voxel.
-        """
-        voxel = self.voxel_of[rows]
-        normals = self.normals[voxel]
-        at_edge = (normals == 0).all(dim=1).nonzero().squeeze(1)
-        near = self.near[voxel[at_edge]]
-        around = self.normals[near]
-        away = self.points[rows[at_edge], None] - self.centers[near]
-        heights = (away * around).sum(dim=2).abs()
-        heights.masked_fill_((around == 0).all(dim=2), torch.inf)
-        best = heights.argmin(dim=1)
-        return normals.index_copy(0, at_edge, around[torch.arange(len(best)), best])
-
     def disc_spacing(self, cap: float, labels: Tensor | None = None) -> Tensor:
         """Return the spacing that the disc of each of the n points must cover, shape ``(n,)``.
 
@@ -80,6 +72,47 @@ class VisibleSurface(NamedTuple):
         if labels is not None:
             in_plane = in_plane & (labels >= 0)
         return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, cap, 1.0))
+
+
+def sample_rows(points: Tensor) -> Tensor:
+    """Return the rows of at most :data:`MAX_DISCS` finite points, evenly spread over surfaces.
+
+    Voxels are hashed to slots, and each slot keeps one point. The memory does not grow with
+    the cloud, and the order of the points matters only for duplicates.
+    """
+    if len(points) <= MAX_DISCS:
+        return points.isfinite().all(dim=-1).nonzero().squeeze(-1)
+    parts = torch.split(points.detach(), _CHUNK_POINTS)
+    low, high = (
+        torch.stack([end(part.nan_to_num(*[missing] * 3), dim=0) for part in parts]).double()
+        for end, missing in ((torch.amin, torch.inf), (torch.amax, -torch.inf))
+    )
+    low, size = low.amin(dim=0), float((high.amax(dim=0) - low.amin(dim=0)).amax()) / 2**8
+    unset = torch.iinfo(torch.int64).max
+    slots = torch.full((MAX_DISCS,), unset, device=points.device)
+    primes = torch.tensor(_PRIMES, device=points.device)
+    for _ in range(_BITS):
+        size /= 2
+        slots.fill_(unset)
+        for number, part in enumerate(parts):
+            rows = part.isfinite().all(dim=1).nonzero().squeeze(1)
+            chosen = part[rows]
+            cells = ((chosen - low) / size).clamp(max=2.0**40).long() * primes
+            bits = chosen.float().view(torch.int32).long() * primes
+            slot, draw = (_mixed(values) for values in (cells, bits))
+            rows += number * _CHUNK_POINTS
+            slots.scatter_reduce_(0, slot % MAX_DISCS, draw % 2**31 << 32 | rows, "amin")
+        # Outliers would make voxels too large.
+        if int(torch.count_nonzero(slots != unset)) > MAX_DISCS // 2:
+            break
+    return (slots[slots != unset] % 2**32).sort().values
+
+
+def _mixed(values: Tensor) -> Tensor:
+    """Return a hash of the rows of ``(n, 3)`` int64 values."""
+    hashed = values[:, 0] ^ values[:, 1] ^ values[:, 2]
+    hashed = (hashed ^ hashed >> 31) * 0x7FB5D329728EA185
+    return (hashed ^ hashed >> 27) * -0x7E25210B43D22BB3
 
 
 def sample_surface(points: Tensor) -> VisibleSurface:
