@@ -60,6 +60,11 @@ def test_planes_that_touch_look_clearly_different():
     assert len(distances) > 200
     assert float(distances.amin()) > CLEARLY
     assert float(distances.median()) > 60
+    _, a, b = lab_of(table).unbind(dim=1)
+    hues = torch.atan2(b, a).rad2deg()
+    turns = ((hues[first] - hues[second] + 180) % 360 - 180).abs()
+    assert float(turns.amin()) > 14
+    assert float(turns.quantile(0.05)) > 29
 
 
 def test_colors_do_not_depend_on_the_order_of_the_points():

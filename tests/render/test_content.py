@@ -69,6 +69,8 @@ def test_the_table_as_csv_names_planes_as_the_file_does():
     assert [int(row["id"]) for row in rows] == names.tolist()
     assert [int(row["count"]) for row in rows] == counts.tolist()
     shown = described(page)["clouds"][0]["planes"]
-    assert [float(row["area"]) for row in rows] == [plane["area"] for plane in shown]
+    assert [float(row["area_m2"]) for row in rows] == pytest.approx(
+        [plane["area"] for plane in shown], abs=1e-4
+    )
     bare = make_page(Result(Cloud(cloud.coordinates)))
     assert "table" not in {entry["name"] for entry in described(bare)["clouds"][0]["arrays"]}

@@ -411,7 +411,7 @@ def test_a_minimum_area_hides_small_planes_and_leaves_them_out_of_the_csv(tab):
     with started.value.path().open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(large)
-    assert min(float(row["area"]) for row in rows) >= 4
+    assert min(float(row["area_m2"]) for row in rows) >= 4
     tab.run("showall.click()")
     assert len(names_of_rows(tab)) == len(areas)
     assert tab.page.locator("#minarea").input_value() == ""
@@ -431,3 +431,24 @@ def test_targets_are_large_and_nothing_overflows(tab, width):
     assert tab.run("document.documentElement.scrollWidth <= innerWidth")
     assert tab.run("planes.scrollWidth <= planes.clientWidth")
     tab.page.set_viewport_size(size)
+
+
+def test_a_phone_shows_the_planes_without_scrolling(tab):
+    size = tab.page.viewport_size
+    tab.page.set_viewport_size({"width": 390, "height": 844})
+    top, bottom = tab.run(
+        "(() => { const b = planes.getBoundingClientRect(); return [b.top, b.bottom] })()"
+    )
+    assert bottom - top >= 200
+    assert bottom <= 844
+    tab.page.set_viewport_size(size)
+
+
+def test_errors_are_in_millimeters_and_level_planes_have_no_dip_direction(tab):
+    tab.run("torchrg.choose({ cloud: 0, plane: torchrg.page.clouds[0].order[0] })")
+    text = tab.run("picked.innerText")
+    assert "mm" in text
+    level = tab.run("torchrg.page.clouds[0].planes.findIndex((p) => p.dip_direction_deg === null)")
+    if level >= 0:
+        tab.run(f"torchrg.choose({{ cloud: 0, plane: {level} }})")
+        assert "dip direction" not in tab.run("picked.innerText")

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.io.result import Result
 from torchrg.render.channels import COLOR_MODES
+from torchrg.render.gallery import draw_planes
 from torchrg.render.page import MAX_SHOWN_POINTS
 from torchrg.structures import Cloud
 from torchrg.structures.colors import narrow_colors
@@ -65,7 +66,7 @@ class Arguments:
     """Maximum points in the viewer; larger clouds are randomly downsampled, with a note."""
     unit: str | None = None
     """Unit of the coordinates, such as m, for lengths and areas in a viewer. Default: m if the
-    cloud is 2 to 6 units high, like a room in meters."""
+    tallest plane is 2 to 6 units high, like a room in meters."""
     columns: ColumnsFlag = None
 
 
@@ -103,15 +104,21 @@ def _render(arguments: Arguments, result: Result, first: Result | None = None) -
     if first and np.array_equal(cloud.coordinates, first.cloud.coordinates, equal_nan=True):
         reference = first.fields.get("labels")
     up = arguments.up or "z"
+    camera: dict[str, Any] = {
+        "view": arguments.view,
+        "up": up,
+        "azimuth_deg": arguments.azimuth_deg,
+        "width": arguments.width // (1 if arguments.compare is None else 2),
+    }
+    by = {None: None, "plane": "labels", "superpoint": "superpoint"}.get(arguments.color, "")
+    if reference is None and by != "" and (by or "labels") in result.fields:
+        return draw_planes(result, by=by or "labels", **camera)
     return render.render_cloud(
         cloud.points,
         _colors(cloud, arguments.color, up, reference),
         normals=None if normals is None else torch.from_numpy(normals).to(cloud.points.dtype),
         labels=result.fields.get("labels") if reference is None else reference,
-        view=arguments.view,
-        up=up,
-        azimuth_deg=arguments.azimuth_deg,
-        width=arguments.width // (1 if arguments.compare is None else 2),
+        **camera,
     )
 
 

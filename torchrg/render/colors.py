@@ -14,6 +14,7 @@ from torchrg.neighbors import search_knn
 from torchrg.neighbors.voxels import sample_voxels
 from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
 from torchrg.regions.directions import horizontal_toward, unit_axis
+from torchrg.render.surface import sample_rows
 from torchrg.structures import AnyCloud
 from torchrg.structures.points import Array, Labels, Points, Values
 
@@ -52,20 +53,23 @@ def _to_bytes(colors: Tensor) -> Tensor:
 UNLABELED_GRAY = 176
 """Red, green and blue of unlabeled points."""
 _CALM = (
-    "f0a7bc f1aa9c deb487 bebf86 98c79a 74cbba 66c9db 81c3ef b0b8f0 daaddc "
-    "fdd3d4 ffd4bf f0dbab cfe4b4 aeeacd 99ebeb abe5fe cadeff e6d6ff ffcfea"
+    "ffaab2 ffad91 efb76e c7c56c 97d083 5dd6a9 0bd7d5 05d3f7 7dc9ff aebefe e0aefe ffa6d6 "
+    "e682a2 e7857d d69160 b89e54 91a95d 63b179 19b49f 08b1c0 02adde 64a4eb a497e2 cf89c7"
 )
-"""Colors of large planes: 10 hues of chroma 30 and 26 in CIE Lab, lightness 76 and 88."""
+"""Colors of large planes: 24 hues of chroma up to 46 in CIE Lab, lightness 78 and 66."""
 _VIVID = (
-    "b6396a b53f41 a4511c 856303 606f00 297727 077758 077472 107284 0c7098 026abb 7159b2 a04592 "
-    "e26077 d96c4f bf7d30 9a8d25 6d9838 269f5d 029d8a 079aa5 0297bd 1392db 7385e4 b372cb d663a3 "
-    "fe8eb2 fe928c f99960 d7aa4b abb850 76c26d 16c897 14c4c1 13c1df 13bdfe 84b1fe bea1ff f08fdf"
+    "c52f53 b74622 936001 6b6f00 277b16 057959 047776 03758a 0072a2 1368cf 8c4fb4 b93487 "
+    "ef4f8e ee5955 d37222 a68901 6d9914 05a053 029d8a 049aa7 0497c1 0391e8 887cf0 d061c6 "
+    "ff909d ff946f e7a33e b4b63a 74c35c 04c894 0ec4c3 0ec1e2 3ebbff 95aeff d796ff ff8acb"
 )
-"""Colors of small planes, more visible: 13 hues of chroma up to 54, lightness 44, 58 and 72."""
+"""Colors of small planes, more visible: 24 hues of chroma up to 66, lightness 45, 58 and 72."""
 _MIN_LARGE_FRACTION = 0.03
 """Minimum fraction of all points in a large plane."""
-_SIMILAR = 120.0
+_SIMILAR = 60.0
 """Squared distance in CIE Lab of two colors that look about the same."""
+_LIGHTNESS_WEIGHT = 0.1
+"""Weight of squared differences in lightness, since two shades of one hue look like one plane under
+different light."""
 _DICHROMACY_WEIGHT = 0.5
 """Weight of color vision deficiency. With less, adjacent planes look the same to color-blind
 viewers; with more, to all other viewers."""
@@ -78,11 +82,11 @@ _MIN_WEIGHT = 0.005
 _GRAY_WEIGHT = 0.05
 """Weight of the gray of unlabeled points, which occur nearly everywhere."""
 PALETTE = torch.tensor([list(bytes.fromhex(row)) for row in f"{_CALM} {_VIVID}".split()]).byte()
-"""Colors of planes, calm ones first, shape ``(59, 3)``, uint8."""
+"""Colors of planes, calm ones first, shape ``(60, 3)``, uint8."""
 
 
 def _similarity() -> Tensor:
-    """Return the similarity of palette colors to each other and to gray, ``(59, 60)``.
+    """Return the similarity of palette colors to each other and to gray, ``(60, 61)``.
 
     Combines normal color vision with the weighted worst dichromacy.
     """
@@ -90,7 +94,7 @@ def _similarity() -> Tensor:
     labs = rgb_to_lab(torch.cat([PALETTE, gray]).double() / 255)
     light, a, b = (labs[: len(PALETTE), None] - labs).unbind(dim=2)
     worst = torch.stack([(a * x + b * y).square() for x, y in _DICHROMACY_AXES]).amin(dim=0)
-    trichromatic, worst = light**2 + a**2 + b**2, light**2 + worst
+    trichromatic, worst = _LIGHTNESS_WEIGHT * light**2 + a**2 + b**2, light**2 + worst
     return 1 / (trichromatic + _SIMILAR) + _DICHROMACY_WEIGHT / (worst + _SIMILAR)
 
 
@@ -312,12 +316,14 @@ def _choose(
 ) -> tuple[Tensor, Tensor]:
     """Return each point's index among the existing labels, and the palette row of each label."""
     rows = number_labels(labels)[1]
-    sizes = torch.bincount(rows[rows >= 0])
+    num_planes = int(rows.max()) + 1 if len(rows) else 0
+    sample = rows if points is None else rows[sample_rows(points)]
+    sizes = torch.bincount(sample[sample >= 0], minlength=num_planes)
     pairs, weights = [sizes.new_zeros((0, 2))], [torch.zeros(0, dtype=torch.float64)]
     if points is not None:
-        counted = (rows >= 0) & points.isfinite().all(dim=-1)
+        shown = points[sample_rows(points)][sample >= 0]
         for num_voxels, weight in _NEIGHBORHOODS:
-            pairs.append(_adjacent_planes(points[counted], rows[counted], num_voxels))
+            pairs.append(_adjacent_planes(shown, sample[sample >= 0], num_voxels))
             weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
     choices = choose_colors(
         sizes.cpu(),

@@ -503,10 +503,10 @@ function describePicked() {
     add("equation", equation(plane));
     add("area", `${number(plane.area)} ${page.unit}²`);
     add("extent", `${plane.extent.map((side) => number(side)).join(" × ")} ${page.unit}`);
-    add("rms", `${number(plane.rms, 3)} ${page.unit}`);
+    add("rms", page.unit === "m" ? `${(1000 * plane.rms).toFixed(1)} mm` : `${number(plane.rms, 3)} ${page.unit}`);
     add("points", plane.count.toLocaleString("en"));
     for (const [name, value] of Object.entries(plane)) {
-      if (SPECIAL.includes(name)) continue;
+      if (SPECIAL.includes(name) || value === null) continue; // A level plane has no dip direction.
       const text = typeof value === "number" ? number(value) : `${value}`;
       add(name.replace(/_deg$/, "").replaceAll("_", " "), name.endsWith("_deg") ? `${text}°` : text);
     }

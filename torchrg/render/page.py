@@ -29,9 +29,8 @@ from torchrg._checks import check_choices
 from torchrg._optional import require
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.files import atomic_path
-from torchrg.io.plane_table import encode_csv
+from torchrg.io.plane_table import encode_csv, guess_unit
 from torchrg.io.result import Result
-from torchrg.linalg.angles import unit_direction
 from torchrg.neighbors.order import scatter_rows
 from torchrg.render.channels import COLOR_MODES, encode_directions, make_channels
 from torchrg.render.colors import palette_of_planes
@@ -55,8 +54,6 @@ if TYPE_CHECKING:
 
 MAX_SHOWN_POINTS = 1_000_000
 """Default maximum number of points in a viewer; laptops display this many smoothly."""
-_ROOM_HEIGHTS = 2.0, 6.0
-"""Range of heights of rooms and halls, in meters."""
 _STEPS = 65535
 """Steps of a position along the longest side of a cloud: two bytes per coordinate."""
 _ASSETS = Path(__file__).parent
@@ -112,7 +109,7 @@ def make_page(
         up: Up direction, as in :func:`torchrg.render.render_cloud`. Default: z; -y for a sensor.
         azimuth_deg: See :func:`torchrg.render.render_cloud`.
         max_points: Maximum number of points per cloud; larger ones are sampled, with a note.
-        unit: Unit of the coordinates. Default: "m" if the cloud is as high as a room in meters.
+        unit: Unit of the coordinates. Default: "m" if a plane is as high as a room in meters.
 
     Returns:
         The viewer.
@@ -156,19 +153,11 @@ def make_page(
             "scale": frame.scale,
         },
         "kinds": PLANE_KINDS,
-        "unit": unit or _guess_unit(cloud, up),
+        "unit": unit or (guess_unit(result.planes) if result.planes else "") or "units",
         "clouds": scenes,
     }
     text = _fill_template(description, [_encode_library(library), *blobs], library)
     return Page(text, tuple(scene["shown"] for scene in scenes))
-
-
-def _guess_unit(cloud: Cloud, up: Sequence[float] | str) -> str:
-    """Return the unit of a cloud, estimated from its height."""
-    axis = unit_direction("make_page", up).numpy()
-    heights = cloud.coordinates[cloud.finite].astype(float) @ axis
-    height = np.ptp(heights) if len(heights) else 0.0
-    return "m" if _ROOM_HEIGHTS[0] <= height <= _ROOM_HEIGHTS[1] else "units"
 
 
 def _check_settings(
