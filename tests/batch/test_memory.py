@@ -30,11 +30,21 @@ print(peak_memory(), scan_memory(len(points)))
 """
 MEASURE = """
 import sys
+import threading
+import time
+from pathlib import Path
 import numpy as np
 import torch
 from torchrg.batch.memory import peak_memory, reset_peak_memory
 from torchrg.config import load_config
 torch.set_num_threads(1)
+taken = [0]
+def watch():  # Pages of files are no such memory: the system can reclaim them.
+    while True:
+        words = Path("/proc/self/status").read_text().split()
+        parts = (int(words[words.index(name) + 1]) for name in ("RssAnon:", "RssShmem:"))
+        taken[0] = max(taken[0], 1024 * sum(parts))
+        time.sleep(0.01)
 what, preset, num_points, folder = *sys.argv[1:3], int(sys.argv[3]), sys.argv[4]
 if what == "frame":
     from torchrg.depth import make_intrinsics, segment_depth
@@ -51,12 +61,14 @@ config = load_config(preset)
 from torchrg.pipeline import make_superpoints, segment_planes
 from contextlib import nullcontext
 from torchrg import scratch
+if "disk" in what:
+    threading.Thread(target=watch, daemon=True).start()
 reset_peak_memory()
 with scratch.on_disk(folder) if "disk" in what else nullcontext():
     seg = segment_planes(points, config, keep_neighbors="superpoints" in what)
     if "superpoints" in what:
         make_superpoints(points, seg)
-print(peak_memory())
+print(taken[0] or peak_memory())
 """
 
 
@@ -76,8 +88,7 @@ def test_what_a_cloud_or_an_image_takes_is_what_the_model_says(tmp_path, what, p
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     options = {"num_levels": 4 * ("superpoints" in what), "on_disk": "disk" in what}
     promised = scan_memory(num_points, **options)
-    pages = 1.5e8 * ("disk" in what)  # Of files, which the system can reclaim.
-    assert 0.5 * promised < int(done.stdout) < promised + pages
+    assert 0.5 * promised < int(done.stdout) < promised
 
 
 @pytest.mark.slow
