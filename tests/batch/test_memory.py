@@ -186,5 +186,5 @@ def test_the_least_limit_of_nested_groups_counts(
 def test_scan_memory_by_example():
     assert (scan_memory(1_000_000), scan_memory(10_000_000, on_disk=True)) == (
         900000000,
-        4400000000,
+        1400000000,
     )
