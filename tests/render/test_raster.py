@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrg.render import raster
-from torchrg.render.raster import Discs, close_gaps, draw_discs, split_keys
+from torchrg.render.raster import Discs, close_gaps, draw_discs, light_colors, split_keys
 
 WIDTH, HEIGHT = 23, 17
 
@@ -95,13 +95,6 @@ def test_largest_discs_are_as_large_as_allowed():
     assert int(is_drawn.sum()) == 13
 
 
-def test_the_depth_of_a_disc_has_no_dome(rng):
-    discs = random_discs(rng, count=1)._replace(pixels=torch.tensor([[11.0, 8.0]]))
-    away = torch.tensor([[12.0, 10.0]])
-    expected = discs.inverse_depth + discs.slopes[:, 0] + 2 * discs.slopes[:, 1]
-    torch.testing.assert_close(discs._replace(max_change=torch.ones(1)).depth_at(away), expected)
-
-
 def test_no_discs_leave_no_keys():
     nothing = facing(torch.zeros(0, 2), torch.zeros(0), torch.zeros(0, 3).byte(), torch.zeros(0))
     assert bool((drawn(nothing, width=4, height=3, max_radius=1) == 0).all())
@@ -120,3 +113,19 @@ def test_closing_does_not_extend_a_surface():
     keys = torch.zeros(30, 30, dtype=torch.int64)
     keys[5:20, 8:21] = 3
     assert torch.equal(close_gaps(keys, reach=2), keys)
+
+
+def test_light_does_not_depend_on_the_sign_of_normals(rng):
+    normals = torch.nn.functional.normalize(torch.randn(100, 3, generator=rng), dim=1)
+    positions = torch.rand(100, 3, generator=rng) + torch.tensor([0.0, 0.0, 2.0])
+    colors = torch.randint(0, 256, (100, 3), generator=rng, dtype=torch.uint8)
+    assert torch.equal(
+        light_colors(colors, normals, positions), light_colors(colors, -normals, positions)
+    )
+
+
+def test_surfaces_that_face_up_are_brighter_than_those_that_face_down():
+    position = torch.tensor([[0.0, 0.0, 5.0]])
+    colors = torch.full((1, 3), 200, dtype=torch.uint8)
+    up, down = (torch.tensor([[0.0, y, -0.7]]) for y in (-0.7, 0.7))
+    assert light_colors(colors, up, position)[0, 0] > light_colors(colors, down, position)[0, 0]

@@ -59,7 +59,7 @@ def draw_picture(
     labels: Tensor,
     supersampling: int,
 ) -> Tensor:
-    """Draw points as discs, close gaps, shade, and average subpixels.
+    """Draw points as shaded discs, close gaps, and average subpixels.
 
     ``is_shown`` ``(n,)`` masks the points of the surface to draw, and ``labels`` ``(n,)`` are their
     planes. Colors and normals cover all points. See :func:`render_cloud`.
@@ -74,53 +74,34 @@ def draw_picture(
     indices = is_shown.nonzero().squeeze(-1)
     lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)[indices]
     rows, position = surface.rows[indices], surface.points[indices]
-    voxel, floor, creases = (
-        surface.voxel_of[indices],
-        supersampling / 2,
-        find_creases(surface, labels),
-    )
+    voxel, creases = surface.voxel_of[indices], find_creases(surface, labels)
     slant = creases.normals_at(position, voxel) if normals is None else normals[rows].float()
     ends = creases.bounds_of(position, slant, voxel)
     # Larger discs fill the surface up to its end.
     ends = ends * (ends[:, :, 3:].abs() < _CREASE_REACH * lengths[:, None, None])
     lengths = torch.where((ends != 0).flatten(1).any(dim=1), _CREASE_REACH * lengths, lengths)
+    floor = supersampling / 2
     discs = _discs(project, position, colors[rows], slant, lengths, floor=floor, ends=ends)
     discs = discs.by_color()
     widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
     keys = raster.draw_discs(
         discs, width=width * supersampling, height=height * supersampling, max_radius=widest
     )
-    radius = float(discs.radii.median()) / supersampling if len(discs.radii) else 1.0
-    reach = max(1, round(_GAP_RADIUS * min(radius, widest / supersampling)))
+    radius = float(discs.radii.clamp(max=widest).median()) if len(discs.radii) else 1.0
+    reach = max(1, round(_GAP_RADIUS * radius / supersampling))
     steps = range(supersampling)
     parts = [keys[row::supersampling, column::supersampling] for row in steps for column in steps]
     # Edges of surfaces are partly covered pixels, which no closing of covered pixels extends.
     closed = raster.close_gaps(functools.reduce(torch.minimum, parts), reach=reach)
     thickness = float(lengths.median()) if len(lengths) else 0.0
     paint = torch.cat([colors.new_full((1, 3), 255), discs.colors])
-    front, total = torch.zeros_like(closed), closed.new_zeros(height, width, 3, dtype=torch.int32)
+    total = closed.new_zeros(height, width, 3, dtype=torch.int32)
     nearest = raster.split_keys(closed)[0]
     for part in parts:
         depth = raster.split_keys(part)[0]
         shown = torch.where(nearest > depth + thickness * depth * nearest, closed, part)
-        front = torch.maximum(front, shown)
         total += paint[raster.split_keys(shown)[1]]
-    brightness = raster.shade_hollows(
-        _plane_depths(discs, front, supersampling),
-        focal=project.focal / supersampling,
-        radius=max(1.0, radius),
-    )
-    return (total * (brightness / supersampling**2)[..., None]).round_().to(torch.uint8)
-
-
-def _plane_depths(discs: raster.Discs, keys: Tensor, supersampling: int) -> Tensor:
-    """Return the inverse depth of the disc of each pixel, without its dome; 0 without a disc."""
-    row, column = (keys > 0).nonzero().unbind(dim=1)
-    centers = supersampling * torch.stack([column, row], dim=1) + (supersampling - 1) / 2
-    chosen = discs.select(raster.split_keys(keys)[1][row, column] - 1)
-    depth = torch.zeros(keys.shape, device=keys.device)
-    depth[row, column] = chosen.depth_at(centers)
-    return depth
+    return (total // supersampling**2).to(torch.uint8)
 
 
 def _discs(

@@ -1,4 +1,4 @@
-"""Rasterization of points as small tilted discs, and the shading of the image.
+"""Rasterization of points as small tilted discs, and their shading.
 
 Discs extend beyond the edge of their surface and would hide the surface behind it. Their depth is
 therefore domed: of discs at about one depth, the one with the nearest center in the image wins.
@@ -24,15 +24,6 @@ _LIGHT = (-0.45, -0.7, -0.55)
 """Direction toward the light in camera axes: from the left, above and behind the camera."""
 _MIN_BRIGHTNESS = 0.62
 """Brightness of a surface that faces away from the light; its color stays recognizable."""
-_MAX_DARKENING = 0.6
-"""Maximum fraction of brightness lost in a hollow. More looks like dirt."""
-_REACHES = ((1, 0.5), (2, 0.3), (3, 0.2))
-"""Distances at which hollows are detected, in radii of a disc, with weights. The weights sum to 1
-and decrease, so that creases are thin lines."""
-_NOISE = 0.7
-"""Tangent of a bend over one disc radius, below which it is noise and not shaded."""
-_MAX_SHADE_RADIUS = 4.0
-"""Maximum radius for detecting hollows, in pixels; larger ones create halos."""
 
 
 class Discs(NamedTuple):
@@ -70,11 +61,6 @@ class Discs(NamedTuple):
         """Return the discs in the order of their colors, which breaks ties."""
         red, green, blue = self.colors.int().unbind(dim=1)
         return self.select((red << 16 | green << 8 | blue).sort(stable=True).indices)
-
-    def depth_at(self, pixels: Tensor) -> Tensor:
-        """Return the inverse depth of each disc's plane at a pixel of it, shape ``(N,)``."""
-        change = ((pixels - self.pixels) * self.slopes).sum(dim=1)
-        return self.inverse_depth + change.clamp(-self.max_change, self.max_change)
 
 
 def draw_discs(discs: Discs, *, width: int, height: int, max_radius: float) -> Tensor:
@@ -197,36 +183,3 @@ def light_colors(colors: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
     cosine = torch.where(away, -1.0, 1.0) * (normals @ light)
     brightness = _MIN_BRIGHTNESS + (1 - _MIN_BRIGHTNESS) * (0.5 + 0.5 * cosine)
     return (colors * brightness[:, None]).round_().to(torch.uint8)
-
-
-def shade_hollows(inverse_depth: Tensor, *, focal: float, radius: float) -> Tensor:
-    """Return the brightness of each pixel; creases and pixels behind an edge are darker.
-
-    Eye-dome lighting [1] on the second difference of the inverse depth, which vanishes on planes,
-    so that tilted planes stay clean. Empty pixels are 0. Steps finer than ``radius``, the median
-    disc radius in pixels, count as noise.
-
-    References:
-        [1] C. Boucheny, A. Ribes. Eye-dome lighting: a non-photorealistic shading technique. 2011.
-    """
-    height, width = inverse_depth.shape
-    drawn = inverse_depth > 0
-    depth = torch.where(drawn, 1 / inverse_depth, 0.0)
-    darkness = torch.zeros_like(inverse_depth)
-    for factor, weight in _REACHES:
-        reach = max(1, round(factor * min(radius, _MAX_SHADE_RADIUS)))
-        padded = functional.pad(inverse_depth[None, None], [reach] * 4, mode="replicate")[0, 0]
-        for dx, dy in ((reach, 0), (0, reach), (reach, reach), (reach, -reach)):
-            after, before = (
-                padded[reach + y : reach + y + height, reach + x : reach + x + width]
-                for x, y in ((dx, dy), (-dx, -dy))
-            )
-            per_step = focal / (dx * dx + dy * dy) ** 0.5
-            # Noise of a surface at a grazing angle has a large depth range, like its slope.
-            slope = torch.minimum((after - inverse_depth).abs_(), (before - inverse_depth).abs_())
-            slope.mul_(depth).mul_(per_step)
-            hollow = (after + before).mul_(depth).sub_(2).mul_(per_step / 2)
-            hollow.sub_(_NOISE * radius / reach).clamp_(min=0)
-            hollow.div_(slope.square_().add_(1).sqrt_())
-            darkness.add_(hollow.div_(hollow + 1), alpha=weight / 4)
-    return torch.where(drawn, 1 - _MAX_DARKENING * darkness, 1.0)
