@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from torchrg.io import dxf
+from torchrg.io.plane_table import bounding_rectangle
 
 ezdxf = pytest.importorskip("ezdxf", reason="needs the extra dxf")
 shapely = pytest.importorskip("shapely", reason="needs the extra outline")
@@ -81,7 +82,7 @@ def test_equal_runs_give_equal_bytes():
 def test_a_plane_without_a_polygon_is_a_rectangle():
     text = dxf.encode_dxf({"planes": [PLANE]}).decode()
     assert text.count("VERTEX") == 4
-    assert dxf._rectangle(PLANE) == [[-1, 2, 2], [3, 2, 2], [3, 2, 4], [-1, 2, 4]]
+    assert bounding_rectangle(PLANE) == [[-1, 2, 2], [3, 2, 2], [3, 2, 4], [-1, 2, 4]]
 
 
 def test_without_ezdxf_it_is_refused_before_the_work(scan, tmp_path, run, monkeypatch):

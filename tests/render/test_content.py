@@ -2,9 +2,11 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from tests.render.test_page import described, places, room, unpacked
 from torchrg.io.result import Result
@@ -74,3 +76,17 @@ def test_the_table_as_csv_names_planes_as_the_file_does():
     )
     bare = make_page(Result(Cloud(cloud.coordinates)))
     assert "table" not in {entry["name"] for entry in described(bare)["clouds"][0]["arrays"]}
+
+
+def test_planes_are_drawn_with_their_polygons_or_bounding_rectangles():
+    square = torch.tensor([[0.0, 0, 1], [4, 0, 1], [4, 2, 1], [0, 2, 1]])
+    points = torch.cartesian_prod(torch.arange(5.0), torch.arange(3.0), torch.ones(1))
+    cloud = Cloud(points.numpy() + 1e6, {"labels": np.zeros(15, dtype=np.int64)})
+    bare = Result(cloud)
+    origin = torch.from_numpy(1e6 - cloud.origin).float()
+    traced = replace(bare, table=replace(bare.planes, outline=((square[:3] + origin,),)))
+    scale = described(make_page(bare))["frame"]["scale"]
+    expected = ((square - torch.tensor([2.0, 1, 1])) / scale).tolist()
+    for result, corners in ((bare, expected), (traced, expected[:3])):
+        (plane,) = described(make_page(result))["clouds"][0]["planes"]
+        assert sorted(plane["rings"][0]) == pytest.approx(np.array(sorted(corners)), abs=1e-4)

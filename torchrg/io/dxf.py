@@ -3,7 +3,7 @@
 import io
 
 from torchrg._optional import require
-from torchrg.io.plane_table import Json, simplify_table
+from torchrg.io.plane_table import Json, bounding_rectangle, simplify_table
 
 _LAYERS = {"wall": ("WALL", 1), "floor": ("FLOOR", 3), "ceiling": ("CEILING", 5)}
 """Layer and AutoCAD color index (red, green, blue) by class."""
@@ -37,7 +37,7 @@ def encode_dxf(described: Json) -> bytes:
             drawing.layers.add(name, color=color)
         for plane in simplify_table(described)["planes"]:
             layer = _LAYERS.get(plane.get("kind"), _OTHER)[0]
-            for ring in plane.get("outline") or [_rectangle(plane)]:
+            for ring in plane.get("outline") or [bounding_rectangle(plane)]:
                 drawing.modelspace().add_polyline3d(ring, close=True, dxfattribs={"layer": layer})
         # Otherwise ezdxf registers them in the order of a set.
         for entity in sorted(drawing.entitydb.dxf_types_in_use()):
@@ -47,10 +47,3 @@ def encode_dxf(described: Json) -> bytes:
     finally:
         ezdxf.options.write_fixed_meta_data_for_testing = metadata
     return text.getvalue().encode()
-
-
-def _rectangle(plane: Json) -> list[list[float]]:
-    """Return the corners of the bounding rectangle of a plane."""
-    (length, height), center, sides = plane["extent"], plane["center"], plane["axes"]
-    halves = [(s * length / 2, t * height / 2) for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return [[c + a * u + b * v for c, u, v in zip(center, *sides, strict=True)] for a, b in halves]

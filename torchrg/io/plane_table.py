@@ -268,6 +268,13 @@ def simplify_table(described: Json) -> Json:
     return described | {"planes": rows}
 
 
+def bounding_rectangle(plane: Json) -> list[list[float]]:
+    """Return the corners of the bounding rectangle of a plane of :func:`describe_planes`."""
+    (length, height), center, sides = plane["extent"], plane["center"], plane["axes"]
+    halves = [(s * length / 2, t * height / 2) for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return [[c + a * u + b * v for c, u, v in zip(center, *sides, strict=True)] for a, b in halves]
+
+
 def _straighten(plane: Json) -> list[list[list[float]]]:
     """Return the straightened rings of a plane."""
     center, axes = np.array(plane["center"]), np.array(plane["axes"])

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
@@ -10,18 +9,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg.io.plane_table import Json, describe_planes
+from torchrg.io.plane_table import Json, bounding_rectangle, describe_planes
 from torchrg.io.result import Result
 from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import number_labels
 from torchrg.neighbors.order import finite_rows
 from torchrg.regions.classes import classify_planes
 from torchrg.regions.directions import horizontal_toward, unit_axis
-from torchrg.regions.table import summarize_planes
 from torchrg.render.channels import COLOR_MODES
 from torchrg.render.cutaway import Sides, find_sides
 from torchrg.render.surface import VisibleSurface, sample_surface
-from torchrg.structures import PLANE_KINDS, Cloud, Planes
+from torchrg.structures import PLANE_KINDS, Cloud
 from torchrg.structures.points import bounding_box
 
 NUM_STRATA = 8
@@ -29,8 +27,6 @@ NUM_STRATA = 8
 slow machines draw only the first strata. Sorting compresses positions to two thirds."""
 PAGE_EXTENT = 10.0
 """Longest side of a cloud in a viewer; independent of the unit."""
-_POLYGON_POINTS = 200_000
-"""Number of points from which polygons are traced; enough for display."""
 _OMITTED_COLUMNS = ("id", "centroid", "axes", "center", "outline")
 """Columns of the plane table that are drawn or omitted."""
 _MEDIAN_RADIUS = 128
@@ -134,38 +130,39 @@ def encode_radii(shown: PointSample) -> Tensor:
     return (octaves * _STEPS_PER_OCTAVE + _MEDIAN_RADIUS).round().to(torch.uint8)
 
 
-def page_planes(result: Result, shown: PointSample, frame: PageFrame) -> list[dict[str, object]]:
+def page_planes(described: Json, frame: PageFrame) -> list[Json]:
     """Return the plane entries of a viewer, by viewer label.
 
-    Entries have the columns of :func:`describe_planes` that are not drawn, ``rings`` in viewer
-    axes, and ``meets``: adjacent planes with angle and boundary length. Planes without
-    classes are classified by the up axis of the viewer.
+    Entries have the columns of :func:`displayed_table` that are not drawn, ``rings`` in viewer
+    axes (the polygon, or the bounding rectangle), and ``meets``: adjacent planes with angle and
+    boundary length.
     """
-    planes, origin, table = result.planes, result.cloud.origin, displayed_table(result, frame)
-    if not planes:
-        return []
-    meets: list[list[tuple[int, float, float]]] = [[] for _ in table["planes"]]
-    for contact in table.get("adjacency", []):
+    meets: list[list[tuple[int, float, float]]] = [[] for _ in described["planes"]]
+    for contact in described.get("adjacency", []):
         for plane, other in (contact["pair"], contact["pair"][::-1]):
             meets[plane].append(
                 (other, round(contact["dihedral_deg"], 1), contact["boundary_length"])
             )
-    rings = planes.outline or _trace(planes, shown.rows, result)
-    corners = _rectangles(planes)
     return [
         {name: value for name, value in row.items() if name not in _OMITTED_COLUMNS}
         | {
             "name": row["id"],
             "kind": PLANE_KINDS.index(row["kind"]),
-            "rings": [rounded(frame.transform(ring, origin)) for ring in outline or (rectangle,)],
+            "rings": [
+                rounded(frame.transform(torch.tensor(ring, dtype=torch.float64), np.zeros(3)))
+                for ring in row.get("outline") or [bounding_rectangle(row)]
+            ],
             "meets": met,
         }
-        for row, outline, rectangle, met in zip(table["planes"], rings, corners, meets, strict=True)
+        for row, met in zip(described["planes"], meets, strict=True)
     ]
 
 
 def displayed_table(result: Result, frame: PageFrame) -> Json:
-    """Return the plane table of a viewer, with the labels of the file as IDs."""
+    """Return the plane table of a viewer, with the labels of the file as IDs.
+
+    Planes without classes are classified by the up axis of the viewer.
+    """
     planes = result.planes
     if not planes:
         return {"planes": []}
@@ -176,28 +173,6 @@ def displayed_table(result: Result, frame: PageFrame) -> Json:
     for row, name in zip(described["planes"], result.names.tolist(), strict=True):
         row["id"] = name
     return described
-
-
-def _trace(planes: Planes, rows: Tensor, result: Result) -> list[tuple[Tensor, ...]]:
-    """Trace polygons of planes from a sample of their points; empty without shapely."""
-    outlines: list[tuple[Tensor, ...]] = [() for _ in planes.count]
-    if find_spec("shapely") is None:
-        return outlines
-    rows = rows[:_POLYGON_POINTS]
-    numbers, labels = number_labels(result.labels[rows])
-    points = result.cloud.points[rows]
-    normals = result.fields.get("normals", torch.zeros_like(result.cloud.points))[rows]
-    table = summarize_planes(points, normals.to(points.dtype).nan_to_num(), labels, outline=True)
-    for number, rings in zip(numbers.tolist(), table.outline or (), strict=True):
-        outlines[number] = rings
-    return outlines
-
-
-def _rectangles(planes: Planes) -> Tensor:
-    """Return the corners of the bounding rectangle of each plane, shape ``(M, 4, 3)``."""
-    half = (planes.axes * planes.extent[:, :, None] / 2).double()
-    signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
-    return planes.center.double()[:, None] + signs @ half
 
 
 def rounded(values: Tensor) -> object:

@@ -219,7 +219,8 @@ def _describe_cloud(
         true_fields["normals"] = true_fields["normals"].float() @ frame.rotation.T.float()
     palettes = _palettes(result, shown, reference)
     channels = list(make_channels(shown.fields, true_fields, palettes))
-    planes = page_planes(result, shown, frame)
+    table = displayed_table(result, frame)
+    planes = page_planes(table, frame)
     covered = scatter_rows(shown.sides.of_points, shown.surface.rows, len(shown.rows))
     if planes:
         labels = shown.fields["labels"]
@@ -234,7 +235,7 @@ def _describe_cloud(
     radii = encode_radii(shown)
     arrays["radii"] = scatter_rows(radii, shown.surface.rows, len(shown.rows)).numpy()
     if planes:
-        arrays["table"] = np.frombuffer(encode_csv(displayed_table(result, frame)), np.uint8)
+        arrays["table"] = np.frombuffer(encode_csv(table), np.uint8)
     if "normals" in shown.fields:
         arrays["normals"] = encode_directions(shown.fields["normals"])
     for channel in channels:
