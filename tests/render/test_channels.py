@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.render.test_page import described, places, room, unpacked
+from tests.render.test_page import decode_directions, described, places, room, unpacked
 from torchrg.io.result import Result
 from torchrg.render import color_curvature, color_normals, color_planes, color_sharp
-from torchrg.render.channels import decode_directions, encode_directions, point_outcomes
+from torchrg.render.channels import encode_directions, point_outcomes
 from torchrg.render.page import make_page
 
 
@@ -26,9 +26,9 @@ def test_colours_are_those_of_pictures(mode):
     page = make_page(Result(cloud), max_points=700, up=(0.0, 1.0, 0.0))
     arrays, found = unpacked(page), places(page)
     rows = [np.abs(cloud.coordinates - place).max(axis=1).argmin() for place in found]
-    shown = arrays[f"{mode} colors"][arrays[mode][:, 0]]
+    shown = arrays[mode] if mode == "normal" else arrays[f"{mode} colors"][arrays[mode][:, 0]]
     differences = np.abs(shown.astype(int) - colors[rows].numpy())
-    assert differences.max() <= (12 if mode in ("normal", "curvature") else 0)
+    assert differences.max() <= {"normal": 1, "curvature": 12}.get(mode, 0)
 
 
 def test_errors_are_shown_against_a_truth():
@@ -57,7 +57,8 @@ def test_point_outcomes_by_example():
 
 
 def test_encode_directions_by_example():
-    assert encode_directions(torch.tensor([[0.0, 0, 1], [1, 0, 0]])).tolist() == [
+    assert encode_directions(torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 0, 0]])).tolist() == [
         [127, 127],
         [254, 127],
+        [255, 255],
     ]

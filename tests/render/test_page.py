@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchrg.render.page import _json_for_html
-
 pytest.importorskip("pydeck", reason="needs the extra view")
 
 from torchrg.errors import ConfigError, MissingDependencyError
 from torchrg.io.result import Result
-from torchrg.render.channels import decode_directions
 from torchrg.render.page import Page, make_page
 from torchrg.scenes import make_room
 from torchrg.structures import Cloud
@@ -63,6 +60,15 @@ def unpacked(page, place=0):
         arrays[entry["name"]] = values.T
     assert not rest
     return arrays
+
+
+def decode_directions(codes):
+    """The unit vectors of the octahedral map, as ``page.js`` decodes them."""
+    x, y = (codes.astype(np.float32) / 127 - 1).T
+    z = 1 - np.abs(x) - np.abs(y)
+    fold = np.maximum(-z, 0)
+    directions = np.stack([x - np.copysign(fold, x), y - np.copysign(fold, y), z], axis=1)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def places(page, place=0):
@@ -235,7 +241,3 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, run, arguments, message
     assert done.code == 2
     assert message in done.error
     assert not list(tmp_path.glob("page.*"))
-
-
-def test_json_for_html_by_example():
-    assert _json_for_html({"name": "</script>&"}) == '{"name":"\\u003c/script\\u003e\\u0026"}'

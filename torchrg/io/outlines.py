@@ -31,11 +31,6 @@ def straighten_rings(rings: Sequence[_Ring], spacing: float, rms: float) -> list
         rings: Rings in the plane, shapes ``(V, 2)``.
         spacing: Distance of the plane's points to their neighbors.
         rms: RMS distance of the points to the plane, in the same unit.
-
-    Example:
-        >>> ragged = np.array([[0.0, 0], [5, 0.1], [10, 0], [10, 5], [5, 4.9], [0, 5]])
-        >>> [len(ring) for ring in straighten_rings([ragged], spacing=0.2, rms=0.0)]
-        [4]
     """
     if find_spec("shapely") is None:
         return list(rings)

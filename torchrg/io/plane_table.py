@@ -294,10 +294,6 @@ def _to_wkt(rings: Sequence[Sequence[Sequence[float]]], normal: Sequence[float])
     """Convert rings to a WKT polygon or multipolygon.
 
     Outer rings are counter-clockwise; each is followed by its holes.
-
-    Example:
-        >>> _to_wkt([[[0.0, 0.0, 7.5], [1.0, 0.0, 7.5], [0.0, 1.0, 7.5]]], [0, 0, 1])
-        'POLYGON Z ((0.0 0.0 7.5, 1.0 0.0 7.5, 0.0 1.0 7.5, 0.0 0.0 7.5))'
     """
     polygons: list[list[str]] = []
     for ring in rings:

@@ -36,8 +36,6 @@ OUTCOMES = {
 """Outcomes of a point against ground truth: color and meaning."""
 _OCTAHEDRON_STEPS = 254
 """Steps along the sides of the octahedral map: about a degree. Even, for exact axes."""
-_DIRECTION_BITS = 6
-"""Bits per coordinate of the octahedral map that select a color."""
 _CURVATURE_END = 0.1
 """Curvature at the end of the color scale."""
 _WORST_ANGLE_DEG = 45.0
@@ -111,18 +109,10 @@ def _region_channel(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) ->
 
 
 def _normal_channel(normals: Tensor) -> Channel:
-    """Return the colors of directions, by their octahedral coordinates."""
-    codes = encode_directions(normals)
-    shift = 8 - _DIRECTION_BITS
-    values = (codes[:, 0].astype(np.uint16) >> shift << _DIRECTION_BITS) | (codes[:, 1] >> shift)
-    values[(normals == 0).all(dim=1).numpy()] = 1 << 2 * _DIRECTION_BITS
-    steps = (np.arange(1 << _DIRECTION_BITS) << shift) + (1 << shift - 1)
-    square = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    directions = torch.from_numpy(decode_directions(square.astype(np.uint8)))
-    colors = color_normals(torch.cat([directions, torch.zeros(1, 3)])).numpy()
-    gray = color_normals(torch.tensor([[0.0, 0, 1]]))[0].tolist()
-    legend = [(gray, "horizontal"), (colors[-1].tolist(), "no normal")]
-    return Channel("normal", values, colors, legend)
+    """Return the colors of directions."""
+    chips = color_normals(torch.tensor([[0.0, 0, 1], [0, 0, 0]])).tolist()
+    legend = [*zip(chips, ("horizontal", "no normal"), strict=True)]
+    return Channel("normal", color_normals(normals).numpy(), None, legend)
 
 
 def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Channel:
@@ -180,28 +170,16 @@ def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
 
 
 def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
-    """Encode unit vectors ``(n, 3)`` by an octahedral map [1] as two bytes each.
+    """Encode unit vectors ``(n, 3)`` by an octahedral map [1] as two bytes each; 255 for zero.
 
     References:
         [1] Z. Cigolle et al. A survey of efficient representations for independent unit vectors.
             Journal of Computer Graphics Techniques 3(2), 2014.
     """
-    size = directions.abs().sum(dim=1, keepdim=True)
-    size = torch.where(size > 0, size, 1.0)
-    x, y, z = (directions / size).unbind(dim=1)
+    x, y, z = (directions / directions.abs().sum(dim=1, keepdim=True)).unbind(dim=1)
     ones = torch.ones_like(x)
     folded_x = torch.where(z < 0, (1 - y.abs()) * torch.copysign(ones, x), x)
     folded_y = torch.where(z < 0, (1 - x.abs()) * torch.copysign(ones, y), y)
     square = torch.stack([folded_x, folded_y], dim=1)
-    steps = ((square * 0.5 + 0.5) * _OCTAHEDRON_STEPS).nan_to_num().round().clamp(0, 255)
+    steps = ((square * 0.5 + 0.5) * _OCTAHEDRON_STEPS).nan_to_num(255).round()
     return steps.numpy().astype(np.uint8)
-
-
-def decode_directions(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Decode the unit vectors ``(n, 3)`` of :func:`encode_directions`."""
-    x, y = (codes.astype(np.float32) / _OCTAHEDRON_STEPS * 2 - 1).T
-    z = 1 - np.abs(x) - np.abs(y)
-    fold = np.maximum(-z, 0)
-    directions = np.stack([x - np.copysign(fold, x), y - np.copysign(fold, y), z], axis=1)
-    unit: NDArray[np.float32] = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return unit

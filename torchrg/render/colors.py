@@ -20,12 +20,7 @@ from torchrg.structures.points import Array, Labels, Points, Values
 
 
 def rgb_to_lab(colors: Tensor) -> Tensor:
-    """Convert sRGB in [0, 1], shape ``(*, 3)``, to CIE Lab, where distances are perceptual.
-
-    Example:
-        >>> rgb_to_lab(torch.tensor([1.0, 1.0, 1.0])).round().abs()
-        tensor([100.,   0.,   0.])
-    """
+    """Convert sRGB in [0, 1], shape ``(*, 3)``, to CIE Lab, where distances are perceptual."""
     from kornia.color import rgb_to_lab as of_image
 
     lab: Tensor = of_image(_as_image(colors))[0, :, :, 0].T.reshape(colors.shape)
@@ -105,11 +100,6 @@ def choose_colors(
 
     Each chosen color repels later ones with the inverse square of its distance in Lab: the color of
     an adjacent plane, in ``pairs`` ``(E, 2)``, with its weight, others weakly. ``fixed`` ones stay.
-
-    Example:
-        >>> choices = choose_colors(torch.tensor([5, 4]), torch.tensor([[0, 1]]), torch.ones(1))
-        >>> len(choices.unique())
-        2
     """
     repulsion = _similarity().T
     fraction = sizes / sizes.sum()

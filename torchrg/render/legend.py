@@ -89,12 +89,7 @@ def add_legend(image: Tensor, legend: Legend, pixels_per_unit: float) -> Tensor:
 
 
 def _scale_bar(pixels_per_unit: float) -> tuple[float, int]:
-    """Return the length of the scale bar, 1, 2 or 5 times a power of ten, and its pixels.
-
-    Example:
-        >>> _scale_bar(100.0)
-        (1.0, 100)
-    """
+    """Return the length of the scale bar, 1, 2 or 5 times a power of ten, and its pixels."""
     power = 10.0 ** math.floor(math.log10(_MAX_BAR / pixels_per_unit))
     length = max(step * power for step in (1, 2, 5) if step * power * pixels_per_unit <= _MAX_BAR)
     return length, round(length * pixels_per_unit)

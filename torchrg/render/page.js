@@ -45,10 +45,10 @@ function unpack(manifest, bytes) {
   return arrays;
 }
 
-function directionsOf(places, zero) {
+function directionsOf(places) {
   const directions = new Float32Array((places.length / 2) * 3);
   for (let i = 0; i < places.length / 2; i++) {
-    if (zero(i)) continue;
+    if (places[2 * i] === 255) continue; // A point without a normal.
     let x = places[2 * i] / 127 - 1, y = places[2 * i + 1] / 127 - 1;
     const z = 1 - Math.abs(x) - Math.abs(y), fold = Math.max(-z, 0);
     x -= x < 0 ? -fold : fold;
@@ -64,9 +64,7 @@ function preparePoints(cloud, bytes) {
   cloud.values = arrays;
   cloud.positions = new Float32Array(3 * n);
   for (let i = 0; i < 3 * n; i++) cloud.positions[i] = arrays.positions[i] * cloud.step + cloud.low[i % 3];
-  const none = 4096; // Color index of points without a normal.
-  cloud.normals = arrays.normals
-    ? directionsOf(arrays.normals, (i) => arrays.normal[i] === none) : new Float32Array(3 * n);
+  cloud.normals = arrays.normals ? directionsOf(arrays.normals) : new Float32Array(3 * n);
   cloud.colors = new Uint8Array(4 * n).fill(255);
   cloud.mask = arrays.covered.slice();
   cloud.hidden = new Set();

@@ -69,14 +69,6 @@ def draw_discs(discs: Discs, *, width: int, height: int, max_radius: float) -> T
     A key has the bits of the inverse depth, which sort like the float, above the row of the disc
     plus 1; see :func:`split_keys`. Radii are clamped to ``max_radius``, in pixels. The time grows
     with the covered pixels, the memory with the number of discs.
-
-    Example:
-        >>> ends, colors = torch.tensor([[0.0, 0.0], [2.0, 0.0]]), torch.zeros(2, 3).byte()
-        >>> flat = torch.zeros(2, 2)
-        >>> ones, endless = torch.ones(2), torch.zeros(2, 0, 3)
-        >>> discs = Discs(ends, ones, colors, ones, flat, torch.zeros(2), endless)
-        >>> split_keys(draw_discs(discs, width=3, height=1, max_radius=1))[1].tolist()
-        [[1, 2, 2]]
     """
     device = discs.pixels.device
     # Discs may extend beyond the image, into a margin that is never shown.
@@ -156,10 +148,6 @@ def _window_maximum(image: Tensor, reach: int) -> Tensor:
     """Return the maximum in the square window around each pixel of an image ``(H, W)``.
 
     Windows of double width are combined from two windows, so the cost grows with the logarithm.
-
-    Example:
-        >>> _window_maximum(torch.tensor([[1, 2, 3, 9], [0, 0, 0, 0]]), 1).tolist()
-        [[2, 3, 9, 9], [2, 3, 9, 9]]
     """
     lowest = torch.iinfo(image.dtype).min
     for axis in (0, 1):
