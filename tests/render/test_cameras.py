@@ -8,8 +8,9 @@ import torch
 
 from torchrg.render.cameras import (
     fit_camera,
+    local_camera,
     make_camera,
-    projection_of,
+    project,
     sensor_camera,
     view_axes,
 )
@@ -34,7 +35,7 @@ def test_projection_equals_the_textbook(rng, finer, far):
     camera = make_camera(matrix, 500.0, (319.5, 200.25), 640, 400)
     local = torch.randn(50, 3, generator=rng) + 6 * rotation[2].float()
     origin = position + torch.tensor([0.25, -0.5, 0.125], dtype=torch.float64)
-    positions, pixels = projection_of(camera, origin, finer=finer)(local)
+    positions, pixels = project(local_camera(camera, origin, finer=finer), local)
     expected, axes = project_by_hand(
         local.double() + origin, rotation.numpy(), position.numpy(), 500.0, (319.5, 200.25)
     )

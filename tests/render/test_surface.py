@@ -42,11 +42,11 @@ def test_only_discs_in_planes_grow_where_points_are_sparse(rng):
         ),
     )
     assert surface.spacing[kind == 2].median() > 4 * usual
-    for labels in (None, torch.where(kind == 2, -1, kind)):
-        found = surface.disc_spacing(4.0, labels)
+    for labels in (kind, torch.where(kind == 2, -1, kind)):
+        found = surface.disc_spacing(labels)
         assert torch.equal(found[kind < 2], surface.spacing[kind < 2].clamp(max=4 * usual))
         assert (found[kind == 2] <= usual).double().mean() > 0.8
-    assert (surface.disc_spacing(4.0, torch.where(kind == 2, -1, kind))[kind == 2] <= usual).all()
+    assert (surface.disc_spacing(torch.where(kind == 2, -1, kind))[kind == 2] <= usual).all()
 
 
 def test_duplicates_count_once(rng):

@@ -1,7 +1,7 @@
 """Pinhole cameras that show a whole cloud, based on kornia."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -130,43 +130,28 @@ def _frame(
     return make_camera(world_to_camera, focal, center, width, height)
 
 
-class Projection(NamedTuple):
-    """Projection of points relative to an origin to pixels.
+def local_camera(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> "PinholeCamera":
+    """Return the float32 camera of points relative to an origin, with ``finer`` times the pixels.
 
-    Attributes:
-        local_to_camera: Transform, shape ``(1, 4, 4)``.
-        intrinsics: Shape ``(3, 3)``.
+    The origin, shape ``(3,)``, is applied in float64, so that clouds far from zero keep their
+    precision.
     """
-
-    local_to_camera: Tensor
-    intrinsics: Tensor
-
-    @property
-    def focal(self) -> float:
-        """Focal length, in pixels."""
-        return float(self.intrinsics[0, 0])
-
-    def __call__(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions ``(N, 3)`` in camera axes, and pixels ``(N, 2)``."""
-        from kornia.geometry.camera import project_points
-        from kornia.geometry.linalg import transform_points
-
-        positions = transform_points(self.local_to_camera, points[None])[0]
-        return positions, project_points(positions, self.intrinsics)
-
-
-def projection_of(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> Projection:
-    """Return the projection of a camera, supersampled ``finer`` times per axis.
-
-    The origin of the points, shape ``(3,)``, is applied in float64, so that clouds far from zero
-    keep their precision. The projection is float32.
-    """
-    intrinsics = camera.intrinsics[0, :3, :3].double().clone()
-    intrinsics[:2] *= finer
-    intrinsics[:2, 2] += (finer - 1) / 2
+    intrinsics = camera.intrinsics[:1].double().clone()
+    intrinsics[0, :2] *= finer
+    intrinsics[0, :2, 2] += (finer - 1) / 2
     matrix = camera.extrinsics[:1].double().clone()
     matrix[0, :3, 3] += matrix[0, :3, :3] @ origin.to(matrix)
-    return Projection(matrix.to(origin.device).float(), intrinsics.to(origin.device).float())
+    size = camera.height[:1] * finer, camera.width[:1] * finer
+    return type(camera)(intrinsics.to(origin).float(), matrix.to(origin).float(), *size)
+
+
+def project(camera: "PinholeCamera", points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions ``(N, 3)`` in camera axes, and pixels ``(N, 2)``."""
+    from kornia.geometry.camera import project_points
+    from kornia.geometry.linalg import transform_points
+
+    positions = transform_points(camera.extrinsics, points[None])[0]
+    return positions, project_points(positions, camera.camera_matrix[0])
 
 
 def _bounds(values: Tensor) -> tuple[float, float]:

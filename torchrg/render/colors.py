@@ -28,21 +28,16 @@ def rgb_to_lab(colors: Tensor) -> Tensor:
 
 
 def _lab_to_rgb(colors: Tensor) -> Tensor:
-    """Convert CIE Lab to sRGB; values outside [0, 1] are out of gamut."""
+    """Convert CIE Lab to the nearest sRGB, uint8."""
     from kornia.color import lab_to_rgb as of_image
 
-    rgb: Tensor = of_image(_as_image(colors), clip=False)[0, :, :, 0].T.reshape(colors.shape)
-    return rgb
+    rgb: Tensor = of_image(_as_image(colors))[0, :, :, 0].T.reshape(colors.shape)
+    return (rgb * 255).round().to(torch.uint8)
 
 
 def _as_image(colors: Tensor) -> Tensor:
     """Reshape colors ``(*, 3)`` to an image of one column ``(1, 3, N, 1)``."""
     return colors.reshape(-1, 3).T[None, :, :, None]
-
-
-def _to_bytes(colors: Tensor) -> Tensor:
-    """Convert sRGB colors in [0, 1] to uint8, clipping values outside."""
-    return (colors.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 UNLABELED_GRAY = 176
@@ -173,7 +168,7 @@ def color_normals(normals: Points, *, up: Sequence[float] | str = "z") -> Tensor
     lab = torch.stack([lightness, _CHROMA * (x * x - y * y), 2 * _CHROMA * x * y], dim=-1)
     missing = (tensor == 0).all(dim=-1, keepdim=True)
     gray = torch.tensor(UNLABELED_GRAY, dtype=torch.uint8, device=tensor.device)
-    return torch.where(missing, gray, _to_bytes(_lab_to_rgb(lab)))
+    return torch.where(missing, gray, _lab_to_rgb(lab))
 
 
 def color_curvature(curvature: Values, *, max_curvature: float = 0.1) -> Tensor:
@@ -204,7 +199,7 @@ def color_curvature(curvature: Values, *, max_curvature: float = 0.1) -> Tensor:
     before = position.long().clamp(max=len(_RAMP) - 2)
     ramp = tensor.new_tensor(_RAMP)
     lab = torch.lerp(ramp[before], ramp[before + 1], (position - before)[..., None])
-    return _to_bytes(_lab_to_rgb(lab))
+    return _lab_to_rgb(lab)
 
 
 def color_sharp(sharp: Tensor | Array) -> Tensor:
@@ -307,13 +302,14 @@ def _choose(
     """Return each point's index among the existing labels, and the palette row of each label."""
     rows = number_labels(labels)[1]
     num_planes = int(rows.max()) + 1 if len(rows) else 0
-    sample = rows if points is None else rows[sample_rows(points)]
-    sizes = torch.bincount(sample[sample >= 0], minlength=num_planes)
+    chosen = torch.arange(len(rows), device=rows.device) if points is None else sample_rows(points)
+    chosen = chosen[rows[chosen] >= 0]
+    sample = rows[chosen]
+    sizes = torch.bincount(sample, minlength=num_planes)
     pairs, weights = [sizes.new_zeros((0, 2))], [torch.zeros(0, dtype=torch.float64)]
     if points is not None:
-        shown = points[sample_rows(points)][sample >= 0]
         for num_voxels, weight in _NEIGHBORHOODS:
-            pairs.append(_adjacent_planes(shown, sample[sample >= 0], num_voxels))
+            pairs.append(_adjacent_planes(points[chosen], sample, num_voxels))
             weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
     choices = choose_colors(
         sizes.cpu(),

@@ -18,7 +18,7 @@ from torchrg.regions.classes import classify_planes
 from torchrg.regions.directions import horizontal_toward, unit_axis
 from torchrg.render.channels import COLOR_MODES
 from torchrg.render.cutaway import Sides, find_sides
-from torchrg.render.surface import VisibleSurface, sample_surface
+from torchrg.render.surface import MAX_SPACING_RATIO, VisibleSurface, sample_surface
 from torchrg.structures import PLANE_KINDS, Cloud
 from torchrg.structures.points import bounding_box
 
@@ -33,8 +33,6 @@ _MEDIAN_RADIUS = 128
 """Encoded median radius, in the middle of the byte range."""
 _STEPS_PER_OCTAVE = 16
 """Steps of the encoded radius per factor of two: one step is 4 percent."""
-_MAX_SPACING_RATIO = 3.0
-"""Maximum ratio of a point's radius to the median, in either direction."""
 
 
 class PageFrame(NamedTuple):
@@ -120,13 +118,13 @@ def choose_points(result: Result, frame: PageFrame, max_points: int) -> PointSam
 
 def encode_radii(shown: PointSample) -> Tensor:
     """Return the encoded radius of each point: 16 steps per factor of two, 128 is the median."""
-    surface, labels = shown.surface, shown.fields.get("labels")
+    surface = shown.surface
     median_spacing = float(surface.spacing.median()) if len(surface.spacing) else 0.0
     if median_spacing == 0:
         return torch.full((len(surface.rows),), _MEDIAN_RADIUS, dtype=torch.uint8)
-    labels = None if labels is None else labels[surface.rows]
-    ratio = surface.disc_spacing(_MAX_SPACING_RATIO, labels) / median_spacing
-    octaves = ratio.clamp(min=1 / _MAX_SPACING_RATIO).log2()
+    labels = shown.fields.get("labels", torch.zeros_like(shown.rows))[surface.rows]
+    ratio = surface.disc_spacing(labels) / median_spacing
+    octaves = ratio.clamp(min=1 / MAX_SPACING_RATIO).log2()
     return (octaves * _STEPS_PER_OCTAVE + _MEDIAN_RADIUS).round().to(torch.uint8)
 
 

@@ -20,8 +20,6 @@ _MAX_COSINE = 0.9
 """Maximum cosine between the normals of two planes that meet in a crease."""
 _MAX_RMS = 0.25
 """Maximum RMS distance of a plane to its voxels, in voxel edges; others are curved."""
-
-
 _NUM_PLANES = 3
 """Number of planes that meet in a corner."""
 

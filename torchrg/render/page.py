@@ -118,9 +118,16 @@ def make_page(
         MissingDependencyError: If pydeck is not installed.
     """
     cloud = result.cloud
-    up = _check_settings(cloud, ground_truth, up, view, max_points)
+    check_choices("make_page", view=(view, View))
+    if max_points < 1:
+        raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
+    if ground_truth is not None and len(ground_truth) != len(cloud):
+        raise ConfigError(
+            f"{ground_truth.source or 'make_page'}: expected ground truth for {len(cloud):,} "
+            f"points, got {len(ground_truth):,}; pass the same points in the same order."
+        )
     library = read_library()
-    frame = make_frame(cloud, up)
+    frame = make_frame(cloud, up or ("-y" if view == "sensor" else "z"))
     true_fields = {} if ground_truth is None else Result(ground_truth).fields
     shown = choose_points(result, frame, max_points)
     described = [_describe_cloud(result, shown, true_fields, None, frame)]
@@ -157,25 +164,6 @@ def make_page(
     }
     text = _fill_template(description, [_encode_library(library), *blobs], library)
     return Page(text, tuple(scene["shown"] for scene in scenes))
-
-
-def _check_settings(
-    cloud: Cloud,
-    ground_truth: Cloud | None,
-    up: Sequence[float] | str | None,
-    view: View,
-    max_points: int,
-) -> Sequence[float] | str:
-    """Return the up direction; raise if a setting is invalid."""
-    check_choices("make_page", view=(view, View))
-    if max_points < 1:
-        raise ConfigError(f"make_page: expected max_points >= 1, got {max_points}.")
-    if ground_truth is not None and len(ground_truth) != len(cloud):
-        raise ConfigError(
-            f"{ground_truth.source or 'make_page'}: expected ground truth for {len(cloud):,} "
-            f"points, got {len(ground_truth):,}; pass the same points in the same order."
-        )
-    return up or ("-y" if view == "sensor" else "z")
 
 
 def write_page(path: str | os.PathLike[str], page: Page) -> None:

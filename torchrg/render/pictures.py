@@ -16,7 +16,7 @@ from torchrg.io.files import atomic_path, wrap_errors
 from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import INTEGERS, check_labels
 from torchrg.render import raster
-from torchrg.render.cameras import Projection, fit_camera, projection_of, sensor_camera, view_axes
+from torchrg.render.cameras import fit_camera, local_camera, project, sensor_camera, view_axes
 from torchrg.render.creases import find_creases, segment_surface
 from torchrg.render.cutaway import View, choose_viewpoint, find_sides
 from torchrg.render.legend import Legend, add_legend
@@ -31,8 +31,6 @@ _RADIUS = 1.3
 """Radius of a disc, in local spacings; leaves only a few gaps in a surface."""
 _CREASE_REACH = 1.7
 """Factor for the radius of discs that end at a crease, up to which no gaps remain."""
-_MAX_RADIUS_RATIO = 4
-"""Maximum radius of a disc in a plane, in median radii; outside planes it is 1."""
 _RADIUS_FRACTION = 0.02
 """Maximum radius of a disc, as a fraction of the image width; bounds the drawing time."""
 _SMALL_RADIUS, _MAX_RADIUS = 8.0, 64.0
@@ -70,9 +68,9 @@ def draw_picture(
             f"render_cloud: expected at most {_MAX_SUBPIXELS:,} subpixels, got {width:,} x "
             f"{height:,} pixels with supersampling {supersampling}; lower one of them."
         )
-    project = projection_of(camera, surface.origin, finer=supersampling)
+    camera = local_camera(camera, surface.origin, finer=supersampling)
     indices = is_shown.nonzero().squeeze(-1)
-    lengths = _RADIUS * surface.disc_spacing(_MAX_RADIUS_RATIO, labels)[indices]
+    lengths = _RADIUS * surface.disc_spacing(labels)[indices]
     rows, position = surface.rows[indices], surface.points[indices]
     voxel, creases = surface.voxel_of[indices], find_creases(surface, labels)
     slant = creases.normals_at(position, voxel) if normals is None else normals[rows].float()
@@ -81,7 +79,7 @@ def draw_picture(
     ends = ends * (ends[:, :, 3:].abs() < _CREASE_REACH * lengths[:, None, None])
     lengths = torch.where((ends != 0).flatten(1).any(dim=1), _CREASE_REACH * lengths, lengths)
     floor = supersampling / 2
-    discs = _discs(project, position, colors[rows], slant, lengths, floor=floor, ends=ends)
+    discs = _discs(camera, position, colors[rows], slant, lengths, floor=floor, ends=ends)
     discs = discs.by_color()
     widest = supersampling * min(max(_SMALL_RADIUS, _RADIUS_FRACTION * width), _MAX_RADIUS)
     keys = raster.draw_discs(
@@ -105,7 +103,7 @@ def draw_picture(
 
 
 def _discs(
-    project: Projection,
+    camera: "PinholeCamera",
     points: Tensor,
     colors: Tensor,
     normals: Tensor,
@@ -118,27 +116,27 @@ def _discs(
 
     Points behind the camera are dropped.
     """
-    positions, pixels = project(points)
+    positions, pixels = project(camera, points)
     ahead = positions[:, 2] > 0
     if not bool(ahead.all()):
         positions, pixels, colors = positions[ahead], pixels[ahead], colors[ahead]
         normals, lengths, ends = normals[ahead], lengths[ahead], ends[ahead]
-    rotation = project.local_to_camera[0, :3, :3]
+    rotation, focal = camera.extrinsics[0, :3, :3], float(camera.fx)
     normals, across = normals @ rotation.T, ends[:, :, :3] @ rotation.T
     inverse = 1 / positions[:, 2]
     along = (normals * positions).sum(dim=-1) * inverse
     min_cosine = torch.where(along < 0, -_MIN_COSINE, _MIN_COSINE)
     along = torch.where(along.abs() < _MIN_COSINE, min_cosine, along)
     # n . X = const gives 1 / z = n . ray / const, with the gradient n_xy / focal in pixels.
-    slopes = normals[:, :2] * (inverse / (along * project.focal))[:, None]
+    slopes = normals[:, :2] * (inverse / (along * focal))[:, None]
     # On the disc, m . X - e = z (m . ray - e / z), of which the factor of z is linear, too.
     offset = (across * positions[:, None]).sum(dim=2) - ends[:, :, 3]
-    bounds = across[:, :, :2] / project.focal - offset[:, :, None] * slopes[:, None]
+    bounds = across[:, :, :2] / focal - offset[:, :, None] * slopes[:, None]
     return raster.Discs(
         pixels,
         inverse,
         raster.light_colors(colors, normals, positions),
-        (lengths * inverse * project.focal).clamp(min=floor),
+        (lengths * inverse * focal).clamp(min=floor),
         slopes=slopes,
         max_change=lengths * inverse * inverse,
         bounds=torch.cat([ends[:, :, 3:] * inverse[:, None, None], bounds], dim=2),
@@ -250,9 +248,9 @@ def render_cloud(
     )
     if legend is None:
         return image
-    project = projection_of(camera, surface.origin, finer=1)
-    depth = float(project(surface.points[near].mean(dim=0, keepdim=True))[0][0, 2])
-    return add_legend(image, legend, project.focal / abs(depth or 1.0))
+    camera = local_camera(camera, surface.origin, finer=1)
+    depth = float(project(camera, surface.points[near].mean(dim=0, keepdim=True))[0][0, 2])
+    return add_legend(image, legend, float(camera.fx) / abs(depth or 1.0))
 
 
 def write_png(path: str | os.PathLike[str], image: Tensor | NDArray[np.generic]) -> None:

@@ -20,8 +20,8 @@ _NEIGHBORS = 16
 """Number of neighboring voxels for density and normals."""
 _FLAT = 0.15
 """Maximum ratio of the two smallest eigenvalues of coplanar voxels."""
-
-
+MAX_SPACING_RATIO = 4.0
+"""Maximum ratio of the spacing of points in a plane to the median."""
 MAX_DISCS = 2**19
 """Maximum number of points that an image shows; more would not be visible in two million pixels."""
 _CHUNK_POINTS = 2**17
@@ -57,21 +57,15 @@ class VisibleSurface(NamedTuple):
     near: Tensor
     size: float
 
-    def disc_spacing(self, cap: float, labels: Tensor | None = None) -> Tensor:
+    def disc_spacing(self, labels: Tensor) -> Tensor:
         """Return the spacing that the disc of each of the n points must cover, shape ``(n,)``.
 
-        It is at most ``cap`` times the median for points in a plane, and at most the median
-        for other points, so that outliers stay small.
-
-        Args:
-            cap: Maximum ratio to the median spacing.
-            labels: Plane of each of the n points, shape ``(n,)``, or negative. Default: points of
-                planar voxels are in a plane.
+        ``labels`` ``(n,)`` are their planes, or negative. The spacing is at most the median for
+        points in no plane or in no planar voxel, so that outliers stay small.
         """
-        in_plane = (self.normals != 0).any(dim=1)[self.voxel_of]
-        if labels is not None:
-            in_plane = in_plane & (labels >= 0)
-        return torch.minimum(self.spacing, self.spacing.median() * torch.where(in_plane, cap, 1.0))
+        in_plane = (self.normals != 0).any(dim=1)[self.voxel_of] & (labels >= 0)
+        cap = torch.where(in_plane, MAX_SPACING_RATIO, 1.0)
+        return torch.minimum(self.spacing, self.spacing.median() * cap)
 
 
 def sample_rows(points: Tensor) -> Tensor:
