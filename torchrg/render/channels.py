@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics.contingency import check_labels, contingency_table, is_first
 from torchrg.metrics.labels import match_regions
-from torchrg.render.colors import UNLABELED_GRAY, color_curvature, color_normals, color_sharp
+from torchrg.render.colors import MAX_CURVATURE, color_curvature, color_normals, color_sharp
 from torchrg.structures import UNLABELED
 from torchrg.structures.points import Labels
 
@@ -36,8 +36,6 @@ OUTCOMES = {
 """Outcomes of a point against ground truth: color and meaning."""
 _OCTAHEDRON_STEPS = 254
 """Steps along the sides of the octahedral map: about a degree. Even, for exact axes."""
-_CURVATURE_END = 0.1
-"""Curvature at the end of the color scale."""
 _WORST_ANGLE_DEG = 45.0
 """Normal error at the end of the color scale, in degrees."""
 _LEVELS = 255
@@ -82,7 +80,9 @@ def make_channels(
     if "color" in fields:
         yield Channel("color", fields["color"].numpy(), None, [])
     if "normals" in fields:
-        yield _normal_channel(fields["normals"])
+        chips = color_normals(torch.tensor([[0.0, 0, 1], [0, 0, 0]])).tolist()
+        legend = [*zip(chips, ("horizontal", "no normal"), strict=True)]
+        yield Channel("normal", color_normals(fields["normals"]).numpy(), None, legend)
     if "curvature" in fields:
         yield _curvature_channel(fields["curvature"])
     if "sharp" in fields:
@@ -95,7 +95,9 @@ def make_channels(
         colors = np.array([color for color, _ in meanings], dtype=np.uint8)
         yield Channel("error", values, colors, meanings)
     if "normals" in fields and "normals" in ground_truth:
-        yield _angle_channel(unsigned_angle_deg(fields["normals"], ground_truth["normals"]))
+        angles_deg = unsigned_angle_deg(fields["normals"], ground_truth["normals"])
+        shown = {angle / _WORST_ANGLE_DEG: f"{angle:g} degrees" for angle in (0, 5, 20, 45)}
+        yield _scale_channel("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
 
 
 def _region_channel(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) -> Channel:
@@ -104,21 +106,14 @@ def _region_channel(mode: str, labels: Tensor, rows: Tensor, palette: Tensor) ->
     values = torch.where(labels < 0, none, labels)
     colors = palette[-1:].repeat(none + 1, 1)
     colors[values] = palette[rows]
-    legend = [([UNLABELED_GRAY] * 3, "unlabeled")] if bool((rows < 0).any()) else []
+    legend = [(palette[-1].tolist(), "unlabeled")] if bool((rows < 0).any()) else []
     return Channel(mode, values.numpy().astype(np.min_scalar_type(none)), colors.numpy(), legend)
-
-
-def _normal_channel(normals: Tensor) -> Channel:
-    """Return the colors of directions."""
-    chips = color_normals(torch.tensor([[0.0, 0, 1], [0, 0, 0]])).tolist()
-    legend = [*zip(chips, ("horizontal", "no normal"), strict=True)]
-    return Channel("normal", color_normals(normals).numpy(), None, legend)
 
 
 def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> Channel:
     """Return the colors of fractions of a scale, with a legend for selected values."""
     steps = torch.arange(_LEVELS + 1, dtype=torch.float64) / _LEVELS
-    colors = color_curvature(steps * steps, max_curvature=1.0).numpy()
+    colors = color_curvature(steps * steps * MAX_CURVATURE).numpy()
     legend = [(colors[round(_LEVELS * part)].tolist(), text) for part, text in shown.items()]
     values = (fractions.clamp(0, 1).nan_to_num() * _LEVELS).round().numpy().astype(np.uint8)
     return Channel(mode, values, colors, legend)
@@ -126,15 +121,9 @@ def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> 
 
 def _curvature_channel(curvature: Tensor) -> Channel:
     """Return the colors of curvature, on a square-root scale."""
-    shown = {math.sqrt(value / _CURVATURE_END): f"{value:g}" for value in (0.0, 0.01, 0.03)}
-    shown[1.0] = f"{_CURVATURE_END:g} and more"
-    return _scale_channel("curvature", (curvature / _CURVATURE_END).clamp(min=0).sqrt(), shown)
-
-
-def _angle_channel(angles_deg: Tensor) -> Channel:
-    """Return the colors of the angles between normals and ground truth."""
-    shown = {angle / _WORST_ANGLE_DEG: f"{angle:g} degrees" for angle in (0, 5, 20, 45)}
-    return _scale_channel("normal-error", angles_deg / _WORST_ANGLE_DEG, shown)
+    shown = {math.sqrt(value / MAX_CURVATURE): f"{value:g}" for value in (0.0, 0.01, 0.03)}
+    shown[1.0] = f"{MAX_CURVATURE:g} and more"
+    return _scale_channel("curvature", (curvature / MAX_CURVATURE).clamp(min=0).sqrt(), shown)
 
 
 def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:
@@ -176,10 +165,9 @@ def encode_directions(directions: Tensor) -> NDArray[np.uint8]:
         [1] Z. Cigolle et al. A survey of efficient representations for independent unit vectors.
             Journal of Computer Graphics Techniques 3(2), 2014.
     """
-    x, y, z = (directions / directions.abs().sum(dim=1, keepdim=True)).unbind(dim=1)
-    ones = torch.ones_like(x)
-    folded_x = torch.where(z < 0, (1 - y.abs()) * torch.copysign(ones, x), x)
-    folded_y = torch.where(z < 0, (1 - x.abs()) * torch.copysign(ones, y), y)
-    square = torch.stack([folded_x, folded_y], dim=1)
+    flat = directions / directions.abs().sum(dim=1, keepdim=True)
+    square, z = flat[:, :2], flat[:, 2:]
+    folded = (1 - square.flip(1).abs()).copysign(square)
+    square = torch.where(z < 0, folded, square)
     steps = ((square * 0.5 + 0.5) * _OCTAHEDRON_STEPS).nan_to_num(255).round()
     return steps.numpy().astype(np.uint8)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import ShapeError
 from torchrg.linalg.angles import unit_direction
 from torchrg.metrics.contingency import check_labels, contingency_table, number_labels
 from torchrg.metrics.labels import match_regions
@@ -99,7 +99,7 @@ def choose_colors(
     repulsion = _similarity().T
     fraction = sizes / sizes.sum()
     strength = (8 * fraction).clamp(_MIN_WEIGHT, 1).double()
-    choices = torch.full_like(sizes, -1) if fixed is None else fixed.clone()
+    choices = torch.full_like(sizes, -1) if fixed is None else fixed.to(sizes, copy=True)
     done = choices >= 0
     field = strength[done] @ repulsion[choices[done]] + _GRAY_WEIGHT * repulsion[-1]
     ends = torch.cat([pairs, pairs.flip(1)])
@@ -133,6 +133,8 @@ _RAMP = (
 )
 """Curvature scale in CIE Lab: light gray, yellow, orange, red, violet, with decreasing lightness,
 so that it also works in print."""
+MAX_CURVATURE = 0.1
+"""Curvature at the end of the color scale."""
 _REGULAR, _SHARP = (205, 205, 205), (214, 40, 40)
 """Red, green and blue of regular points (light gray) and of sharp ones (red)."""
 
@@ -171,21 +173,20 @@ def color_normals(normals: Points, *, up: Sequence[float] | str = "z") -> Tensor
     return torch.where(missing, gray, _lab_to_rgb(lab))
 
 
-def color_curvature(curvature: Values, *, max_curvature: float = 0.1) -> Tensor:
+def color_curvature(curvature: Values) -> Tensor:
     """Color curvature from light gray through yellow and red to dark violet.
 
-    The scale is proportional to the square root of the curvature, and the same for every cloud.
+    The scale is proportional to the square root of the curvature, ends at 0.1, and is the same for
+    every cloud.
 
     Args:
         curvature: Surface variation in [0, 1/3], shape ``(*)``.
-        max_curvature: End of the scale.
 
     Returns:
         Shape ``(*, 3)``, uint8.
 
     Raises:
         ShapeError: If the dtype is invalid.
-        ConfigError: If ``max_curvature`` is not positive.
 
     Example:
         >>> color_curvature(torch.tensor([0.0, 0.1, 0.3])).tolist()
@@ -193,9 +194,7 @@ def color_curvature(curvature: Values, *, max_curvature: float = 0.1) -> Tensor:
     """
     tensor = as_tensor("color_curvature", "curvature", curvature)
     check_floating("color_curvature", curvature=tensor)
-    if not max_curvature > 0:
-        raise ConfigError(f"color_curvature: expected max_curvature > 0, got {max_curvature!r}.")
-    position = (tensor / max_curvature).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
+    position = (tensor / MAX_CURVATURE).clamp(0, 1).sqrt().nan_to_num() * (len(_RAMP) - 1)
     before = position.long().clamp(max=len(_RAMP) - 2)
     ramp = tensor.new_tensor(_RAMP)
     lab = torch.lerp(ramp[before], ramp[before + 1], (position - before)[..., None])
@@ -311,12 +310,7 @@ def _choose(
         for num_voxels, weight in _NEIGHBORHOODS:
             pairs.append(_adjacent_planes(points[chosen], sample, num_voxels))
             weights.append(torch.full((len(pairs[-1]),), weight, dtype=torch.float64))
-    choices = choose_colors(
-        sizes.cpu(),
-        torch.cat(pairs).cpu(),
-        torch.cat(weights),
-        fixed=None if fixed is None else fixed.cpu(),
-    )
+    choices = choose_colors(sizes.cpu(), torch.cat(pairs).cpu(), torch.cat(weights), fixed=fixed)
     return rows, choices.to(labels.device)
 
 

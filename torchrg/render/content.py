@@ -137,10 +137,9 @@ def page_planes(described: Json, frame: PageFrame) -> list[Json]:
     """
     meets: list[list[tuple[int, float, float]]] = [[] for _ in described["planes"]]
     for contact in described.get("adjacency", []):
+        sizes = round(contact["dihedral_deg"], 1), contact["boundary_length"]
         for plane, other in (contact["pair"], contact["pair"][::-1]):
-            meets[plane].append(
-                (other, round(contact["dihedral_deg"], 1), contact["boundary_length"])
-            )
+            meets[plane].append((other, *sizes))
     return [
         {name: value for name, value in row.items() if name not in _OMITTED_COLUMNS}
         | {

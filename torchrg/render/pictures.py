@@ -224,9 +224,7 @@ def render_cloud(
     if len(surface.rows) == 0:
         shape = (height or round(0.75 * width), width, 3)
         return torch.full(shape, 255, dtype=torch.uint8, device=cloud.device)
-    planes = None if planes is None else planes[surface.rows]
-    if planes is None:
-        planes = segment_surface(surface)
+    planes = segment_surface(surface) if planes is None else planes[surface.rows]
     near = surface.spacing <= _OUTLIER_SPACING * surface.spacing.median()
     is_shown = torch.ones_like(near)
     if not isinstance(view, str):
