@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchrg.render.cameras import (
+    FIELD_OF_VIEW_DEG,
     fit_camera,
     local_camera,
     make_camera,
@@ -85,11 +86,9 @@ def test_default_height_is_what_the_points_need(rng):
 def test_angle_of_view_is_over_the_longer_side():
     axes = torch.eye(3, dtype=torch.float64)
     for width, height in ((300, 200), (200, 300)):
-        camera = fit_camera(
-            torch.rand(9, 3), axes, width=width, height=height, field_of_view_deg=60
-        )
+        camera = fit_camera(torch.rand(9, 3), axes, width=width, height=height)
         focal = float(camera.intrinsics[0, 0, 0])
-        assert 2 * math.degrees(math.atan(150 / focal)) == pytest.approx(60)
+        assert 2 * math.degrees(math.atan(150 / focal)) == pytest.approx(FIELD_OF_VIEW_DEG)
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -9,6 +9,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
+FIELD_OF_VIEW_DEG = 30.0
+"""Field of view over the larger of width and height, in degrees."""
 _MARGIN_FRACTION = 0.03
 """Margin on each side of the image, as a fraction of its size."""
 _MIN_DISTANCE_FRACTION = 0.25
@@ -59,12 +61,7 @@ def view_axes(toward: Tensor, up: Tensor) -> Tensor:
 
 
 def fit_camera(
-    points: Tensor,
-    axes: Tensor,
-    *,
-    width: int,
-    height: int | None = None,
-    field_of_view_deg: float = 30.0,
+    points: Tensor, axes: Tensor, *, width: int, height: int | None = None
 ) -> "PinholeCamera":
     """Return the nearest camera with the given axes that has all points in its image.
 
@@ -77,13 +74,12 @@ def fit_camera(
         axes: Right, down and forward, shape ``(3, 3)``.
         width: Width of the image, in pixels.
         height: Height of the image. Default: fitted, from a quarter of the width to the width.
-        field_of_view_deg: Field of view over the larger of width and height, in degrees.
     """
     across = points.double() @ axes.to(points.device).T
     nearest, farthest = _bounds(across[:, 2])
     forward = across[:, 2] - nearest
     longer = max(width, height or width)
-    half = math.tan(math.radians(field_of_view_deg) / 2)
+    half = math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
     distance = _MIN_DISTANCE_FRACTION * (farthest - nearest)
     midpoint = across.new_zeros(2)
     for axis, size in enumerate((width, height or width)):

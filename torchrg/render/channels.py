@@ -84,7 +84,10 @@ def make_channels(
         legend = [*zip(chips, ("horizontal", "no normal"), strict=True)]
         yield Channel("normal", color_normals(fields["normals"]).numpy(), None, legend)
     if "curvature" in fields:
-        yield _curvature_channel(fields["curvature"])
+        shown = {math.sqrt(part): f"{part * MAX_CURVATURE:g}" for part in (0.0, 0.1, 0.3)}
+        shown[1.0] = f"{MAX_CURVATURE:g} and more"
+        fractions = (fields["curvature"] / MAX_CURVATURE).clamp(min=0).sqrt()
+        yield _scale_channel("curvature", fractions, shown)
     if "sharp" in fields:
         colors = color_sharp(torch.tensor([False, True])).numpy()
         legend = [(colors[0].tolist(), "smooth"), (colors[1].tolist(), "sharp")]
@@ -117,13 +120,6 @@ def _scale_channel(mode: str, fractions: Tensor, shown: Mapping[float, str]) -> 
     legend = [(colors[round(_LEVELS * part)].tolist(), text) for part, text in shown.items()]
     values = (fractions.clamp(0, 1).nan_to_num() * _LEVELS).round().numpy().astype(np.uint8)
     return Channel(mode, values, colors, legend)
-
-
-def _curvature_channel(curvature: Tensor) -> Channel:
-    """Return the colors of curvature, on a square-root scale."""
-    shown = {math.sqrt(value / MAX_CURVATURE): f"{value:g}" for value in (0.0, 0.01, 0.03)}
-    shown[1.0] = f"{MAX_CURVATURE:g} and more"
-    return _scale_channel("curvature", (curvature / MAX_CURVATURE).clamp(min=0).sqrt(), shown)
 
 
 def point_outcomes(labels: Labels, ground_truth: Labels) -> Tensor:

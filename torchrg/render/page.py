@@ -254,15 +254,12 @@ def _palettes(
     result: Result, shown: PointSample, reference: Tensor | None
 ) -> dict[str, tuple[Tensor, Tensor]]:
     """Return the colors of planes and superpoints, the same as in images of the cloud."""
-    regions = {}
-    if "labels" in result.fields:
-        regions["plane"] = result.labels, reference
-    if "superpoint" in result.fields:
-        regions["superpoint"] = result.fields["superpoint"].long().clamp(min=-1), None
-    palettes = {}
-    for mode, (labels, same) in regions.items():
-        rows, colors = palette_of_planes(labels, result.cloud.points, reference=same)
-        palettes[mode] = rows[shown.rows], colors
+    palettes, labels = {}, result.fields | {"labels": result.labels}
+    for mode, name, same in (("plane", "labels", reference), ("superpoint", "superpoint", None)):
+        if name in result.fields:
+            regions = labels[name].long().clamp(min=-1)
+            rows, colors = palette_of_planes(regions, result.cloud.points, reference=same)
+            palettes[mode] = rows[shown.rows], colors
     return palettes
 
 
