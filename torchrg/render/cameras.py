@@ -137,7 +137,7 @@ def local_camera(camera: "PinholeCamera", origin: Tensor, *, finer: int) -> "Pin
     intrinsics[0, :2, 2] += (finer - 1) / 2
     matrix = camera.extrinsics[:1].double().clone()
     matrix[0, :3, 3] += matrix[0, :3, :3] @ origin.to(matrix)
-    size = camera.height[:1] * finer, camera.width[:1] * finer
+    size = (side[:1].to(origin.device) * finer for side in (camera.height, camera.width))
     return type(camera)(intrinsics.to(origin).float(), matrix.to(origin).float(), *size)
 
 
