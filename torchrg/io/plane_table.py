@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg.io.outlines import straighten_rings
+from torchrg.linalg.precision import machine_epsilon, smallest_normal
 from torchrg.structures import PLANE_KINDS, PlaneAdjacency, Planes
 from torchrg.structures.planes import PLANE_COLUMNS
 from torchrg.structures.points import Array
@@ -188,7 +189,7 @@ def describe_planes(planes: Planes, *, origin: Sequence[float] | None = None) ->
     with np.errstate(divide="ignore", invalid="ignore"):
         error = arrays["plane_rms"] / arrays["plane_extent"][:, 1]
         error = _NUM_ERRORS * error * np.sqrt(12 / arrays["plane_count"])
-    error = np.nan_to_num(error, nan=np.inf) + np.finfo(arrays["plane_normal"].dtype).eps
+    error = np.nan_to_num(error, nan=np.inf) + machine_epsilon(planes.normal.dtype)
     columns["dip_direction_deg"] = [
         None if is_level else fall
         for is_level, fall in zip(dip <= error, falls.tolist(), strict=True)
@@ -260,7 +261,8 @@ def simplify_table(described: Json) -> Json:
     planes = described["planes"]
     error = float(np.median([plane.get("rms", 0.0) for plane in planes])) if planes else 0.0
     size = max((side for plane in planes for side in plane.get("extent", ())), default=1.0)
-    decimals = math.ceil(2 - math.log10(max(error, _MIN_ERROR * size, np.finfo(float).tiny)))
+    smallest = max(error, _MIN_ERROR * size, smallest_normal(torch.float64))
+    decimals = math.ceil(2 - math.log10(smallest))
     rows = []
     for plane in planes:
         row = plane | ({"outline": _straighten(plane)} if plane.get("outline") else {})
