@@ -5,7 +5,7 @@ import unicodedata
 import numpy as np
 import pytest
 
-from torchrg.batch.run import list_jobs, lock_folder
+from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import convert_scan
 from torchrg.batch.sources import CloudSource, RGBDSource
 from torchrg.config import load_config
@@ -115,30 +115,11 @@ def test_the_command_refuses_them_before_any_work(root, refused):
         assert "layout npy: a/b_c and a_b/c both use a_b_c; rename one" in error
 
 
-def test_short_names_of_mask3d_are_compared_too(root, tmp_path, convert, refused, run):
+def test_short_names_of_mask3d_are_compared_too(root, convert, refused):
     save(root, "scene0011_00.npy", "0011_00.npy")
     error = refused("--layout", "mask3d")
     assert "layout mask3d: 0011_00 and scene0011_00 both use 0011_00" in error
     assert convert("--layout", "npy", "--dry-run").code == 0
-    out = tmp_path / "out"
-    done = run("segment", *root.iterdir(), "--out", out, "--layout", "mask3d")
-    assert (done.code, done.out) == (2, "")
-    assert "layout mask3d: " in done.error
-    assert not [*out.iterdir()]
-
-
-def test_a_second_command_does_not_write_into_the_files_of_a_layout(
-    root, tmp_path, run, monkeypatch
-):
-    save(root, "hall.npy")
-    monkeypatch.setattr("torchrg.batch.run.LOCK_TIMEOUT_SECONDS", 0)
-    command = ("segment", root / "hall.npy", "--out", tmp_path, "--preset", "classic")
-    with lock_folder(tmp_path):
-        assert "another torchrg process" in run(*command, "--layout", "npy").error
-        assert not (tmp_path / "superpoints").exists()
-        # A folder for each scan is no place of others.
-        assert run(*command, "--layout", "pointcept").code == 0
-    assert run(*command, "--layout", "npy").code == 0
 
 
 def test_a_scan_of_another_command_with_the_same_files_is_refused(root, tmp_path):

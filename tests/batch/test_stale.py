@@ -353,24 +353,14 @@ def test_copies_are_no_new_names(tmp_path, out, convert):
     assert len([*(out / "a_backup").iterdir()]) == 6
 
 
-def test_another_layout_goes_to_another_directory(root, out, run, convert):
+def test_another_layout_goes_to_another_directory(root, out, convert):
     assert convert("scannet", root, out, "--layout", "mask3d").code == 0
     before, message = files_of(out), "expected results in layout npy, got mask3d; choose another "
     for flags in ([], ["--force"], ["--prune"], ["--dry-run"]):
         done = convert("scannet", root, out, "--layout", "npy", *flags)
         assert (done.code, done.error.count("\n")) == (2, 1)
         assert f"{out}/train/{FIRST}: {message}" in done.error
-    save_rooms(out.parent / "in", "a.npy")
-    command = ("segment", out.parent / "in" / "a.npy", "--out", out, "--layout")
-    assert f"{out}/train/{FIRST}: {message}" in run(*command, "npy").error
     assert files_of(out) == before
-    assert run(*command, "mask3d").code == 0
-    # A single result in the directory of a data set is none of its scans.
-    assert convert("scannet", root, out, "--layout", "mask3d").code == 0
-    assert (out / "a" / RECORD).is_file()
-    single = ("segment", out.parent / "in" / "a.npy", "--out", out.parent / "single", "--layout")
-    assert run(*single, "npy").code == 0
-    assert "a: expected results in layout mask3d, got npy; " in run(*single, "mask3d").error
 
 
 def test_pages_leave_with_their_scan(tmp_path, out, convert, monkeypatch):

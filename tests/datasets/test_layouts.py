@@ -302,10 +302,12 @@ def test_the_command_knows_kind_and_layouts(root, room, tmp_path, run):
 
 def test_colors_of_16_bits_are_those_of_8_in_layouts(room, tmp_path, run):
     color = room.color * np.uint16(257) - np.uint16(9) * (room.color > 0)
-    write_cloud(tmp_path / "hall.npz", Cloud(room.coord, {"color": color}))
-    command = ("segment", tmp_path / "hall.npz", "--preset", "classic", "--superpoints", "50")
+    (tmp_path / "scans").mkdir()
+    write_cloud(tmp_path / "scans" / "hall.npz", Cloud(room.coord, {"color": color}))
+    flags = ("--preset", "classic", "--superpoints", "50", "--layout")
     for layout in ("mmdet3d", "spformer", "mask3d", "pointcept"):
-        assert run(*command, "--out", tmp_path / layout, "--layout", layout).code == 0
+        out = tmp_path / layout
+        assert run("convert", "folder", tmp_path / "scans", out, *flags, layout).code == 0
     points = np.load(tmp_path / "mmdet3d" / "scannet_instance_data" / "hall_vert.npy")
     assert np.array_equal(points[:, 3:], room.color)
     content = load_pth(tmp_path / "spformer" / "test" / "hall_inst_nostuff.pth")
@@ -316,13 +318,14 @@ def test_colors_of_16_bits_are_those_of_8_in_layouts(room, tmp_path, run):
 
 
 def test_one_scan_of_any_format(room, tmp_path, run):
-    """``segment`` writes the same superpoints as ``convert``."""
-    scan = tmp_path / "hall.ply"
+    scan = tmp_path / "scans" / "hall.ply"
+    scan.parent.mkdir()
     write_cloud(scan, Cloud(room.coord, {"color": room.color}))
     flags = ["--preset", "classic", "--superpoints", f"200,{NUM_PARTS}", "--level", "1"]
     for layout in ("mmdet3d", "spformer", "pointcept"):
         out = tmp_path / layout
-        assert run("segment", scan, "--out", out, "--layout", layout, *flags).code == 0
+        command = ("convert", "folder", scan.parent, out, *flags)
+        assert run(*command, "--layout", layout).code == 0
         assert (out / "hall" / "planes.json").is_file()
     found = np.fromfile(tmp_path / "mmdet3d" / "super_points" / "hall.bin", dtype=np.int64)
     assert np.array_equal(found, room.superpoint)
@@ -331,16 +334,17 @@ def test_one_scan_of_any_format(room, tmp_path, run):
     assert np.array_equal(np.load(folder / "superpoint.npy"), room.superpoint)
     assert np.array_equal(np.load(folder / "plane.npy"), room.plane)
     assert read_cloud(scan).fields.keys() == {"color"}
-    wrong = run("segment", scan, "--out", out, "--layout", "npy", "--level", "4")
-    assert "expected --level from 0 to 3" in wrong.error
+    wrong = run(*command, "--layout", "npy", "--level", "4")
+    assert "expected --level from 0 to 1" in wrong.error
 
 
 def test_far_scans_are_about_their_origin_with_a_word(room, tmp_path, run):
-    scan = tmp_path / "far.npz"
-    np.savez(scan, points=room.coord.astype(np.float64) + np.array([5e5, 4e6, 0]))
-    command = ("segment", scan, "--out", tmp_path / "out", "--layout", "mmdet3d")
+    (tmp_path / "scans").mkdir()
+    points = room.coord.astype(np.float64) + np.array([5e5, 4e6, 0])
+    np.savez(tmp_path / "scans" / "far.npz", points=points)
+    command = ("convert", "folder", tmp_path / "scans", tmp_path / "out", "--layout", "mmdet3d")
     done = run(*command, "--preset", "classic")
-    assert "coordinates are written relative to 5000" in done.err
+    assert "coordinates are written relative to 5000" in done.out
     points = np.fromfile(tmp_path / "out" / "points" / "far.bin", dtype=np.float32).reshape(-1, 6)
     shift = points[:, :3] - room.coord
     assert np.ptp(shift, axis=0).max() < 1e-5
@@ -349,10 +353,11 @@ def test_far_scans_are_about_their_origin_with_a_word(room, tmp_path, run):
 def test_points_that_are_not_finite_are_refused(room, tmp_path, run):
     coord = room.coord.copy()
     coord[7] = np.nan
-    np.save(tmp_path / "holes.npy", coord)
-    command = ("segment", tmp_path / "holes.npy", "--out", tmp_path / "out", "--layout", "npy")
+    (tmp_path / "scans").mkdir()
+    np.save(tmp_path / "scans" / "holes.npy", coord)
+    command = ("convert", "folder", tmp_path / "scans", tmp_path / "out", "--layout", "npy")
     wrong = run(*command, "--preset", "classic")
-    assert wrong.code == 2
+    assert wrong.code == 3
     assert "expected finite points for layout npy, got 1 non-finite of 4,000" in wrong.err
     assert not [*(tmp_path / "out").rglob("*.npy")]
 

@@ -6,6 +6,7 @@ The reading is that of the programs in our own words; each function names whose 
 import json
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -200,9 +201,10 @@ def test_a_damaged_entry_is_named(converted, tmp_path):
 
 def test_one_scan_after_the_other_is_on_the_list_of_the_test(root, tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    command = ("convert", "folder", "in", "out", "--layout", "mask3d", "--preset", "classic")
     for name in SPLITS["val"] + SPLITS["test"]:
-        scan = root / "scans" / name / f"{name}_vh_clean_2.ply"
-        command = ("segment", scan, "--out", "out", "--layout", "mask3d", "--preset", "classic")
+        Path("in").mkdir(exist_ok=True)
+        shutil.copy(root / "scans" / name / f"{name}_vh_clean_2.ply", "in")
         assert run(*command).code == 0
     monkeypatch.chdir("/")
     samples, _ = load_mask3d(tmp_path / "out", "test")

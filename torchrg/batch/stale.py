@@ -78,10 +78,9 @@ def find_stale(jobs: Sequence[Job]) -> list[StaleResult]:
         FormatError: If there is another data set, kind or layout, or a corrupt record.
     """
     out, source = jobs[0].out, jobs[0].source
-    names, found, described = {job.name for job in jobs}, find_records(out), source.describe()
-    for name, record in found.items():
+    names, records, described = {job.name for job in jobs}, find_records(out), source.describe()
+    for name, record in records.items():
         check_source(out / name, record, described)
-    records = {name: found[name] for name in found if "kind" in found[name]["source"]}
     inputs = {name: _first_input(record) for name, record in records.items()}
     paths = {n: Path(os.path.realpath(source.root / first)) for n, (first, _) in inputs.items()}
     files = {job.name: job.scan.files[0] for job in jobs if job.scan.files}

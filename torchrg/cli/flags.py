@@ -214,7 +214,7 @@ def check_columns(columns: str | None, paths: Iterable[str | os.PathLike[str]]) 
         raise ConfigError("expected text or .npy input for --columns, got files that name columns.")
 
 
-def check_superpoints(config: SuperpointsConfig, level: int, *, is_on: bool) -> None:
+def check_superpoints(config: SuperpointsConfig, level: int = 0, *, is_on: bool) -> None:
     """Raise if there are no superpoints for the settings, or they have no such level."""
     if not is_on and (config, level) != (SuperpointsConfig(), 0):
         raise ConfigError("expected --superpoints with --partition or --level, got none; add it.")

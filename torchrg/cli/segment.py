@@ -5,7 +5,7 @@ import dataclasses
 import os
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -15,23 +15,11 @@ import torch
 
 from torchrg import scratch
 from torchrg.batch.memory import available_memory, scan_memory
-from torchrg.batch.run import lock_folder
-from torchrg.batch.sites import count_sites, propose_voxel
-from torchrg.batch.stale import find_records
 from torchrg.cli import flags, loop
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, warn
 from torchrg.config import PipelineConfig, SuperpointsConfig
-from torchrg.datasets.folder import SceneFiles
-from torchrg.datasets.layouts import (
-    VERSION,
-    check_layout,
-    check_stems,
-    note_on_origin,
-    write_scan,
-)
-from torchrg.datasets.lists import check_lists, write_lists
-from torchrg.datasets.provenance import Record, check_source, describe_run
+from torchrg.datasets.provenance import Record, describe_run
 from torchrg.depth import find_intrinsics
 from torchrg.errors import ConfigError
 from torchrg.io import RESULT_FIELDS, check_output, estimate_points, read_cloud, write_cloud
@@ -39,6 +27,7 @@ from torchrg.io.files import check_space
 from torchrg.io.merge import merge_clouds
 from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.io.result import Result, write_table
+from torchrg.neighbors import sample_voxels
 from torchrg.pipeline.clouds import (
     describe_multipliers,
     find_objects,
@@ -47,10 +36,8 @@ from torchrg.pipeline.clouds import (
 )
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, write_entry, write_index, write_planes
-from torchrg.structures import Cloud, Segmentation, Superpoints
+from torchrg.structures import Cloud, Segmentation
 
-_DATASET = "ScanNet"
-"""Data set whose file layout is used for clouds without labels."""
 IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
 """Flags of depth images, handled by torchrg depth."""
 
@@ -86,11 +73,6 @@ class Arguments(flags.PlaneSettings):
     """Also partition all points into superpoints, stored as "superpoint" (finest), "superpoint_1"
     and so on. Optional numbers set how many per level, as in --superpoints 1000,300. Uses point
     colors if the cloud has them. Images then show superpoints instead of planes."""
-    level: int = 0
-    """Superpoint level exported by --layout; 0 is the finest."""
-    layout: flags.Layout | None = None
-    """Write the file layout of another project into the directory OUT instead of a single result,
-    as torchrg convert --layout does. Implies --superpoints."""
     partition: SuperpointsConfig = dataclasses.field(default_factory=SuperpointsConfig)
     threads: flags.ThreadsFlag = None
     columns: flags.ColumnsFlag = None
@@ -110,15 +92,7 @@ def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
     _reject_images(argv)
     arguments = parse(Arguments, argv, prog="torchrg segment")
-    if arguments.layout not in (None, "pointcept"):
-        arguments = dataclasses.replace(arguments, superpoints=True)
-    if arguments.level and arguments.layout is None:
-        raise ConfigError(
-            "expected --layout with --level, got none; omit it, as other files contain all levels."
-        )
-    flags.check_superpoints(arguments.partition, arguments.level, is_on=arguments.superpoints)
-    if arguments.layout is not None:
-        check_layout(arguments.layout, _DATASET, "clouds")
+    flags.check_superpoints(arguments.partition, is_on=arguments.superpoints)
     flags.limit_threads(arguments.threads)
     flags.limit_in_bytes(arguments.limit_memory)
     if arguments.voxel is not None and not arguments.voxel > 0:
@@ -127,37 +101,19 @@ def run(argv: list[str]) -> int:
     flags.check_columns(arguments.columns, arguments.inputs)
     flags.check_viewpoint(arguments.viewpoint, arguments.orient)
     firsts = tuple(sources[0] for sources in clouds if sources)
-    suffix = ".npz" if arguments.layout is None else ""
-    outputs = loop.output_paths(firsts, arguments.out, suffix=suffix)
+    outputs = loop.output_paths(firsts, arguments.out)
     pictures = loop.sidecar_paths(outputs, arguments.picture)
     tables = loop.sidecar_paths(outputs, arguments.table, suffixes=TABLE_SUFFIXES)
     loop.check_distinct([*outputs, *filter(None, tables)], arguments.inputs)
     if arguments.pages:
         _check_pages(arguments, pictures)
-    with _layout_lock(arguments, outputs):
-        code = loop.run_each(_segment, arguments, clouds, outputs, tables, pictures)
+    code = loop.run_each(_segment, arguments, clouds, outputs, tables, pictures)
     if arguments.pages and arguments.picture is not None:
         pages = [(path, path.with_suffix(".html")) for path in filter(None, pictures)]
         done = [(path, page) for path, page in pages if page.is_file()]
         entries = [Entry(path.stem, path.name, page.name) for path, page in done]
         print_lines(f"pages -> {write_index(arguments.picture, 'Planes', entries)}")
     return code
-
-
-@contextlib.contextmanager
-def _layout_lock(arguments: Arguments, outputs: Sequence[Path]) -> Iterator[None]:
-    """Lock the output directory and update the lists of a layout that shares folders."""
-    if arguments.layout in (None, "pointcept"):
-        yield
-        return
-    check_stems(arguments.layout, {path.name: path.name for path in outputs})
-    with lock_folder(arguments.out):
-        source = {"layout": arguments.layout, "version": VERSION}
-        for name, record in find_records(arguments.out).items():
-            check_source(arguments.out / name, record, source)
-        check_lists(arguments.layout, _DATASET, arguments.out)
-        yield
-        write_lists(arguments.layout, _DATASET, arguments.out)
 
 
 def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
@@ -218,11 +174,8 @@ def _segment_cloud(
         )
     for note in note_on_copies(seg.num_copies, len(cloud)):
         print_lines(f"{source}: {note}")
-    if arguments.layout is None:
-        provenance = _describe(arguments, sources, seg)
-        write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)
-    else:
-        _write_layout(arguments, target, cloud, seg, superpoints)
+    provenance = _describe(arguments, sources, seg)
+    write_cloud(target, cloud, seg, superpoints=superpoints, provenance=provenance)
     if table is not None:
         write_table(table, describe_planes(seg.planes, origin=cloud.origin.tolist()))
     if picture is not None:
@@ -259,11 +212,8 @@ def _read(
         storage.enter_context(_array_storage(arguments, source, target, len(cloud), limit))
     _check_limit(arguments, source, len(cloud), limit)  # The number was an estimate for text.
     if arguments.voxel is not None:
-        num_sites = count_sites(cloud.points, arguments.voxel)
+        num_sites = len(sample_voxels(cloud.points, arguments.voxel).rows)
         print_lines(f"{source}: {num_sites:,} sites, one of the {len(cloud):,} points per voxel")
-    elif scratch.is_active():
-        voxel = propose_voxel(cloud.points)
-        print_lines(f"{source}: --voxel {voxel:g} would segment about half of the points")
     return cloud
 
 
@@ -313,10 +263,8 @@ def _check_points(arguments: Arguments, source: str, cloud: Cloud, target: Path)
     """Warn about the input before the computation; raise if the output cannot be written."""
     levels = range(arguments.partition.num_levels if arguments.superpoints else 0)
     parts = [f"superpoint_{i}" if i else "superpoint" for i in levels]
-    written = () if arguments.layout is not None else (*RESULT_FIELDS, *parts)
-    loop.note_input(source, cloud, target, written)
-    if arguments.layout is None:
-        check_output(target, cloud)
+    loop.note_input(source, cloud, target, (*RESULT_FIELDS, *parts))
+    check_output(target, cloud)
     grid = cloud.grid_shape
     pixels = None if grid is None else torch.from_numpy(cloud.coordinates).view(*grid, 3)
     if pixels is not None and find_intrinsics(pixels) is not None:
@@ -341,21 +289,6 @@ def _describe(arguments: Arguments, sources: tuple[Path, ...], seg: Segmentation
     if len(sources) > 1:
         provenance["input"] = [describe_run(source, settings)["input"] for source in sources]
     return provenance
-
-
-def _write_layout(
-    arguments: Arguments,
-    target: Path,
-    cloud: Cloud,
-    seg: Segmentation,
-    superpoints: Superpoints | None,
-) -> None:
-    """Write a result in a layout to the folder ``target``."""
-    layout, level = arguments.layout or "pointcept", arguments.level
-    for note in note_on_origin(layout, cloud):
-        warn(f"{cloud.source}: {note}.")
-    scene = SceneFiles(target.name, target, ())
-    write_scan(layout, scene, target, cloud, seg, superpoints, level=level)
 
 
 def _draw(arguments: Arguments, picture: Path, result: Result) -> None:

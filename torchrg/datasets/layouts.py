@@ -214,7 +214,7 @@ def write_scan(
     files = LAYOUTS[layout][scan.dataset](scan)
     contents = {f"{up}{path}": content for path, content in files.items()}
     table = describe_planes(seg.planes, origin=cloud.origin.tolist())
-    return write_files(folder, contents, table, {"source": {"layout": layout, "version": VERSION}})
+    return write_files(folder, contents, table)
 
 
 def _scannet(scan: LayoutScan) -> Files:

@@ -147,14 +147,13 @@ def write_files(
     target: Path,
     contents: Mapping[str, Array | bytes],
     planes: Mapping[str, object],
-    description: provenance.Record | None = None,
 ) -> list[str]:
     """Write files and the plane table of a scene, and return their names.
 
     ``contents`` has bytes, or arrays to write as ``.npy``, by path relative to the folder of the
     scene. Files of an earlier call, as listed in ``provenance.json``, are replaced, or removed if
     this call does not write them; files of other origin raise FormatError. A claim on the files
-    precedes them, when all of them are complete. ``description`` are entries of a new claim.
+    precedes them, when all of them are complete.
     """
     contents = {**contents, PLANES_FILE: json.dumps(planes, indent=1).encode()}
     earlier = provenance.read_record(target, strict=True)
@@ -171,9 +170,7 @@ def write_files(
                     stream.write(content)
                 else:
                     npy_format.write_array(stream, content, allow_pickle=False)
-        provenance.write_record(
-            target, provenance.claim_files(earlier or description or {}, contents)
-        )
+        provenance.write_record(target, provenance.claim_files(earlier or {}, contents))
     provenance.remove_unwritten(target, target, earlier, contents)
     return [*contents]
 
