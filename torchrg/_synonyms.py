@@ -49,6 +49,7 @@ _ADVICE = {
     "num_planes",
     "an estimator is a method, as method='pca' of estimate_normals, {'normals.method': 'pca'} of "
     "other functions, or --normals.method pca": "detmcd fastmcd irls jet mve pca",
+    "torchrg depth segments depth images": "depth_kind depth_scale intrinsics",
     "regions grow without random samples; leave it out": "max_iterations num_iterations "
     "probability ransac_n",
     "finished scans are skipped; leave it out": "continue resume skip_existing",

@@ -104,21 +104,6 @@ def test_a_scale_of_zero_is_not_that_of_the_layout(tum):
         RGBDFrames.from_folder(tum, "tum", depth_scale=0.0)
 
 
-def test_icl_nuim_frames_are_matched_by_number(tmp_path):
-    root = tmp_path / "living_room_traj0"
-    for number in (0, 2, 10):
-        write_depth(root / "depth" / f"{number}.png", 5000 + number)
-        write_color(root / "rgb" / f"{number}.png")
-    write_text(root / "livingRoom0.gt.freiburg", f"2 0.5 0.25 2 {QUARTER}\n10 0 0 0 0 0 0 1\n")
-    data = RGBDFrames.from_folder(root, "icl-nuim")
-    assert [scene.name for scene in data.scenes] == [f"living_room_traj0/{n}" for n in (0, 2, 10)]
-    assert [float(sample["depth"].max()) for sample in data] == pytest.approx([1, 1.0004, 1.002])
-    assert data[0]["intrinsics"].diagonal().tolist() == pytest.approx([481.2 * 6 / 640, -4, 1])
-    assert "pose" not in data[0]
-    torch.testing.assert_close(data[1]["pose"], expected_pose())
-    assert torch.equal(data[2]["pose"], torch.eye(4).double())
-
-
 def test_scannet_frames_have_files_of_their_own(tmp_path):
     for scene in ("scene0000_00", "scene0000_01"):
         root = tmp_path / scene
@@ -213,7 +198,7 @@ def test_wrong_files_are_refused(tmp_path, tum):
 def test_wrong_folders_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="expected layout to be one of 3rscan, 7-scenes"):
         RGBDFrames.from_folder(tmp_path, "nyu")
-    for layout in ("tum", "icl-nuim", "scannet", "7-scenes"):
+    for layout in ("tum", "scannet", "7-scenes"):
         with pytest.raises(FormatError, match=r"expected recordings that contain .* got none"):
             RGBDFrames.from_folder(tmp_path, layout)
         with pytest.raises(FormatError, match="no such folder"):

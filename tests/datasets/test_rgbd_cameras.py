@@ -179,7 +179,7 @@ def test_the_nearest_camera_file_counts(scene, place, up, start, down):
     assert frame.intrinsics[0].tolist() == [FX, 0, CX]
 
 
-@pytest.mark.parametrize("layout", ["tum", "icl-nuim", "images", "scannet"])
+@pytest.mark.parametrize("layout", ["tum", "images", "scannet"])
 def test_every_layout_without_cameras_of_frames_looks_for_a_file(tmp_path, layout):
     root = tmp_path / "rgbd_freiburg1_desk"
     write_depth(root / "depth" / "0.png", np.full((HEIGHT, WIDTH), 1.5))

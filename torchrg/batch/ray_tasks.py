@@ -114,11 +114,6 @@ def _check_address(address: str) -> None:
     """Raise ConfigError unless a process listens at an address of the form ``host:port``.
 
     Other addresses of Ray, ``auto`` and ``ray://host:port``, are not tested.
-
-    Example:
-        >>> _check_address("nowhere")
-        Traceback (most recent call last):
-        torchrg.errors.ConfigError: Ray address 'nowhere': expected auto or host:port of a cluster.
     """
     if address in ("auto", "local") or "://" in address:
         return

@@ -61,12 +61,6 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
     Raises:
         FormatError: If another command holds the lock, or the lock file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder, lock_folder(Path(folder)):
-        ...     print("locked")
-        locked
     """
     lock = filelock.FileLock(folder / LOCK)
     try:

@@ -54,7 +54,7 @@ from torchrg.io.result import PLANES_FILE, RECORD, read_result
 from torchrg.render.gallery import INDEX, Entry, check_gallery, write_entry, write_index
 from torchrg.render.page import read_library
 
-_Benchmark = Literal["tum", "icl-nuim", "scannet", "7-scenes"]
+_Benchmark = Literal["tum", "scannet", "7-scenes"]
 _MEMORY_FRACTION = 0.8
 """Fraction of the available memory for all scans by default; other programs get the remainder."""
 _Capture = Literal["nerfstudio", "arkitscenes", "replica", "scannetpp", "3rscan"]

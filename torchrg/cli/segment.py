@@ -7,7 +7,6 @@ import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +36,6 @@ from torchrg.pipeline.clouds import (
 from torchrg.render import make_page, write_page
 from torchrg.render.gallery import Entry, check_gallery, write_entry, write_index, write_planes
 from torchrg.structures import Cloud, Segmentation
-
-IMAGE_FLAGS = ("--intrinsics", "--depth-scale", "--image")
-"""Flags of depth images, handled by torchrg depth."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +86,6 @@ class Arguments(flags.PlaneSettings):
 
 def run(argv: list[str]) -> int:
     """Parse the arguments, segment each input and write its result."""
-    _reject_images(argv)
     arguments = parse(Arguments, argv, prog="torchrg segment")
     flags.check_superpoints(arguments.partition, is_on=arguments.superpoints)
     flags.limit_threads(arguments.threads)
@@ -121,20 +116,6 @@ def _check_pages(arguments: Arguments, pictures: Sequence[Path | None]) -> None:
     if arguments.picture is None or not arguments.picture.is_dir():
         raise ConfigError("expected --pages together with --picture DIRECTORY.")
     check_gallery(arguments.picture, [path.stem for path in pictures if path is not None])
-
-
-def _reject_images(argv: list[str]) -> None:
-    """Raise an error that refers to torchrg depth if the arguments are depth images."""
-    for last, argument in pairwise(("", *argv)):
-        is_flag = argument.partition("=")[0] in IMAGE_FLAGS
-        is_value = last.startswith("--") and "=" not in last
-        is_input = not argument.startswith("-") and not is_value
-        if is_flag or (is_input and argument.lower().endswith(".png")):
-            what, name = ("", "IMAGES...") if is_flag else ("the image ", argument)
-            raise ConfigError(
-                f"segment: expected point clouds, got {what}{argument}; use torchrg depth {name} "
-                "--intrinsics FX,FY,CX,CY --depth-scale S --out PATH."
-            )
 
 
 def _segment(arguments: Arguments, *paths: Any) -> None:  # noqa: ANN401

@@ -8,9 +8,7 @@ in every layout, because programs that read raw bytes expect that.
 
 import io
 import json
-import pickle
 import re
-import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -484,22 +482,6 @@ Clouds without labels are written like ScanNet scans."""
 def _to_pickle(content: Any) -> bytes:  # noqa: ANN401
     """Return the output of ``torch.save`` in a form that NumPy 1 can also load."""
     with io.BytesIO() as stream:
-        torch.save(content, stream, pickle_module=_OLD_PICKLE)
-        return stream.getvalue()
-
-
-class _OldPickler(pickle.Pickler):
-    """Pickler that writes NumPy's module names from before version 2, which still exist."""
-
-    def __init__(self, file: io.BytesIO, protocol: int) -> None:
-        self._file, self._memory = file, io.BytesIO()
-        super().__init__(self._memory, protocol)
-
-    def dump(self, obj: Any) -> None:  # noqa: ANN401
-        """Pickle an object; its protocol names a function on a line of its own."""
-        super().dump(obj)
-        self._file.write(self._memory.getvalue().replace(b"cnumpy._core.", b"cnumpy.core."))
-
-
-_OLD_PICKLE = types.ModuleType("pickle")
-_OLD_PICKLE.Pickler = _OldPickler  # type: ignore[attr-defined]
+        # Its older form has no checksum, so the module can get its name before NumPy 2.
+        torch.save(content, stream, _use_new_zipfile_serialization=False)
+        return stream.getvalue().replace(b"cnumpy._core.", b"cnumpy.core.")

@@ -166,7 +166,7 @@ class RGBDFrames(SceneDataset):
                 or ``images`` for any folder of depth images. Default: detected from the folder.
             intrinsics: Camera matrix, shape ``(3, 3)``, or a camera of images of another size.
                 Default: from the frames or a camera file next to them, else the built-in camera of
-                ``tum``, ``icl-nuim`` and ``7-scenes``.
+                ``tum`` and ``7-scenes``.
             depth_scale: Depth units per meter. Default: from the camera file, else the layout's;
                 ``images`` and ``.npy`` have no default.
             depth_kind: ``"ray"`` for distances from the camera center. Default: ``"z"``, depth.

@@ -46,8 +46,6 @@ _TUM_CAMERAS = {
     "freiburg3": Pinhole(535.4, 539.2, 320.1, 247.6, _KINECT_SIZE),
 }
 """The three cameras in the data set's documentation."""
-_ICL_NUIM_CAMERA = Pinhole(481.2, -480.0, 319.5, 239.5, _KINECT_SIZE)
-"""The scenes were rendered with y up, so the vertical focal length is negative."""
 _SEVEN_SCENES_CAMERA = Pinhole(585.0, 585.0, 320.0, 240.0, _KINECT_SIZE)
 _NON_DEPTH_WORDS = frozenset(
     re.findall(
@@ -88,7 +86,7 @@ class FrameLayout(NamedTuple):
         depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
         array_scale: The same for ``.npy`` and ``.exr``.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark,
-            or ``file:text``; ``("",)`` if the mark is enough, empty if it cannot be detected.
+            or ``file:text``; ``("",)`` if the mark is enough.
         levels: Maximum depth of recordings below the root folder.
         axes: Turn from torchrg's camera axes to those of the poses, ``(4, 4)``. Default: the same.
         cameras: Cameras of recordings without a camera file, by a part of the recording's name.
@@ -123,17 +121,6 @@ def _tum_frames(folder: Path) -> Iterator[ListedFrame]:
 def _listed_path(folder: Path, name: object) -> Path:
     """Return the path of a file listed by a program, which may run on Windows."""
     return folder / str(name).replace("\\", "/")
-
-
-def _icl_nuim_frames(folder: Path) -> Iterator[ListedFrame]:
-    """Yield the frames of ICL-NUIM in its TUM-compatible form: ``depth/0.png``, ``rgb/0.png``.
-
-    An optional trajectory ``*.gt.freiburg`` has the image number in its first column.
-    """
-    tracks = tuple(sorted(folder.glob("*.gt.freiburg"))[:1])
-    poses = dict(zip(*read_trajectory(tracks[0]), strict=True)) if tracks else {}
-    for frame in _list_frames(folder, "depth/*", "rgb/*"):
-        yield frame._replace(pose=poses.get(_number(frame)), sources=tracks)
 
 
 def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterator[ListedFrame]]:
@@ -375,9 +362,6 @@ FRAME_LAYOUTS = {
     ),
     "rtabmap": FrameLayout(_rtabmap_frames, "*_camera_poses.txt", 1000.0, signs=("*_calib",)),
     "tum": FrameLayout(_tum_frames, "depth.txt", 5000.0, cameras=_TUM_CAMERAS),
-    "icl-nuim": FrameLayout(
-        _icl_nuim_frames, "depth", 5000.0, signs=(), cameras={"": _ICL_NUIM_CAMERA}
-    ),
     "scannet": FrameLayout(
         _named_frames("depth/*", "color/*", "pose/*.txt"),
         "depth",
@@ -393,9 +377,8 @@ FRAME_LAYOUTS = {
 }
 """Layouts by name, in the order that :func:`find_layout` tries them: ScanNet++ (ICCV, 2023);
 ARKitScenes (NeurIPS, 2021); 3RScan (RIO, ICCV, 2019); Replica as in NICE-SLAM (CVPR, 2022);
-J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS, 2012; A. Handa et al.,
-A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM, ICRA, 2014; ScanNet (CVPR, 2017)
-as its reader exports it; J. Shotton et al., Scene coordinate regression forests, CVPR, 2013;
+J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS, 2012; ScanNet (CVPR,
+2017) as its reader exports it; J. Shotton et al., Scene coordinate regression forests, CVPR, 2013;
 Nerfstudio (SIGGRAPH, 2023); and any other folder. Stray Scanner, Polycam and Record3D are apps,
 and ``rtabmap-export`` belongs to RTAB-Map."""
 
@@ -406,7 +389,7 @@ def find_layout(root: Path) -> str:
     Default: ``images``.
     """
     for name, layout in FRAME_LAYOUTS.items():
-        for folder in _marked_folders(root, layout) if layout.mark and layout.signs else ():
+        for folder in _marked_folders(root, layout) if layout.mark else ():
             if any(not sign or _has_sign(folder, sign) for sign in layout.signs):
                 return name
     return "images"
