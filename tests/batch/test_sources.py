@@ -45,10 +45,10 @@ def test_the_command_knows_every_kind_and_layout(tmp_path):
     rays = RGBDSource(frames(depth_kind="ray"), settings)
     assert rays.describe()["depth_kind"] == "ray"
     (tmp_path / "1.npy").unlink()
-    options = {"kind": "s3dis", "class_order": "spt", "superpoint": True, "orient": "auto"}
+    options = {"kind": "s3dis", "superpoint": True, "orient": "auto"}
     write_room(tmp_path / "Area_5" / "a", {"floor_1": grid()})
     np.save(tmp_path / "a.npy", grid())
-    rooms = S3DIS(tmp_path, (5,), class_order="spt")
+    rooms = S3DIS(tmp_path, (5,))
     assert CloudSource(rooms, CLASSIC, superpoint=True).describe() == options
     options = {"kind": "folder", "superpoint": False, "orient": "none"}
     assert CloudSource(FolderOfClouds(tmp_path), CLASSIC, orient="none").describe() == options

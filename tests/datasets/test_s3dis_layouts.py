@@ -181,10 +181,6 @@ def test_databases_have_an_area_without_rooms_as_an_empty_one(converted):
             ["--layout", "scannet"],
             "pointcept, mmdet3d, isbnet, mask3d, nag, npy for S3DIS, got scannet",
         ),
-        (
-            ["--layout", "mask3d", "--class-order", "spt"],
-            "--class-order requires --layout pointcept, got layout mask3d",
-        ),
     ],
 )
 @pytest.mark.parametrize("more", [[], ["--dry-run"]])

@@ -12,7 +12,7 @@ from tests.datasets.s3dis_tree import (
     write_objects,
 )
 from torchrg.datasets import CLASS_ORDERS, read_room
-from torchrg.errors import ConfigError, FormatError
+from torchrg.errors import FormatError
 
 pytest.importorskip("pyarrow", reason="needs torchrg[text]")
 
@@ -95,13 +95,12 @@ def test_two_objects_of_the_same_points_are_told(room):
     assert len(found) == 60
 
 
-def test_class_orders_name_the_same_objects(room):
-    write_clean_room(room, 2, {f"{name}_1": 3 for name in CLASS_ORDERS["pointcept"]})
-    names = {
-        order: [classes[i] for i in read_room(room, class_order=order).fields["segment"]]
-        for order, classes in CLASS_ORDERS.items()
-    }
-    assert names["pointcept"] == names["spt"] == sorted(names["spt"])
+def test_classes_are_those_of_pointcept(room):
+    classes = CLASS_ORDERS["pointcept"]
+    write_clean_room(room, 2, {f"{name}_1": 3 for name in classes})
+    names = [classes[i] for i in read_room(room).fields["segment"]]
+    assert names == sorted(names)
+    assert {*names} == {*classes} == {*CLASS_ORDERS["spt"]}
 
 
 def test_class_orders_are_those_of_the_two_families():
@@ -121,11 +120,6 @@ def test_rooms_without_objects_are_refused(room):
     write_objects(room, {"notes.txt": b"1 2 3 4 5 6"})
     with pytest.raises(FormatError, match=r"expected CLASS_NUMBER\.txt"):
         read_room(room)
-
-
-def test_an_unknown_class_order_is_refused(room):
-    with pytest.raises(ConfigError, match="expected class_order to be one of pointcept, spt"):
-        read_room(room, class_order="kpconv")
 
 
 @pytest.mark.parametrize("scale", [1, 255])

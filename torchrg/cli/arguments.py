@@ -31,7 +31,7 @@ Command = TypeVar("Command")
 ADVANCED = (
     *("--pages", "--level", "--layout", "--columns", "--viewpoint", "--within", "--merge"),
     *("--config", "--angle-deg", "--sort", "--chunk-size", "--engine"),
-    *("--ignore", "--boundary-distance", "--azimuth-deg", "--class-order"),
+    *("--ignore", "--boundary-distance", "--azimuth-deg"),
 )
 """Command flags that appear only in ``--help-all``."""
 RESOURCES = (*("--workers", "--threads", "--limit-memory", "--chunk-size", "--engine"),)

@@ -38,7 +38,7 @@ from torchrg.datasets import S3DIS, FolderOfClouds, RGBDFrames, ScanNet
 from torchrg.datasets.folder import SceneDataset
 from torchrg.datasets.provenance import read_record
 from torchrg.datasets.rgbd import FusedRecordings
-from torchrg.datasets.s3dis import ClassOrder, find_areas
+from torchrg.datasets.s3dis import find_areas
 from torchrg.errors import ConfigError, FormatError, TorchrgError
 from torchrg.io import FOLDER_SUFFIXES
 from torchrg.io.dxf import check_dxf
@@ -175,13 +175,11 @@ class S3DISArguments(CloudArguments):
 
     areas: tuple[int, ...] = ()
     """Area numbers. Default: all areas in ROOT."""
-    class_order: ClassOrder = "pointcept"
-    """Class order of segment.npy. Other layouts always use pointcept."""
 
     def data(self, root: Path) -> SceneDataset:
         """Open the rooms of the areas."""
         require("pyarrow", extra="text", purpose="read S3DIS")
-        return S3DIS(root, self.areas or find_areas(root), class_order=self.class_order)
+        return S3DIS(root, self.areas or find_areas(root))
 
 
 @dataclass(frozen=True)

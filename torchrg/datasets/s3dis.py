@@ -14,12 +14,11 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrg._checks import check_choices
 from torchrg._optional import require
 from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError, warn
@@ -29,8 +28,7 @@ from torchrg.io.files import check_file, local_path
 from torchrg.structures import Cloud
 from torchrg.structures.colors import find_white, narrow_colors, read_colors
 
-ClassOrder = Literal["pointcept", "spt"]
-CLASS_ORDERS: dict[ClassOrder, tuple[str, ...]] = {
+CLASS_ORDERS: dict[str, tuple[str, ...]] = {
     "pointcept": (
         "ceiling", "floor", "wall", "beam", "column", "window", "door",
         "table", "chair", "sofa", "bookcase", "board", "clutter",
@@ -40,8 +38,8 @@ CLASS_ORDERS: dict[ClassOrder, tuple[str, ...]] = {
         "chair", "table", "bookcase", "sofa", "board", "clutter",
     ),
 }  # fmt: skip
-"""Class names by index, in the order of Pointcept, MMDetection3D and PointNet, and in the order of
-Superpoint Transformer and KPConv."""
+"""Class names by index, in the order of Pointcept, MMDetection3D and PointNet, which torchrg reads
+and writes, and in the order of Superpoint Transformer and KPConv."""
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms per area in the release, 272 in all."""
 ANNOTATIONS = "Annotations"
@@ -68,7 +66,6 @@ class S3DIS(SceneDataset):
     Args:
         root: The folder that contains ``Area_1`` to ``Area_6``.
         areas: Numbers of the areas to use.
-        class_order: Class order of ``segment``: a key of :data:`torchrg.datasets.CLASS_ORDERS`.
         transform: Applied to each sample.
 
     Attributes:
@@ -77,7 +74,7 @@ class S3DIS(SceneDataset):
 
     Raises:
         FormatError: If an area is missing.
-        ConfigError: If an area or the class order is unknown.
+        ConfigError: If an area is unknown.
 
     Warns:
         UserWarning: If the number of rooms in an area differs from the release.
@@ -93,37 +90,22 @@ class S3DIS(SceneDataset):
         root: str | os.PathLike[str],
         areas: Sequence[int] = tuple(ROOMS_PER_AREA),
         *,
-        class_order: ClassOrder = "pointcept",
         transform: Transform | None = None,
     ) -> None:
         self.root = local_path(root)
-        self.class_order = class_order
-        self.classes = class_names(class_order)
+        self.classes = CLASS_ORDERS["pointcept"]
         self.transform = transform
         self.scenes = [scene for area in areas for scene in _list_area(self.root, area)]
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
         """Return the cloud of a room; see :func:`read_room`."""
-        return read_room(scene.path, class_order=self.class_order)
+        return read_room(scene.path)
 
     def count_points(self, scene: SceneFiles) -> int:
         """Estimate the number of points from the file sizes and the lines of the largest file."""
         sizes = {file: file.stat().st_size for file in scene.files}
         largest = max(sizes, key=lambda file: sizes[file])
         return round(sum(sizes.values()) * estimate_points(largest) / max(sizes[largest], 1))
-
-    def describe(self) -> dict[str, Any]:
-        """Return the JSON-serializable parameters that affect the samples."""
-        return {"class_order": self.class_order}
-
-    def check_output(self, layout: str, out: Path) -> None:
-        """Raise ConfigError if a layout needs another class order, or results go to ``root``."""
-        super().check_output(layout, out)
-        if layout != "pointcept" and self.class_order != "pointcept":
-            raise ConfigError(
-                f"--class-order requires --layout pointcept, got layout {layout}, which uses the "
-                "order pointcept; remove --class-order."
-            )
 
 
 def _list_area(root: Path, area: int) -> list[SceneFiles]:
@@ -157,27 +139,26 @@ def find_areas(root: Path) -> tuple[int, ...]:
     return tuple(n for n in ROOMS_PER_AREA if (root / f"Area_{n}").is_dir()) or (*ROOMS_PER_AREA,)
 
 
-def read_room(path: Path, *, class_order: ClassOrder = "pointcept") -> Cloud:
+def read_room(path: Path) -> Cloud:
     """Read a room from the raw release. Points of an object are contiguous.
 
     Args:
         path: Folder of the room, the parent of ``Annotations``.
-        class_order: Class order of ``segment``: a key of :data:`CLASS_ORDERS`.
 
     Returns:
-        The cloud, in float32, with ``color`` ``(N, 3)`` uint8, ``segment`` ``(N,)`` int16, and
-        ``instance`` ``(N,)``. The latter is the object index in natural order of the file names,
-        int16, or int32 if it does not fit. ``repairs`` has a line for each repaired byte: file,
-        line and column (from one), and the line before and after; the file itself is unchanged.
+        The cloud, in float32, with ``color`` ``(N, 3)`` uint8, ``segment`` ``(N,)`` int16, an index
+        into ``CLASS_ORDERS["pointcept"]``, and ``instance`` ``(N,)``. The latter is the object
+        index in natural order of the file names, int16, or int32 if it does not fit. ``repairs``
+        has a line for each repaired byte: file, line and column (from one), and the line before and
+        after; the file itself is unchanged.
         ``notes`` has a line for each folder entry that is not an object, and for each file of an
         unknown class, for example ``stairs``.
 
     Raises:
         FormatError: If there is no object, or a line is not a point.
-        ConfigError: If the class order is unknown.
         MissingDependencyError: If pyarrow is not installed.
     """
-    classes = class_names(class_order)
+    classes = CLASS_ORDERS["pointcept"]
     objects, notes = _list_room(path)
     coords, colors, repairs = zip(*(read_annotation(file) for _, file in objects), strict=True)
     numbers = [classes.index(name if name in classes else "clutter") for name, _ in objects]
@@ -201,12 +182,6 @@ def read_room(path: Path, *, class_order: ClassOrder = "pointcept") -> Cloud:
         notes=(*notes, *more),
         repairs=tuple(itertools.chain.from_iterable(repairs)),
     )
-
-
-def class_names(class_order: ClassOrder) -> tuple[str, ...]:
-    """Return the names of the 13 classes in the order of a key of :data:`CLASS_ORDERS`."""
-    check_choices("S3DIS", class_order=(class_order, ClassOrder))
-    return CLASS_ORDERS[class_order]
 
 
 def object_files(room: Path) -> tuple[Path, ...]:
