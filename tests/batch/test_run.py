@@ -83,8 +83,8 @@ def test_many_small_scans_take_room_and_time_of_their_own(faults, tmp_path):
     assert plan.num_bytes > 99 * 6 * 4096
     costs = format_costs(plan, 1, 10**10, 10**10, (10.0, "points"))
     assert "disk: about 0.003 GB" in costs
-    assert "time: about 3 s, at 10 core seconds" in costs
-    assert "time: about 5 min" in format_costs(
+    assert "time: about 0:00:03 (h:mm:ss), at 10 core seconds" in costs
+    assert "time: about 0:04:58 " in format_costs(
         plan._replace(jobs=plan.jobs * 100), 1, 10**10, 10**10, (10.0, "points")
     )
 

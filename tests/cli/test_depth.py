@@ -137,16 +137,6 @@ def test_several_images_go_into_a_folder_and_a_damaged_one_stops_no_other(tmp_pa
     assert len(contents(out / "1")) == 6
 
 
-def test_a_folder_of_one_image_is_that_image(tmp_path, frame, run):
-    folder = tmp_path / "one"
-    folder.mkdir()
-    frame.rename(folder / frame.name)
-    assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels").code == 0
-    assert run("depth", folder, *CAMERA, "--out", tmp_path / "labels.png").code == 0
-    labels = kornia_rs.io.read_image_png_u16(str(tmp_path / "labels.png"), "mono")[..., 0]
-    np.testing.assert_array_equal(np.load(tmp_path / "labels/frame/plane.npy") + 1, labels)
-
-
 def test_images_in_a_directory_write_what_convert_writes(tmp_path, frame, depth, run):
     folder, out = tmp_path / "images", tmp_path / "out"
     folder.mkdir()
@@ -172,11 +162,10 @@ def test_images_in_a_directory_write_what_convert_writes(tmp_path, frame, depth,
     assert picture == (tmp_path / "labels_planes.png").read_bytes()
 
 
-def test_a_folder_of_several_is_refused_with_the_command_for_it(tmp_path, frame, run):
-    (tmp_path / "next.png").write_bytes(frame.read_bytes())
+def test_a_folder_is_refused_with_the_command_for_it(tmp_path, frame, run):
     error = run("depth", tmp_path, *CAMERA, "--out", tmp_path / "out").error
-    assert f"with one depth image, got 2; use torchrg convert rgbd {tmp_path} OUT" in error
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.png", "next.png"]
+    assert f"depth images, got a folder; use torchrg convert rgbd {tmp_path} OUT" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mkv", ".r3d"])
@@ -267,7 +256,6 @@ def test_a_scale_of_another_unit_is_doubted_at_every_door(tmp_path, frame, run, 
     )
     for command in (
         ("depth", root / frame.name, "--out", tmp_path / "labels.png"),
-        ("depth", root, "--out", tmp_path / "labels.npz"),
         ("convert", "rgbd", root, tmp_path / "out", "--dry-run"),
     ):
         (line,) = run(*command, *flags).err.splitlines()
@@ -322,14 +310,12 @@ def test_missing_pixels_and_rays_are_converted_at_every_door(tmp_path, depth, ru
     root.mkdir()
     np.save(root / "0.npy", stored.numpy())
     assert run("depth", root / "0.npy", *flags, "--out", tmp_path / "a.npz").err == ""
-    assert run("depth", root, *flags, "--out", tmp_path / "b.npz").err == ""
     assert run("convert", "rgbd", root, tmp_path / "c", *flags, "--workers", "1").err == ""
     expected = segment_depth(depth, INTRINSICS).labels
-    for name in ("a.npz", "b.npz"):
-        with np.load(tmp_path / name) as found:
-            np.testing.assert_array_equal(found["labels"], expected.flatten())
-            np.testing.assert_allclose(found["plane_offset"], [2.0, 2.5], rtol=1e-6)
-            assert json.loads(str(found["provenance"]))["pose"] == "camera"
+    with np.load(tmp_path / "a.npz") as found:
+        np.testing.assert_array_equal(found["labels"], expected.flatten())
+        np.testing.assert_allclose(found["plane_offset"], [2.0, 2.5], rtol=1e-6)
+        assert json.loads(str(found["provenance"]))["pose"] == "camera"
     np.testing.assert_array_equal(np.load(tmp_path / "c/0/plane.npy"), expected)
     record = json.loads((tmp_path / "c/0/provenance.json").read_text())
     assert record["measured"]["pose"] == "camera"

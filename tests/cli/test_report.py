@@ -2,7 +2,7 @@
 
 from torchrg.batch.run import BatchReport
 from torchrg.batch.task import TaskReport
-from torchrg.cli.report import _format_time, format_report, format_table
+from torchrg.cli.report import format_report, format_table
 
 
 def test_depth_frames_are_counted_by_the_second():
@@ -14,10 +14,6 @@ def test_depth_frames_are_counted_by_the_second():
 
 def test_an_empty_table_is_its_head():
     assert format_table(["scan", "points"], []) == "scan  points"
-
-
-def test_format_time_by_example():
-    assert (_format_time(8), _format_time(500), _format_time(9000)) == ("8 s", "8 min", "2.5 h")
 
 
 def test_format_table_by_example():

@@ -140,7 +140,7 @@ def match_jobs(jobs: Sequence[Job], only: str | None) -> list[Job]:
 def _is_inside_scans(source: Source, scans: Sequence[SceneFiles], out: Path) -> bool:
     """Whether results would be read as scans by the next run, also through links."""
     if source.root == out:
-        return False
+        return not source.data.allows_results(source.layout)
     inputs = (Path(os.path.realpath(file)) for scan in scans for file in scan.files)
     return any((out / scan.name).is_relative_to(source.root) for scan in scans) or (
         not source.root.is_relative_to(out) and any(file.is_relative_to(out) for file in inputs)

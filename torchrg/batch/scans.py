@@ -40,6 +40,8 @@ class Source:
     data: SceneDataset
     settings: PipelineConfig | DepthConfig
     table: str | None
+    layout = ""
+    """Layout of the results, if the data set has several."""
     num_levels = 0
     """Number of levels of superpoints into which conversion also partitions clouds."""
     bytes_per_point: ClassVar[int]
@@ -231,9 +233,7 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
 
 def claim_pages(job: Job, folder: Path) -> None:
     """Add a folder of pages to the record of a complete scan, before they are written."""
-    record, pages = (
-        provenance.read_record(job.folder),
-        os.path.relpath(os.path.realpath(folder), job.out),
-    )
-    if record is not None and pages not in (known := record.get("pages", [])):
-        provenance.write_record(job.folder, record | {"pages": sorted([*known, pages])})
+    record, pages = provenance.read_record(job.folder), os.path.realpath(folder)
+    name = os.path.relpath(pages, job.out)
+    if record is not None and name not in (known := record.get("pages", [])):
+        provenance.write_record(job.folder, record | {"pages": sorted([*known, name])})

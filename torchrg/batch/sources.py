@@ -72,7 +72,6 @@ class CloudSource(Source):
 
     def list_scans(self, out: Path) -> list[SceneFiles]:
         """Return the scenes in natural order; their results go to ``out``."""
-        self.data.check_output(self.layout, out)
         for scene in self.data.scenes:
             dataset = "ScanNet" if scene.dataset is None else scene.dataset
             check_layout(self.layout, dataset, scene.dataset or scene.name)
@@ -180,7 +179,6 @@ class RGBDSource(Source):
 
     def list_scans(self, out: Path) -> list[SceneFiles]:
         """Return the frames in natural order."""
-        self.data.check_output("", out)
         # A wrong scale affects all frames, so warn before the work.
         with suppress(FormatError, OSError):
             self.data.read_sample(0)

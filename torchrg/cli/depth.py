@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -19,13 +19,14 @@ from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_warnings, warn
 from torchrg.cli.loop import (
     check_distinct,
+    has_suffix,
     note_input,
     output_paths,
     report_planes,
     run_each,
     sidecar_paths,
 )
-from torchrg.datasets import RGBDFrame, RGBDFrames
+from torchrg.datasets import RGBDFrame
 from torchrg.datasets.provenance import describe_run
 from torchrg.datasets.rgbd import scale_camera
 from torchrg.datasets.rgbd_files import DEPTH_SUFFIXES, num_pixels, refuse_form
@@ -33,7 +34,7 @@ from torchrg.depth import DepthConfig, find_intrinsics, segment_depth
 from torchrg.depth.camera import Pinhole, format_intrinsics, reprojection_error, unproject_image
 from torchrg.errors import ConfigError, DepthWarning, FormatError
 from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
-from torchrg.io.files import check_writable, create_folder
+from torchrg.io.files import check_writable
 from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.io.result import PLANES_FILE, write_table
 from torchrg.render import color_planes, write_png
@@ -66,10 +67,10 @@ class Arguments:
     """
 
     inputs: Annotated[tuple[Path, ...], Argument("IMAGE", is_positional=True)]
-    """Depth images (16-bit .png, .pgm, or .npy), folders with one, or organized clouds (.pcd)."""
+    """Depth images (16-bit .png, .pgm, or .npy), or organized clouds (.pcd)."""
     out: Path
-    """Output file: .png for labels, or a point cloud format. With several inputs, or a folder, an
-    output directory: each image gets a folder with coord, normal, curvature and plane as .npy, and
+    """Output file: .png for labels, or a point cloud format. With several inputs, an output
+    directory: each image gets a folder with coord, normal, curvature and plane as .npy, and
     planes.json."""
     intrinsics: flags.IntrinsicsFlag = None
     depth_scale: flags.DepthScaleFlag = None
@@ -90,11 +91,7 @@ def run(argv: list[str]) -> int:
     flags.limit_threads(arguments.threads)
     camera = flags.parse_intrinsics(arguments.intrinsics)
     frames = [_find_frame(arguments, camera, path) for path in arguments.inputs]
-    sources = [frame or camera for frame in frames]
-    pairs = zip(arguments.inputs, frames, strict=True)
-    inputs = [path if frame is None else frame.depth for path, frame in pairs]
-    if any(path.is_dir() for path in arguments.inputs) and not arguments.out.suffix:
-        create_folder(arguments.out)
+    sources, inputs = [frame or camera for frame in frames], arguments.inputs
     is_folder = arguments.out.is_dir() or (
         len(inputs) > 1 and arguments.out.suffix.lower() not in (".png", *FORMATS)
     )
@@ -102,7 +99,7 @@ def run(argv: list[str]) -> int:
     pictures = sidecar_paths(targets, arguments.picture, suffixes=(".png",))
     table_paths = sidecar_paths(targets, arguments.table, suffixes=TABLE_SUFFIXES)
     tables = [set() if path is None else {path} for path in table_paths]
-    if not is_folder and _is_png(targets[0]):
+    if not is_folder and has_suffix(targets[0], ".png"):
         if arguments.picture is None:
             pictures = [targets[0].with_name(f"{targets[0].stem}_planes.png")]
         tables[0].add(targets[0].with_suffix(".json"))
@@ -117,21 +114,13 @@ def run(argv: list[str]) -> int:
 
 
 def _find_frame(arguments: Arguments, camera: Pinhole | None, path: Path) -> RGBDFrame | None:
-    """Return the depth image of an input file or folder; None for a cloud.
+    """Return the depth image of an input file; None for a cloud.
 
     Raises before reading if the camera or the depth scale is missing.
     """
     if path.is_dir():
-        names = ("depth_scale", "depth_kind")
-        options: dict[str, Any] = {name: getattr(arguments, name) for name in names}
-        with print_warnings():
-            frame, *others = RGBDFrames.from_folder(path, intrinsics=camera, **options).frames
-        if others:
-            raise ConfigError(
-                f"{path}: expected a folder with one depth image, got {1 + len(others):,}; use "
-                f"torchrg convert rgbd {path} OUT."
-            )
-        return frame
+        command = f"torchrg convert rgbd {path} OUT"
+        raise ConfigError(f"{path}: expected depth images, got a folder; use {command}.")
     refuse_form(path, *FORMATS)
     if path.suffix.lower() not in DEPTH_SUFFIXES:
         if arguments.depth_scale is not None or arguments.depth_kind != "z":
@@ -169,7 +158,7 @@ def _label(
             cloud, depth, camera = _read_image(known)
     else:
         cloud, depth, camera = _read_cloud(source, known)
-    is_image = _is_png(target)
+    is_image = has_suffix(target, ".png")
     if not is_folder and not is_image:
         check_output(target, cloud)
     note_input(f"{source}", cloud, target, () if is_folder or is_image else RESULT_FIELDS)
@@ -219,11 +208,6 @@ def _check_memory(image: Path) -> None:
             f"{image}: not enough memory for {size:,} pixels: needs at least {needed / 1e9:,.1f} "
             f"GB, {free / 1e9:,.1f} GB are free; scale it down, or use a machine with more memory."
         )
-
-
-def _is_png(path: Path) -> bool:
-    """Return whether labels are written as an image."""
-    return path.suffix.lower() == ".png"
 
 
 def _read_image(frame: RGBDFrame) -> tuple[Cloud, Tensor, Tensor]:

@@ -15,7 +15,6 @@ SOME_FAILED = 3
 """Exit code if some inputs failed; the results of the remaining ones are complete."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C by shell convention: 128 plus the signal number."""
-
 INTERRUPTED_LINE = "interrupted; every file written is complete."
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 """Ctrl-C, and the termination signal of batch systems."""

@@ -28,7 +28,7 @@ from torchrg.io import FORMATS, takes_columns
 from torchrg.io.result import Result, read_result
 from torchrg.io.tables import COLUMNS_RULE
 from torchrg.normals import Orientation
-from torchrg.structures import FARTHEST, Sampling
+from torchrg.structures import Sampling
 
 _MAX_THREADS = 1024
 """Upper bound of --threads: more than any machine has cores, and few enough to start."""
@@ -225,30 +225,21 @@ def check_superpoints(config: SuperpointsConfig, level: int = 0, *, is_on: bool)
 
 def parse_intrinsics(text: str | None) -> Pinhole | None:
     """Parse a camera from ``fx,fy,cx,cy`` or a file; None stays None."""
-    from torchrg.datasets.camera_files import SUFFIXES, read_camera
+    from torchrg.datasets.camera_files import SUFFIXES, parse_camera, read_camera
 
     if text is None:
         return None
     numbers: list[float] = []
     with suppress(ValueError):
         numbers = [*map(float, text.split(","))]
-    if len(numbers) == 4:
-        fx, fy, cx, cy = numbers
-        if 0 in (fx, fy) or not all(abs(number) <= FARTHEST for number in numbers):
-            raise ConfigError(
-                f"expected finite --intrinsics with nonzero fx and fy, got {text}; pass pixels."
-            )
-        if min(fx, fy) < 0:
-            warn(
-                f"--intrinsics {text}: a negative focal length flips the image; leave out the "
-                "minus sign unless intended."
-            )
-        return Pinhole(fx, fy, cx, cy)
     is_file = False
     with suppress(OSError):
         is_file = Path(text).is_file()
-    if is_file or text.lower().endswith(SUFFIXES[1:]):
-        with print_warnings():
+    with print_warnings():
+        if len(numbers) == 4:
+            record = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
+            return parse_camera(Path(f"--intrinsics {text}"), record)
+        if is_file or text.lower().endswith(SUFFIXES[1:]):
             return read_camera(Path(text))
     raise ConfigError(
         f"expected --intrinsics fx,fy,cx,cy (no spaces) or a camera file, got {text!r}."

@@ -22,11 +22,8 @@ from torchrg.structures.points import Array, bounding_box
 _DIGITS = {4: 6, 8: 10}
 """Significant digits printed for a coordinate, by its size in bytes. float32 has at most six; ten
 resolve a millimeter at a thousand kilometers."""
-
-
 _NUM_NEIGHBORS = 50
 """Number of neighbors for measuring the surfaces, as in the default preset."""
-
 _NUM_FOR_SPACING = 10_000
 """Number of points, evenly along the canonical order, from which the spacing is measured."""
 

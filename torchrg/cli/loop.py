@@ -16,6 +16,7 @@ from torchrg.io.dxf import check_dxf
 from torchrg.io.fields import describe_renamed_fields
 from torchrg.io.files import check_writable, create_folder, list_some, normalize_file_name
 from torchrg.io.npy import DISPLAYED_FIELDS
+from torchrg.io.result import PAGE_SUFFIXES
 from torchrg.render.page import read_library
 from torchrg.structures import Cloud, Segmentation
 
@@ -24,8 +25,6 @@ tqdm.set_lock(RLock())
 # Its thread would keep workers from being forked. Bars of long steps refresh without it.
 tqdm.monitor_interval = 0
 
-IMAGE_SUFFIXES = (".png", ".html")
-"""File extensions of images and viewers."""
 STAGES = ("neighbors", "normals", "regions", "planes", "orientation")
 """Stages of the segmentation of a cloud, as in progress bars."""
 
@@ -89,7 +88,7 @@ def _file_id(path: Path) -> tuple[int, int] | None:
 
 
 def sidecar_paths(
-    results: Sequence[Path], output: Path | None, *, suffixes: Sequence[str] = IMAGE_SUFFIXES
+    results: Sequence[Path], output: Path | None, *, suffixes: Sequence[str] = PAGE_SUFFIXES
 ) -> Sequence[Path | None]:
     """Return the path of the image or table of each result, like :func:`output_paths`.
 
@@ -110,7 +109,7 @@ def sidecar_paths(
     return paths
 
 
-def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> None:
+def check_sidecar(path: Path, *, suffixes: Sequence[str] = PAGE_SUFFIXES) -> None:
     """Raise if an image, viewer or table cannot be written; call before long computations."""
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
@@ -118,20 +117,15 @@ def check_sidecar(path: Path, *, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> No
             f"{path}: expected a file ending in {endings}, got {path.suffix!r}; write one."
         )
     check_writable(path)
-    if is_viewer(path):
+    if has_suffix(path, ".html"):
         read_library()
-    if path.suffix.lower() == ".dxf":
+    if has_suffix(path, ".dxf"):
         check_dxf()
 
 
-def is_viewer(path: Path) -> bool:
-    """Return whether a path is a viewer."""
-    return path.suffix.lower() == ".html"
-
-
-def is_archive(path: Path) -> bool:
-    """Return whether a result is written as .npz, without the fields of the cloud."""
-    return path.suffix.lower() == ".npz"
+def has_suffix(path: Path, suffix: str) -> bool:
+    """Return whether a file has an extension, which is in lower case here."""
+    return path.suffix.lower() == suffix
 
 
 def display_name(source: Path | Sequence[Path]) -> str:
@@ -183,8 +177,11 @@ def print_failure(report: TaskReport) -> None:
 def note_input(
     source: str, cloud: Cloud, target: Path, results: Collection[str] = RESULT_FIELDS
 ) -> None:
-    """Warn about assumptions made while reading, and about fields that results replace."""
-    replaced = () if is_archive(target) else describe_renamed_fields(cloud.fields, results)
+    """Warn about assumptions made while reading, and about fields that results replace.
+
+    An ``.npz`` file does not have the fields of the cloud.
+    """
+    replaced = () if has_suffix(target, ".npz") else describe_renamed_fields(cloud.fields, results)
     for note in (*cloud.notes, *replaced):
         warn(f"{source}: {note}.")
 
@@ -192,7 +189,7 @@ def note_input(
 def dropped_fields_note(target: Path, fields: Collection[str]) -> str:
     """Describe the fields of a cloud that its result omits."""
     kept = (*DISPLAYED_FIELDS, *RESULT_FIELDS)  # Results replace earlier results.
-    names = [name for name in fields if name not in kept and is_archive(target)]
+    names = [name for name in fields if name not in kept and has_suffix(target, ".npz")]
     return f" (without the input fields {', '.join(names)})" if names else ""
 
 

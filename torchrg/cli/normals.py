@@ -88,7 +88,7 @@ def _estimate_file(arguments: Arguments, source: Path, target: Path) -> None:
     provenance |= {name: getattr(arguments, name) for name in names}
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     results = zip(RESULTS, (fit.normals, fit.curvature, sharp, fit.valid), strict=True)
-    keeps_fields = not loop.is_archive(target)
+    keeps_fields = not loop.has_suffix(target, ".npz")
     fields = {
         name: v for name, v in cloud.fields.items() if keeps_fields or name in DISPLAYED_FIELDS
     }

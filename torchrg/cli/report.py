@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from datetime import timedelta
 
 from torchrg.batch.run import BatchReport, Plan
 from torchrg.batch.task import TaskReport
@@ -9,8 +10,6 @@ from torchrg.cli.ending import printable
 
 _SECONDS_PER_SCAN = 0.03
 """Time for a scan of 40 points on one core of an AMD EPYC, in seconds: hashing, flushing."""
-_MIN_NEXT_UNIT = 100
-"""Durations from this many seconds or minutes on are printed in the next larger unit."""
 MAX_ROWS = 300
 """Maximum number of scans in a report with one row per scan."""
 
@@ -42,11 +41,11 @@ def format_costs(plan: Plan, workers: int, limit: int, free: int, rate: tuple[fl
         memory, at_once = memory + needed, at_once + 1
     num_points = sum(job.scan.num_points for job in jobs)
     total = seconds * num_points / 1e6 + _SECONDS_PER_SCAN * len(jobs)
+    duration = timedelta(seconds=math.ceil(total / at_once))
     return (
         f"disk: about {plan.num_bytes / 1e9:,.3f} GB of {free / 1e9:,.1f} GB free\n"
         f"memory: about {memory / 1e9:,.1f} GB, {at_once} at a time, limit {limit / 1e9:,.1f} GB\n"
-        f"time: about {_format_time(total / at_once)}, at {seconds:g} core seconds per million "
-        f"{of_what}"
+        f"time: about {duration} (h:mm:ss), at {seconds:g} core seconds per million {of_what}"
     )
 
 
@@ -78,14 +77,6 @@ def format_report(report: BatchReport, *, unit: str = "scan") -> str:
     )
     head = ["scan", "status", "points", "planes", "GB"]
     return "\n".join([format_table(head, rows), *notes, speed])
-
-
-def _format_time(seconds: float) -> str:
-    """Format a duration in a suitable unit."""
-    if seconds < _MIN_NEXT_UNIT:
-        return f"{math.ceil(seconds)} s"
-    minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < _MIN_NEXT_UNIT else f"{minutes / 60:,.1f} h"
 
 
 def _row(scan: TaskReport) -> list[str]:

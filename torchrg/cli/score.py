@@ -21,7 +21,6 @@ from torchrg.structures import UNLABELED, Cloud
 
 Scores: TypeAlias = dict[str, dict[str, float | None]]
 """Metrics by part (``labels``, ``normals``, ``superpoints``) and name."""
-
 _MAX_NAMED = 5
 """Maximum number of scans listed in an error."""
 
@@ -148,11 +147,11 @@ def _score_files(arguments: Arguments, predicted: Path, ground_truth: Path) -> S
 
 def _check_rows(predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud) -> None:
     """Raise unless both scans have the same points in the same rows."""
+    repair = "to compare each point with the nearest one within D, pass --match-distance D."
     if len(ours) != len(theirs):
         raise FormatError(
             f"{predicted}: expected {len(theirs):,} points as in {ground_truth}, got "
-            f"{len(ours):,}; to compare each point with the nearest one within D, "
-            "pass --match-distance D."
+            f"{len(ours):,}; {repair}"
         )
     rows = metrics.differing_rows(ours, theirs)
     if len(rows):
@@ -160,8 +159,8 @@ def _check_rows(predicted: Path, ground_truth: Path, ours: Cloud, theirs: Cloud)
         got, expected = (" ".join(f"{value:.9g}" for value in point) for point in points)
         raise FormatError(
             f"{predicted}: expected the same points as {ground_truth} in every row, got "
-            f"{len(rows):,} of {len(ours):,} that differ (row {rows[0]}: {got} for {expected}); to "
-            "compare each point with the nearest one within D, pass --match-distance D."
+            f"{len(rows):,} of {len(ours):,} that differ (row {rows[0]}: {got} for {expected}); "
+            f"{repair}"
         )
 
 

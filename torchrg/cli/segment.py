@@ -189,24 +189,12 @@ def _read(
     storage.enter_context(_array_storage(arguments, source, target, num_points, limit))
     columns = {path: flags.file_columns(path, arguments.columns) for path in sources}
     cloud = merge_clouds([read_cloud(path, columns=columns[path]) for path in sources])
-    if not scratch.is_active():
-        storage.enter_context(_array_storage(arguments, source, target, len(cloud), limit))
-    _check_limit(arguments, source, len(cloud), limit)  # The number was an estimate for text.
+    # The number was an estimate for text.
+    storage.enter_context(_array_storage(arguments, source, target, len(cloud), limit))
     if arguments.voxel is not None:
         num_sites = len(sample_voxels(cloud.points, arguments.voxel).rows)
         print_lines(f"{source}: {num_sites:,} sites, one of the {len(cloud):,} points per voxel")
     return cloud
-
-
-def _check_limit(arguments: Arguments, source: str, num_points: int, limit: int) -> None:
-    """Raise if a cloud exceeds the memory limit even with its large arrays on disk."""
-    minimum = _needed_memory(arguments, num_points, on_disk=True)
-    if minimum > limit:
-        raise ConfigError(
-            f"{source}: expected --limit-memory of at least {minimum / 1e9:.3g} GB for about "
-            f"{num_points:,} points{describe_multipliers(*_memory_settings(arguments))}, got "
-            f"{limit / 1e9:.3g} GB; raise it, or split the cloud."
-        )
 
 
 def _memory_settings(arguments: Arguments) -> tuple[PipelineConfig, SuperpointsConfig | None]:
@@ -224,10 +212,19 @@ def _needed_memory(arguments: Arguments, num_points: int, *, on_disk: bool) -> i
 def _array_storage(
     arguments: Arguments, source: str, target: Path, num_points: int, limit: int
 ) -> contextlib.AbstractContextManager[None]:
-    """Return the context for large arrays: memory, or disk if they exceed the limit."""
-    _check_limit(arguments, source, num_points, limit)
+    """Return the context for large arrays: memory, or disk if they exceed the limit.
+
+    Raises ConfigError if a cloud exceeds the limit even with these arrays on disk.
+    """
+    minimum = _needed_memory(arguments, num_points, on_disk=True)
+    if minimum > limit:
+        raise ConfigError(
+            f"{source}: expected --limit-memory of at least {minimum / 1e9:.3g} GB for about "
+            f"{num_points:,} points{describe_multipliers(*_memory_settings(arguments))}, got "
+            f"{limit / 1e9:.3g} GB; raise it, or split the cloud."
+        )
     needed = _needed_memory(arguments, num_points, on_disk=False)
-    if needed <= limit:
+    if needed <= limit or scratch.is_active():
         return contextlib.nullcontext()
     folder = Path(os.environ.get("TMPDIR") or target.parent)
     k = min(arguments.settings.max_neighbors, num_points)
@@ -276,7 +273,7 @@ def _draw(arguments: Arguments, picture: Path, result: Result) -> None:
     """Write the image or viewer of a result, or both."""
     if arguments.pages:
         write_entry(picture.parent, picture.stem, result)
-    elif loop.is_viewer(picture):
+    elif loop.has_suffix(picture, ".html"):
         write_page(picture, make_page(result))
     else:
         write_planes(picture, result)

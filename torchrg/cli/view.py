@@ -13,7 +13,7 @@ from torchrg import render
 from torchrg.cli.arguments import Argument, parse
 from torchrg.cli.ending import print_lines
 from torchrg.cli.flags import ColumnsFlag, check_columns, read_noted
-from torchrg.cli.loop import check_sidecar, is_viewer
+from torchrg.cli.loop import check_sidecar, has_suffix
 from torchrg.config import Up
 from torchrg.errors import ConfigError
 from torchrg.io.result import Result
@@ -76,7 +76,7 @@ def run(argv: list[str]) -> int:
     check_sidecar(arguments.out)
     files = (arguments.file, arguments.compare, arguments.ground_truth)
     check_columns(arguments.columns, [path for path in files if path is not None])
-    write = _write_page if is_viewer(arguments.out) else _write_picture
+    write = _write_page if has_suffix(arguments.out, ".html") else _write_picture
     summary = write(arguments, read_noted(arguments.file, arguments.columns))
     print_lines(f"{arguments.file} -> {arguments.out} ({summary})")
     return 0

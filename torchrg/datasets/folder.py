@@ -16,7 +16,7 @@ from torch.utils.data import Dataset, Subset
 from torchrg._checks import as_tensor
 from torchrg.datasets.collate import collate_offset
 from torchrg.datasets.pointcept import POINT_ARRAYS, SOURCE_ARRAYS, read_pointcept_scene
-from torchrg.errors import ConfigError, FormatError, warn
+from torchrg.errors import FormatError, warn
 from torchrg.io import FOLDER_SUFFIXES, TEXT_SUFFIXES, estimate_points, read_cloud, takes_columns
 from torchrg.io.files import decode_file, list_some, local_path
 from torchrg.io.npy import map_array, map_folder
@@ -120,9 +120,9 @@ class SceneDataset(Dataset[Sample]):
         """Return the JSON-serializable parameters that affect the samples."""
         return {}
 
-    def check_output(self, layout: str, out: Path) -> None:
-        """Raise ConfigError if results written to ``out`` would be read as scenes."""
-        check_outside(self.root, out)
+    def allows_results(self, layout: str) -> bool:
+        """Return whether results of a layout in ``root`` would not be read as scenes."""
+        return False
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -242,12 +242,9 @@ class FolderOfClouds(SceneDataset):
         """Return the JSON-serializable parameters that affect the samples."""
         return {} if self.columns is None else {"columns": list(self.columns)}
 
-    def check_output(self, layout: str, out: Path) -> None:
-        """Raise ConfigError if results in ``root`` would not just complete Pointcept folders."""
-        files = [scene.path.name for scene in self.scenes if not scene.path.is_dir()]
-        if files or layout != "pointcept":
-            what = f"the results of {files[0]}" if files else f"layout {layout}"
-            check_outside(self.root, out, f"for {what}")
+    def allows_results(self, layout: str) -> bool:
+        """Return whether results of a layout just complete Pointcept folders."""
+        return layout == "pointcept" and all(scene.path.is_dir() for scene in self.scenes)
 
     def read_scene(self, scene: SceneFiles) -> Cloud:
         """Return the cloud of a file, or of a folder in Pointcept's layout."""
@@ -320,12 +317,6 @@ def _is_matched(path: Path, patterns: Sequence[str]) -> bool:
 def is_scene(folder: Path) -> bool:
     """Whether a folder is itself a cloud in Pointcept's layout."""
     return (folder / "coord.npy").is_file()
-
-
-def check_outside(root: Path, out: Path, why: str = "so that no result is read as a scan") -> None:
-    """Raise ConfigError if results would be written to the folder of a data set."""
-    if out == root:
-        raise ConfigError(f"{out}: expected a directory outside {root}, {why}; choose another.")
 
 
 def check_folder(folder: Path) -> None:

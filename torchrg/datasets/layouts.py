@@ -464,8 +464,6 @@ _NAG_CLASSES = {
     "S3DIS": [*map(CLASS_ORDERS["spt"].index, CLASS_ORDERS["pointcept"]), 13],
 }
 """Class IDs in Superpoint Transformer by class of the data set; the last is for none."""
-
-
 LAYOUTS: dict[str, dict[str, Callable[[LayoutScan], Files]]] = {
     "scannet": dict.fromkeys(("ScanNet", "ScanNet++", ""), _scannet),
     "mmdet3d": {"ScanNet": _mmdet3d, "S3DIS": _mmdet3d_s3dis},

@@ -309,7 +309,7 @@ def _find_frames(
         DepthWarning: See :meth:`RGBDFrames.from_folder`; once per kind, of cameras per recording.
     """
     layout, frames, is_posed = FRAME_LAYOUTS[name], list[RGBDFrame](), False
-    signs = [sign for sign in layout.signs if sign]
+    signs = layout.signs
     notes: dict[object, str] = {}
     for prefix, folder in find_recordings(root, layout):
         shared: dict[Path, tuple[Pinhole | None, tuple[Path, ...]]] = {}

@@ -318,20 +318,15 @@ def _rows_by_time(path: Path, num_words: int, what: str) -> list[list[str]]:
 
 
 def _rows(path: Path, num_words: int, what: str) -> list[list[str]]:
-    """Return rows of ``num_words`` words."""
-    rows = _words(path)
+    """Return the non-empty rows, of ``num_words`` words each; ``#`` begins a comment."""
+    lines = decode_file(path).splitlines()
+    words = (line.split("#")[0].replace(",", " ").split() for line in lines)
+    rows = [row for row in words if row]
     wrong = next((row for row in rows if len(row) != num_words), [])
     if wrong or not rows:
         got = repr(" ".join(wrong)[:60]) if wrong else "none"
         raise FormatError(f"{path}: expected {what} in each row, got {got}; it may be corrupt.")
     return rows
-
-
-def _words(path: Path) -> list[list[str]]:
-    """Return the words of each non-empty row; ``#`` begins a comment."""
-    lines = decode_file(path).splitlines()
-    words = (line.split("#")[0].replace(",", " ").split() for line in lines)
-    return [row for row in words if row]
 
 
 def _numbers(path: Path, rows: list[list[str]]) -> list[list[float]]:

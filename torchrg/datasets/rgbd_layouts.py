@@ -86,7 +86,7 @@ class FrameLayout(NamedTuple):
         depth_scale: Depth units per meter in images of integers; None if unknown or per frame.
         array_scale: The same for ``.npy`` and ``.exr``.
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark,
-            or ``file:text``; ``("",)`` if the mark is enough.
+            or ``file:text``. Default: the mark is enough.
         levels: Maximum depth of recordings below the root folder.
         axes: Turn from torchrg's camera axes to those of the poses, ``(4, 4)``. Default: the same.
         cameras: Cameras of recordings without a camera file, by a part of the recording's name.
@@ -96,7 +96,7 @@ class FrameLayout(NamedTuple):
     mark: str = ""
     depth_scale: float | None = None
     array_scale: float | None = None
-    signs: tuple[str, ...] = ("",)
+    signs: tuple[str, ...] = ()
     levels: int = 1
     axes: Tensor | None = None
     cameras: Mapping[str, Pinhole] = MappingProxyType({})
@@ -390,7 +390,7 @@ def find_layout(root: Path) -> str:
     """
     for name, layout in FRAME_LAYOUTS.items():
         for folder in _marked_folders(root, layout) if layout.mark else ():
-            if any(not sign or _has_sign(folder, sign) for sign in layout.signs):
+            if not layout.signs or any(_has_sign(folder, sign) for sign in layout.signs):
                 return name
     return "images"
 

@@ -149,10 +149,9 @@ class ScanNet(SceneDataset):
         note = "no labels: the annotations or the table of label categories are missing"
         return replace(cloud, notes=(*cloud.notes, note))
 
-    def check_output(self, layout: str, out: Path) -> None:
-        """Raise ConfigError if ScanNet files go to ``root``; other layouts may be written there."""
-        if layout == "scannet":
-            super().check_output(layout, out)
+    def allows_results(self, layout: str) -> bool:
+        """Return whether a layout may be written to ``root``: all but ScanNet's."""
+        return layout != "scannet"
 
     def read_sample(self, index: int) -> SampleDict:
         """Return the sample of a scan."""
