@@ -291,23 +291,6 @@ def test_depth_that_is_missing_fails_its_frame_and_leaves_nothing(tmp_path, run)
     (reported,) = [line for line in done.err.splitlines() if "frame_00001" in line]
     assert reported.endswith(f"{root / 'depth' / 'frame_00001.png'}: No such file or directory.")
     assert [path.name for path in (out / "capture" / "depth").iterdir()] == ["frame_00000"]
-    alone = tmp_path / "alone"
-    shared = json.loads((root / "transforms.json").read_text())
-    write_text(alone / "transforms.json", {**shared, "frames": shared["frames"][1:]})
-    error = run("depth", alone, "--out", tmp_path / "labels.png").error
-    assert error.endswith("frame_00001.png: file not found; check the path.\n")
-    assert not (tmp_path / "labels.png").exists()
-
-
-def test_a_capture_of_one_frame_needs_no_camera(tmp_path, run):
-    root = write_nerfstudio(tmp_path / "capture")
-    shared = json.loads((root / "transforms.json").read_text())
-    write_text(root / "transforms.json", {**shared, "frames": shared["frames"][:1]})
-    assert run("depth", root, "--out", tmp_path / "planes.npz").code == 0
-    with np.load(tmp_path / "planes.npz") as result:
-        # In coordinates of the camera: x right, y down, z forwards.
-        expected = (FRAMES[0].points - FRAMES[0].place) @ (FRAMES[0].turn * [1, -1, -1])
-        np.testing.assert_allclose(result["points"], expected.reshape(-1, 3), atol=1e-3)
 
 
 def test_an_image_of_replica_beyond_its_poses_has_none(tmp_path):

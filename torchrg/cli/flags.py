@@ -85,13 +85,13 @@ IntrinsicsFlag = Annotated[
         metavar="CAMERA",
         text="Camera as fx,fy,cx,cy in pixels, with 0,0 at the center of the first pixel, or a "
         "camera file: a 3 x 3 or 4 x 4 matrix, JSON, YAML, info.txt or COLMAP's cameras.txt. "
-        "Intrinsics for a larger image size are scaled. Default: the camera file in the folder.",
+        "Intrinsics for a larger image are scaled. convert rgbd finds the camera file of a folder.",
     ),
 ]
 DepthScaleFlag = Annotated[
     float | None,
     Argument(
-        text="Depth units per meter, such as 1000 for millimeters. Default: that of the folder."
+        text="Depth units per meter, as 1000 for millimeters. convert rgbd knows those of layouts."
     ),
 ]
 DepthKindFlag = Annotated[
